@@ -1,0 +1,22 @@
+"""Opt3DGS optimizers for existing 3D Gaussian Splatting trainers.
+
+`AWSGLD` explores, `LQNAdam` exploits, `PhaseScheduler` puts both into a trainer's optimizers and
+switches between them. Paper: Huang, Chen, Liu, Ji, "Opt3DGS", AAAI 2026, arXiv 2511.13571.
+"""
+
+from opt3dgs_optim._version import __version__
+from opt3dgs_optim.awsgld import AWSGLD
+from opt3dgs_optim.curvature import two_loop
+from opt3dgs_optim.energy import EnergyHistogram
+from opt3dgs_optim.lqnadam import LQNAdam
+from opt3dgs_optim.phases import Phase, PhaseScheduler
+
+__all__ = [
+    "AWSGLD",
+    "EnergyHistogram",
+    "LQNAdam",
+    "Phase",
+    "PhaseScheduler",
+    "__version__",
+    "two_loop",
+]

@@ -1,0 +1,27 @@
+"""Which parameter group is which Gaussian parameter, in the names trainers use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+# gsplat | INRIA and 3dgs-mcmc | nerfstudio
+GAUSSIAN_NAMES: Mapping[str, tuple[str, ...]] = {
+    "means": ("means", "xyz"),
+    "scales": ("scales", "scaling"),
+    "quats": ("quats", "rotation"),
+    "opacities": ("opacities", "opacity"),
+    "sh0": ("sh0", "f_dc", "features_dc", "colors"),
+    "shN": ("shN", "f_rest", "features_rest", "features"),
+}
+_CANONICAL = {alias: name for name, aliases in GAUSSIAN_NAMES.items() for alias in aliases}
+
+
+def canonical_name(name: str | None) -> str | None:
+    """Gsplat's name of a Gaussian parameter group, or None for any other group."""
+    return _CANONICAL.get(name) if name is not None else None
+
+
+def is_positions(group: Mapping[str, Any]) -> bool:
+    """Whether a parameter group holds the Gaussians' positions."""
+    return canonical_name(group.get("name")) == "means"

@@ -1,0 +1,160 @@
+"""The optimizer that a trainer holds from the first step to the last, whatever the phase."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+from torch.optim import Adam, Optimizer
+
+from opt3dgs_optim._adam import HookedAdam, fused_on_cuda
+from opt3dgs_optim._groups import canonical_name, is_positions
+from opt3dgs_optim.awsgld import EnergyWatch
+from opt3dgs_optim.lqnadam import LQNAdam
+
+if TYPE_CHECKING:
+    from opt3dgs_optim.phases import PhaseScheduler
+
+STATE_KEY = "opt3dgs"  # in param_groups[0] of a state_dict: plain floats, lists and dicts
+CONSTRUCTOR_OPTIONS = (
+    "betas",
+    "eps",
+    "weight_decay",
+    "amsgrad",
+    "foreach",
+    "maximize",
+    "capturable",
+    "differentiable",
+    "fused",
+)
+
+
+class PhasedAdam(LQNAdam):
+    """Adam with nu and noise while exploring, with curvature on the positions while exploiting.
+
+    Made by `PhaseScheduler.upgrade`, never by hand. It takes over the parameter groups (the very
+    dicts: a learning-rate scheduler built on the old optimizer goes on working) and the state.
+    """
+
+    def __init__(self, optimizer: Adam, scheduler: PhaseScheduler) -> None:
+        defaults = {key: optimizer.defaults[key] for key in CONSTRUCTOR_OPTIONS}
+        if optimizer.defaults.get("decoupled_weight_decay"):
+            defaults["decoupled_weight_decay"] = True
+        groups = optimizer.param_groups
+        fused = fused_on_cuda(
+            groups, defaults["fused"], defaults["foreach"], bool(defaults["capturable"])
+        )
+        defaults["fused"] = fused
+        embedded = groups[0].pop(STATE_KEY, None)
+        # A class of torch's decides its options by the defaults, a step by its group's.
+        HookedAdam.__init__(self, groups, optimizer.defaults["lr"], **defaults)
+        self._init_curvature(scheduler.curvature_options)
+        self.scheduler = scheduler
+        self.switched = False
+        self._energy_watch = EnergyWatch("PhaseScheduler")
+        self.state.update(optimizer.state)
+        self._trust_loaded = True
+        if fused:
+            self._use_fused()
+        if embedded is not None:
+            self._load_embedded(embedded)
+
+    def _use_fused(self) -> None:
+        for group in self.param_groups:
+            group["fused"] = True
+        for param, state in self.state.items():
+            if "step" in state:
+                state["step"] = state["step"].to(param.device, torch.float32)
+
+    # -- phases ------------------------------------------------------------------------------
+
+    def _begin_step(self, loss: Any) -> None:
+        super()._begin_step(loss)
+        if loss is not None:
+            self.scheduler.observe(loss)
+        self._energy_watch.check(self.scheduler)
+        if self.scheduler.exploiting and not self.switched:
+            self.switched = True
+            if self.scheduler.reset_moments:
+                self._reset_moments()
+
+    def _reset_moments(self) -> None:
+        """Loss and direction change scale at the switch: old second moments would stall it."""
+        for state in self.state.values():
+            for key in ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq"):
+                if key in state:
+                    state[key].zero_()
+
+    def _bad_step(self) -> Tensor | None:
+        return ~self.scheduler.last_finite if self.scheduler.num_observed else None
+
+    def _factor(self, group: dict[str, Any]) -> Tensor | None:
+        multiplier = self.scheduler.multiplier
+        if multiplier is None or self.scheduler.exploiting or self.scheduler.num_observed == 0:
+            return None
+        return multiplier.multiplier if canonical_name(group.get("name")) else None
+
+    def _uses_curvature(self, group: Mapping[str, Any]) -> bool:
+        scheduler = self.scheduler
+        return scheduler.exploiting and scheduler.curvature and is_positions(group)
+
+    def _after_group(self, group: dict[str, Any], params: list[Tensor]) -> None:
+        noise = self.scheduler.noise
+        if noise is not None and is_positions(group):
+            for param in params:
+                noise.add_to(param, group["lr"])
+
+    # -- checkpoints -------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Any]:
+        """torch's, with the scheduler's state inside `param_groups[0]` as plain numbers."""
+        state_dict = super().state_dict()
+        state_dict["param_groups"][0][STATE_KEY] = {
+            "scheduler": self.scheduler.state_dict(),
+            "switched": self.switched,
+        }
+        return state_dict
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """As torch's, and restores the scheduler from `state_dict()`; plain Adam's is taken too."""
+        groups = [dict(group) for group in state_dict["param_groups"]]
+        embedded = groups[0].pop(STATE_KEY, None)
+        super().load_state_dict({**state_dict, "param_groups": groups})
+        if embedded is not None:
+            self._load_embedded(embedded)
+
+    def _load_embedded(self, embedded: Mapping[str, Any]) -> None:
+        self.switched = bool(embedded["switched"])
+        self.scheduler.load_state_dict(embedded["scheduler"])
+
+
+def check_upgradable(optimizer: Any, name: str) -> Adam:
+    """Return `optimizer` if it is torch's Adam (or AdamW built on it), else TypeError."""
+    call = "PhaseScheduler.upgrade"
+    if isinstance(optimizer, HookedAdam):
+        raise TypeError(
+            f"{call}: {name} is a {type(optimizer).__name__} of this package already; upgrade the "
+            "trainer's own torch.optim.Adam, once"
+        )
+    same_step = isinstance(optimizer, Adam) and (
+        inspect.unwrap(type(optimizer).step) is inspect.unwrap(Adam.step)
+    )
+    if not same_step:
+        kind = f"{type(optimizer).__module__}.{type(optimizer).__qualname__}"
+        raise TypeError(
+            f"{call}: {name} is a {kind}, but torch.optim.Adam (or a subclass with Adam's own "
+            "step) is needed"
+        )
+    return optimizer
+
+
+def named_groups(optimizer: Optimizer) -> list[str]:
+    """Names of the optimizer's groups; ValueError if one occurs twice."""
+    names = [group["name"] for group in optimizer.param_groups if "name" in group]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"PhaseScheduler.upgrade: two groups are named {twice[0]!r}")
+    return names

@@ -1,0 +1,183 @@
+"""AWSGLD: Adam's step times the flat-histogram multiplier, plus Langevin noise (eq. 15)."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, Literal, Protocol
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim._adam import HookedAdam, fused_on_cuda
+from opt3dgs_optim._checks import check_choice
+from opt3dgs_optim._groups import is_positions
+from opt3dgs_optim.energy import EnergyHistogram
+from opt3dgs_optim.noise import CovarianceNoise, IsotropicNoise
+
+STALE_STEPS = 200  # steps without a new energy before the user is told
+
+
+class AWSGLD(HookedAdam):
+    """Adaptively weighted stochastic gradient Langevin dynamics, driven by Adam (eq. 15).
+
+        x <- x - lr * nu * Adam(grad) + noise
+
+    nu comes from a flat histogram over the training loss (`EnergyHistogram`): steps are longer
+    where the loss is being seen more often with rising energy, shorter or backwards beyond the
+    peak. With `histogram=None` and `noise=None` this is `torch.optim.Adam`, bit for bit.
+
+    Args:
+        params, lr, betas, eps, weight_decay, amsgrad, foreach, maximize, capturable,
+        differentiable, fused: as in `torch.optim.Adam`. With CUDA parameters and no path asked
+            for, the fused one is used: it alone takes nu from the device without a
+            synchronisation.
+        histogram: where nu comes from; several optimizers may share one. None: nu is off.
+        noise: `IsotropicNoise` for any parameters, `CovarianceNoise` for the positions of
+            Gaussians (the group named `means` or `xyz`, or the only group), or None.
+        preconditioner: `"adam"`, or `"none"` for the plain SGLD drift `lr * nu * grad`, which
+            samples exp(-energy / temperature) together with `IsotropicNoise(temperature=...)`.
+        skip_nonfinite: rows with a non-finite gradient keep parameters and moments for a step
+            (those rows of `.grad` are set to zero).
+
+    The energy is the closure's value, or comes from `histogram.observe(loss)`, called once per
+    iteration before `step()`. A non-finite energy skips the step. Memory: Adam's.
+
+    Example:
+        >>> import torch
+        >>> from opt3dgs_optim import AWSGLD, EnergyHistogram
+        >>> x = torch.nn.Parameter(torch.tensor([2.0, 2.0]))
+        >>> histogram = EnergyHistogram(energy_range=(0.0, 8.0), temperature=1.0, warmup=10)
+        >>> optimizer = AWSGLD([x], lr=0.01, histogram=histogram)
+        >>> for _ in range(20):
+        ...     optimizer.zero_grad()
+        ...     loss = (x**2).sum()
+        ...     loss.backward()
+        ...     _ = histogram.observe(loss)
+        ...     optimizer.step()
+        >>> bool((x**2).sum() < 8.0)
+        True
+
+    Raises:
+        ValueError: an option is outside what is allowed.
+    """
+
+    def __init__(
+        self,
+        params: Any,
+        lr: float | Tensor = 1e-3,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-8,
+        weight_decay: float = 0.0,
+        amsgrad: bool = False,
+        *,
+        histogram: EnergyHistogram | None = None,
+        noise: IsotropicNoise | CovarianceNoise | None = None,
+        preconditioner: Literal["adam", "none"] = "adam",
+        skip_nonfinite: bool = True,
+        foreach: bool | None = None,
+        maximize: bool = False,
+        capturable: bool = False,
+        differentiable: bool = False,
+        fused: bool | None = None,
+    ) -> None:
+        check_choice("AWSGLD", "preconditioner", preconditioner, ("adam", "none"))
+        params = list(params)
+        if histogram is not None:
+            fused = fused_on_cuda(params, fused, foreach, capturable)
+        super().__init__(
+            params,
+            lr,
+            betas,
+            eps,
+            weight_decay,
+            amsgrad,
+            skip_nonfinite=skip_nonfinite,
+            foreach=foreach,
+            maximize=maximize,
+            capturable=capturable,
+            differentiable=differentiable,
+            fused=fused,
+        )
+        self.histogram = histogram
+        self.noise = noise
+        self.preconditioner = preconditioner
+        self._energy_watch = EnergyWatch("AWSGLD")
+
+    def _begin_step(self, loss: Any) -> None:
+        if self.histogram is None:
+            return
+        if loss is not None:
+            self.histogram.observe(loss)
+        self._energy_watch.check(self.histogram)
+
+    def _bad_step(self) -> Tensor | None:
+        return None if self.histogram is None else ~self.histogram.last_finite
+
+    def _factor(self, group: dict[str, Any]) -> Tensor | float | None:
+        if self.histogram is None or self.histogram.num_observed == 0:
+            return None
+        return self.histogram.multiplier
+
+    def _update(
+        self,
+        group: dict[str, Any],
+        params: list[Tensor],
+        grads: list[Tensor],
+        moments: tuple[list[Tensor], ...],
+        found_inf: Tensor | None,
+        has_complex: bool,
+    ) -> None:
+        if self.preconditioner == "adam":
+            super()._update(group, params, grads, moments, found_inf, has_complex)
+            return
+        lr = self._scaled_lr(group, params[0].device)
+        sign = 1.0 if group["maximize"] else -1.0
+        for param, grad in zip(params, grads, strict=True):
+            drift = grad + group["weight_decay"] * param if group["weight_decay"] else grad
+            if found_inf is not None:
+                drift = torch.where(found_inf > 0, 0.0, drift)
+            param.add_(drift * (sign * lr))
+
+    def _after_group(self, group: dict[str, Any], params: list[Tensor]) -> None:
+        if self.noise is None:
+            return
+        if isinstance(self.noise, CovarianceNoise) and not self._holds_positions(group):
+            return
+        for param in params:
+            self.noise.add_to(param, group["lr"])
+
+    def _holds_positions(self, group: dict[str, Any]) -> bool:
+        return is_positions(group) or (len(self.param_groups) == 1 and "name" not in group)
+
+
+class EnergySource(Protocol):
+    """What tells how many energies have been observed."""
+
+    num_observed: int
+
+
+class EnergyWatch:
+    """Says once, clearly, that an optimizer is stepped without any energy."""
+
+    def __init__(self, call: str) -> None:
+        self._call = call
+        self._seen = -1
+        self._stale = 0
+        self._told = False
+
+    def check(self, source: EnergySource) -> None:
+        """Call in every step."""
+        if self._told:
+            return
+        self._stale = self._stale + 1 if source.num_observed == self._seen else 0
+        self._seen = source.num_observed
+        if source.num_observed == 0 or self._stale >= STALE_STEPS:
+            since = "yet" if source.num_observed == 0 else f"for {STALE_STEPS} steps"
+            self._told = True
+            warnings.warn(
+                f"{self._call}: step() was called but no energy has been observed {since}, so "
+                "the multiplier is not being adapted and this is plain Adam. Call observe(loss) "
+                "on the histogram or the scheduler once per iteration, before step(), or pass "
+                "step() a closure that returns the loss.",
+                stacklevel=5,
+            )

@@ -1,0 +1,266 @@
+"""LQNAdam: a per-point L-BFGS direction as the gradient that Adam is fed (eq. 17)."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim import curvature
+from opt3dgs_optim._adam import HookedAdam
+from opt3dgs_optim._checks import (
+    check_choice,
+    check_count,
+    check_flag,
+    check_interval,
+    check_number,
+)
+
+HISTORY = "history"  # state keys: float tensors, points first, an all-zero row means "nothing"
+EPOCH = "epoch"
+
+
+@dataclass(frozen=True)
+class CurvatureOptions:
+    """Options of the per-point L-BFGS; see `LQNAdam` for their meaning."""
+
+    history_size: int = 5
+    pairs: Literal["consecutive", "epoch"] = "consecutive"
+    epoch_steps: int | None = None
+    min_cosine: float = 1e-6
+    powell: bool = False
+    graft: bool = True
+    gamma_clamp: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        call = "LQNAdam"
+        check_count(call, "history_size", self.history_size, 1, curvature.MAX_HISTORY)
+        check_choice(call, "pairs", self.pairs, ("consecutive", "epoch"))
+        if self.pairs == "epoch":
+            check_count(call, "epoch_steps (needed for pairs='epoch')", self.epoch_steps, 1)
+        elif self.epoch_steps is not None:
+            raise ValueError(
+                f"{call}: epoch_steps={self.epoch_steps!r}, but it is used with pairs='epoch' only"
+            )
+        check_number(call, "min_cosine", self.min_cosine, 0.0, 1.0, open_high=True)
+        check_flag(call, "powell", self.powell)
+        check_flag(call, "graft", self.graft)
+        if self.gamma_clamp is not None:
+            low, _ = check_interval(call, "gamma_clamp", self.gamma_clamp)
+            check_number(call, "gamma_clamp[0]", low, 0.0)
+
+
+class LQNAdam(HookedAdam):
+    """Adam fed with the local quasi-Newton direction of every point (eq. 17).
+
+    Dimension 0 of a parameter is points; the rest of it (3 coordinates, for Gaussians) is one
+    small optimization problem per point. Each keeps the last `history_size` curvature pairs, and
+    the L-BFGS two-loop recursion turns its gradient into a pseudo-gradient. There is no line
+    search: Adam takes the step. A point without a usable pair is stepped by plain Adam, bit for
+    bit.
+
+    Args:
+        params, lr, betas, eps, weight_decay, amsgrad, foreach, maximize, capturable,
+        differentiable, fused: as in `torch.optim.Adam`.
+        history_size: K, number of pairs, 1 to 16 (the paper: 5).
+        pairs: `"consecutive"` takes a pair between two consecutive visible steps of a point
+            (paper). `"epoch"` takes it between the means over two whole epochs of views, so that
+            y is not mostly the difference between two views.
+        epoch_steps: steps per epoch (the number of training views) for `pairs="epoch"`.
+        min_cosine: a pair is accepted if s.y > min_cosine |s| |y|.
+        powell: damp pairs of too little curvature instead of rejecting them.
+        graft: give the pseudo-gradient of each point the length of its gradient.
+        gamma_clamp: (low, high) bounds of gamma = s.y / y.y, parameter units per gradient unit.
+        skip_nonfinite: rows with a non-finite gradient keep parameters, moments and pairs for a
+            step (those rows of `.grad` are set to zero).
+
+    A point whose gradient is exactly zero is taken as not visible: no pair is stored for it. The
+    history is dropped where the parameter object, or its number of rows, is not the one of the
+    last step: a trainer's density control has moved the rows. A row that it sets to zero starts
+    anew.
+
+    Memory: 32 K bytes per point beyond Adam's (K > 3, D = 3, float32), 32 more with epoch pairs.
+
+    Example:
+        >>> import torch
+        >>> from opt3dgs_optim import LQNAdam
+        >>> points = torch.nn.Parameter(torch.ones(4, 3))
+        >>> optimizer = LQNAdam([points], lr=0.05)
+        >>> for _ in range(100):
+        ...     optimizer.zero_grad()
+        ...     (points**2 * torch.tensor([1.0, 10.0, 100.0])).sum().backward()
+        ...     optimizer.step()
+        >>> bool(points.abs().max() < 0.2)
+        True
+
+    Raises:
+        ValueError: an option is outside what is allowed, or a parameter is complex.
+    """
+
+    def __init__(
+        self,
+        params: Any,
+        lr: float | Tensor = 1e-3,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-8,
+        weight_decay: float = 0.0,
+        amsgrad: bool = False,
+        *,
+        history_size: int = 5,
+        pairs: Literal["consecutive", "epoch"] = "consecutive",
+        epoch_steps: int | None = None,
+        min_cosine: float = 1e-6,
+        powell: bool = False,
+        graft: bool = True,
+        gamma_clamp: tuple[float, float] | None = None,
+        skip_nonfinite: bool = True,
+        foreach: bool | None = None,
+        maximize: bool = False,
+        capturable: bool = False,
+        differentiable: bool = False,
+        fused: bool | None = None,
+    ) -> None:
+        options = CurvatureOptions(
+            history_size, pairs, epoch_steps, min_cosine, powell, graft, gamma_clamp
+        )
+        super().__init__(
+            params,
+            lr,
+            betas,
+            eps,
+            weight_decay,
+            amsgrad,
+            skip_nonfinite=skip_nonfinite,
+            foreach=foreach,
+            maximize=maximize,
+            capturable=capturable,
+            differentiable=differentiable,
+            fused=fused,
+        )
+        self._init_curvature(options)
+
+    def _init_curvature(self, options: CurvatureOptions) -> None:
+        self.curvature_options = options
+        self._seen: dict[int, tuple[weakref.ref[Tensor], int]] = {}
+        self._trust_loaded = False
+        self._tally: list[Tensor] = []  # [accepted, candidates] per parameter of the last step
+
+    @property
+    def accepted_share(self) -> Tensor | None:
+        """Share of the last step's candidate pairs that were accepted, 0-d; None before any."""
+        if not self._tally:
+            return None
+        accepted, candidates = torch.stack(self._tally).sum(0).unbind()
+        return accepted / candidates.clamp(min=1)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """As torch's; a loaded history is used if its shape fits the parameters."""
+        super().load_state_dict(state_dict)
+        self._seen.clear()
+        self._trust_loaded = True
+
+    # -- the step ----------------------------------------------------------------------------
+
+    def _begin_step(self, loss: Any) -> None:
+        super()._begin_step(loss)
+        self._tally = []
+
+    def _uses_curvature(self, group: Mapping[str, Any]) -> bool:
+        return True
+
+    def _gradients(
+        self, group: dict[str, Any], params: list[Tensor], grads: list[Tensor]
+    ) -> list[Tensor]:
+        if not self._uses_curvature(group):
+            return grads
+        epoch_ends = self._advance_epoch(group)
+        # Curvature is that of the function being minimised, in unscaled units.
+        unit = -1.0 if group["maximize"] else 1.0
+        grad_scale = getattr(self, "grad_scale", None)
+        if grad_scale is not None:
+            unit = unit * grad_scale
+        plain = isinstance(unit, float) and unit == 1.0
+        fed = []
+        for param, grad in zip(params, grads, strict=True):
+            used = grad if plain else grad / unit
+            used = self._pseudo_gradient(param, used, epoch_ends)
+            fed.append(used if plain else used * unit)
+        self._trust_loaded = False
+        return fed
+
+    def _advance_epoch(self, group: dict[str, Any]) -> bool:
+        """Count the steps of the epoch (in the group: a plain int that checkpoints keep)."""
+        steps = self.curvature_options.epoch_steps
+        if steps is None:
+            return False
+        group["epoch_step"] = group.get("epoch_step", 0) % steps + 1
+        return group["epoch_step"] == steps
+
+    def _pseudo_gradient(self, param: Tensor, grad: Tensor, epoch_ends: bool) -> Tensor:
+        if param.is_complex():
+            raise ValueError("LQNAdam: complex parameters have no real curvature pairs")
+        if param.numel() == 0:
+            return grad
+        options = self.curvature_options
+        rows = param.shape[0] if param.dim() else 1
+        position, gradient = param.detach().reshape(rows, -1), grad.reshape(rows, -1)
+        history = self._history(param, position)
+        visible = (gradient != 0).any(dim=1) & torch.isfinite(gradient).all(dim=1)
+        if options.pairs == "epoch":
+            recorded = self._average_epoch(param, position, gradient, visible, epoch_ends)
+        else:
+            recorded = (position, gradient, visible)
+        if recorded is not None:
+            accepted, candidates = curvature.record(
+                history,
+                options.history_size,
+                *recorded,
+                min_cosine=options.min_cosine,
+                powell=options.powell,
+            )
+            self._tally.append(torch.stack([accepted.sum(), candidates.sum()]))
+        return curvature.direction(
+            gradient,
+            history,
+            options.history_size,
+            graft=options.graft,
+            gamma_clamp=options.gamma_clamp,
+        ).reshape(grad.shape)
+
+    def _average_epoch(
+        self,
+        param: Tensor,
+        position: Tensor,
+        gradient: Tensor,
+        visible: Tensor,
+        epoch_ends: bool,
+    ) -> tuple[Tensor, Tensor, Tensor] | None:
+        state, steps = self.state[param], self.curvature_options.epoch_steps or 0
+        if EPOCH not in state:
+            state[EPOCH] = curvature.new_history(position, 1)[:, 0].clone()
+        curvature.accumulate(state[EPOCH], position, gradient, visible)
+        if not epoch_ends:
+            return None
+        mean = curvature.epoch_mean(state[EPOCH], steps)
+        state[EPOCH].zero_()
+        return mean
+
+    def _history(self, param: Tensor, position: Tensor) -> Tensor:
+        """This parameter's history; a new one if somebody has exchanged or resized its rows."""
+        state = self.state[param]
+        size = self.curvature_options.history_size
+        slots = curvature.num_slots(size, position.shape[1])
+        shape = (position.shape[0], slots, 2 * (position.shape[1] + 1))
+        seen = self._seen.get(id(param))
+        known = seen is not None and seen[0]() is param and seen[1] == position.shape[0]
+        fits = HISTORY in state and tuple(state[HISTORY].shape) == shape
+        if not fits or not (known or self._trust_loaded):
+            state[HISTORY] = curvature.new_history(position, size)
+            state.pop(EPOCH, None)
+        self._seen = {key: entry for key, entry in self._seen.items() if entry[0]() is not None}
+        self._seen[id(param)] = (weakref.ref(param), position.shape[0])
+        return state[HISTORY]
