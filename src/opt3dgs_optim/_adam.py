@@ -24,9 +24,11 @@ class HookedAdam(Adam):
         self.skip_nonfinite = bool(kwargs.pop("skip_nonfinite", True))
         super().__init__(params, lr, *args, **kwargs)
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
-        self.__dict__.setdefault("skip_nonfinite", True)
+    # Attributes of ours that a copy or a pickle takes along (torch keeps its own three only).
+    _own: tuple[str, ...] = ("skip_nonfinite",)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), **{name: getattr(self, name) for name in self._own}}
 
     # -- what subclasses say -----------------------------------------------------------------
 

@@ -39,6 +39,8 @@ class PhasedAdam(LQNAdam):
     dicts: a learning-rate scheduler built on the old optimizer goes on working) and the state.
     """
 
+    _own = (*LQNAdam._own, "scheduler", "switched", "_energy_watch")
+
     def __init__(self, optimizer: Adam, scheduler: PhaseScheduler) -> None:
         defaults = {key: optimizer.defaults[key] for key in CONSTRUCTOR_OPTIONS}
         if optimizer.defaults.get("decoupled_weight_decay"):

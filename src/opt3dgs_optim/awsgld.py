@@ -61,6 +61,8 @@ class AWSGLD(HookedAdam):
         ValueError: an option is outside what is allowed.
     """
 
+    _own = (*HookedAdam._own, "histogram", "noise", "preconditioner", "_energy_watch")
+
     def __init__(
         self,
         params: Any,

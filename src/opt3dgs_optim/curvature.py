@@ -84,10 +84,10 @@ def two_loop(
         pairs gets its gradient back.
     """
     dim = grad.shape[1]
-    if history.shape[0] != grad.shape[0] or history.shape[2] != 2 * (dim + 1):
+    needed = (grad.shape[0], num_slots(history_size, dim), 2 * (dim + 1))
+    if tuple(history.shape) != needed:
         raise ValueError(
-            f"two_loop: history has shape {tuple(history.shape)}, but "
-            f"[{grad.shape[0]}, {num_slots(history_size, dim)}, {2 * (dim + 1)}] is needed for a "
+            f"two_loop: history has shape {tuple(history.shape)}, but {needed} is needed for a "
             f"gradient of shape {tuple(grad.shape)} and history_size={history_size}"
         )
     s, y, inverse_sy = _ordered_pairs(history, history_size, dim)
@@ -199,7 +199,7 @@ def record(
     pair = normalised_pair(position - head.position, gradient - head.gradient)
     candidate = visible & (head.counter > 0)
     if powell:
-        pair = _damped(pair, _gamma(history, history_size))
+        pair = damped_pair(pair, newest_gamma(history, history_size))
     accepted = candidate & (pair.cosine > min_cosine) & torch.isfinite(pair.s).all(dim=1)
     _push(history, history_size, pair, accepted)
     row = visible.unsqueeze(1)
@@ -209,7 +209,7 @@ def record(
     return accepted, candidate
 
 
-def _gamma(history: Tensor, history_size: int) -> Tensor:
+def newest_gamma(history: Tensor, history_size: int) -> Tensor:
     """Gamma of the newest pair, [N]; 0 where there is none."""
     n, slots, lanes = history.shape
     dim = lanes // 2 - 1
@@ -219,7 +219,7 @@ def _gamma(history: Tensor, history_size: int) -> Tensor:
     return (pair[:, :dim] * pair[:, dim + 1 : 2 * dim + 1]).sum(1)
 
 
-def _damped(pair: Pair, gamma: Tensor) -> Pair:
+def damped_pair(pair: Pair, gamma: Tensor) -> Pair:
     sy = (pair.s * pair.y).sum(1)
     s_bs = (pair.s * pair.s).sum(1) / torch.where(gamma > 0, gamma, 1.0)
     low = (gamma > 0) & (sy < 0.2 * s_bs)

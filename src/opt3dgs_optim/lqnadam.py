@@ -101,6 +101,13 @@ class LQNAdam(HookedAdam):
         ValueError: an option is outside what is allowed, or a parameter is complex.
     """
 
+    _own = (*HookedAdam._own, "curvature_options")
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._init_curvature(self.curvature_options)
+        self._trust_loaded = True  # the copied parameters are other objects, the rows the same
+
     def __init__(
         self,
         params: Any,

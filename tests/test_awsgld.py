@@ -1,0 +1,325 @@
+"""AWSGLD: torch's Adam where nu is off, the sampler's law where it samples."""
+
+from __future__ import annotations
+
+import copy
+import math
+import re
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from oracles import adam_steps
+from torch import Tensor
+
+from opt3dgs_optim import AWSGLD, EnergyHistogram
+from opt3dgs_optim.multiplier import ConstantMultiplier
+from opt3dgs_optim.noise import CovarianceNoise, IsotropicNoise
+
+PATHS = [
+    {},
+    {"foreach": True},
+    {"foreach": False},
+    {"fused": True},
+    {"amsgrad": True},
+    {"weight_decay": 0.1},
+    {"maximize": True},
+    {"fused": True, "amsgrad": True, "weight_decay": 0.1},
+    {"foreach": True, "maximize": True, "weight_decay": 0.1},
+]
+SHAPES = [(5, 3), (5, 1, 3), (5,), ()]
+
+
+def parameters(seed: int = 0) -> list[torch.nn.Parameter]:
+    generator = torch.Generator().manual_seed(seed)
+    return [torch.nn.Parameter(torch.randn(shape, generator=generator)) for shape in SHAPES]
+
+
+def set_gradients(params: list[torch.nn.Parameter], seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    for param in params:
+        param.grad = torch.randn(param.shape, generator=generator)
+
+
+@pytest.mark.parametrize("path", PATHS, ids=str)
+@pytest.mark.parametrize("histogram", ["none", "warm-up"])
+def test_is_torch_adam_bit_for_bit_with_nu_off(path: dict, histogram: str) -> None:
+    ours, theirs = parameters(), parameters()
+    source = EnergyHistogram(warmup=1000) if histogram == "warm-up" else None
+    a = AWSGLD(ours, lr=0.01, histogram=source, **path)
+    b = torch.optim.Adam(theirs, lr=0.01, **path)
+    for step in range(30):
+        set_gradients(ours, step)
+        set_gradients(theirs, step)
+        if source is not None:
+            source.observe(0.1)
+        a.step()
+        b.step()
+    for x, y in zip(ours, theirs, strict=True):
+        assert torch.equal(x, y)
+        for key in b.state[y]:
+            assert torch.equal(a.state[x][key], b.state[y][key])
+
+
+@pytest.mark.parametrize("path", PATHS, ids=str)
+def test_a_computed_nu_of_one_is_adam_to_rounding(path: dict) -> None:
+    ours, theirs = parameters(), parameters()
+    source = ConstantMultiplier(1.0)
+    a = AWSGLD(ours, lr=0.01, histogram=source, **path)  # pyright: ignore[reportArgumentType]
+    b = torch.optim.Adam(theirs, lr=0.01, **path)
+    for step in range(30):
+        set_gradients(ours, step)
+        set_gradients(theirs, step)
+        source.observe(0.1)
+        a.step()
+        b.step()
+    for x, y in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(x, y, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("path", [{}, {"foreach": True}, {"fused": True}], ids=str)
+def test_nu_multiplies_adams_output(path: dict) -> None:
+    """Against a float64 Adam with a factor on every step; nu negative at times."""
+    start = np.random.default_rng(0).normal(size=(4, 3))
+    param = torch.nn.Parameter(torch.tensor(start))
+    histogram = EnergyHistogram(8, (0.0, 1.0), temperature=1.5, warmup=5, step_size=0.3)
+    optimizer = AWSGLD([param], lr=0.05, histogram=histogram, **path)
+    rng, grads, factors = np.random.default_rng(1), [], []
+    for _ in range(60):
+        grads.append(rng.normal(size=(4, 3)))
+        param.grad = torch.tensor(grads[-1])
+        factors.append(float(histogram.observe(float(rng.uniform(0.2, 0.9)))))
+        optimizer.step()
+    assert min(factors) < 0 < max(factors)
+    expected = adam_steps(start, grads, 0.05, factors)
+    np.testing.assert_allclose(param.detach().numpy(), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_learning_rate_is_never_touched() -> None:
+    params = parameters()
+    histogram = EnergyHistogram(8, (0.0, 1.0), temperature=1.0, warmup=0, step_size=0.3)
+    optimizer = AWSGLD(params, lr=0.01, histogram=histogram)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.9)
+    for step in range(10):
+        set_gradients(params, step)
+        histogram.observe(0.1 * step)
+        optimizer.step()
+        schedule.step()
+    assert optimizer.param_groups[0]["lr"] == pytest.approx(0.01 * 0.9**10, rel=1e-12)
+
+
+def test_energy_comes_from_the_closure() -> None:
+    x = torch.nn.Parameter(torch.tensor([3.0]))
+    histogram = EnergyHistogram(8, (0.0, 10.0), temperature=0.1, warmup=0)
+    optimizer = AWSGLD([x], lr=0.1, histogram=histogram)
+
+    def closure() -> Tensor:
+        optimizer.zero_grad()
+        loss = (x**2).sum()
+        loss.backward()
+        return loss
+
+    assert float(optimizer.step(closure).detach()) == 9.0
+    assert histogram.num_observed == 1
+
+
+@pytest.mark.parametrize("path", [{}, {"foreach": True}, {"fused": True}], ids=str)
+def test_non_finite_energy_skips_the_step(path: dict) -> None:
+    params = parameters()
+    histogram = EnergyHistogram.paper(warmup=0)
+    optimizer = AWSGLD(params, lr=0.1, histogram=histogram, noise=IsotropicNoise(std=1.0), **path)
+    set_gradients(params, 0)
+    histogram.observe(0.1)
+    optimizer.step()
+    before = [p.detach().clone() for p in params]
+    state = copy.deepcopy(optimizer.state_dict())
+    histogram.observe(float("nan"))
+    optimizer.step()
+    assert all(torch.equal(p, q) for p, q in zip(params, before, strict=True))
+    for a, b in zip(
+        state["state"].values(), optimizer.state_dict()["state"].values(), strict=True
+    ):
+        assert all(torch.equal(a[key], b[key]) for key in a)
+
+
+@pytest.mark.parametrize("path", [{}, {"foreach": True}, {"fused": True}], ids=str)
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_non_finite_rows_stand_still_and_the_others_do_not_notice(path: dict, bad: float) -> None:
+    clean, hostile = [torch.nn.Parameter(torch.ones(6, 3)) for _ in "ab"]
+    a, b = AWSGLD([clean], lr=0.1, **path), AWSGLD([hostile], lr=0.1, **path)
+    for step in range(8):
+        generator = torch.Generator().manual_seed(step)
+        clean.grad = torch.randn(6, 3, generator=generator)
+        hostile.grad = clean.grad.clone()
+        if step == 3:
+            hostile.grad[2, 1] = bad
+            before = [hostile[2].detach().clone()]
+            before += [b.state[hostile][key][2].clone() for key in ("exp_avg", "exp_avg_sq")]
+        a.step()
+        b.step()
+        if step == 3:
+            now = [hostile[2]] + [b.state[hostile][key][2] for key in ("exp_avg", "exp_avg_sq")]
+            assert all(torch.equal(x, y) for x, y in zip(before, now, strict=True))
+    others = [0, 1, 3, 4, 5]
+    assert torch.equal(clean[others], hostile[others])
+    assert bool(torch.isfinite(hostile).all())
+    assert not torch.equal(hostile[2], before[0])  # it moves again once its gradient is finite
+
+
+def test_without_any_energy_it_says_so_once() -> None:
+    params = parameters()
+    optimizer = AWSGLD(params, lr=0.01, histogram=EnergyHistogram())
+    set_gradients(params, 0)
+    with pytest.warns(UserWarning, match="no energy has been observed yet"):
+        optimizer.step()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        optimizer.step()
+
+
+def test_an_energy_that_stops_coming_is_noticed() -> None:
+    params = parameters()
+    histogram = EnergyHistogram()
+    optimizer = AWSGLD(params, lr=0.01, histogram=histogram)
+    set_gradients(params, 0)
+    histogram.observe(0.1)
+    with pytest.warns(UserWarning, match="no energy has been observed for 200 steps"):
+        for _ in range(202):
+            optimizer.step()
+
+
+def test_isotropic_noise_has_the_stated_deviation() -> None:
+    torch.manual_seed(0)
+    x = torch.nn.Parameter(torch.zeros(20_000))
+    optimizer = AWSGLD([x], lr=0.25, noise=IsotropicNoise(temperature=2.0))
+    x.grad = torch.zeros_like(x)
+    optimizer.step()
+    # sqrt(2 lr T) = 1; standard error of a deviation from 20,000 draws: 0.005
+    assert float(x.detach().std()) == pytest.approx(1.0, abs=0.025)
+
+
+def test_covariance_noise_moves_the_positions_only() -> None:
+    torch.manual_seed(0)
+    means, scales = [torch.nn.Parameter(torch.zeros(50, 3)) for _ in "ab"]
+    gaussians = {"scales": scales, "quats": torch.ones(50, 4), "opacities": torch.full((50,), -9.0)}
+    optimizer = AWSGLD(
+        [{"params": [means], "name": "means"}, {"params": [scales], "name": "scales"}],
+        lr=0.1,
+        noise=CovarianceNoise(gaussians, scale=1.0),
+    )
+    means.grad, scales.grad = torch.zeros(50, 3), torch.zeros(50, 3)
+    optimizer.step()
+    assert float(means.detach().std()) == pytest.approx(0.1 * 0.62, rel=0.3)  # gate sigmoid(.5) = .62
+    assert not scales.any()
+
+
+def test_plain_drift_samples_a_gaussian() -> None:
+    """SGLD on x^2 / 2 at temperature T samples N(0, T / (1 - lr / 2)) exactly (AR(1) process)."""
+    torch.manual_seed(0)
+    x = torch.nn.Parameter(torch.zeros(4000))
+    lr, temperature = 0.2, 0.5
+    optimizer = AWSGLD(
+        [x], lr=lr, preconditioner="none", noise=IsotropicNoise(temperature=temperature)
+    )
+    moments = []
+    for step in range(120):
+        x.grad = x.detach().clone()
+        optimizer.step()
+        if step >= 60 and step % 15 == 0:
+            moments.append(x.detach().square().mean())
+    expected = temperature / (1 - lr / 2)
+    # relative standard error of a variance from 16,000 nearly independent draws: 1.1 %
+    assert float(torch.stack(moments).mean()) == pytest.approx(expected, rel=0.04)
+    # kurtosis of a Gaussian
+    z = x.detach() / x.detach().std()
+    assert float((z**4).mean()) == pytest.approx(3.0, abs=0.4)
+
+
+def test_plain_drift_samples_a_double_well() -> None:
+    """Both wells, and the density between them, at a small step."""
+    torch.manual_seed(1)
+    height, temperature, lr = 1.0, 1.0, 0.01
+    x = torch.nn.Parameter(torch.linspace(-1.5, 1.5, 8000, dtype=torch.float64))
+    optimizer = AWSGLD(
+        [x], lr=lr, preconditioner="none", noise=IsotropicNoise(temperature=temperature)
+    )
+    for _ in range(600):
+        x.grad = 4 * height * x.detach() * (x.detach() ** 2 - 1)
+        optimizer.step()
+    grid = torch.linspace(-2.5, 2.5, 2001, dtype=torch.float64)
+    density = torch.exp(-height * (grid**2 - 1) ** 2 / temperature)
+    cdf = density.cumsum(0) / density.sum()
+    draws = x.detach().sort().values
+    empirical = torch.searchsorted(draws, grid).double() / draws.numel()
+    # Kolmogorov-Smirnov of 8,000 draws: 1 % critical value 0.018; 0.01 for the step's own bias
+    assert float((empirical - cdf).abs().max()) < 0.03
+
+
+def test_plain_drift_takes_nu() -> None:
+    x = torch.nn.Parameter(torch.tensor([1.0], dtype=torch.float64))
+    histogram = ConstantMultiplier(-0.5)
+    optimizer = AWSGLD([x], lr=0.1, preconditioner="none", histogram=histogram)  # pyright: ignore
+    x.grad = torch.tensor([3.0], dtype=torch.float64)
+    histogram.observe(0.0)
+    optimizer.step()
+    assert x.item() == pytest.approx(1.0 + 0.1 * 0.5 * 3.0)
+
+
+def test_equal_seeds_give_equal_runs() -> None:
+    runs = []
+    for _ in "ab":
+        torch.manual_seed(3)
+        x = torch.nn.Parameter(torch.zeros(10))
+        optimizer = AWSGLD([x], lr=0.1, noise=IsotropicNoise(std=0.3))
+        for _ in range(5):
+            x.grad = torch.ones(10)
+            optimizer.step()
+        runs.append(x.detach().clone())
+    assert torch.equal(*runs)
+
+
+def test_step_hooks_run_once() -> None:
+    params = parameters()
+    optimizer = AWSGLD(params, lr=0.01)
+    torch.optim.Adam(parameters())  # torch wraps Adam.step on the first construction
+    calls = []
+    optimizer.register_step_pre_hook(lambda *_: calls.append("pre"))
+    optimizer.register_step_post_hook(lambda *_: calls.append("post"))
+    set_gradients(params, 0)
+    optimizer.step()
+    assert calls == ["pre", "post"]
+    assert isinstance(optimizer, torch.optim.Adam)
+
+
+def test_deepcopy_goes_on_alike() -> None:
+    params = parameters()
+    histogram = EnergyHistogram(8, (0.0, 1.0), temperature=1.0, warmup=0, step_size=0.3)
+    optimizer = AWSGLD(params, lr=0.01, histogram=histogram)
+    set_gradients(params, 0)
+    histogram.observe(0.3)
+    optimizer.step()
+    twin = copy.deepcopy(optimizer)
+    twins = twin.param_groups[0]["params"]
+    for p, q in zip(params, twins, strict=True):
+        q.grad = p.grad.clone()  # pyright: ignore[reportOptionalMemberAccess]
+    for each in (optimizer, twin):
+        each.histogram.observe(0.55)
+        each.step()
+    assert all(torch.equal(p, q) for p, q in zip(params, twins, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: AWSGLD(parameters(), preconditioner="rmsprop"), "preconditioner='rmsprop'"),  # pyright: ignore
+        (lambda: AWSGLD(parameters(), lr=-1.0), "learning rate"),
+        (lambda: IsotropicNoise(), "exactly one"),
+        (lambda: IsotropicNoise(temperature=-1.0), "temperature=-1.0"),
+        (lambda: IsotropicNoise(temperature=1.0, std=1.0), "exactly one"),
+        (lambda: CovarianceNoise({}, scale=-1.0), "scale=-1.0"),
+    ],
+)
+def test_bad_options(make, message: str) -> None:  # noqa: ANN001
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make()

@@ -1,0 +1,114 @@
+"""Small stand-ins for a trainer, with the row edits that density control makes."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+
+from opt3dgs_optim import PhaseScheduler
+
+RATES = {
+    "means": 1e-2,
+    "scales": 5e-3,
+    "quats": 1e-3,
+    "opacities": 5e-2,
+    "sh0": 2.5e-3,
+    "shN": 1.25e-4,
+}
+SHAPES = {
+    "means": (3,),
+    "scales": (3,),
+    "quats": (4,),
+    "opacities": (),
+    "sh0": (1, 3),
+    "shN": (15, 3),
+}
+INRIA_NAMES = {
+    "means": "xyz",
+    "sh0": "f_dc",
+    "shN": "f_rest",
+    "opacities": "opacity",
+    "scales": "scaling",
+    "quats": "rotation",
+}
+
+
+def make_splats(n: int = 12, seed: int = 0) -> dict[str, Parameter]:
+    """Random Gaussians under gsplat's names."""
+    generator = torch.Generator().manual_seed(seed)
+    return {
+        name: Parameter(torch.randn(n, *shape, generator=generator))
+        for name, shape in SHAPES.items()
+    }
+
+
+def gsplat_optimizers(splats: dict[str, Parameter], **options) -> dict[str, torch.optim.Optimizer]:  # noqa: ANN003
+    """One Adam per parameter, built as gsplat's simple_trainer does."""
+    return {
+        name: torch.optim.Adam(
+            [{"params": param, "lr": RATES[name], "name": name}], eps=1e-15, **options
+        )
+        for name, param in splats.items()
+    }
+
+
+def inria_optimizer(splats: dict[str, Parameter]) -> torch.optim.Adam:
+    """One Adam with named groups, built as INRIA's training_setup does."""
+    groups = [
+        {"params": [splats[name]], "lr": RATES[name], "name": inria}
+        for name, inria in INRIA_NAMES.items()
+    ]
+    return torch.optim.Adam(groups, lr=0.0, eps=1e-15)
+
+
+def view_loss(splats: dict[str, Parameter], view: int, phases: PhaseScheduler | None = None) -> Tensor:
+    """A smooth loss in which all parameters and the view matter; every third point is unseen."""
+    generator = torch.Generator().manual_seed(1000 + view)
+    loss = torch.zeros(())
+    for name, param in splats.items():
+        weight = torch.rand(param.shape[1:], generator=generator) + 0.5
+        seen = torch.arange(param.shape[0]) % 3 != view % 3
+        render = (param * weight)[seen]
+        target = torch.full_like(render, 0.1 * (view + 1))
+        term = (render - target).abs().mean() if phases is None else phases.pixel_loss(render, target)
+        loss = loss + (0.02 if name != "means" else 0.05) * term
+    return loss
+
+
+def train(
+    splats: dict[str, Parameter],
+    optimizers: dict[str, torch.optim.Optimizer] | torch.optim.Optimizer,
+    phases: PhaseScheduler | None,
+    first: int,
+    last: int,
+) -> None:
+    """Iterations first .. last - 1 in gsplat's order: backward, (observe), step, zero_grad."""
+    every = optimizers.values() if isinstance(optimizers, dict) else [optimizers]
+    for iteration in range(first, last):
+        loss = view_loss(splats, iteration % 5, phases)
+        loss.backward()
+        if phases is not None:
+            phases.observe(loss, view=iteration % 5)
+        for optimizer in every:
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+
+
+def edit_rows(
+    splats: dict[str, Parameter], optimizers: dict[str, torch.optim.Optimizer], rows: Tensor, new: int
+) -> None:
+    """gsplat's `_update_param_with_optimizer`: keep `rows`, append `new` zero-state rows."""
+    for name, optimizer in optimizers.items():
+        for group in optimizer.param_groups:
+            old = group["params"][0]
+            added = old.detach()[:new].clone()
+            fresh = Parameter(torch.cat([old.detach()[rows], added]))
+            state = optimizer.state.pop(old, {})
+            for key, value in state.items():
+                if key != "step":
+                    zeros = torch.zeros((new, *value.shape[1:]))
+                    state[key] = torch.cat([value[rows], zeros])
+            optimizer.state[fresh] = state
+            group["params"] = [fresh]
+            splats[name] = fresh
