@@ -1,0 +1,239 @@
+"""Density control of 3DGS-MCMC: dead Gaussians move to live ones, and the number grows to a cap.
+
+Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", NeurIPS 2024. The Langevin
+noise is not here: the optimizer package injects it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+
+from splatting.relocation import MAX_OPACITY, relocated_values
+
+_REFERENCE_RUN = 30_000  # iterations that 500, 25,000 and 100 were made for
+Optimizers = Mapping[str, torch.optim.Optimizer]
+
+_REQUIRED = ("means", "scales", "quats", "opacities")
+
+
+@dataclass(frozen=True)
+class DensityReport:
+    """What one `MCMCDensityControl.step` did."""
+
+    refined: bool  # whether this was a refinement iteration
+    relocated: int  # dead Gaussians that were moved
+    added: int  # new Gaussians
+    total: int  # Gaussians afterwards
+
+
+class MCMCDensityControl:
+    """Relocation and growth on a schedule, with gsplat 1.5.3's edits of the optimizer state.
+
+    Args:
+        cap_max: at most so many Gaussians.
+        refine_start: refine after this iteration.
+        refine_stop: refine before this iteration.
+        refine_every: refine at the multiples of this.
+        min_opacity: at or below it (after the sigmoid) a Gaussian is dead.
+        growth: factor on the number of Gaussians at each refinement, rounded down.
+        generator: for the sampling; None is torch's global one.
+    """
+
+    def __init__(
+        self,
+        cap_max: int,
+        refine_start: int = 500,
+        refine_stop: int = 25_000,
+        refine_every: int = 100,
+        min_opacity: float = 0.005,
+        growth: float = 1.05,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        _check_at_least("cap_max", cap_max, 0)
+        _check_at_least("refine_start", refine_start, 0)
+        _check_at_least("refine_stop", refine_stop, refine_start)
+        _check_at_least("refine_every", refine_every, 1)
+        _check_at_least("growth", growth, 1.0)
+        if not 0.0 < min_opacity < 1.0:
+            raise ValueError(
+                f"MCMCDensityControl: min_opacity={min_opacity}, must be inside (0, 1)"
+            )
+        self.cap_max, self.min_opacity, self.growth = cap_max, min_opacity, growth
+        self.refine_start, self.refine_stop = refine_start, refine_stop
+        self.refine_every = refine_every
+        self.generator = generator
+
+    @classmethod
+    def for_run(
+        cls,
+        iterations: int,
+        cap_max: int,
+        *,
+        num_points: int | None = None,
+        min_opacity: float = 0.005,
+        generator: torch.Generator | None = None,
+    ) -> MCMCDensityControl:
+        """Fit the stock schedule (500, 25,000, 100 of 30,000 iterations) to a run of any length.
+
+        Start and stop scale with the run. The cadence does too, but stays within 20 to 100
+        iterations: Adam's first moment needs some ten updates to settle after a move. That leaves
+        a short run fewer refinements than the 244 of a stock one (61 of 1,500 iterations, enough
+        for a factor of 19.6 at 5 %). Where `num_points` is given and 5 % would not reach the cap
+        half-way between start and stop, the growth is raised until it does.
+
+        Args:
+            iterations: length of the whole run.
+            cap_max: at most so many Gaussians.
+            num_points: how many the run starts with; None leaves the growth at 5 %.
+            min_opacity: see the class.
+            generator: see the class.
+        """
+        _check_at_least("iterations", iterations, 1)
+        scale = iterations / _REFERENCE_RUN
+        start, stop = round(500 * scale), round(25_000 * scale)
+        every = min(max(round(100 * scale), 20), 100)
+        growth = 1.05
+        if num_points is not None:
+            _check_at_least("num_points", num_points, 1)
+            half = max(((start + stop) // 2 - start) // every, 1)
+            growth = max(growth, (cap_max / num_points) ** (1.0 / half))
+        return cls(cap_max, start, stop, every, min_opacity, growth, generator)
+
+    def step(
+        self,
+        iteration: int,
+        gaussians: dict[str, Parameter],
+        optimizers: Optimizers,
+    ) -> DensityReport:
+        """Relocate and grow if this is a refinement iteration; call it after the optimizers' step.
+
+        Edits the way gsplat does: every entry of `gaussians` becomes a new Parameter object,
+        relocation keeps its storage and zeroes the state of the *sampled* rows (not of the moved
+        ones), growth appends float32 zeros to every state tensor but "step".
+
+        Args:
+            iteration: counted from 0.
+            gaussians: the dict of `gaussians.py`; its entries are replaced.
+            optimizers: one for each key, with one group that holds that one parameter.
+
+        Raises:
+            ValueError: keys are missing, an optimizer is not of that form, or an opacity is NaN.
+        """
+        total = len(gaussians["means"])
+        in_window = self.refine_start < iteration < self.refine_stop
+        if not in_window or iteration % self.refine_every != 0:
+            return DensityReport(False, 0, 0, total)
+        _check_slots(gaussians, optimizers)
+        with torch.no_grad():
+            relocated = self._relocate(gaussians, optimizers)
+            added = self._grow(gaussians, optimizers)
+        return DensityReport(True, relocated, added, total + added)
+
+    def _relocate(self, gaussians: dict[str, Parameter], optimizers: Optimizers) -> int:
+        opacities = torch.sigmoid(gaussians["opacities"].flatten())
+        if torch.isnan(opacities).any():
+            raise ValueError("MCMCDensityControl.step: NaN among the opacities")
+        is_dead = opacities <= self.min_opacity
+        dead, alive = is_dead.nonzero()[:, 0], (~is_dead).nonzero()[:, 0]
+        if len(dead) == 0 or len(alive) == 0:  # gsplat fails with none alive; nowhere to go
+            return 0
+        sources = alive[self._sample(opacities[alive], len(dead))]
+        self._shrink(gaussians, opacities, sources)
+        for name, parameter in list(gaussians.items()):
+            parameter[dead] = parameter[sources]
+            # Upstream keeps the moved rows' moments and zeroes those of their sources.
+            _replace(name, parameter.data, gaussians, optimizers, _zero_rows(sources))
+        return len(dead)
+
+    def _grow(self, gaussians: dict[str, Parameter], optimizers: Optimizers) -> int:
+        count = len(gaussians["means"])
+        added = max(0, min(self.cap_max, int(self.growth * count)) - count)
+        opacities = torch.sigmoid(gaussians["opacities"].flatten())
+        if added == 0 or not opacities.sum() > 0:
+            return 0
+        sources = self._sample(opacities, added)
+        self._shrink(gaussians, opacities, sources)
+        for name, parameter in list(gaussians.items()):
+            grown = torch.cat((parameter.data, parameter.data[sources]))
+            _replace(name, grown, gaussians, optimizers, _append_zero_rows(added))
+        return added
+
+    def _sample(self, weights: Tensor, count: int) -> Tensor:
+        return torch.multinomial(weights, count, replacement=True, generator=self.generator)
+
+    def _shrink(self, gaussians: dict[str, Parameter], opacities: Tensor, sources: Tensor) -> None:
+        """Give the sampled Gaussians, in place, what they share with their copies (eq. 9)."""
+        copies = torch.bincount(sources)[sources] + 1
+        log_scales, logits = gaussians["scales"], gaussians["opacities"]
+        opacity, scale = relocated_values(opacities[sources], log_scales[sources].exp(), copies)
+        opacity = opacity.clamp(self.min_opacity, MAX_OPACITY)
+        logits[sources] = torch.logit(opacity).reshape(-1, *logits.shape[1:])
+        log_scales[sources] = scale.log()
+
+
+def regularisers(gaussians: dict[str, Parameter]) -> Tensor:
+    """0.01 * mean(opacity) + 0.01 * mean(scale), both after activation; 0 where there are none."""
+    opacities, scales = gaussians["opacities"], gaussians["scales"]
+    if opacities.numel() == 0:
+        return opacities.sum() + scales.sum()
+    return 0.01 * torch.sigmoid(opacities).mean() + 0.01 * torch.exp(scales).mean()
+
+
+def _check_at_least(name: str, value: float, least: float) -> None:
+    if not value >= least:  # refuses NaN too
+        raise ValueError(f"MCMCDensityControl: {name}={value}, must be at least {least}")
+
+
+def _check_slots(gaussians: dict[str, Parameter], optimizers: Optimizers) -> None:
+    missing = [key for key in _REQUIRED if key not in gaussians]
+    if missing:
+        raise ValueError(f"MCMCDensityControl.step: gaussians lack {missing}")
+    for name, parameter in gaussians.items():
+        if name not in optimizers:
+            raise ValueError(f"MCMCDensityControl.step: no optimizer for {name!r}")
+        held = [p for group in optimizers[name].param_groups for p in group["params"]]
+        if len(held) != 1 or held[0] is not parameter:
+            raise ValueError(
+                f"MCMCDensityControl.step: the optimizer of {name!r} must hold that parameter and "
+                f"nothing else, it holds {len(held)}"
+            )
+
+
+def _zero_rows(rows: Tensor) -> Callable[[Tensor], Tensor]:
+    def edit(value: Tensor) -> Tensor:
+        value[rows] = 0
+        return value
+
+    return edit
+
+
+def _append_zero_rows(count: int) -> Callable[[Tensor], Tensor]:
+    def edit(value: Tensor) -> Tensor:
+        # float32 whatever the state's dtype is, as upstream: that is what optimizers must survive
+        return torch.cat((value, torch.zeros(count, *value.shape[1:], device=value.device)))
+
+    return edit
+
+
+def _replace(
+    name: str,
+    data: Tensor,
+    gaussians: dict[str, Parameter],
+    optimizers: Optimizers,
+    edit_state: Callable[[Tensor], Tensor],
+) -> None:
+    """Swap in a new Parameter and carry the optimizer's state over, edited, all but "step"."""
+    old, optimizer = gaussians[name], optimizers[name]
+    new = Parameter(data, requires_grad=old.requires_grad)
+    state = optimizer.state.pop(old, {})
+    for key, value in state.items():
+        if key != "step":
+            state[key] = edit_state(value)
+    optimizer.param_groups[0]["params"] = [new]
+    optimizer.state[new] = state
+    gaussians[name] = new

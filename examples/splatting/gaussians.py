@@ -1,0 +1,240 @@
+"""Gaussians as a dict of parameters: how they start, their learning rates, and .ply files.
+
+Keys and activations are gsplat's: `means` [N, 3] world units, `scales` [N, 3] log, `quats` [N, 4]
+wxyz, not normalised, `opacities` [N] logit, `sh0` [N, 1, 3] and, from SH degree 1 on, `shN`
+[N, K - 1, 3], with K = (degree + 1)^2 coefficients a channel.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TypedDict
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement, PlyParseError
+from torch import Tensor
+from torch.nn import Parameter
+
+Gaussians = dict[str, Parameter]
+
+
+class InitPreset(TypedDict):
+    """Options of `gaussians_from_points` and `random_gaussians`."""
+
+    init_opacity: float
+    init_scale: float
+
+
+MCMC_PRESET: InitPreset = {"init_opacity": 0.5, "init_scale": 0.1}  # 3dgs-mcmc, gsplat's "mcmc"
+DEFAULT_PRESET: InitPreset = {"init_opacity": 0.1, "init_scale": 1.0}  # INRIA, gsplat's "default"
+
+_SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
+_MIN_SQUARED_DISTANCE = 1e-7  # world units squared; INRIA's bound, keeps coincident points finite
+_MAX_SH_DEGREE = 3
+
+
+def gaussians_from_points(
+    points: Tensor,
+    colors: Tensor,
+    *,
+    num_points: int | None = None,
+    sh_degree: int = 0,
+    init_opacity: float = 0.5,
+    init_scale: float = 0.1,
+    generator: torch.Generator | None = None,
+) -> Gaussians:
+    """One round Gaussian a point, as wide as its neighbours are far (3DGS; gsplat `sfm`).
+
+    Args:
+        points: [P, 3], world units.
+        colors: [P, 3], 0..1.
+        num_points: keep a random subset of at most so many; None keeps all.
+        sh_degree: 0..3; what is above the constant term starts at zero.
+        init_opacity: after the sigmoid.
+        init_scale: factor on the root mean square distance to the three nearest neighbours. The
+            defaults of both are those of MCMC trainers, `DEFAULT_PRESET` has the others.
+        generator: for the subset; None is torch's global one.
+
+    Returns:
+        leaf parameters of the dtype of `points`.
+    """
+    call = "gaussians_from_points"
+    _check_options(call, sh_degree, init_opacity, init_scale)
+    if points.dim() != 2 or points.shape[1] != 3 or points.shape != colors.shape:
+        raise ValueError(
+            f"{call}: points and colors must both be [P, 3], "
+            f"got {tuple(points.shape)} and {tuple(colors.shape)}"
+        )
+    if len(points) == 0 or not torch.isfinite(points).all():
+        raise ValueError(f"{call}: needs at least 1 point, all finite, got {len(points)} points")
+    if num_points is not None and num_points < 1:
+        raise ValueError(f"{call}: num_points={num_points}, must be at least 1 or None")
+    if num_points is not None and num_points < len(points):
+        kept = torch.randperm(len(points), generator=generator)[:num_points]
+        points, colors = points[kept], colors[kept]
+    count, dtype = len(points), points.dtype
+    # gsplat starts from random rotations and INRIA from none: a round Gaussian looks the same.
+    quats = torch.zeros(count, 4, dtype=dtype)
+    quats[:, 0] = 1.0
+    tensors = {
+        "means": points.clone(),
+        "scales": torch.log(neighbour_distance(points) * init_scale)[:, None].repeat(1, 3),
+        "quats": quats,
+        "opacities": torch.full((count,), math.log(init_opacity / (1 - init_opacity)), dtype=dtype),
+        "sh0": ((colors.to(dtype) - 0.5) / _SH_C0)[:, None],
+    }
+    if sh_degree > 0:
+        tensors["shN"] = torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3, dtype=dtype)
+    return {key: Parameter(tensor) for key, tensor in tensors.items()}
+
+
+def random_gaussians(
+    extent: float,
+    num_points: int,
+    *,
+    center: Tensor | None = None,
+    spread: float = 3.0,
+    sh_degree: int = 0,
+    init_opacity: float = 0.5,
+    init_scale: float = 0.1,
+    generator: torch.Generator | None = None,
+) -> Gaussians:
+    """Gaussians of random colour, uniform in a cube: what trainers do without sparse points.
+
+    The cube has half-side `spread * extent`: 3 scene extents in gsplat's simple_trainer
+    (`init_type="random"`, `init_extent=3`) and in 3dgs-mcmc, both around the origin.
+
+    Args:
+        extent: `Scene.extent`, world units.
+        num_points: how many.
+        center: of the cube, [3], world units; None is the origin.
+        spread: half-side of the cube in extents.
+        sh_degree: see `gaussians_from_points`, like the rest.
+        init_opacity: after the sigmoid.
+        init_scale: factor on the neighbour distance.
+        generator: None is torch's global one.
+    """
+    if not (0 < extent < math.inf and 0 < spread < math.inf) or num_points < 1:
+        raise ValueError(
+            f"random_gaussians: extent={extent}, spread={spread}, num_points={num_points}, "
+            "all must be positive and finite"
+        )
+    offsets = (2.0 * torch.rand(num_points, 3, generator=generator) - 1.0) * (spread * extent)
+    return gaussians_from_points(
+        offsets if center is None else offsets + center.to(offsets.dtype),
+        torch.rand(num_points, 3, generator=generator),
+        sh_degree=sh_degree,
+        init_opacity=init_opacity,
+        init_scale=init_scale,
+        generator=generator,
+    )
+
+
+def neighbour_distance(points: Tensor, chunk: int = 512) -> Tensor:
+    """Root mean square distance to the (up to) three nearest other points, [P], world units.
+
+    Exact search, P^2 distances in chunks of rows. A lone point has no neighbour and gets 1.
+    """
+    neighbours = min(3, len(points) - 1)
+    if neighbours == 0:
+        return torch.ones(len(points), dtype=points.dtype)
+    squared = torch.empty(len(points), dtype=points.dtype)
+    for start in range(0, len(points), chunk):
+        # The matrix product form of cdist loses small distances to cancellation.
+        distances = torch.cdist(
+            points[start : start + chunk], points, compute_mode="donot_use_mm_for_euclid_dist"
+        )
+        nearest = distances.topk(neighbours + 1, largest=False).values[:, 1:]  # [0] is itself
+        squared[start : start + chunk] = nearest.square().mean(dim=1)
+    return squared.clamp(min=_MIN_SQUARED_DISTANCE).sqrt()
+
+
+def stock_learning_rates(extent: float) -> dict[str, float]:
+    """Adam's learning rate for each parameter, as in 3DGS and gsplat.
+
+    That of the means is the initial one; trainers let it decay to 1 % over the run.
+
+    Args:
+        extent: `Scene.extent`, world units.
+    """
+    if not 0 < extent < math.inf:
+        raise ValueError(f"stock_learning_rates: extent={extent}, must be positive and finite")
+    return {
+        "means": 1.6e-4 * extent,
+        "scales": 5e-3,
+        "quats": 1e-3,
+        "opacities": 5e-2,
+        "sh0": 2.5e-3,
+        "shN": 2.5e-3 / 20,
+    }
+
+
+def _check_options(call: str, sh_degree: int, init_opacity: float, init_scale: float) -> None:
+    if sh_degree not in range(_MAX_SH_DEGREE + 1):
+        raise ValueError(f"{call}: sh_degree={sh_degree}, must be 0..{_MAX_SH_DEGREE}")
+    if not 0.0 < init_opacity < 1.0:
+        raise ValueError(f"{call}: init_opacity={init_opacity}, must be inside (0, 1)")
+    if not 0.0 < init_scale < math.inf:
+        raise ValueError(f"{call}: init_scale={init_scale}, must be positive and finite")
+
+
+# Columns of INRIA's point_cloud.ply. f_rest is channel-major: all of red's coefficients, then
+# green's, then blue's; the normals are unused but expected by some viewers.
+_COLUMNS = {
+    "means": ("x", "y", "z"),
+    "normals": ("nx", "ny", "nz"),
+    "sh0": ("f_dc_0", "f_dc_1", "f_dc_2"),
+    "opacities": ("opacity",),
+    "scales": ("scale_0", "scale_1", "scale_2"),
+    "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
+}
+
+
+def save_ply(path: str | Path, gaussians: Gaussians) -> None:
+    """Write the .ply layout of INRIA's trainer, which standard viewers open, as float32."""
+    count = len(gaussians["means"])
+    tables = {key: gaussians[key].detach().cpu().reshape(count, -1) for key in gaussians}
+    tables["normals"] = torch.zeros(count, 3)
+    parts, names = [], []
+    for key, columns in _COLUMNS.items():
+        parts.append(tables[key])
+        names.extend(columns)
+        if key == "sh0" and "shN" in gaussians:
+            rest = gaussians["shN"].detach().cpu().transpose(1, 2).reshape(count, -1)
+            parts.append(rest)
+            names.extend(f"f_rest_{index}" for index in range(rest.shape[1]))
+    table = torch.cat([part.float() for part in parts], dim=1).numpy()
+    vertices = np.empty(count, dtype=[(name, "<f4") for name in names])
+    for index, name in enumerate(names):
+        vertices[name] = table[:, index]
+    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
+
+
+def load_ply(path: str | Path) -> Gaussians:
+    """Read what `save_ply`, gsplat's exporter or INRIA's trainer wrote, as float32 parameters."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"load_ply: {path} is missing")
+    try:
+        vertices = PlyData.read(str(path))["vertex"]
+        names = [prop.name for prop in vertices.properties]
+        tables = {
+            key: np.stack([np.asarray(vertices[name], np.float32) for name in columns], axis=1)
+            for key, columns in _COLUMNS.items()
+            if key != "normals"
+        }
+    except (PlyParseError, KeyError, ValueError, EOFError) as error:
+        raise ValueError(f"load_ply: {path} is no .ply file of Gaussians: {error}") from None
+    rest = sum(name.startswith("f_rest_") for name in names)
+    if rest not in {3 * ((degree + 1) ** 2 - 1) for degree in range(_MAX_SH_DEGREE + 1)}:
+        raise ValueError(f"load_ply: {path} has {rest} f_rest columns, expected 0, 9, 24 or 45")
+    tensors = {key: torch.from_numpy(table) for key, table in tables.items()}
+    tensors["opacities"] = tensors["opacities"][:, 0]
+    tensors["sh0"] = tensors["sh0"][:, None]
+    if rest:
+        columns = [np.asarray(vertices[f"f_rest_{i}"], np.float32) for i in range(rest)]
+        by_channel = torch.from_numpy(np.stack(columns, axis=1)).reshape(-1, 3, rest // 3)
+        tensors["shN"] = by_channel.transpose(1, 2).contiguous()
+    order = ("means", "scales", "quats", "opacities", "sh0", "shN")
+    return {key: Parameter(tensors[key]) for key in order if key in tensors}

@@ -1,0 +1,159 @@
+"""Rendering of 3D Gaussians: the public entry point, and the reference made of its plain parts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from splatting.camera import Camera
+from splatting.compositing import composite
+from splatting.projection import project, visible_points
+from splatting.spherical_harmonics import MAX_DEGREE, sh_colors
+
+Backend = Literal["reference", "numba"]
+TRAILING_SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3)}
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What `render` returns; `image` and `alpha` carry gradients."""
+
+    image: Tensor  # [H, W, 3] linear in the colours, not limited to 1
+    alpha: Tensor  # [H, W] in [0, 1)
+    visible: Tensor  # [N] bool, projected inside the image with positive radius
+
+
+def render(
+    gaussians: Mapping[str, Tensor],
+    camera: Camera,
+    *,
+    sh_degree: int | None = None,
+    background: Tensor | None = None,
+    backend: Backend = "numba",
+) -> Rendering:
+    """Render Gaussians as gsplat 1.5.3 does with its defaults ("classic" mode, no antialiasing).
+
+    Args:
+        gaussians: means [N, 3] world units; quats [N, 4] wxyz, not normalised; scales [N, 3] log
+            of world units; opacities [N] logit; sh0 [N, 1, 3] and, if there are any, shN
+            [N, K - 1, 3] spherical harmonics with K = 1, 4, 9 or 16. All of one floating dtype.
+            Other entries are ignored.
+        camera: The pinhole camera.
+        sh_degree: The highest degree of spherical harmonics to use; by default all there are.
+        background: The colour [3] behind everything; by default black.
+        backend: "numba", compiled, on the CPU, with constant cameras; or "reference", plain
+            torch on any device, whose memory grows as pixels times points, differentiable in the
+            camera's pose too. Both compute the same numbers up to rounding; in float32 the
+            reference loses Gaussians so large that their variance squared overflows.
+
+    Raises:
+        ValueError: on a missing entry, wrong shape, dtype or device, sh_degree or backend.
+
+    Source: 3D Gaussian Splatting (Kerbl et al. 2023, section 4 and 6).
+    """
+    degree = _check(gaussians, camera, sh_degree, backend)
+    values = {name: gaussians[name] for name in TRAILING_SHAPES}
+    values["shN"] = _higher_harmonics(gaussians)
+    means = values["means"]
+    if background is None:
+        background = means.new_zeros(3)
+    elif background.shape != (3,):
+        raise ValueError(f"render: background has shape {tuple(background.shape)}, must be (3,)")
+    background = background.to(means)
+    if backend == "reference":
+        return _render_reference(values, camera.to(means.dtype), degree, background)
+    from splatting.rasterizer_numba import RasterizeNumba  # numba stays optional
+
+    return Rendering(*RasterizeNumba.apply(*values.values(), background, camera, degree))
+
+
+def _render_reference(
+    values: Mapping[str, Tensor], camera: Camera, degree: int, background: Tensor
+) -> Rendering:
+    means, quats, scales = values["means"], values["quats"], values["scales"]
+    # Cull first and differentiate only what is left: a point behind the camera would otherwise
+    # turn its zero gradient into 0 * inf = NaN.
+    with torch.no_grad():
+        everything = project(means, quats, scales, camera)
+        visible = visible_points(everything, torch.sigmoid(values["opacities"]), camera)
+    means, quats, scales = means[visible], quats[visible], scales[visible]
+    projection = project(means, quats, scales, camera)
+    coefficients = torch.cat([values["sh0"], values["shN"]], 1)[visible]
+    image, alpha = composite(
+        projection.means,
+        projection.conics,
+        sh_colors(means, camera.position, coefficients, degree),
+        torch.sigmoid(values["opacities"][visible]),
+        projection.depths,
+        background=background,
+        width=camera.width,
+        height=camera.height,
+    )
+    return Rendering(image, alpha, visible)
+
+
+def _higher_harmonics(gaussians: Mapping[str, Tensor]) -> Tensor:
+    sh0 = gaussians["sh0"]
+    return gaussians["shN"] if "shN" in gaussians else sh0.new_empty(len(sh0), 0, 3)
+
+
+def _check(
+    gaussians: Mapping[str, Tensor], camera: Camera, sh_degree: int | None, backend: str
+) -> int:
+    """Raise ValueError on unusable input; otherwise return the degree to use."""
+    missing = [name for name in TRAILING_SHAPES if name not in gaussians]
+    if missing:
+        raise ValueError(
+            f"render: gaussians lacks {missing}, must have {[*TRAILING_SHAPES]} (shN optional)"
+        )
+    means = gaussians["means"]
+    n = len(means)
+    for name, trailing in TRAILING_SHAPES.items():
+        if gaussians[name].shape != (n, *trailing):
+            shape = tuple(gaussians[name].shape)
+            raise ValueError(f"render: {name} has shape {shape}, must be {(n, *trailing)}")
+    shN = _higher_harmonics(gaussians)
+    counts = {degree: (degree + 1) ** 2 - 1 for degree in range(MAX_DEGREE + 1)}
+    if shN.dim() != 3 or shN.shape != (n, shN.shape[1], 3) or shN.shape[1] not in counts.values():
+        raise ValueError(
+            f"render: shN has shape {tuple(shN.shape)}, must be ({n}, K, 3) "
+            f"with K in {[*counts.values()]}"
+        )
+    for name in (*TRAILING_SHAPES, "shN"):
+        tensor = gaussians.get(name, means)
+        if tensor.dtype != means.dtype or tensor.device != means.device:
+            raise ValueError(
+                f"render: {name} is {tensor.dtype} on {tensor.device}, "
+                f"must be as means, {means.dtype} on {means.device}"
+            )
+    _check_backend(means, camera, backend)
+    stored = next(degree for degree, count in counts.items() if count == shN.shape[1])
+    degree = stored if sh_degree is None else sh_degree
+    if degree not in range(stored + 1):
+        raise ValueError(f"render: sh_degree is {sh_degree}, must be from 0 to the stored {stored}")
+    return degree
+
+
+def _check_backend(means: Tensor, camera: Camera, backend: str) -> None:
+    if backend not in get_args(Backend):
+        raise ValueError(f"render: backend is {backend!r}, must be one of {get_args(Backend)}")
+    if means.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"render: means is {means.dtype}, must be torch.float32 or torch.float64")
+    if camera.viewmat.shape != (4, 4):
+        raise ValueError(
+            f"render: camera.viewmat has shape {tuple(camera.viewmat.shape)}, must be (4, 4)"
+        )
+    if camera.width < 1 or camera.height < 1:
+        raise ValueError(
+            f"render: camera is {camera.width} x {camera.height} pixels, must be at least 1 x 1"
+        )
+    if backend == "numba" and (means.device.type != "cpu" or camera.viewmat.requires_grad):
+        raise ValueError(
+            f'render: backend "numba" with means on {means.device} and camera.viewmat.'
+            f"requires_grad {camera.viewmat.requires_grad}, must be on the CPU and False; "
+            'the backend "reference" has neither limit'
+        )

@@ -1,0 +1,175 @@
+"""Scenes to fit: photos with known cameras, and the sparse points to start from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
+
+from splatting.camera import Camera
+from splatting.colmap import PosedImage, SparseModel, read_colmap
+from splatting.transforms import read_json_object, read_transforms
+
+Size = Literal["small", "large"]
+Layout = Literal["auto", "colmap", "transforms"]
+
+_IMAGE_FOLDERS = {"small": "images_4", "large": "images"}
+_TEST_EVERY = 8  # the convention of Mip-NeRF 360 and of every 3DGS paper since
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One photo and the camera that took it."""
+
+    name: str
+    camera: Camera
+    image: Tensor  # [H, W, 3] float32, 0..1
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Views to train on, views to judge by, and sparse points to start from."""
+
+    name: str
+    train: list[View]
+    test: list[View]
+    points: Tensor  # [P, 3] float32, world units
+    colors: Tensor  # [P, 3] float32, 0..1
+    extent: float  # world units; see `scene_extent`
+
+
+def load_scene(source: str | Path, size: Size = "small", layout: Layout = "auto") -> Scene:
+    """Load a scene from a folder, or make the embedded one.
+
+    A folder holds `images/` and `images_4/` and either a COLMAP model in `sparse/0/` (or
+    `sparse/`), or `transforms.json` with its .ply. Test views are those of `split.json` where
+    there is one, and otherwise every 8th of the sorted names.
+
+    Args:
+        source: "embedded" (procedural, nothing to download; see `embedded.py`) or a folder.
+        size: "small" reads `images_4`, "large" `images`; intrinsics follow the actual image size.
+        layout: "auto" prefers COLMAP where both layouts are present.
+
+    Raises:
+        FileNotFoundError: a file or folder of the scene is missing.
+        ValueError: a file is malformed, or an option is not one of those above.
+    """
+    for option, value, allowed in (("size", size, Size), ("layout", layout, Layout)):
+        if value not in get_args(allowed):
+            raise ValueError(f"load_scene: {option}={value!r}, allowed are {get_args(allowed)}")
+    if str(source) == "embedded":
+        from splatting.embedded import embedded_scene  # it imports Scene from here
+
+        return embedded_scene(size)
+    folder = Path(source)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"load_scene: {folder} is no folder; expected one, or 'embedded'")
+    model = _read_model(folder, layout)
+    if len(model.points) == 0 or not np.isfinite(model.points).all():
+        raise ValueError(f"{folder}: expected finite sparse points, got {len(model.points)} points")
+    train_names, test_names = _split(folder, sorted(image.name for image in model.images))
+    images = folder / _IMAGE_FOLDERS[size]
+    if not images.is_dir():
+        raise FileNotFoundError(f"{images}: missing, expected the photos of size={size!r}")
+    views = {posed.name: _load_view(images, posed) for posed in model.images}
+    train = [views[name] for name in train_names]
+    return Scene(
+        folder.resolve().name,
+        train,
+        [views[name] for name in test_names],
+        torch.from_numpy(model.points).float(),
+        torch.from_numpy(model.colors).float(),
+        scene_extent([view.camera for view in train]),
+    )
+
+
+def scene_extent(cameras: list[Camera]) -> float:
+    """1.1 times the largest distance of a camera from their mean (INRIA and gsplat), world units.
+
+    Learning rates of the positions are multiples of it, so zero is refused.
+    """
+    if len(cameras) < 2:
+        raise ValueError(f"scene_extent: needs at least 2 train views, got {len(cameras)}")
+    positions = torch.stack([camera.position for camera in cameras]).double()
+    extent = 1.1 * float((positions - positions.mean(dim=0)).norm(dim=1).max())
+    if not 0.0 < extent < float("inf"):
+        raise ValueError(f"scene_extent: train cameras span {extent}, expected distinct positions")
+    return extent
+
+
+def _read_model(folder: Path, layout: Layout) -> SparseModel:
+    sparse = folder / "sparse"
+    has_colmap, has_transforms = sparse.is_dir(), (folder / "transforms.json").is_file()
+    if layout == "colmap" or (layout == "auto" and has_colmap):
+        return read_colmap(sparse / "0" if (sparse / "0").is_dir() else sparse)
+    if layout == "transforms" or has_transforms:
+        return read_transforms(folder)
+    raise FileNotFoundError(f"{folder}: expected sparse/0/ (COLMAP) or transforms.json, found none")
+
+
+def _split(folder: Path, names: list[str]) -> tuple[list[str], list[str]]:
+    if len(set(names)) != len(names):
+        doubled = sorted({name for name in names if names.count(name) > 1})
+        raise ValueError(f"{folder}: images listed more than once: {doubled}")
+    path = folder / "split.json"
+    if path.is_file():
+        train, test = _read_split(path, names)
+    else:
+        test = names[::_TEST_EVERY]
+        train = [name for name in names if name not in test]
+    if len(train) < 2:
+        raise ValueError(
+            f"{folder}: needs at least 2 train views, got {len(train)} of {len(names)} views"
+        )
+    return train, test
+
+
+def _read_split(path: Path, names: list[str]) -> tuple[list[str], list[str]]:
+    table = read_json_object(path)
+    parts: list[list[str]] = []
+    for key in ("train", "test"):
+        part = table.get(key)
+        if not isinstance(part, list) or not all(isinstance(name, str) for name in part):
+            raise ValueError(f"{path}: expected lists of image names under 'train' and 'test'")
+        parts.append(sorted(part))
+    train, test = parts
+    unknown = sorted({*train, *test}.difference(names))
+    if unknown:
+        raise ValueError(f"{path}: names {unknown}, which the scene's model does not have")
+    if len({*train, *test}) != len(train) + len(test):
+        raise ValueError(f"{path}: a view is listed more than once, or in both 'train' and 'test'")
+    return train, test
+
+
+def _load_view(folder: Path, posed: PosedImage) -> View:
+    path = folder / posed.name
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: missing, but the scene's model lists it")
+    try:
+        with Image.open(path) as file:
+            pixels = np.array(file.convert("RGB"))
+    except (UnidentifiedImageError, OSError) as error:
+        raise ValueError(f"{path}: expected an image: {error}") from None
+    height, width = pixels.shape[:2]
+    scale_x, scale_y = width / posed.width, height / posed.height
+    # A downscaled side is rounded by up to a pixel, so that is how far the two may disagree.
+    if min(abs(width - posed.width * scale_y), abs(height - posed.height * scale_x)) > 1.0:
+        raise ValueError(
+            f"{path}: image is {width}x{height}, expected the shape of its camera, "
+            f"{posed.width}x{posed.height}, at some scale"
+        )
+    camera = Camera(
+        torch.from_numpy(posed.viewmat).float(),
+        posed.fx * scale_x,
+        posed.fy * scale_y,
+        posed.cx * scale_x,
+        posed.cy * scale_y,
+        width,
+        height,
+    )
+    return View(posed.name, camera, torch.from_numpy(pixels).float() / 255.0)

@@ -1,0 +1,245 @@
+"""A report as a picture: the metric over seconds and over iterations, nu and pairs underneath."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from opt3dgs_optim.report_stats import Arm, Comparison, higher_is_better
+
+__all__ = ["draw"]
+
+# Okabe and Ito's colour-blind-safe palette, without the yellow that white swallows.
+COLOURS = ("#333333", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+STYLES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))  # one for each round through the colours
+INK, FAINT = "#222222", "#8a8a8a"
+NAMES = {"psnr": "PSNR (dB)", "train_psnr": "training PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS"}
+AXES = ("seconds", "iteration")
+BINS = 50
+LEGEND_COLUMNS = 4
+
+
+def draw(comparison: Comparison, path: Path, footer: str) -> None:
+    """Draw ``comparison`` into the PNG file ``path``, with ``footer`` in small print.
+
+    Lines are means over seeds, bands reach from the least to the greatest. Uses matplotlib's
+    Agg canvas alone: no backend is chosen and no global setting changed.
+
+    Raises:
+        ModuleNotFoundError: matplotlib is not installed.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    extras = [name for name in ("nu", "accepted") if _has_step(comparison, name)]
+    heights = [3.4, *[1.15] * len(extras)]
+    legend = 0.25 * -(-len(comparison.arms) // LEGEND_COLUMNS)  # inches
+    figure = Figure(figsize=(11, 1.85 + legend + sum(heights)), dpi=150, facecolor="white")
+    FigureCanvasAgg(figure)
+    height = figure.get_figheight()
+    grid = figure.subplots(
+        len(heights),
+        2,
+        sharex="col",
+        sharey="row",
+        squeeze=False,
+        gridspec_kw={
+            "height_ratios": heights,
+            "left": 0.075,
+            "right": 0.985,
+            "top": 1 - (0.8 + legend) / height,
+            "bottom": 1.0 / height,
+            "wspace": 0.06,
+            "hspace": 0.14,
+        },
+    )
+    for column, axis in enumerate(AXES):
+        _metric_panel(grid[0, column], comparison, axis)
+        for row, name in enumerate(extras, start=1):
+            _step_panel(grid[row, column], comparison, axis, name)
+        grid[-1, column].set_xlabel("run time (s)" if axis == "seconds" else "iteration")
+        _phases(grid[:, column], comparison, axis)
+    for row, name in enumerate(["metric", *extras]):
+        labels = {"nu": "nu", "accepted": "accepted\npairs (share)"}
+        grid[row, 0].set_ylabel(labels.get(name, NAMES.get(comparison.metric, comparison.metric)))
+    for panel in grid.flat:
+        _plain_style(panel)
+    _texts(figure, comparison, footer)
+    figure.savefig(path)
+
+
+def _look(index: int) -> dict[str, Any]:
+    return {
+        "color": COLOURS[index % len(COLOURS)],
+        "linestyle": STYLES[index // len(COLOURS) % len(STYLES)],
+    }
+
+
+def _has_step(comparison: Comparison, name: str) -> bool:
+    return any(name in run.steps for arm in comparison.arms for run in arm.runs)
+
+
+def _metric_panel(panel: Any, comparison: Comparison, axis: str) -> None:
+    seen: list[tuple[np.ndarray, np.ndarray]] = []
+    for i, arm in enumerate(comparison.arms):
+        curves = _metric_curves(arm, comparison.metric, axis)
+        if curves:
+            x, table = _on_common_grid(curves)
+            _line_and_band(panel, x, table, i)
+            panel.plot(x[-1:], table.mean(axis=0)[-1:], "o", ms=4, color=_look(i)["color"])
+            seen += curves
+    if not seen:
+        text = f"no finite evaluation of {comparison.metric}"
+        panel.text(0.5, 0.5, text, transform=panel.transAxes, ha="center", color=FAINT)
+        return
+    if comparison.target is not None:
+        panel.axhline(comparison.target, lw=0.8, ls=(0, (4, 3)), color=FAINT, zorder=1)
+    _zoom(panel, seen)
+
+
+def _metric_curves(arm: Arm, metric: str, axis: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    curves = []
+    for run in arm.runs:
+        iteration, seconds, values = run.series(metric)
+        x = seconds if axis == "seconds" else iteration.astype(float)
+        finite = np.isfinite(values)
+        if finite.any():
+            curves.append((x[finite], values[finite]))
+    return curves
+
+
+def _on_common_grid(curves: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """All points of all curves inside the range they share: exact for piecewise lines."""
+    start, end = max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves)
+    x = np.unique(np.concatenate([[min(start, end), end], *(x for x, _ in curves)]))
+    x = x[(x >= min(start, end)) & (x <= end)]
+    return x, np.stack([np.interp(x, *curve) for curve in curves])
+
+
+def _line_and_band(panel: Any, x: np.ndarray, table: np.ndarray, index: int) -> None:
+    look = _look(index)
+    if len(table) > 1:
+        low, high = table.min(axis=0), table.max(axis=0)
+        panel.fill_between(x, low, high, color=look["color"], alpha=0.16, lw=0)
+    panel.plot(x, table.mean(axis=0), lw=1.8, solid_capstyle="round", **look)
+
+
+def _zoom(panel: Any, curves: list[tuple[np.ndarray, np.ndarray]]) -> None:
+    """Cut off the steep first fifth of the run, which would flatten the differences to be seen."""
+    last = max(x[-1] for x, _ in curves)
+    shown = np.concatenate([y[x >= 0.2 * last] for x, y in curves])
+    low, high = float(shown.min()), float(shown.max())
+    room = 0.06 * (high - low) or 0.05 * abs(high) or 1.0
+    panel.set_ylim(low - room, high + room)
+
+
+def _step_panel(panel: Any, comparison: Comparison, axis: str, name: str) -> None:
+    for i, arm in enumerate(comparison.arms):
+        curves = [_binned(run.series(name, "step"), axis) for run in arm.runs]
+        curves = [curve for curve in curves if len(curve[0])]
+        if curves:
+            _line_and_band(panel, *_on_common_grid(curves), i)
+    if name == "nu":
+        panel.axhline(1.0, lw=0.8, ls=(0, (4, 3)), color=FAINT, zorder=1)
+    else:
+        panel.set_ylim(-0.04, 1.04)
+
+
+def _binned(series: tuple[np.ndarray, ...], axis: str) -> tuple[np.ndarray, np.ndarray]:
+    """Means over equal stretches of the run: single steps are too noisy to look at."""
+    iteration, seconds, values = series
+    x = seconds if axis == "seconds" else iteration.astype(float)
+    finite = np.isfinite(values)
+    x, values = x[finite], values[finite]
+    parts = np.array_split(np.arange(len(x)), min(BINS, len(x))) if len(x) else []
+    return (
+        np.array([x[part].mean() for part in parts]),
+        np.array([values[part].mean() for part in parts]),
+    )
+
+
+def _phases(panels: Any, comparison: Comparison, axis: str) -> None:
+    """Vertical lines where the phase changes: one in grey if the arms agree, else in colours."""
+    found = [(i, _switches(arm, axis)) for i, arm in enumerate(comparison.arms)]
+    found = [(i, switches) for i, switches in found if switches]
+    places = {(round(x, 3), name) for _, switches in found for x, name in switches}
+    agree = len(places) == max((len(switches) for _, switches in found), default=0)
+    for i, switches in found[:1] if agree else found:
+        for x, name in switches:
+            colour = FAINT if agree else _look(i)["color"]
+            for panel in panels:
+                panel.axvline(x, lw=1.0, ls=(0, (1, 1.5)), color=colour, zorder=1)
+            if agree:
+                panels[0].annotate(
+                    f"{name} ",
+                    (x, 0.02),
+                    xycoords=("data", "axes fraction"),
+                    ha="right",
+                    fontsize=8.5,
+                    color="#666666",
+                )
+
+
+def _switches(arm: Arm, axis: str) -> list[tuple[float, str]]:
+    """(mean place over the seeds, name) of every phase that begins during the run."""
+    places: dict[str, list[float]] = {}
+    for run in arm.runs:
+        phase = run.steps.get("phase", np.array([], str))
+        for i in np.flatnonzero(phase[1:] != phase[:-1]) + 1:
+            places.setdefault(str(phase[i]), []).append(float(run.steps[axis][i]))
+    return [(float(np.mean(where)), name) for name, where in places.items()]
+
+
+def _plain_style(panel: Any) -> None:
+    panel.set_facecolor("white")
+    panel.grid(True, axis="y", lw=0.6, color="#e4e4e4")
+    panel.set_axisbelow(True)
+    for side, spine in panel.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color("#999999")
+    panel.tick_params(labelsize=9, colors=INK, length=3)
+    for label in (panel.xaxis.label, panel.yaxis.label):
+        label.set_fontsize(10)
+        label.set_color(INK)
+    panel.margins(x=0.02)
+
+
+def _texts(figure: Any, comparison: Comparison, footer: str) -> None:
+    from matplotlib.lines import Line2D
+
+    height = figure.get_figheight()
+    metric = NAMES.get(comparison.metric, comparison.metric)
+    title = f"{metric} against run time and iterations"
+    if comparison.scene is not None:
+        title += f", {comparison.scene}"
+    place = {"fontsize": 13, "weight": "bold", "color": INK, "va": "top", "parse_math": False}
+    figure.text(0.075, 1 - 0.22 / height, title, **place)
+    handles, labels = [], []
+    for i, arm in enumerate(comparison.arms):
+        handles.append(Line2D([], [], lw=2.4, **_look(i)))
+        seeds = f"{len(arm.runs)} seeds" if len(arm.runs) > 1 else "1 seed"
+        role = ", baseline" if arm.name == comparison.baseline else ""
+        labels.append(f" {arm.name} ({seeds}{role})")
+    legend = figure.legend(
+        handles,
+        labels,
+        loc="upper left",
+        bbox_to_anchor=(0.068, 1 - 0.5 / height),
+        ncols=min(len(labels), LEGEND_COLUMNS),
+        frameon=False,
+        fontsize=9.5,
+        labelcolor=INK,
+        handlelength=1.8,
+        columnspacing=1.6,
+    )
+    for text in legend.get_texts():  # a dollar sign in an arm's name is no formula
+        text.set_parse_math(False)
+    better = "higher" if higher_is_better(comparison.metric) else "lower"
+    caption = f"Lines: mean over seeds; bands: least to greatest; {better} is better. "
+    caption += "Dashed: the baseline's final mean (above), nu = 1 (below). Dotted: next phase. "
+    text = textwrap.fill(caption + footer, 175)
+    small = {"fontsize": 7.5, "color": "#666666", "va": "bottom", "parse_math": False}
+    figure.text(0.075, 0.1 / height, text, **small)

@@ -1,0 +1,291 @@
+"""MCMC density control: the paper's equation, the edits of optimizer state, the schedule."""
+
+from __future__ import annotations
+
+import copy
+import importlib.util
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+import torch
+from relocation_oracle import printed_equation
+from splatting.density import DensityReport, MCMCDensityControl, regularisers
+from splatting.gaussians import gaussians_from_points
+from splatting.relocation import relocated_values
+
+F64 = torch.float64
+
+
+def _gaussians(count: int, dtype: torch.dtype = torch.float32, dead: int = 0):
+    generator = torch.Generator().manual_seed(2)
+    points, colors = (torch.rand(count, 3, generator=generator, dtype=dtype) for _ in range(2))
+    gaussians = gaussians_from_points(points, colors, sh_degree=1)
+    logits = gaussians["opacities"].data
+    logits.copy_(torch.randn(count, generator=generator, dtype=dtype))
+    logits[:dead] = -8.0  # opacity 3e-4
+    return gaussians
+
+
+def _optimizers(gaussians: Mapping[str, torch.nn.Parameter], steps: int = 1):
+    optimizers = {
+        name: torch.optim.Adam([{"params": parameter, "lr": 1e-3, "name": name}], eps=1e-15)
+        for name, parameter in gaussians.items()
+    }
+    for name, parameter in gaussians.items() if steps else ():
+        parameter.grad = torch.ones_like(parameter)
+        optimizers[name].step()
+    return optimizers
+
+
+def _control(**overrides: Any) -> MCMCDensityControl:
+    options: dict[str, Any] = {"cap_max": 10_000, "generator": torch.Generator().manual_seed(9)}
+    options |= overrides
+    return MCMCDensityControl(**options)
+
+
+def test_relocation_moves_the_dead_and_edits_the_state_as_gsplat_does():
+    gaussians = _gaussians(40, dead=6)
+    optimizers = _optimizers(gaussians)
+    old = dict(gaussians)
+    before = {name: p.detach().clone() for name, p in gaussians.items()}
+    pointers = {name: p.data_ptr() for name, p in gaussians.items()}
+    report = _control(cap_max=0).step(600, gaussians, optimizers)
+    assert report == DensityReport(True, 6, 0, 40)
+    changed = (gaussians["opacities"] != before["opacities"])[6:].nonzero()[:, 0] + 6
+    kept = [i for i in range(6, 40) if i not in changed.tolist()]
+    assert 1 <= len(changed) <= 6
+    for name, parameter in gaussians.items():
+        assert parameter is not old[name]
+        assert parameter.requires_grad
+        assert parameter.is_leaf
+        assert parameter.data_ptr() == pointers[name]  # same storage, as upstream
+        for row in range(6):  # every dead row is now a copy of a sampled one
+            assert any(torch.equal(parameter[row], parameter[source]) for source in changed)
+        assert torch.equal(parameter[kept], before[name][kept])
+        (held,) = optimizers[name].param_groups[0]["params"]
+        assert held is parameter
+        assert list(optimizers[name].state) == [parameter]
+        state = optimizers[name].state[parameter]
+        assert state["step"] == 1
+        for key in ("exp_avg", "exp_avg_sq"):
+            assert (state[key][changed] == 0).all()
+            assert (state[key][:6] != 0).all()  # the moved rows keep theirs, on purpose upstream
+            assert (state[key][kept] != 0).all()
+
+
+def test_relocation_shares_opacity_and_scale_between_the_copies():
+    gaussians = _gaussians(8, torch.float64, dead=7)  # one is alive: it gets all seven copies
+    opacity = float(torch.sigmoid(gaussians["opacities"].detach()[7]))
+    scale = gaussians["scales"][7].detach().exp()
+    _control(cap_max=0).step(600, gaussians, _optimizers(gaussians, steps=0))
+    new, factor = printed_equation(opacity, 8)
+    shared = torch.sigmoid(gaussians["opacities"].detach())
+    torch.testing.assert_close(shared, torch.full((8,), new, dtype=F64), rtol=1e-9, atol=0)
+    torch.testing.assert_close(
+        gaussians["scales"].detach().exp(), (factor * scale).expand(8, 3), rtol=1e-9, atol=0
+    )
+    # rendered at the common centre: alpha of eight copies against alpha of the one
+    torch.testing.assert_close(
+        1 - (1 - shared).prod(), torch.tensor(opacity, dtype=F64), rtol=1e-12, atol=0
+    )
+
+
+def test_new_opacities_are_clipped_to_the_dead_limit():
+    gaussians = _gaussians(30, dead=29)
+    gaussians["opacities"].data[29] = math.log(0.02 / 0.98)
+    _control(cap_max=0).step(600, gaussians, _optimizers(gaussians))
+    # 0.02 among 30 would be 0.00067 each
+    torch.testing.assert_close(
+        torch.sigmoid(gaussians["opacities"].detach()), torch.full((30,), 0.005)
+    )
+    saturated = _gaussians(2)
+    saturated["opacities"].data.fill_(60.0)
+    _control(growth=1.5).step(600, saturated, _optimizers(saturated))
+    assert torch.isfinite(saturated["opacities"]).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_growth_appends_rows_with_zero_state(dtype):
+    gaussians = _gaussians(100, dtype)
+    optimizers = _optimizers(gaussians)
+    for name, parameter in gaussians.items():  # an optimizer's own entry, any trailing shape
+        optimizers[name].state[parameter]["history"] = torch.ones(100, 5, 8)
+    old = dict(gaussians)
+    before = gaussians["means"].detach().clone()
+    report = _control().step(600, gaussians, optimizers)
+    assert report == DensityReport(True, 0, 5, 105)
+    assert torch.equal(gaussians["means"][:100], before)  # growth moves nothing
+    for name, parameter in gaussians.items():
+        assert parameter is not old[name]
+        assert len(parameter) == 105
+        assert parameter.dtype == dtype
+        state = optimizers[name].state[parameter]
+        assert list(optimizers[name].state) == [parameter]
+        for key in ("exp_avg", "exp_avg_sq", "history"):
+            assert len(state[key]) == 105
+            assert (state[key][100:] == 0).all()
+            assert (state[key][:100] != 0).all()  # upstream does not reset the sources here
+        parameter.grad = torch.ones_like(parameter)
+        optimizers[name].step()
+
+
+def test_growth_stops_at_the_cap_and_never_shrinks():
+    gaussians = _gaussians(100)
+    optimizers = _optimizers(gaussians)
+    control = _control(cap_max=107, refine_every=10)
+    totals = [control.step(i, gaussians, optimizers).total for i in range(501, 541)]
+    assert totals == [100] * 9 + [105] * 10 + [107] * 21
+    assert _control(cap_max=50).step(600, gaussians, optimizers) == DensityReport(True, 0, 0, 107)
+
+
+def test_schedule_is_gsplats():
+    gaussians = _gaussians(30)
+    optimizers = _optimizers(gaussians)
+    control = _control(refine_start=10, refine_stop=50, refine_every=10)
+    refined = [i for i in range(80) if control.step(i, gaussians, optimizers).refined]
+    assert refined == [20, 30, 40]  # after the start, before the stop
+
+
+@pytest.mark.parametrize("count", [0, 1])
+@pytest.mark.parametrize("dead", [False, True])
+def test_none_and_one(count, dead):
+    gaussians = _gaussians(1, dead=int(dead))
+    for name in gaussians:
+        gaussians[name] = torch.nn.Parameter(gaussians[name].data[:count])
+    report = _control(growth=2.0).step(600, gaussians, _optimizers(gaussians))
+    assert report == DensityReport(True, 0, count, 2 * count)
+    assert torch.isfinite(gaussians["means"]).all()
+
+
+def test_all_dead_stay_where_they_are():
+    gaussians = _gaussians(5, dead=5)
+    before = gaussians["means"].detach().clone()
+    optimizers = _optimizers(gaussians, steps=0)
+    assert _control(cap_max=0).step(600, gaussians, optimizers).relocated == 0
+    assert torch.equal(gaussians["means"], before)
+
+
+def test_a_seeded_generator_repeats_and_leaves_the_global_one_alone():
+    torch.manual_seed(0)
+    results = []
+    for _ in range(2):
+        gaussians = _gaussians(60, dead=7)
+        _control().step(600, gaussians, _optimizers(gaussians))
+        results.append(gaussians)
+    for name, parameter in results[0].items():
+        assert torch.equal(parameter, results[1][name])
+    drawn = torch.rand(3)
+    torch.manual_seed(0)
+    assert torch.equal(drawn, torch.rand(3))
+
+
+def test_opacities_with_a_trailing_dimension():
+    flat, column = _gaussians(40, dead=4), _gaussians(40, dead=4)
+    column["opacities"] = torch.nn.Parameter(column["opacities"].data[:, None])
+    _control().step(600, flat, _optimizers(flat))
+    _control().step(600, column, _optimizers(column))
+    assert column["opacities"].shape == (42, 1)
+    assert torch.equal(column["opacities"][:, 0], flat["opacities"])
+
+
+@pytest.mark.parametrize("iterations", [100, 1500, 3000, 7000, 30_000, 90_000])
+def test_for_run_reaches_the_cap(iterations):
+    control = MCMCDensityControl.for_run(iterations, 2000, num_points=300)
+    assert control.refine_stop == round(iterations * 25_000 / 30_000)
+    assert 20 <= control.refine_every <= 100
+    count = 300
+    for i in range(iterations):
+        if control.refine_start < i < control.refine_stop and i % control.refine_every == 0:
+            count = min(2000, int(control.growth * count))
+    assert count >= 1980  # the growth rounds down, which may cost 1 % of the cap
+
+
+def test_for_run_at_full_length_is_stock():
+    stock, fitted = MCMCDensityControl(7), MCMCDensityControl.for_run(30_000, 7)
+    for field in ("refine_start", "refine_stop", "refine_every", "growth", "min_opacity"):
+        assert getattr(stock, field) == getattr(fitted, field), field
+    short = MCMCDensityControl.for_run(1500, 2000)
+    assert (short.refine_start, short.refine_stop, short.refine_every) == (25, 1250, 20)
+    assert short.growth == 1.05
+
+
+def test_regularisers():
+    gaussians = _gaussians(10)
+    opacities, scales = gaussians["opacities"].detach(), gaussians["scales"].detach()
+    expected = 0.01 * torch.sigmoid(opacities).mean() + 0.01 * scales.exp().mean()
+    value = regularisers(gaussians)
+    torch.testing.assert_close(value.detach(), expected)
+    value.backward()
+    assert gaussians["opacities"].grad is not None
+    for name in gaussians:
+        gaussians[name] = torch.nn.Parameter(gaussians[name].data[:0])
+    assert regularisers(gaussians) == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"cap_max": -1}, "cap_max=-1, must be at least 0"),
+        ({"refine_every": 0}, "refine_every=0"),
+        ({"refine_start": 9, "refine_stop": 8}, "refine_stop=8, must be at least 9"),
+        ({"growth": 0.9}, "growth=0.9"),
+        ({"growth": math.nan}, "growth=nan"),
+        ({"min_opacity": 0.0}, r"min_opacity=0.0, must be inside \(0, 1\)"),
+    ],
+)
+def test_bad_options_are_named(options, message):
+    with pytest.raises(ValueError, match=message):
+        _control(**options)
+
+
+def test_bad_slots_are_named():
+    gaussians = _gaussians(4)
+    optimizers = _optimizers(gaussians)
+    with pytest.raises(ValueError, match="no optimizer for 'means'"):
+        _control().step(600, gaussians, {})
+    swapped = optimizers | {"means": optimizers["scales"]}
+    with pytest.raises(ValueError, match="optimizer of 'means' must hold that parameter"):
+        _control().step(600, gaussians, swapped)
+    with pytest.raises(ValueError, match=r"gaussians lack \['scales', 'quats', 'opacities'\]"):
+        _control().step(600, {"means": gaussians["means"]}, optimizers)
+    gaussians["opacities"].data[0] = math.nan
+    with pytest.raises(ValueError, match="NaN among the opacities"):
+        _control().step(600, gaussians, optimizers)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("gsplat") is None, reason="gsplat is not installed")
+def test_same_draws_give_the_same_bits_as_gsplats_strategy(monkeypatch):
+    # gsplat looks for nvcc at import and would build its extension; its relocation is CUDA only.
+    monkeypatch.setattr("torch.utils.cpp_extension._find_cuda_home", lambda: None)
+    ops = pytest.importorskip("gsplat.strategy.ops", exc_type=ImportError)
+    mcmc = pytest.importorskip("gsplat.strategy.mcmc", exc_type=ImportError)
+
+    def compute_relocation(opacities, scales, ratios, binoms):
+        return relocated_values(opacities, scales, ratios)
+
+    monkeypatch.setattr(ops, "compute_relocation", compute_relocation)
+    ours = _gaussians(500, dead=60)
+    theirs = copy.deepcopy(ours)
+    our_optimizers, their_optimizers = _optimizers(ours), _optimizers(theirs)
+    strategy = mcmc.MCMCStrategy(cap_max=540, noise_lr=0.0)
+    state = strategy.initialize_state()
+    control = MCMCDensityControl(540)  # torch's global generator, like gsplat
+    for iteration in (600, 700, 800):
+        torch.manual_seed(iteration)
+        control.step(iteration, ours, our_optimizers)
+        torch.manual_seed(iteration)
+        strategy._relocate_gs(theirs, their_optimizers, state["binoms"])
+        strategy._add_new_gs(theirs, their_optimizers, state["binoms"])
+        for name in ours:
+            assert torch.equal(ours[name], theirs[name]), (iteration, name)
+            ours_state = our_optimizers[name].state[ours[name]]
+            theirs_state = their_optimizers[name].state[theirs[name]]
+            assert list(ours_state) == list(theirs_state)
+            for key, value in ours_state.items():
+                assert torch.equal(value, theirs_state[key]), (iteration, name, key)
+        for gaussians, optimizers in ((ours, our_optimizers), (theirs, their_optimizers)):
+            for name, parameter in gaussians.items():
+                parameter.grad = torch.full_like(parameter, 0.5)
+                optimizers[name].step()

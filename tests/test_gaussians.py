@@ -1,0 +1,189 @@
+"""Initial Gaussians, learning rates and the .ply round trip."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData
+from splatting.gaussians import (
+    DEFAULT_PRESET,
+    MCMC_PRESET,
+    gaussians_from_points,
+    load_ply,
+    neighbour_distance,
+    random_gaussians,
+    save_ply,
+    stock_learning_rates,
+)
+
+
+def _cloud(count: int, dtype: torch.dtype = torch.float32):
+    generator = torch.Generator().manual_seed(3)
+    points = torch.randn(count, 3, generator=generator, dtype=dtype)
+    return points, torch.rand(count, 3, generator=generator, dtype=dtype)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 200])
+def test_neighbour_distance_against_sorting_every_pair(count):
+    points, _ = _cloud(count, torch.float64)
+    expected = []
+    for i in range(count):
+        others = sorted(float((points[i] - points[j]).norm()) for j in range(count) if j != i)[:3]
+        expected.append(math.sqrt(sum(d * d for d in others) / len(others)))
+    # 1e-12: float64 rounding
+    torch.testing.assert_close(
+        neighbour_distance(points, chunk=7),
+        torch.tensor(expected, dtype=torch.float64),
+        rtol=1e-12,
+        atol=0,
+    )
+
+
+def test_coincident_and_lone_points_stay_finite():
+    points = torch.ones(5, 3)
+    torch.testing.assert_close(neighbour_distance(points), torch.full((5,), math.sqrt(1e-7)))
+    assert neighbour_distance(points[:1]).tolist() == [1.0]
+    far = torch.tensor([[1000.0, 0, 0], [1000.001, 0, 0]])  # cancels in a matrix product
+    expected = far[1, 0] - far[0, 0]
+    torch.testing.assert_close(neighbour_distance(far), expected.repeat(2))
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
+def test_shapes_and_activations(sh_degree):
+    points, colors = _cloud(50)
+    gaussians = gaussians_from_points(points, colors, sh_degree=sh_degree, **DEFAULT_PRESET)
+    coefficients = (sh_degree + 1) ** 2
+    shapes = {
+        "means": (50, 3),
+        "scales": (50, 3),
+        "quats": (50, 4),
+        "opacities": (50,),
+        "sh0": (50, 1, 3),
+    }
+    if sh_degree:
+        shapes["shN"] = (50, coefficients - 1, 3)
+    assert {key: tuple(p.shape) for key, p in gaussians.items()} == shapes
+    assert all(isinstance(p, torch.nn.Parameter) and p.is_leaf for p in gaussians.values())
+    torch.testing.assert_close(torch.sigmoid(gaussians["opacities"]), torch.full((50,), 0.1))
+    distance = neighbour_distance(points)
+    torch.testing.assert_close(gaussians["scales"].exp(), distance[:, None].expand(50, 3))
+    shown = 0.5 + 0.5 / math.sqrt(math.pi) * gaussians["sh0"][:, 0]
+    torch.testing.assert_close(shown, colors)
+    assert torch.equal(gaussians["quats"].detach(), torch.tensor([[1.0, 0, 0, 0]]).expand(50, 4))
+    gaussians["means"].data.zero_()
+    assert points.abs().sum() > 0  # the parameters are copies
+
+
+def test_the_mcmc_preset_is_the_default():
+    points, colors = _cloud(20)
+    plain = gaussians_from_points(points, colors)
+    preset = gaussians_from_points(points, colors, **MCMC_PRESET)
+    assert all(torch.equal(plain[key], preset[key]) for key in plain)
+    torch.testing.assert_close(torch.sigmoid(plain["opacities"]), torch.full((20,), 0.5))
+
+
+def test_a_subset_follows_the_generator_and_keeps_points_with_their_colours():
+    points, colors = _cloud(40)
+    first, second = (
+        gaussians_from_points(
+            points, colors, num_points=15, generator=torch.Generator().manual_seed(1)
+        )
+        for _ in range(2)
+    )
+    assert torch.equal(first["means"], second["means"])
+    assert len(first["means"]) == 15
+    rows = [(points == mean).all(dim=1).nonzero()[0, 0] for mean in first["means"].detach()]
+    assert len(set(map(int, rows))) == 15
+    shown = 0.5 + 0.28209479177387814 * first["sh0"][:, 0]
+    torch.testing.assert_close(shown, colors[torch.stack(rows)])
+    assert len(gaussians_from_points(points, colors, num_points=99)["means"]) == 40
+
+
+def test_float64_points_give_float64_parameters():
+    points, colors = _cloud(5, torch.float64)
+    gaussians = gaussians_from_points(points, colors, sh_degree=1)
+    assert {p.dtype for p in gaussians.values()} == {torch.float64}
+
+
+def test_random_gaussians_fill_their_cube():
+    center = torch.tensor([10.0, 0.0, -4.0])
+    gaussians = random_gaussians(
+        2.0, 3000, center=center, generator=torch.Generator().manual_seed(0)
+    )
+    offsets = gaussians["means"].detach() - center
+    assert offsets.abs().max() <= 6.0
+    assert offsets.abs().max() > 5.9  # 3000 uniform draws come closer than 0.1 to the wall
+    assert offsets.mean(dim=0).abs().max() < 0.32  # 5 deviations: 5 * 12 / sqrt(12 * 3000)
+    again = random_gaussians(2.0, 3000, center=center, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(gaussians["sh0"], again["sh0"])
+
+
+def test_stock_learning_rates():
+    assert stock_learning_rates(4.0) == {
+        "means": 4 * 1.6e-4,
+        "scales": 5e-3,
+        "quats": 1e-3,
+        "opacities": 5e-2,
+        "sh0": 2.5e-3,
+        "shN": 1.25e-4,
+    }
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("count", [1, 30])
+def test_ply_round_trip(tmp_path, sh_degree, count):
+    gaussians = gaussians_from_points(*_cloud(count), sh_degree=sh_degree)
+    generator = torch.Generator().manual_seed(5)
+    for parameter in gaussians.values():
+        parameter.data.copy_(torch.randn(parameter.shape, generator=generator))
+    save_ply(tmp_path / "point_cloud.ply", gaussians)
+    loaded = load_ply(tmp_path / "point_cloud.ply")
+    assert list(loaded) == list(gaussians)
+    for key, parameter in gaussians.items():
+        assert torch.equal(loaded[key], parameter), key
+
+
+def test_ply_columns_are_inrias(tmp_path):
+    gaussians = gaussians_from_points(*_cloud(4), sh_degree=1)
+    rest = torch.arange(4 * 3 * 3).reshape(4, 3, 3).float()
+    gaussians["shN"].data.copy_(rest)
+    save_ply(tmp_path / "g.ply", gaussians)
+    vertices = PlyData.read(str(tmp_path / "g.ply"))["vertex"]
+    expected = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    expected += [f"f_rest_{i}" for i in range(9)]
+    expected += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    assert [prop.name for prop in vertices.properties] == expected
+    # channel-major: coefficient 1 of green is column 3 + 1
+    np.testing.assert_array_equal(vertices["f_rest_4"], rest[:, 1, 1].numpy())
+
+
+def test_bad_input_is_named(tmp_path):
+    points, colors = _cloud(4)
+    bad: list[tuple[dict[str, Any], str]] = [
+        ({"sh_degree": 4}, "sh_degree=4"),
+        ({"init_opacity": 1.0}, r"init_opacity=1.0, must be inside"),
+        ({"init_scale": 0.0}, "init_scale=0.0"),
+        ({"num_points": 0}, "num_points=0"),
+    ]
+    for options, message in bad:
+        with pytest.raises(ValueError, match=message):
+            gaussians_from_points(points, colors, **options)
+    with pytest.raises(ValueError, match=r"both be \[P, 3\]"):
+        gaussians_from_points(points, colors[:2])
+    with pytest.raises(ValueError, match="at least 1 point"):
+        gaussians_from_points(points[:0], colors[:0])
+    with pytest.raises(ValueError, match="finite"):
+        gaussians_from_points(points * math.nan, colors)
+    with pytest.raises(ValueError, match="extent=0"):
+        random_gaussians(0.0, 10)
+    with pytest.raises(ValueError, match="extent=0"):
+        stock_learning_rates(0.0)
+    with pytest.raises(FileNotFoundError, match=r"none\.ply"):
+        load_ply(tmp_path / "none.ply")
+    (tmp_path / "text.ply").write_text("hello")
+    with pytest.raises(ValueError, match=r"no \.ply file of Gaussians"):
+        load_ply(tmp_path / "text.ply")

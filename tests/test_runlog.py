@@ -1,0 +1,396 @@
+"""The run log: what is written comes back, whatever happens to the process that writes."""
+
+from __future__ import annotations
+
+import gc
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+import weakref
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from opt3dgs_optim import runlog
+from opt3dgs_optim.runlog import RunLog, read_run
+
+NUMBERS = st.one_of(
+    st.floats(allow_nan=True, allow_infinity=True), st.integers(-(2**53), 2**53), st.booleans()
+)
+SHARED_TMP = settings(
+    deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+
+
+def same(a, b):
+    return a == b or (math.isnan(a) and math.isnan(b))
+
+
+def strict_lines(path):
+    def refuse(name):
+        raise AssertionError(f"{name} is not strict JSON")
+
+    return [json.loads(text, parse_constant=refuse) for text in path.read_text().splitlines()]
+
+
+def write_sample(path):
+    with RunLog(path, metadata={"arm": "mcmc", "seed": 0}) as log:
+        for i in range(1, 5):
+            log.step(i, phase="exploration", energy=0.1 * i, nu=float("nan"))
+        log.evaluation(4, psnr=20.5)
+        log.event("finished", 4, note="a\nb é")
+
+
+@SHARED_TMP
+@given(rows=st.lists(st.dictionaries(st.sampled_from(["energy", "nu", "loss"]), NUMBERS)))
+def test_steps_round_trip_exactly(tmp_path, rows):
+    path = tmp_path / "run.jsonl"
+    path.unlink(missing_ok=True)
+    with RunLog(path) as log:
+        for i, row in enumerate(rows):
+            log.step(i, phase="exploration", **row)
+    strict_lines(path)
+    run = read_run(path)
+    assert run.steps["iteration"].tolist() == list(range(len(rows)))
+    for name in ("energy", "nu", "loss"):
+        iterations, _, values = run.series(name, "step")
+        expected = [(i, float(row[name])) for i, row in enumerate(rows) if name in row]
+        assert iterations.tolist() == [i for i, _ in expected]
+        assert all(same(a, b) for a, (_, b) in zip(values, expected, strict=True))
+
+
+@SHARED_TMP
+@given(
+    value=st.floats(width=32, allow_nan=True, allow_infinity=True), dtype=st.sampled_from([32, 64])
+)
+def test_tensors_round_trip_exactly(tmp_path, value, dtype):
+    path = tmp_path / "run.jsonl"
+    path.unlink(missing_ok=True)
+    with RunLog(path) as log:
+        tensor = torch.tensor(value, dtype=getattr(torch, f"float{dtype}"), requires_grad=True)
+        log.step(0, phase="exploration", energy=tensor)
+        log.evaluation(0, psnr=tensor[None], flag=torch.tensor(True), points=np.int64(7))  # type: ignore[arg-type]
+    run = read_run(path)
+    assert same(run.steps["energy"][0], value)
+    assert same(run.evaluations["psnr"][0], value)
+    assert run.evaluations["flag"][0] == 1
+    assert run.evaluations["points"][0] == 7
+
+
+@SHARED_TMP
+@given(
+    info=st.recursive(
+        st.none() | st.booleans() | st.integers() | st.text() | st.floats(allow_nan=False),
+        lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+        max_leaves=8,
+    )
+)
+def test_metadata_and_events_round_trip(tmp_path, info):
+    path = tmp_path / "run.jsonl"
+    path.unlink(missing_ok=True)
+    with RunLog(path, metadata={"info": info}) as log:
+        log.event("switch", 3, info=info)
+    run = read_run(path)
+    assert run.metadata["info"] == info
+    assert run.events[0]["info"] == info
+    assert run.events[0]["event"] == "switch"
+
+
+def test_first_line_describes_the_run_without_host_or_folders(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["/home/me/train.py", "--data=/data/plush/", "--arm", "mcmc"])
+    write_sample(tmp_path / "run.jsonl")
+    run = read_run(tmp_path / "run.jsonl")
+    assert run.name == "run"
+    assert run.metadata == {"arm": "mcmc", "seed": 0}
+    assert run.origin["command"] == "train.py --data=plush --arm mcmc"
+    assert run.origin["machine"]["cpus"] == os.cpu_count()
+    assert "phase" in run.steps
+    assert run.evaluations["peak_host_bytes"][0] > 1e6
+    assert not torch.cuda.is_initialized()
+
+
+def test_cut_at_every_byte_every_complete_line_comes_back_and_the_log_goes_on(tmp_path):
+    whole, cut = tmp_path / "whole.jsonl", tmp_path / "cut.jsonl"
+    write_sample(whole)
+    data = whole.read_bytes()
+    for offset in range(len(data) + 1):
+        cut.write_bytes(data[:offset])
+        complete = data[:offset].count(b"\n")
+        assert len(read_run(cut).records) == complete
+        with RunLog(cut) as log:
+            log.step(9, phase="exploitation", energy=1.0)
+        # The start and the step; a line that lacked only its newline counts as well now.
+        only_newline = offset < len(data) and data[offset : offset + 1] == b"\n"
+        assert len(read_run(cut).records) == complete + 2 + only_newline
+        assert read_run(cut).steps["energy"][-1] == 1.0
+
+
+def test_torn_twice(tmp_path):
+    path = tmp_path / "run.jsonl"
+    write_sample(path)
+    path.write_bytes(path.read_bytes()[:-5] + b'\n{"kind":"sta')
+    assert len(read_run(path).records) == 6
+    with RunLog(path) as log:
+        log.event("finished", 4)
+    assert len(read_run(path).records) == 8
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"no json",
+        b"[1]",
+        b'{"kind":"other","iteration":1,"seconds":1}',
+        b'{"kind":"step","iteration":1.5,"seconds":1}',
+        b'{"kind":"step","iteration":1}',
+        b'{"kind":"step","iteration":1,"seconds":1,"nu":NaN}',
+        b'{"kind":"evaluation","iteration":1,"seconds":1,"psnr":"good"}',
+        b'{"kind":"event","iteration":1,"seconds":1}',
+        b'{"kind":"start","iteration":1,"seconds":1,"metadata":3}',
+        b"\xff\xfe",
+        b"",
+    ],
+)
+def test_any_other_malformed_line_is_named(tmp_path, line):
+    path = tmp_path / "run.jsonl"
+    write_sample(path)
+    lines = path.read_bytes().splitlines()
+    path.write_bytes(b"\n".join([*lines[:2], line, *lines[2:]]) + b"\n")
+    with pytest.raises(ValueError, match=r"run\.jsonl, line 3: "):
+        read_run(path)
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match="line 3"):
+        RunLog(path)
+    assert path.read_bytes() == before
+
+
+def test_kill_loses_at_most_the_last_line(tmp_path):
+    path = tmp_path / "run.jsonl"
+    code = (
+        "import sys\nfrom opt3dgs_optim.runlog import RunLog\nlog = RunLog(sys.argv[1])\n"
+        "for i in range(10**9):\n"
+        "    log.step(i, phase='exploration', energy=0.1)\n"
+        "    sys.stdout.write(f'{i}\\n'); sys.stdout.flush()\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        seen = [int(child.stdout.readline()) for _ in range(200)]
+        child.send_signal(signal.SIGKILL)
+        seen += [int(text) for text in child.stdout.read().split(b"\n")[:-1]]
+    iterations = read_run(path).steps["iteration"].tolist()
+    assert iterations[: len(seen)] == seen
+    assert len(iterations) <= len(seen) + 1
+    RunLog(path).close()  # and the lock went with the process
+
+
+def test_resume_supersedes_and_continues_the_clock(tmp_path, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    path = tmp_path / "run.jsonl"
+    with RunLog(path, metadata={"arm": "a"}) as log:
+        for i in range(1, 11):
+            now[0] += 1
+            log.step(i, phase="exploration", energy=float(i))
+        log.evaluation(10, psnr=1.0)
+    now[0] += 1000
+    with RunLog.resume(path, iteration=6, metadata={"machine": "b"}) as log:
+        assert log.seconds == 6
+        now[0] += 2
+        log.step(7, phase="exploration", energy=70.0)
+    run = read_run(path)
+    assert run.steps["iteration"].tolist() == [1, 2, 3, 4, 5, 6, 7]
+    assert run.steps["energy"].tolist() == [1, 2, 3, 4, 5, 6, 70]
+    assert run.steps["seconds"].tolist() == [1, 2, 3, 4, 5, 6, 8]
+    assert len(run.evaluations["iteration"]) == 0
+    assert [event["event"] for event in run.events] == ["resumed"]
+    assert run.metadata == {"arm": "a", "machine": "b"}
+    with RunLog.resume(path, iteration=0) as log:
+        assert log.seconds == 0
+    assert len(read_run(path).steps["iteration"]) == 0
+
+
+def test_plain_reopening_appends_and_continues_the_clock(tmp_path, monkeypatch):
+    monkeypatch.setattr("time.perf_counter", lambda: 0.0)
+    path = tmp_path / "run.jsonl"
+    path.write_text('{"kind":"step","iteration":3,"seconds":7.5,"energy":1}\n')
+    with RunLog(path) as log:
+        assert log.seconds == 7.5
+        log.step(4, phase="exploration")
+    assert read_run(path).steps["seconds"].tolist() == [7.5, 7.5]
+    with pytest.raises(FileNotFoundError, match=r"RunLog\.resume.*missing"):
+        RunLog.resume(tmp_path / "missing.jsonl", iteration=1)
+
+
+def test_pauses_stop_the_clock_also_nested_and_after_an_error(tmp_path, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    with RunLog(tmp_path / "run.jsonl") as log:
+        now[0] = 2
+        with log.paused():
+            now[0] = 10
+            with log.paused():
+                now[0] = 20
+            assert log.seconds == 2
+            log.evaluation(1, psnr=20.0)
+        now[0] = 23
+        assert log.seconds == 5
+        pause = log.paused()
+        pause.__enter__()
+        now[0] = 50
+        assert not pause.__exit__(RuntimeError, RuntimeError(), None)
+        now[0] = 51
+        assert log.seconds == 6
+    assert read_run(tmp_path / "run.jsonl").evaluations["seconds"].tolist() == [2]
+
+
+class Witness:
+    """Something that an autograd graph keeps alive."""
+
+
+class Doubled(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x, witness):  # type: ignore[override]
+        ctx.witness = witness
+        return x * 2
+
+    @staticmethod
+    def backward(ctx, grad):  # type: ignore[override]
+        return grad * 2, None
+
+
+def test_no_autograd_graph_is_kept(tmp_path):
+    with RunLog(tmp_path / "run.jsonl") as log:
+        witness = Witness()
+        alive = weakref.ref(witness)
+        loss = Doubled.apply(torch.ones(3, requires_grad=True), witness).sum()  # type: ignore
+        del witness
+        assert alive() is not None
+        log.step(1, phase="exploration", loss=loss)
+        log.evaluation(1, loss=loss)
+        del loss
+        gc.collect()
+        assert alive() is None
+
+
+def test_thinning_keeps_multiples_only_of_steps(tmp_path):
+    with RunLog(tmp_path / "run.jsonl", every=3) as log:
+        for i in range(10):
+            log.step(i, phase="exploration", energy=1)
+            log.evaluation(i, psnr=1)
+    run = read_run(tmp_path / "run.jsonl")
+    assert run.steps["iteration"].tolist() == [0, 3, 6, 9]
+    assert len(run.evaluations["psnr"]) == 10
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no fcntl on this system, so no lock")
+def test_a_second_writer_is_refused(tmp_path):
+    path = tmp_path / "run.jsonl"
+    with RunLog(path):
+        with pytest.raises(BlockingIOError, match="another RunLog is writing"):
+            RunLog(path)
+        code = f"from opt3dgs_optim.runlog import RunLog; RunLog({str(path)!r})"
+        result = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
+        assert b"another RunLog is writing this file" in result.stderr
+        read_run(path)
+    RunLog(path).close()
+
+
+class FakeEvent:
+    """Stands for a torch.cuda.Event: completes when told to, or when waited for."""
+
+    def __init__(self):
+        self.done = False
+
+    def query(self):
+        return self.done
+
+    def synchronize(self):
+        self.done = True
+
+
+def test_lines_wait_for_the_gpu_in_order_without_waiting_for_it(tmp_path, monkeypatch):
+    # On a machine without CUDA: every tensor plays the part of a CUDA one.
+    events = []
+
+    def to_pinned(values):
+        events.append(FakeEvent())
+        return torch.full((len(values),), float(len(events)), dtype=torch.float64), events[-1]
+
+    monkeypatch.setattr(runlog, "_to_pinned", to_pinned)
+    monkeypatch.setattr(runlog, "_on_gpu", lambda value: isinstance(value, torch.Tensor))
+    path, scalar = tmp_path / "run.jsonl", torch.tensor(0.0)
+    with RunLog(path) as log:
+        log.step(1, phase="exploration", energy=scalar)
+        log.step(2, phase="exploration", energy=scalar, nu=2.0)
+        log.step(3, phase="exploration", energy=3.0)
+        assert len(strict_lines(path)) == 1
+        events[1].done = True  # not the first: order is kept
+        log.step(4, phase="exploration", energy=scalar)
+        assert len(strict_lines(path)) == 1
+        events[0].done = True
+        log.step(5, phase="exploration", energy=scalar)
+        assert len(strict_lines(path)) == 4
+        log.flush()
+        assert len(strict_lines(path)) == 6
+        log.step(6, phase="exploration", energy=scalar)
+    assert read_run(path).steps["energy"].tolist() == [1, 2, 3, 3, 4, 5]
+    assert read_run(path).steps["iteration"].tolist() == [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_cuda_steps_do_not_synchronize(tmp_path):
+    with RunLog(tmp_path / "run.jsonl") as log:
+        energy = torch.zeros((), device="cuda", requires_grad=True)
+        count = torch.zeros((), device="cuda", dtype=torch.int64)
+        log.step(0, phase="exploration", energy=energy, count=count)  # first pinned allocation
+        torch.cuda.set_sync_debug_mode("error")
+        try:
+            for i in range(1, 100):
+                count += 1
+                log.step(i, phase="exploration", energy=energy, count=count, nu=1.0)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+        log.evaluation(99, psnr=energy)
+    run = read_run(tmp_path / "run.jsonl")
+    assert run.steps["count"].tolist() == list(range(100))
+    assert run.evaluations["peak_cuda_bytes"][0] > 0
+
+
+def test_wrong_arguments_name_call_value_and_what_is_allowed(tmp_path):
+    for every in (0, 1.5):
+        with pytest.raises(ValueError, match=r"RunLog\(every=.*>= 1"):
+            RunLog(tmp_path / "run.jsonl", every=every)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"metadata.*no string"):
+        RunLog(tmp_path / "run.jsonl", metadata={"x": object()})
+    assert not (tmp_path / "run.jsonl").exists()
+    with RunLog(tmp_path / "a" / "run.jsonl") as log:
+        with pytest.raises(ValueError, match=r"RunLog\.step\(iteration=-1\)"):
+            log.step(-1, phase="exploration")
+        with pytest.raises(TypeError, match=r"RunLog\.evaluation\(iteration=1\.5\)"):
+            log.evaluation(1.5)  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match=r"energy=tensor of shape \(2,\)"):
+            log.step(1, phase="exploration", energy=torch.zeros(2))
+        with pytest.raises(TypeError, match="psnr='nan'"):
+            log.evaluation(1, psnr="nan")  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match="reserved"):
+            log.evaluation(1, seconds=3.0)
+        with pytest.raises(ValueError, match="reserved"):
+            log.event("switch", 1, seconds=3.0)
+    assert len(read_run(log.path).records) == 1
+    with pytest.raises(ValueError, match="is closed"):
+        log.step(1, phase="exploration")
+    log.close()
+
+
+def test_real_clock_runs(tmp_path):
+    with RunLog(tmp_path / "run.jsonl") as log:
+        time.sleep(0.02)
+        assert 0.02 <= log.seconds < 20
