@@ -58,7 +58,7 @@ class PhasedAdam(LQNAdam):
         self.switched = False
         self._energy_watch = EnergyWatch("PhaseScheduler")
         self.state.update(optimizer.state)
-        self._trust_loaded = True
+        self._trust_present()
         if fused:
             self._use_fused()
         if embedded is not None:

@@ -106,7 +106,7 @@ class LQNAdam(HookedAdam):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self._init_curvature(self.curvature_options)
-        self._trust_loaded = True  # the copied parameters are other objects, the rows the same
+        self._trust_present()  # the copied parameters are other objects, the rows the same
 
     def __init__(
         self,
@@ -153,7 +153,6 @@ class LQNAdam(HookedAdam):
     def _init_curvature(self, options: CurvatureOptions) -> None:
         self.curvature_options = options
         self._seen: dict[int, tuple[weakref.ref[Tensor], int]] = {}
-        self._trust_loaded = False
         self._tally: list[Tensor] = []  # [accepted, candidates] per parameter of the last step
 
     @property
@@ -167,8 +166,32 @@ class LQNAdam(HookedAdam):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """As torch's; a loaded history is used if its shape fits the parameters."""
         super().load_state_dict(state_dict)
+        self._trust_present()
+
+    def state_dict(self) -> dict[str, Any]:
+        """As torch's, without a history that density control has edited since the last step."""
+        for param, state in self.state.items():
+            if HISTORY in state and not self._is_known(param):
+                del state[HISTORY]
+                state.pop(EPOCH, None)
+        return super().state_dict()
+
+    def _trust_present(self) -> None:
+        """Take the histories in the state as those of the parameters' present rows."""
         self._seen.clear()
-        self._trust_loaded = True
+        for group in self.param_groups:
+            for param in group["params"]:
+                if HISTORY in self.state.get(param, {}):
+                    self._remember(param)
+
+    def _remember(self, param: Tensor) -> None:
+        rows = param.shape[0] if param.dim() else 1
+        self._seen[id(param)] = (weakref.ref(param), rows)
+
+    def _is_known(self, param: Tensor) -> bool:
+        seen = self._seen.get(id(param))
+        rows = param.shape[0] if param.dim() else 1
+        return seen is not None and seen[0]() is param and seen[1] == rows
 
     # -- the step ----------------------------------------------------------------------------
 
@@ -196,7 +219,6 @@ class LQNAdam(HookedAdam):
             used = grad if plain else grad / unit
             used = self._pseudo_gradient(param, used, epoch_ends)
             fed.append(used if plain else used * unit)
-        self._trust_loaded = False
         return fed
 
     def _advance_epoch(self, group: dict[str, Any]) -> bool:
@@ -262,12 +284,10 @@ class LQNAdam(HookedAdam):
         size = self.curvature_options.history_size
         slots = curvature.num_slots(size, position.shape[1])
         shape = (position.shape[0], slots, 2 * (position.shape[1] + 1))
-        seen = self._seen.get(id(param))
-        known = seen is not None and seen[0]() is param and seen[1] == position.shape[0]
         fits = HISTORY in state and tuple(state[HISTORY].shape) == shape
-        if not fits or not (known or self._trust_loaded):
+        if not fits or not self._is_known(param):
             state[HISTORY] = curvature.new_history(position, size)
             state.pop(EPOCH, None)
         self._seen = {key: entry for key, entry in self._seen.items() if entry[0]() is not None}
-        self._seen[id(param)] = (weakref.ref(param), position.shape[0])
+        self._remember(param)
         return state[HISTORY]
