@@ -49,7 +49,9 @@ def test_secant_equation(sizes: tuple[int, int, int, int]) -> None:
     """H y = s for the newest pair, whatever came before."""
     k, d, n, seed = sizes
     s, y, _ = convex_pairs(k, d, n, seed)
-    torch.testing.assert_close(two_loop(y[-1], history_from_pairs(s, y), k), s[-1], rtol=1e-8, atol=1e-9)
+    torch.testing.assert_close(
+        two_loop(y[-1], history_from_pairs(s, y), k), s[-1], rtol=1e-8, atol=1e-9
+    )
 
 
 @settings(max_examples=100, deadline=None)
@@ -96,7 +98,9 @@ def test_points_do_not_see_each_other(sizes: tuple[int, int, int, int]) -> None:
     order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))
     whole = two_loop(g, history, k)
     # other rows, other SIMD lanes: equal to rounding
-    torch.testing.assert_close(two_loop(g[order], history[order], k), whole[order], rtol=1e-13, atol=0)
+    torch.testing.assert_close(
+        two_loop(g[order], history[order], k), whole[order], rtol=1e-13, atol=0
+    )
 
 
 @settings(max_examples=60, deadline=None)
@@ -214,7 +218,9 @@ def test_acceptance_is_relative_not_absolute() -> None:
     """torch's LBFGS asks for s.y > 1e-10; the pairs of a splat have s.y of 1e-13."""
     visible = torch.ones(1, dtype=torch.bool)
     history = curvature.new_history(torch.zeros(1, 3), 5)
-    curvature.record(history, 5, torch.zeros(1, 3), torch.full((1, 3), 1e-6), visible, min_cosine=1e-6)
+    curvature.record(
+        history, 5, torch.zeros(1, 3), torch.full((1, 3), 1e-6), visible, min_cosine=1e-6
+    )
     accepted, _ = curvature.record(
         history, 5, torch.full((1, 3), 1e-7), torch.full((1, 3), 2e-6), visible, min_cosine=1e-6
     )
@@ -245,7 +251,9 @@ def test_powell_damping_makes_every_pair_acceptable() -> None:
         for k in range(12):
             s = torch.randn(64, 3, generator=generator, dtype=torch.float64)
             x, g = x + s, g + (s if k == 1 else torch.randn(64, 3, generator=generator).double())
-            accepted, _ = curvature.record(history, 5, x, g, visible, min_cosine=1e-6, powell=powell)
+            accepted, _ = curvature.record(
+                history, 5, x, g, visible, min_cosine=1e-6, powell=powell
+            )
         shares.append(float(accepted.double().mean()))
     assert shares[0] < 0.7
     assert shares[1] == 1.0

@@ -10,9 +10,7 @@ import pytest
 
 import opt3dgs_optim
 
-MODULES = [
-    name for _, name, _ in pkgutil.walk_packages(opt3dgs_optim.__path__, "opt3dgs_optim.")
-]
+MODULES = [name for _, name, _ in pkgutil.walk_packages(opt3dgs_optim.__path__, "opt3dgs_optim.")]
 
 
 @pytest.mark.parametrize("name", [name for name in MODULES if not name.endswith("__main__")])

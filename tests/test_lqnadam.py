@@ -182,7 +182,9 @@ def test_dropped_when_the_parameter_is_another_object() -> None:
     plain, twin = torch.nn.Parameter(new.detach().clone()), None
     twin = torch.optim.Adam([plain], lr=0.01)
     twin.state[plain] = {
-        k: v.clone() for k, v in optimizer.state[new].items() if k in ("step", "exp_avg", "exp_avg_sq")
+        k: v.clone()
+        for k, v in optimizer.state[new].items()
+        if k in ("step", "exp_avg", "exp_avg_sq")
     }
     new.grad = noise_gradient(6, 0)
     plain.grad = noise_gradient(6, 0)

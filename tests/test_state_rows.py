@@ -103,7 +103,9 @@ class Trainer:
 
 
 @settings(max_examples=150, deadline=None)
-@given(st.integers(1, 5), st.lists(st.tuples(st.sampled_from(EDITS), st.integers(0, 99)), max_size=14))
+@given(
+    st.integers(1, 5), st.lists(st.tuples(st.sampled_from(EDITS), st.integers(0, 99)), max_size=14)
+)
 def test_every_row_goes_where_it_would_go_alone(n: int, edits: list[tuple[str, int]]) -> None:
     trainer = Trainer(n)
     for kind, seed in [*edits, ("step", 0)]:

@@ -43,7 +43,7 @@ def make_splats(n: int = 12, seed: int = 0) -> dict[str, Parameter]:
     }
 
 
-def gsplat_optimizers(splats: dict[str, Parameter], **options) -> dict[str, torch.optim.Optimizer]:  # noqa: ANN003
+def gsplat_optimizers(splats: dict[str, Parameter], **options) -> dict[str, torch.optim.Optimizer]:
     """One Adam per parameter, built as gsplat's simple_trainer does."""
     return {
         name: torch.optim.Adam(
@@ -62,7 +62,9 @@ def inria_optimizer(splats: dict[str, Parameter]) -> torch.optim.Adam:
     return torch.optim.Adam(groups, lr=0.0, eps=1e-15)
 
 
-def view_loss(splats: dict[str, Parameter], view: int, phases: PhaseScheduler | None = None) -> Tensor:
+def view_loss(
+    splats: dict[str, Parameter], view: int, phases: PhaseScheduler | None = None
+) -> Tensor:
     """A smooth loss in which all parameters and the view matter; every third point is unseen."""
     generator = torch.Generator().manual_seed(1000 + view)
     loss = torch.zeros(())
@@ -71,7 +73,9 @@ def view_loss(splats: dict[str, Parameter], view: int, phases: PhaseScheduler | 
         seen = torch.arange(param.shape[0]) % 3 != view % 3
         render = (param * weight)[seen]
         target = torch.full_like(render, 0.1 * (view + 1))
-        term = (render - target).abs().mean() if phases is None else phases.pixel_loss(render, target)
+        term = (
+            (render - target).abs().mean() if phases is None else phases.pixel_loss(render, target)
+        )
         loss = loss + (0.02 if name != "means" else 0.05) * term
     return loss
 
@@ -96,7 +100,10 @@ def train(
 
 
 def edit_rows(
-    splats: dict[str, Parameter], optimizers: dict[str, torch.optim.Optimizer], rows: Tensor, new: int
+    splats: dict[str, Parameter],
+    optimizers: dict[str, torch.optim.Optimizer],
+    rows: Tensor,
+    new: int,
 ) -> None:
     """gsplat's `_update_param_with_optimizer`: keep `rows`, append `new` zero-state rows."""
     for name, optimizer in optimizers.items():

@@ -5,23 +5,54 @@ edits optimizer state by rows (gathers, zeroes, appends zero rows): all zero mea
 
 Layout, [N, slots, 2 (D + 1)] for points of D coordinates and a history of K pairs:
 
-    slot j, lanes 0 .. D-1        s, the parameter difference   } of the j-th ring slot, both
+    slot j, lanes 0 .. D-1        s, the parameter difference   } of the j-th newest pair, both
     slot j, lanes D+1 .. 2D       y, the gradient difference    } divided by |y|
     lanes D and 2D + 1            spare; the header below lives in them
 
 The header holds the point's last visible position and gradient and a counter. With K > D it fits
 into the spare lanes of slots 0 .. D (slots = K: no further memory, 160 bytes per point in float32
 for K = 5, D = 3); otherwise it gets a slot of its own (slots = K + 1).
+
+A new pair moves the older ones down a slot. A ring would write less, but every reader would have
+to gather by row, which costs torch more than all the arithmetic; and the header dirties the same
+memory sectors anyway. In memory, a history that torch computes on is transposed (strides of a
+[slots, lanes, N] tensor), one that the CUDA kernel computes on is contiguous; every function here
+takes both.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import threshold
+
+from opt3dgs_optim import _pairs
+from opt3dgs_optim._pairs import Pair, damped_pair, normalised_pair
+
+__all__ = [
+    "MAX_HISTORY",
+    "Header",
+    "Pair",
+    "accumulate",
+    "damped_pair",
+    "direction",
+    "epoch_mean",
+    "header",
+    "history_from_pairs",
+    "new_history",
+    "newest_gamma",
+    "normalised_pair",
+    "num_slots",
+    "record",
+    "step",
+    "two_loop",
+]
 
 MAX_HISTORY = 16
+CHUNK = 16384  # rows that a CPU works on at a time, so that intermediates stay in its cache
 
 
 def num_slots(history_size: int, dim: int) -> int:
@@ -29,12 +60,18 @@ def num_slots(history_size: int, dim: int) -> int:
     return history_size if history_size > dim else history_size + 1
 
 
-def new_history(points: Tensor, history_size: int) -> Tensor:
-    """An empty history for `points` [N, D]; float32, or float64 for float64 points."""
+def new_history(points: Tensor, history_size: int, *, contiguous: bool = False) -> Tensor:
+    """An empty history for `points` [N, D]; float32, or float64 for float64 points.
+
+    `contiguous` is for the CUDA kernel; otherwise the memory is laid out for torch.
+    """
     dim = points.shape[1]
     dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
-    shape = (points.shape[0], num_slots(history_size, dim), 2 * (dim + 1))
-    return torch.zeros(shape, dtype=dtype, device=points.device)
+    shape = (num_slots(history_size, dim), 2 * (dim + 1))
+    if contiguous:
+        return torch.zeros((points.shape[0], *shape), dtype=dtype, device=points.device)
+    cells = torch.zeros((*shape, points.shape[0]), dtype=dtype, device=points.device)
+    return cells.permute(2, 0, 1)
 
 
 class Header(NamedTuple):
@@ -42,7 +79,7 @@ class Header(NamedTuple):
 
     position: Tensor  # [N, D] at the last visible step
     gradient: Tensor  # [N, D] at the last visible step
-    counter: Tensor  # [N] 0: never visible; c: c - 1 pairs accepted since the row was last zeroed
+    counter: Tensor  # [N] 0: never visible; c: holds c - 1 pairs
 
 
 def header(history: Tensor, history_size: int) -> Header:
@@ -76,57 +113,60 @@ def two_loop(
     Args:
         grad: [N, D] gradients, any finite size.
         history: [N, slots, 2 (D + 1)], see the module's docstring; `history_from_pairs` makes one.
-        history_size: K, the number of ring slots.
+        history_size: K, the number of pairs there is room for.
         gamma_clamp: (low, high) bounds of gamma, in units of parameter per gradient.
 
     Returns:
         [N, D], in the parameters' units; the search direction is its negative. A point without
         pairs gets its gradient back.
     """
-    dim = grad.shape[1]
-    needed = (grad.shape[0], num_slots(history_size, dim), 2 * (dim + 1))
+    _check_shape("two_loop", grad, history, history_size)
+    result = torch.empty_like(grad)
+    for rows in _chunks(grad):
+        unit, scale = _scaled(_coordinates(grad[rows], history))
+        s, y = _stored(history[rows], history_size)
+        result[rows] = (_pairs.two_loop(unit, s, y, gamma_clamp) * scale).T
+    return result
+
+
+def _check_shape(call: str, grad: Tensor, history: Tensor, history_size: int) -> None:
+    rows, dim = grad.shape
+    needed = (rows, num_slots(history_size, dim), 2 * (dim + 1))
     if tuple(history.shape) != needed:
         raise ValueError(
-            f"two_loop: history has shape {tuple(history.shape)}, but {needed} is needed for a "
+            f"{call}: history has shape {tuple(history.shape)}, but {list(needed)} is needed for a "
             f"gradient of shape {tuple(grad.shape)} and history_size={history_size}"
         )
-    s, y, inverse_sy = _ordered_pairs(history, history_size, dim)
-    # Scaling g first keeps s.q finite for gradients near the end of the floating-point range.
-    scale = grad.abs().amax(dim=1).to(history.dtype)
-    scale = torch.where(scale > 0, scale, 1.0)
-    q = (grad.to(history.dtype) / scale.unsqueeze(1)).T
-    alphas = []
-    for j in range(history_size):
-        alpha = (s[j] * q).sum(0) * inverse_sy[j]
-        q = torch.addcmul(q, alpha, y[j], value=-1)
-        alphas.append(alpha)
-    # |y| = 1, hence gamma = s.y / y.y = s.y. No pair: gamma = 1, and r stays the gradient.
-    newest = inverse_sy[0]
-    gamma = torch.where(newest > 0, newest.reciprocal(), 1.0)
-    if gamma_clamp is not None:
-        gamma = torch.where(newest > 0, gamma.clamp(*gamma_clamp), gamma)
-    r = q * gamma
-    for j in reversed(range(history_size)):
-        beta = (y[j] * r).sum(0) * inverse_sy[j]
-        r = torch.addcmul(r, alphas[j] - beta, s[j])
-    return (r * scale).T.to(grad.dtype)
 
 
-def _ordered_pairs(history: Tensor, history_size: int, dim: int) -> tuple[Tensor, Tensor, Tensor]:
-    """s, y [K, D, N] and 1 / s.y [K, N], newest first; empty slots are zero.
+def _chunks(points: Tensor) -> Iterator[slice]:
+    """Rows to work on at a time: all of them, except on a CPU without a compiler's loop fusion."""
+    rows = points.shape[0]
+    if points.device.type != "cpu" or torch.compiler.is_compiling() or rows == 0:
+        yield slice(0, rows)
+        return
+    for start in range(0, rows, CHUNK):
+        yield slice(start, min(start + CHUNK, rows))
 
-    Component-wise on [.., N] is several times faster than the same on [N, K, D].
-    """
-    n, slots, lanes = history.shape
-    # Each row has its own ring: the newest pair is in slot (count - 2) mod K.
-    newest = header(history, history_size).counter.long() - 2
-    age = torch.arange(history_size, device=history.device).unsqueeze(1)
-    slot = torch.remainder(newest - age, history_size)
-    row = torch.arange(n, device=history.device) * slots
-    pairs = history.reshape(n * slots, lanes)[row + slot].permute(0, 2, 1).contiguous()
-    s, y = pairs[:, :dim], pairs[:, dim + 1 : 2 * dim + 1]
-    sy = (s * y).sum(1)
-    return s, y, torch.where(sy > 0, sy.reciprocal(), 0.0)
+
+def _coordinates(points: Tensor, history: Tensor) -> Tensor:
+    """Points [N, D] as [D, N] in the history's dtype, rows contiguous."""
+    return points.T.to(history.dtype).contiguous()
+
+
+def _scaled(grad: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients [D, N] over their largest component, and that [N]: keeps s.q finite."""
+    scale = threshold(grad.abs().amax(0), 0.0, 1.0)
+    return grad / scale, scale
+
+
+def _stored(history: Tensor, history_size: int) -> tuple[Tensor, Tensor]:
+    """s and y of the stored pairs, [K, D, N] each, newest first."""
+    dim = history.shape[2] // 2 - 1
+    cells = history[:, :history_size].permute(1, 2, 0)
+    if cells.stride(2) != 1:
+        cells = cells.contiguous()
+    return cells[:, :dim], cells[:, dim + 1 : 2 * dim + 1]
 
 
 def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:
@@ -141,28 +181,12 @@ def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:
     """
     size = s.shape[0]
     history = new_history(s[0], size)
-    header(history, size).counter.fill_(1)
     everywhere = torch.ones(s.shape[1], dtype=torch.bool, device=s.device)
     for k in range(size):
-        pair = normalised_pair(s[k].to(history.dtype), y[k].to(history.dtype))
+        pair = normalised_pair(_coordinates(s[k], history), _coordinates(y[k], history))
         _push(history, size, pair, everywhere)
+    header(history, size).counter.fill_(size + 1)
     return history
-
-
-class Pair(NamedTuple):
-    """A candidate curvature pair, both vectors divided by |y|."""
-
-    s: Tensor  # [N, D]
-    y: Tensor  # [N, D], unit length (zero where the gradients were equal)
-    cosine: Tensor  # [N] s.y / (|s| |y|); 0 where s or y is zero
-
-
-def normalised_pair(s: Tensor, y: Tensor) -> Pair:
-    """Divide a pair by |y|, without overflow or underflow on the way."""
-    length = safe_norm(y).unsqueeze(1)
-    s, y = s / length, y / length
-    unit = s / safe_norm(s).unsqueeze(1)
-    return Pair(s, y, (unit * y).sum(1))
 
 
 def record(
@@ -194,63 +218,55 @@ def record(
     Returns:
         (accepted, candidates), [N] bool each.
     """
+    flags = torch.empty((2, position.shape[0]), dtype=torch.bool, device=position.device)
+    for rows in _chunks(position):
+        part = history[rows]
+        moved = _coordinates(position[rows], history), _coordinates(gradient[rows], history)
+        flags[0, rows], flags[1, rows] = _record(
+            part, history_size, *moved, visible[rows], min_cosine, powell
+        )
+    return flags[0], flags[1]
+
+
+def _record(
+    history: Tensor,
+    history_size: int,
+    position: Tensor,  # [D, N], as is the gradient
+    gradient: Tensor,
+    visible: Tensor,
+    min_cosine: float,
+    powell: bool,
+) -> tuple[Tensor, Tensor]:
     head = header(history, history_size)
-    position, gradient = position.to(history.dtype), gradient.to(history.dtype)
-    pair = normalised_pair(position - head.position, gradient - head.gradient)
+    last_position, last_gradient = head.position.T, head.gradient.T
+    pair = normalised_pair(position - last_position, gradient - last_gradient)
     candidate = visible & (head.counter > 0)
     if powell:
         pair = damped_pair(pair, newest_gamma(history, history_size))
-    accepted = candidate & (pair.cosine > min_cosine) & torch.isfinite(pair.s).all(dim=1)
+    accepted = candidate & (pair.cosine > min_cosine)  # false where the pair is not finite
     _push(history, history_size, pair, accepted)
-    row = visible.unsqueeze(1)
-    head.position.copy_(torch.where(row, position, head.position))
-    head.gradient.copy_(torch.where(row, gradient, head.gradient))
-    head.counter.copy_(torch.where(visible & (head.counter == 0), 1.0, head.counter))
+    last_position.copy_(torch.where(visible, position, last_position))
+    last_gradient.copy_(torch.where(visible, gradient, last_gradient))
+    count = head.counter.maximum(visible.to(history.dtype)) + accepted
+    head.counter.copy_(count.clamp(max=history_size + 1))
     return accepted, candidate
 
 
 def newest_gamma(history: Tensor, history_size: int) -> Tensor:
     """Gamma of the newest pair, [N]; 0 where there is none."""
-    n, slots, lanes = history.shape
-    dim = lanes // 2 - 1
-    newest = torch.remainder(header(history, history_size).counter.long() - 2, history_size)
-    row = torch.arange(n, device=history.device) * slots + newest
-    pair = history.reshape(n * slots, lanes)[row]
-    return (pair[:, :dim] * pair[:, dim + 1 : 2 * dim + 1]).sum(1)
-
-
-def damped_pair(pair: Pair, gamma: Tensor) -> Pair:
-    sy = (pair.s * pair.y).sum(1)
-    s_bs = (pair.s * pair.s).sum(1) / torch.where(gamma > 0, gamma, 1.0)
-    low = (gamma > 0) & (sy < 0.2 * s_bs)
-    theta = torch.where(low, 0.8 * s_bs / (s_bs - sy), 1.0).unsqueeze(1)
-    bs = pair.s / torch.where(gamma > 0, gamma, 1.0).unsqueeze(1)
-    damped = normalised_pair(pair.s, theta * pair.y + (1 - theta) * bs)
-    keep = ~low.unsqueeze(1)
-    return Pair(
-        torch.where(keep, pair.s, damped.s),
-        torch.where(keep, pair.y, damped.y),
-        torch.where(low, damped.cosine, pair.cosine),
-    )
+    s, y = _stored(history[:, :1], 1)
+    return _pairs.dot(s[0], y[0])
 
 
 def _push(history: Tensor, history_size: int, pair: Pair, accept: Tensor) -> None:
-    """Write a pair over the oldest one of the rows in `accept` [N] (bool), in place."""
-    n, slots, lanes = history.shape
-    dim = pair.s.shape[1]
-    count = header(history, history_size).counter
-    slot = torch.remainder(count.long() - 1, history_size)
-    row = torch.arange(n, device=history.device) * slots + slot
-    flat = history.view(n * slots, lanes)
-    slots_now = flat[row]
-    write = accept.unsqueeze(1)
+    """Put a pair in front of the others, in the rows of `accept` [N] (bool), in place."""
+    dim = pair.s.shape[0]
+    cells = history.permute(1, 2, 0)
     for first, new in ((0, pair.s), (dim + 1, pair.y)):
-        old = slots_now[:, first : first + dim]
-        old.copy_(torch.where(write, new, old))
-    flat[row] = slots_now
-    # The counter is a float: one turn of the ring further back means the same and keeps it small.
-    count.add_(accept.to(count.dtype))
-    count.sub_((count > 2 * history_size).to(count.dtype) * history_size)
+        lanes = cells[:, first : first + dim]
+        for slot in range(history_size - 1, 0, -1):
+            lanes[slot].copy_(torch.where(accept, lanes[slot - 1], lanes[slot]))
+        lanes[0].copy_(torch.where(accept, new, lanes[0]))
 
 
 def direction(
@@ -275,22 +291,67 @@ def direction(
             for a thousand iterations.
         gamma_clamp: see `two_loop`.
     """
-    result = two_loop(grad, history, history_size, gamma_clamp=gamma_clamp)
-    grad_length, length = safe_norm(grad), safe_norm(result)
-    cosine = ((grad / grad_length.unsqueeze(1)) * (result / length.unsqueeze(1))).sum(1)
-    usable = (header(history, history_size).counter > 1) & (cosine > 0)
-    usable = usable & torch.isfinite(result).all(dim=1)
+    _check_shape("direction", grad, history, history_size)
+    result = torch.empty_like(grad)
+    for rows in _chunks(grad):
+        gradient = _coordinates(grad[rows], history)
+        result[rows] = _direction(gradient, history[rows], history_size, graft, gamma_clamp).T
+    return result
+
+
+def _direction(
+    grad: Tensor,  # [D, N]
+    history: Tensor,
+    history_size: int,
+    graft: bool,
+    gamma_clamp: tuple[float, float] | None,
+) -> Tensor:
+    unit, scale = _scaled(grad)
+    result = _pairs.two_loop(unit, *_stored(history, history_size), gamma_clamp)
+    size = _pairs.length(result)
+    # Zero where the gradient is, NaN where the result is not finite.
+    descent = _pairs.dot(unit, result / size)
+    usable = (header(history, history_size).counter > 1) & (descent > 0)
     if graft:
-        result = result / length.unsqueeze(1) * grad_length.unsqueeze(1)
-    return torch.where(usable.unsqueeze(1), result, grad)
+        result = result * (_pairs.dot(unit, unit).sqrt() / size)
+    result = result * scale
+    usable = usable & torch.isfinite(_pairs.dot(result, torch.zeros_like(result)))
+    return torch.where(usable, result, grad)
 
 
-def safe_norm(x: Tensor) -> Tensor:
-    """Euclidean norm over the last dimension without overflow or underflow; 1 for a zero row."""
-    largest = x.abs().amax(dim=-1)
-    divisor = torch.where(largest > 0, largest, 1.0)
-    length = divisor * torch.linalg.vector_norm(x / divisor.unsqueeze(-1), dim=-1)
-    return torch.where(largest > 0, length, 1.0)
+def step(
+    position: Tensor,
+    grad: Tensor,
+    history: Tensor,
+    history_size: int,
+    *,
+    min_cosine: float,
+    powell: bool,
+    graft: bool,
+    gamma_clamp: tuple[float, float] | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`record`, then `direction`, while a chunk of rows is in the cache; see there.
+
+    Returns:
+        (direction [N, D], accepted [N], candidates [N]).
+    """
+    _check_shape("lqn_direction", grad, history, history_size)
+    result = torch.empty_like(grad)
+    flags = torch.empty((2, grad.shape[0]), dtype=torch.bool, device=grad.device)
+    for rows in _chunks(grad):
+        part, gradient = history[rows], _coordinates(grad[rows], history)
+        visible = torch.isfinite(gradient).all(0) & (gradient != 0).any(0)
+        flags[0, rows], flags[1, rows] = _record(
+            part,
+            history_size,
+            _coordinates(position[rows], history),
+            gradient,
+            visible,
+            min_cosine,
+            powell,
+        )
+        result[rows] = _direction(gradient, part, history_size, graft, gamma_clamp).T
+    return result, flags[0], flags[1]
 
 
 def accumulate(epoch: Tensor, position: Tensor, gradient: Tensor, visible: Tensor) -> None:

@@ -38,8 +38,8 @@ class EnergyHistogram:
         energy_range: (low, high) in units of the loss, cut uniformly; the first and the last
             partition are open (eq. 7). `"auto"` measures it: during the first half of the
             warm-up the energies' recent mean and deviation are tracked, then the range is fixed
-            at mean - 8 to mean + 4 deviations (not below 0 where no energy was negative: the
-            loss still falls, so there is more room below).
+            at mean - 30 to mean + 4 deviations, but not below 0 where no energy was negative (the
+            loss goes on falling, by many deviations in a short run).
         zeta: flattening exponent, 0 (no flattening) to 1.
         temperature: tau, in units of the loss, or `"auto"`:
             (1 - zeta) / (2 zeta) * deviation of the energy, so that an energy two deviations
@@ -237,7 +237,7 @@ class EnergyHistogram:
         # A constant energy has no deviation: keep the width above what float64 resolves.
         deviation = self._recent.variance.sqrt().clamp(min=1e-12).maximum(mean.abs() * 1e-12)
         if self.energy_range == "auto":
-            low, high = mean - 8 * deviation, mean + 4 * deviation
+            low, high = mean - 30 * deviation, mean + 4 * deviation
             low = torch.where(self._recent.low >= 0, low.clamp(min=0.0), low)
             self._low = torch.where(measuring, low, self._low)
             self._width = torch.where(measuring, (high - low) / self.num_partitions, self._width)

@@ -260,17 +260,23 @@ class PhaseScheduler:
         if self.multiplier is not None and not self.exploiting:
             self.multiplier.observe(value, view=view)
         if self.log is not None:
-            self._write_log(value)
+            phase = self._phase_of(self._current).value
+            self.log.step(self._current, phase=phase, energy=value, **self.log_values())
 
-    def _write_log(self, energy: Tensor) -> None:
-        values: dict[str, Any] = {"energy": energy}
-        if self.multiplier is not None and not self.exploiting:
-            values["nu"] = self.multiplier.multiplier
-        share = self.accepted_share
-        if share is not None and self.exploiting:
-            values["accepted"] = share  # of the step before
-        assert self.log is not None
-        self.log.step(self._current, phase=self._phase_of(self._current).value, **values)
+    def log_values(self) -> dict[str, Tensor]:
+        """What this step's line of a run log should hold, 0-d: nu and the accepted share.
+
+        nu only where it is adapted (after the warm-up, while exploring); the accepted share while
+        exploiting, as of the last `step()`.
+        """
+        values: dict[str, Tensor] = {}
+        multiplier = self.multiplier
+        if multiplier is not None and not self.exploiting:
+            if multiplier.num_observed > multiplier.warmup:
+                values["nu"] = multiplier.multiplier
+        elif self.accepted_share is not None:
+            values["accepted"] = self.accepted_share
+        return values
 
     def pixel_loss(self, render: Tensor, target: Tensor) -> Tensor:
         """The photometric term: mean |error| while exploring, mean error^2 while exploiting.

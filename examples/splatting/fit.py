@@ -1,0 +1,313 @@
+"""Fit one scene with one arm: the trainer of the examples, with checkpoints and a run log."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from signal import SIGINT, SIGTERM
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+
+from opt3dgs_optim import Phase, PhaseScheduler
+from opt3dgs_optim.noise import CovarianceNoise
+from opt3dgs_optim.runlog import RunLog
+from splatting.arms import NOISE_LR, Arm
+from splatting.density import MCMCDensityControl, regularisers
+from splatting.gaussians import (
+    DEFAULT_PRESET,
+    MCMC_PRESET,
+    gaussians_from_points,
+    random_gaussians,
+    stock_learning_rates,
+)
+from splatting.metrics import photometric_loss, psnr, ssim
+from splatting.rasterizer import render
+from splatting.scenes import Scene, View
+
+LR_DECAY = 0.01  # of the positions' learning rate over the run
+TRAIN_VIEWS_EVALUATED = 8
+CHECKPOINT_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How to fit; two runs are comparable if these agree."""
+
+    iterations: int = 1500
+    points: int = 2000  # the most Gaussians
+    seed: int = 0
+    init: Literal["sfm", "random"] = "sfm"
+    sh_degree: int = 0
+    switch: float = 29 / 30
+    evaluations: int = 20
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "points", "evaluations"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"FitOptions: {name}={getattr(self, name)}, must be at least 1")
+        if self.init not in ("sfm", "random"):
+            raise ValueError(f"FitOptions: init={self.init!r}, must be 'sfm' or 'random'")
+        if not 0 < self.switch <= 1:
+            raise ValueError(f"FitOptions: switch={self.switch}, must be in (0, 1]")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a fit is, for a progress bar."""
+
+    iteration: int
+    loss: float
+    psnr: float
+    phase: str
+
+
+class Fit:
+    """The state of one training: Gaussians, optimizers, schedules, random generators."""
+
+    def __init__(
+        self, scene: Scene, arm: Arm, options: FitOptions, mean_nu: float | None = None
+    ) -> None:
+        self.scene, self.arm, self.options = scene, arm, options
+        torch.manual_seed(options.seed)  # the noise
+        self.order = torch.Generator().manual_seed(options.seed + 1)
+        self.density_draws = torch.Generator().manual_seed(options.seed + 2)
+        self.gaussians = self._initial_gaussians()
+        self.rates = stock_learning_rates(scene.extent)
+        self.optimizers: dict[str, torch.optim.Optimizer] = {
+            name: torch.optim.Adam(
+                [{"params": param, "lr": self.rates[name], "name": name}], eps=1e-15
+            )
+            for name, param in self.gaussians.items()
+        }
+        self.phases: PhaseScheduler | None = None
+        self.noise: CovarianceNoise | None = None
+        if arm.make is not None:
+            self.phases = arm.make(options.iterations, options.switch, mean_nu)
+            self.optimizers = self.phases.upgrade(self.optimizers, self.gaussians)
+        elif arm.mcmc:
+            self.noise = CovarianceNoise(self.gaussians, NOISE_LR)
+        self.density = self._density_control() if arm.mcmc else None
+        self.iteration = 0
+        self.views: list[int] = []  # what is left of this epoch
+
+    def _initial_gaussians(self) -> dict[str, Parameter]:
+        scene, options = self.scene, self.options
+        draw = torch.Generator().manual_seed(options.seed + 3)
+        common: dict[str, Any] = {"sh_degree": options.sh_degree, "generator": draw}
+        common.update(MCMC_PRESET if self.arm.mcmc else DEFAULT_PRESET)
+        if options.init == "sfm":
+            return gaussians_from_points(
+                scene.points, scene.colors, num_points=options.points, **common
+            )
+        # A tenth of the budget to start with where density control can fill the rest.
+        count = max(options.points // 10, 1) if self.arm.mcmc else options.points
+        center = scene.points.median(0).values
+        spread = float((scene.points - center).abs().quantile(0.9)) / scene.extent
+        return random_gaussians(scene.extent, count, center=center, spread=spread, **common)
+
+    def _density_control(self) -> MCMCDensityControl:
+        return MCMCDensityControl.for_run(
+            self.options.iterations,
+            self.options.points,
+            num_points=len(self.gaussians["means"]),
+            generator=self.density_draws,
+        )
+
+    # -- one iteration -------------------------------------------------------------------------
+
+    def step(self) -> Tensor:
+        """One iteration; returns the detached loss."""
+        index = self._next_view()
+        view = self.scene.train[index]
+        image = render(self.gaussians, view.camera, sh_degree=self.options.sh_degree).image
+        pixel_loss = None if self.phases is None else self.phases.pixel_loss
+        loss = photometric_loss(image, view.image, pixel_loss)
+        if self.arm.mcmc:
+            loss = loss + regularisers(self.gaussians)
+        loss.backward()
+        if self.phases is not None:
+            self.phases.observe(loss, view=index)
+        for optimizer in self.optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        self._inject_noise()
+        if self.density is not None:
+            self.density.step(self.iteration, self.gaussians, self.optimizers)
+        self.iteration += 1
+        decay = LR_DECAY ** (self.iteration / self.options.iterations)
+        self.optimizers["means"].param_groups[0]["lr"] = self.rates["means"] * decay
+        return loss.detach()
+
+    @torch.no_grad()
+    def _inject_noise(self) -> None:
+        """What an MCMC trainer does itself; with a scheduler, the optimizer of the means does."""
+        if self.noise is not None:
+            lr = self.optimizers["means"].param_groups[0]["lr"]
+            self.noise.add_to(self.gaussians["means"], lr)
+
+    def _next_view(self) -> int:
+        if not self.views:
+            self.views = torch.randperm(len(self.scene.train), generator=self.order).tolist()
+        return self.views.pop()
+
+    @property
+    def phase(self) -> Phase:
+        """The phase of the iteration that comes next."""
+        return Phase.EXPLORATION if self.phases is None else self.phases.phase
+
+    @property
+    def mean_nu(self) -> float | None:
+        """Mean of nu since the warm-up, or None where nu is off."""
+        multiplier = None if self.phases is None else self.phases.multiplier
+        return None if multiplier is None else float(multiplier.mean_multiplier)
+
+    # -- looking at it -------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def image(self, view: View) -> Tensor:
+        """The render of a view, [H, W, 3] in 0..1."""
+        return render(self.gaussians, view.camera, sh_degree=self.options.sh_degree).image.clamp(
+            0, 1
+        )
+
+    def evaluate(self) -> dict[str, float]:
+        """PSNR and SSIM of the test views, PSNR of a few train views, number of Gaussians."""
+        test = [(self.image(view), view.image) for view in self.scene.test]
+        stride = max(len(self.scene.train) // TRAIN_VIEWS_EVALUATED, 1)
+        train = [(self.image(view), view.image) for view in self.scene.train[::stride]]
+        return {
+            "psnr": _mean([psnr(a, b) for a, b in test]),
+            "ssim": _mean([ssim(a, b) for a, b in test]),
+            "train_psnr": _mean([psnr(a, b) for a, b in train]),
+            "num_points": float(len(self.gaussians["means"])),
+        }
+
+    # -- checkpoints ---------------------------------------------------------------------------
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint; an old one stays whole until the new one is."""
+        state = {
+            "format": CHECKPOINT_FORMAT,
+            "arm": self.arm.name,
+            "scene": self.scene.name,
+            "options": asdict(self.options),
+            "iteration": self.iteration,
+            "gaussians": {name: param.detach() for name, param in self.gaussians.items()},
+            "optimizers": {name: opt.state_dict() for name, opt in self.optimizers.items()},
+            "views": self.views,
+            "random": [
+                torch.get_rng_state(),
+                self.order.get_state(),
+                self.density_draws.get_state(),
+            ],
+        }
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_suffix(".partial")
+        torch.save(state, partial)
+        os.replace(partial, path)
+
+    def load(self, path: Path) -> None:
+        """Go on from a checkpoint; ValueError if it is of another scene, arm or options."""
+        state = torch.load(path, weights_only=True)
+        mine = (self.scene.name, self.arm.name, asdict(self.options), CHECKPOINT_FORMAT)
+        its = (state["scene"], state["arm"], state["options"], state["format"])
+        if mine != its:
+            raise ValueError(
+                f"{path}: a checkpoint of {its}, but this run is {mine}; choose another folder"
+            )
+        for name, value in state["gaussians"].items():
+            fresh = Parameter(value)
+            self.optimizers[name].param_groups[0]["params"] = [fresh]
+            self.optimizers[name].load_state_dict(state["optimizers"][name])
+            self.gaussians[name] = fresh
+        self.iteration, self.views = state["iteration"], state["views"]
+        torch.set_rng_state(state["random"][0])
+        self.order.set_state(state["random"][1])
+        self.density_draws.set_state(state["random"][2])
+
+
+def run(
+    fit: Fit,
+    folder: Path,
+    show: Callable[[Progress], None] = lambda _progress: None,
+    metadata: dict[str, Any] | None = None,
+) -> dict[str, float]:
+    """Train to the end, or on from where an earlier call was stopped; return the last metrics.
+
+    Writes `folder/log.jsonl` and `folder/checkpoint.pt`. On Ctrl-C the iteration is finished, its
+    checkpoint written, and KeyboardInterrupt raised; a second Ctrl-C stops at once.
+    """
+    checkpoint, total = folder / "checkpoint.pt", fit.options.iterations
+    if checkpoint.exists():
+        fit.load(checkpoint)
+    if fit.iteration == total:
+        return fit.evaluate()
+    every = max(total // fit.options.evaluations, 1)
+    with _open_log(fit, folder / "log.jsonl", metadata or {}) as log, _StopRequest() as stop:
+        metrics = _evaluate(fit, log)
+        while fit.iteration < total:
+            phase = fit.phase
+            loss = fit.step()
+            _log_step(fit, log, phase, loss)
+            if fit.iteration % every == 0 or fit.iteration == total:
+                metrics = _evaluate(fit, log)
+            if fit.iteration % every == 0 or fit.iteration == total or stop.requested:
+                with log.paused():
+                    fit.save(checkpoint)
+            if fit.iteration % 10 == 0 or fit.iteration == total:
+                show(Progress(fit.iteration, float(loss), metrics["psnr"], phase.value))
+            if stop.requested:
+                log.event("interrupted", fit.iteration)
+                raise KeyboardInterrupt
+        log.event("finished", fit.iteration, mean_nu=fit.mean_nu)
+    return metrics
+
+
+class _StopRequest:
+    """Ctrl-C or a termination signal asks for a stop after the iteration; a second one insists."""
+
+    requested = False
+
+    def __enter__(self) -> _StopRequest:
+        self._old = {kind: signal.signal(kind, self._ask) for kind in (SIGINT, SIGTERM)}
+        return self
+
+    def _ask(self, _kind: int, _frame: object) -> None:
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
+
+    def __exit__(self, *_: object) -> None:
+        for kind, old in self._old.items():
+            signal.signal(kind, old)
+
+
+def _open_log(fit: Fit, path: Path, metadata: dict[str, Any]) -> RunLog:
+    about = {"arm": fit.arm.name, "scene": fit.scene.name, **asdict(fit.options), **metadata}
+    if path.exists():  # lines past the checkpoint, or of a run without one, are superseded
+        return RunLog.resume(path, iteration=fit.iteration, metadata=about)
+    return RunLog(path, metadata=about)
+
+
+def _log_step(fit: Fit, log: RunLog, phase: Phase, loss: Tensor) -> None:
+    values: dict[str, Any] = {"loss": loss}
+    if fit.phases is not None:
+        values.update(fit.phases.log_values())
+    log.step(fit.iteration, phase=phase.value, **values)
+
+
+def _evaluate(fit: Fit, log: RunLog) -> dict[str, float]:
+    with log.paused():
+        metrics = fit.evaluate()
+    log.evaluation(fit.iteration, **metrics)
+    return metrics
+
+
+def _mean(values: list[Tensor]) -> float:
+    return float(torch.stack(values).mean())

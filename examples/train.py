@@ -1,0 +1,103 @@
+"""Fit one scene with one arm: python examples/train.py --scene embedded --arm opt3dgs -o runs/one.
+
+A second start with the same folder goes on from the checkpoint of the first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from splatting.arms import ARMS, find_arm
+from splatting.fit import Fit, FitOptions, Progress, run
+from splatting.gaussians import save_ply
+from splatting.scenes import load_scene
+from tqdm import tqdm
+
+
+def add_fit_options(parser: argparse.ArgumentParser) -> None:
+    """Options that train.py and error_vs_time.py share."""
+    defaults = FitOptions()
+    add = parser.add_argument
+    add("--scene", default="embedded", metavar="DIR", help="scene folder, or 'embedded'")
+    add("--size", default="small", choices=("small", "large"), help="image size")
+    add("--points", type=int, default=defaults.points, help="the most Gaussians")
+    add("--iterations", type=int, default=defaults.iterations)
+    add("--init", default=defaults.init, choices=("sfm", "random"), help="first Gaussians")
+    add("--sh-degree", type=int, default=defaults.sh_degree, choices=range(4))
+    add("--switch", type=float, default=defaults.switch, help="where exploitation starts, 0..1")
+
+
+def recorded_command(
+    program: str, parser: argparse.ArgumentParser, args: argparse.Namespace
+) -> str:
+    """The command for the report: options that differ from their defaults, folders by name."""
+    words = ["python", f"examples/{program}"]
+    for name, value in vars(args).items():
+        if name in ("out", "quiet", "command", "jobs") or value == parser.get_default(name):
+            continue
+        plain = Path(value).name if name == "scene" else value
+        listed = ",".join(map(str, plain)) if isinstance(plain, list) else str(plain)
+        words += [f"--{name.replace('_', '-')}", listed]
+    return shlex.join(words)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    add_fit_options(parser)
+    arms = "; ".join(f"{arm.name}: {arm.what}" for arm in ARMS.values())
+    parser.add_argument("--arm", default="opt3dgs", choices=ARMS, metavar="ARM", help=arms)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--mean-nu", type=float, help="for mcmc+constant-multiplier")
+    parser.add_argument("-o", "--out", type=Path, default=Path("runs/train"), metavar="DIR")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    parser.add_argument("--command", help="the command to record in the log")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line; 0, 2 after one line that says what is wrong, 130 when interrupted."""
+    args = _parser().parse_args(arguments)
+    torch.set_num_threads(1)
+    try:
+        options = FitOptions(
+            args.iterations, args.points, args.seed, args.init, args.sh_degree, args.switch
+        )
+        scene = load_scene(args.scene, args.size)
+        fit = Fit(scene, find_arm(args.arm), options, args.mean_nu)
+    except (OSError, ValueError) as error:
+        print(f"train: {error}", file=sys.stderr)
+        return 2
+    command = args.command or recorded_command("train.py", _parser(), args)
+    about = {"size": args.size, "command": command}
+    bar = tqdm(total=options.iterations, desc=args.arm, unit="it", disable=args.quiet)
+
+    def show(progress: Progress) -> None:
+        bar.update(progress.iteration - bar.n)
+        bar.set_postfix_str(
+            f"loss {progress.loss:.4f}, PSNR {progress.psnr:.2f} dB, {progress.phase}"
+        )
+
+    try:
+        metrics = run(fit, args.out, show, about)
+    except KeyboardInterrupt:
+        bar.close()
+        print(f"interrupted at iteration {fit.iteration}: start again to go on", file=sys.stderr)
+        return 130
+    except ValueError as error:
+        bar.close()
+        print(f"train: {error}", file=sys.stderr)
+        return 2
+    bar.close()
+    save_ply(args.out / "gaussians.ply", fit.gaussians)
+    if not args.quiet:
+        print(f"{args.arm}: test PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.4f}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
