@@ -294,6 +294,41 @@ def test_step_hooks_run_once() -> None:
     assert isinstance(optimizer, torch.optim.Adam)
 
 
+def test_resume_is_exact_with_the_histogram_inside_the_state_dict() -> None:
+    def run(params: list, optimizer: AWSGLD, first: int, last: int) -> None:
+        for step in range(first, last):
+            set_gradients(params, step)
+            assert optimizer.histogram is not None
+            optimizer.histogram.observe(0.5 + 0.3 * math.sin(step))
+            optimizer.step()
+
+    def make() -> tuple[list, AWSGLD]:
+        params = parameters()
+        histogram = EnergyHistogram(8, (0.0, 1.0), temperature=1.0, warmup=0, step_size=0.3)
+        return params, AWSGLD(params, lr=0.01, histogram=histogram)
+
+    whole, optimizer = make()
+    run(whole, optimizer, 0, 20)
+    first, before = make()
+    run(first, before, 0, 9)
+    second, after = make()
+    for p, q in zip(second, first, strict=True):
+        p.data.copy_(q.data)
+    after.load_state_dict(before.state_dict())
+    run(second, after, 9, 20)
+    assert all(torch.equal(p, q) for p, q in zip(whole, second, strict=True))
+
+
+def test_skipped_rows_are_counted() -> None:
+    x = torch.nn.Parameter(torch.ones(6, 3))
+    optimizer = AWSGLD([x], lr=0.1)
+    for bad_rows in (0, 2, 1):
+        x.grad = torch.ones(6, 3)
+        x.grad[:bad_rows] = math.nan
+        optimizer.step()
+    assert int(optimizer.skipped_rows) == 3
+
+
 def test_deepcopy_goes_on_alike() -> None:
     params = parameters()
     histogram = EnergyHistogram(8, (0.0, 1.0), temperature=1.0, warmup=0, step_size=0.3)

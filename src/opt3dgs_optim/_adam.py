@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -10,6 +10,8 @@ from torch import Tensor
 from torch.optim.adam import Adam, adam
 
 from opt3dgs_optim._nonfinite import FrozenRows
+
+STATE_KEY = "opt3dgs"  # in param_groups[0] of a state_dict: plain floats, lists and dicts
 
 
 class HookedAdam(Adam):
@@ -22,13 +24,39 @@ class HookedAdam(Adam):
 
     def __init__(self, params: Any, lr: float | Tensor, *args: Any, **kwargs: Any) -> None:
         self.skip_nonfinite = bool(kwargs.pop("skip_nonfinite", True))
+        self.skipped_rows: Tensor | int = 0  # so far, for a non-finite gradient; 0-d on a GPU
         super().__init__(params, lr, *args, **kwargs)
 
     # Attributes of ours that a copy or a pickle takes along (torch keeps its own three only).
-    _own: tuple[str, ...] = ("skip_nonfinite",)
+    _own: tuple[str, ...] = ("skip_nonfinite", "skipped_rows")
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), **{name: getattr(self, name) for name in self._own}}
+
+    # -- checkpoints -------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Any]:
+        """torch's, with what several optimizers share inside `param_groups[0]`."""
+        state_dict = super().state_dict()
+        shared = self._shared_state()
+        if shared is not None:
+            state_dict["param_groups"][0][STATE_KEY] = shared
+        return state_dict
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """As torch's; also takes the `state_dict()` of a plain Adam."""
+        groups = [dict(group) for group in state_dict["param_groups"]]
+        shared = groups[0].pop(STATE_KEY, None) if groups else None
+        super().load_state_dict({**state_dict, "param_groups": groups})
+        if shared is not None:
+            self._load_shared_state(shared)
+
+    def _shared_state(self) -> dict[str, Any] | None:
+        """What a checkpoint must hold besides torch's state, as plain numbers, or None."""
+        return None
+
+    def _load_shared_state(self, shared: Mapping[str, Any]) -> None:
+        """Restore `_shared_state()`."""
 
     # -- what subclasses say -----------------------------------------------------------------
 
@@ -95,6 +123,7 @@ class HookedAdam(Adam):
             rows = FrozenRows.find(grad, kept)
             if rows is not None:
                 frozen.append(rows)
+                self.skipped_rows = self.skipped_rows + rows.count
         return frozen
 
     def _found_inf(

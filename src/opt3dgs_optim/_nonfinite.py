@@ -14,6 +14,7 @@ class FrozenRows:
     def __init__(self, rows: Tensor, bad: Tensor, kept: list[Tensor]) -> None:
         self._rows, self._bad, self._kept = rows, bad, kept
         self._saved = [tensor[rows].clone() for tensor in kept]
+        self.count = bad.sum()
         self.overflow: Tensor | None = None  # 0-d float: more bad rows than could be saved
 
     @classmethod

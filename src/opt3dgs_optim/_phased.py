@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.optim import Adam, Optimizer
 
-from opt3dgs_optim._adam import HookedAdam, fused_on_cuda
+from opt3dgs_optim._adam import STATE_KEY, HookedAdam, fused_on_cuda
 from opt3dgs_optim._groups import canonical_name, is_positions
 from opt3dgs_optim.awsgld import EnergyWatch
 from opt3dgs_optim.lqnadam import LQNAdam
@@ -18,7 +18,6 @@ from opt3dgs_optim.lqnadam import LQNAdam
 if TYPE_CHECKING:
     from opt3dgs_optim.phases import PhaseScheduler
 
-STATE_KEY = "opt3dgs"  # in param_groups[0] of a state_dict: plain floats, lists and dicts
 CONSTRUCTOR_OPTIONS = (
     "betas",
     "eps",
@@ -50,7 +49,7 @@ class PhasedAdam(LQNAdam):
             groups, defaults["fused"], defaults["foreach"], bool(defaults["capturable"])
         )
         defaults["fused"] = fused
-        embedded = groups[0].pop(STATE_KEY, None)
+        shared = groups[0].pop(STATE_KEY, None)
         # A class of torch's decides its options by the defaults, a step by its group's.
         HookedAdam.__init__(self, groups, optimizer.defaults["lr"], **defaults)
         self._init_curvature(scheduler.curvature_options)
@@ -61,8 +60,8 @@ class PhasedAdam(LQNAdam):
         self._trust_present()
         if fused:
             self._use_fused()
-        if embedded is not None:
-            self._load_embedded(embedded)
+        if shared is not None:
+            self._load_shared_state(shared)
 
     def _use_fused(self) -> None:
         for group in self.param_groups:
@@ -111,26 +110,12 @@ class PhasedAdam(LQNAdam):
 
     # -- checkpoints -------------------------------------------------------------------------
 
-    def state_dict(self) -> dict[str, Any]:
-        """torch's, with the scheduler's state inside `param_groups[0]` as plain numbers."""
-        state_dict = super().state_dict()
-        state_dict["param_groups"][0][STATE_KEY] = {
-            "scheduler": self.scheduler.state_dict(),
-            "switched": self.switched,
-        }
-        return state_dict
+    def _shared_state(self) -> dict[str, Any]:
+        return {"scheduler": self.scheduler.state_dict(), "switched": self.switched}
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """As torch's, and restores the scheduler from `state_dict()`; plain Adam's is taken too."""
-        groups = [dict(group) for group in state_dict["param_groups"]]
-        embedded = groups[0].pop(STATE_KEY, None)
-        super().load_state_dict({**state_dict, "param_groups": groups})
-        if embedded is not None:
-            self._load_embedded(embedded)
-
-    def _load_embedded(self, embedded: Mapping[str, Any]) -> None:
-        self.switched = bool(embedded["switched"])
-        self.scheduler.load_state_dict(embedded["scheduler"])
+    def _load_shared_state(self, shared: Mapping[str, Any]) -> None:
+        self.switched = bool(shared["switched"])
+        self.scheduler.load_state_dict(shared["scheduler"])
 
 
 def check_upgradable(optimizer: Any, name: str) -> Adam:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from typing import Any, Literal, Protocol
 
 import torch
@@ -40,7 +41,8 @@ class AWSGLD(HookedAdam):
             (those rows of `.grad` are set to zero).
 
     The energy is the closure's value, or comes from `histogram.observe(loss)`, called once per
-    iteration before `step()`. A non-finite energy skips the step. Memory: Adam's.
+    iteration before `step()`. A non-finite energy skips the step. The histogram's state travels
+    inside `state_dict()`. Memory: Adam's.
 
     Example:
         >>> import torch
@@ -104,6 +106,13 @@ class AWSGLD(HookedAdam):
         self.noise = noise
         self.preconditioner = preconditioner
         self._energy_watch = EnergyWatch("AWSGLD")
+
+    def _shared_state(self) -> dict[str, Any] | None:
+        return None if self.histogram is None else {"histogram": self.histogram.state_dict()}
+
+    def _load_shared_state(self, shared: Mapping[str, Any]) -> None:
+        if self.histogram is not None and "histogram" in shared:
+            self.histogram.load_state_dict(shared["histogram"])
 
     def _begin_step(self, loss: Any) -> None:
         if self.histogram is None:
