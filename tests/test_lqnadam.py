@@ -151,8 +151,9 @@ def test_epoch_pairs_are_taken_between_whole_epochs() -> None:
     for j in range(3):
         s, y = means_x[j + 1] - means_x[j], means_g[j + 1] - means_g[j]
         length = y.norm(dim=1, keepdim=True)
-        torch.testing.assert_close(history[:, j, :3], s / length, rtol=1e-6, atol=1e-9)
-        torch.testing.assert_close(history[:, j, 4:7], y / length, rtol=1e-6, atol=1e-9)
+        slot = history[:, 2 - j]  # newest first
+        torch.testing.assert_close(slot[:, :3], s / length, rtol=1e-6, atol=1e-9)
+        torch.testing.assert_close(slot[:, 4:7], y / length, rtol=1e-6, atol=1e-9)
 
 
 def test_part_of_an_epoch_makes_no_pair() -> None:
