@@ -24,7 +24,7 @@ def dense_bfgs(s: np.ndarray, y: np.ndarray, gamma: float | None = None) -> np.n
 
 
 class LoopHistogram:
-    """Eq. 7, 13, 14 and 16 with Python loops; the ends, the clamp and lambda as METHOD.md has it."""
+    """Eq. 7, 13, 14 and 16 with Python loops; ends and clamp as the class documents them."""
 
     def __init__(
         self,

@@ -213,7 +213,7 @@ def test_dropped_when_rows_were_resized_in_place_of_the_state() -> None:
 
 
 def test_state_is_float32_with_points_first() -> None:
-    """HOSTS.md 1: what density control edits by rows must be just that."""
+    """What density control edits by rows must be just that."""
     x = points(7)
     optimizer = LQNAdam([x], lr=0.01, pairs="epoch", epoch_steps=3)
     x.grad = torch.ones(7, 3)
