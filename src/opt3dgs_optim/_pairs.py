@@ -51,9 +51,7 @@ def damped_pair(pair: Pair, gamma: Tensor) -> Pair:
     return Pair(*(torch.where(low, new, old) for new, old in zip(damped, pair, strict=True)))
 
 
-def two_loop(
-    grad: Tensor, s: Tensor, y: Tensor, gamma_clamp: tuple[float, float] | None
-) -> Tensor:
+def two_loop(grad: Tensor, s: Tensor, y: Tensor, gamma_clamp: tuple[float, float] | None) -> Tensor:
     """The recursion of `curvature.two_loop`, [D, N], for gradients of moderate size.
 
     Args:

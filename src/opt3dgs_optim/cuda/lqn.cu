@@ -1,0 +1,41 @@
+// Per-point L-BFGS step: store the new pair, then the two-loop direction. One thread per point.
+// Compiled by NVRTC for one history size, -D HISTORY_SIZE=K; `two_loop.cuh` goes in front.
+#ifndef HISTORY_SIZE
+#error "HISTORY_SIZE, the number of pairs, must be defined"
+#endif
+
+template <typename T>
+POINT void lqn_row(const T* positions, const T* grads, T* histories, T* directions, unsigned char* accepted,
+                   unsigned char* candidates, long long rows, Options<T> options) {
+  const long long row = static_cast<long long>(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (row >= rows) return;
+  const T* p = positions + 3 * row;
+  const T* g = grads + 3 * row;
+  Vec3<T> fed;
+  const Flags flags =
+      lqn_point<T, HISTORY_SIZE>({p[0], p[1], p[2]}, {g[0], g[1], g[2]},
+                                 histories + History<T, HISTORY_SIZE>::slots * 8 * row, options, &fed);
+  T* out = directions + 3 * row;
+  out[0] = fed.x;
+  out[1] = fed.y;
+  out[2] = fed.z;
+  accepted[row] = flags.accepted;
+  candidates[row] = flags.candidate;
+}
+
+// 5 blocks of 128 threads per multiprocessor: at most 96 registers.
+#define LQN_KERNEL(NAME, T, BLOCKS)                                                                      \
+  extern "C" __global__ void __launch_bounds__(128, BLOCKS)                                              \
+      NAME(const T* __restrict__ positions, const T* __restrict__ grads, T* histories,      \
+           T* __restrict__ directions, unsigned char* __restrict__ accepted,                             \
+           unsigned char* __restrict__ candidates, long long rows, T min_cosine, T gamma_low,            \
+           T gamma_high, int powell, int graft, int clamp) {                                             \
+    lqn_row<T>(positions, grads, histories, directions, accepted, candidates, rows,                      \
+               {min_cosine, gamma_low, gamma_high, powell != 0, graft != 0, clamp != 0});                \
+  }
+
+#ifdef IN_FLOAT64
+LQN_KERNEL(lqn_direction, double, 1)
+#else
+LQN_KERNEL(lqn_direction, float, 5)
+#endif
