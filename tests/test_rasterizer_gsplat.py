@@ -29,7 +29,7 @@ def import_gsplat():
         ):
             warnings.simplefilter("ignore")
             patch.setattr(torch.utils.cpp_extension, "_find_cuda_home", lambda: None)
-            import gsplat.cuda._torch_impl as torch_impl
+            import gsplat.cuda._torch_impl as torch_impl  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         pytest.skip(f"needs gsplat 1.5: {error}", allow_module_level=True)
     return torch_impl

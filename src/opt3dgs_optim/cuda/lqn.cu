@@ -23,9 +23,9 @@ POINT void lqn_row(const T* positions, const T* grads, T* histories, T* directio
   candidates[row] = flags.candidate;
 }
 
-// 5 blocks of 128 threads per multiprocessor: at most 96 registers.
-#define LQN_KERNEL(NAME, T, BLOCKS)                                                                      \
-  extern "C" __global__ void __launch_bounds__(128, BLOCKS)                                              \
+// More blocks asked for per multiprocessor make ptxas use more registers here, up to spills.
+#define LQN_KERNEL(NAME, T)                                                                              \
+  extern "C" __global__ void __launch_bounds__(128)                                                      \
       NAME(const T* __restrict__ positions, const T* __restrict__ grads, T* histories,      \
            T* __restrict__ directions, unsigned char* __restrict__ accepted,                             \
            unsigned char* __restrict__ candidates, long long rows, T min_cosine, T gamma_low,            \
@@ -35,7 +35,7 @@ POINT void lqn_row(const T* positions, const T* grads, T* histories, T* directio
   }
 
 #ifdef IN_FLOAT64
-LQN_KERNEL(lqn_direction, double, 1)
+LQN_KERNEL(lqn_direction, double)
 #else
-LQN_KERNEL(lqn_direction, float, 5)
+LQN_KERNEL(lqn_direction, float)
 #endif
