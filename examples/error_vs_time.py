@@ -13,6 +13,7 @@ import argparse
 import json
 import math
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -97,6 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ]
         _refuse_other_options(trainings, args, scene.name)
         command = recorded_command("error_vs_time.py", parser, args)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         _train_all(trainings, args, command)
     except (OSError, ValueError) as error:
         print(f"error_vs_time: {error}", file=sys.stderr)
@@ -184,7 +186,8 @@ def _start(
         words += ["--mean-nu", repr(_source(training, trainings).mean_nu())]
     # One thread each: trainings side by side share the cores, and the figures stay comparable.
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-    training.process = subprocess.Popen(words, env=environment)
+    # A session of its own: Ctrl-C reaches this process alone, which passes it on once.
+    training.process = subprocess.Popen(words, env=environment, start_new_session=True)
 
 
 def _reap(running: list[Training]) -> None:
@@ -204,7 +207,7 @@ def _stop(running: list[Training]) -> None:
     """Ask each for a checkpoint, and wait for it."""
     for training in running:
         if training.process is not None and training.process.poll() is None:
-            training.process.terminate()
+            training.process.send_signal(signal.SIGINT)
     for training in running:
         if training.process is not None:
             training.process.wait()

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 from PIL import Image
+
+from opt3dgs_optim.runlog import read_run
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 TINY = ["--iterations", "40", "--points", "120", "--seeds", "1", "--switch", "0.75"]
@@ -65,6 +69,38 @@ def test_second_start_repeats_nothing(finished: Path) -> None:
     result = compare(*TINY, "--arms", "mcmc,opt3dgs", "-o", str(finished))
     assert result.returncode == 0, result.stderr
     assert log.read_bytes() == before
+
+
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
+def test_interruption_leaves_checkpoints_and_the_same_command_goes_on(
+    kind: signal.Signals, tmp_path: Path
+) -> None:
+    words = ["--iterations", "300", "--points", "120", "--seeds", "1", "--arms", "mcmc,adam"]
+    words += ["--jobs", "2", "-o", str(tmp_path)]
+    process = subprocess.Popen(
+        [sys.executable, str(EXAMPLES / "error_vs_time.py"), *words],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
+    logs = [tmp_path / arm / "seed-0" / "log.jsonl" for arm in ("mcmc", "adam")]
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        if all(log.exists() and log.read_bytes().count(b"\n") > 25 for log in logs):
+            break
+        time.sleep(0.01)
+    process.send_signal(kind)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130, stderr
+    assert b"goes on from the checkpoints" in stderr
+    for log in logs:
+        run = read_run(log)
+        if run.events[-1]["event"] == "interrupted":
+            assert (log.parent / "checkpoint.pt").exists()
+    assert any(read_run(log).events[-1]["event"] == "interrupted" for log in logs)
+    result = compare(*words)
+    assert result.returncode == 0, result.stderr
+    for log in logs:
+        assert read_run(log).steps["iteration"].tolist() == list(range(1, 301))
 
 
 def test_folder_with_other_options_is_refused(finished: Path) -> None:
