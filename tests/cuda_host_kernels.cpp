@@ -1,8 +1,9 @@
 // The kernels as plain functions for ctypes. Compiled once per history size and precision:
-// -D HISTORY_SIZE=K [-D IN_FLOAT64], with -I to the folder of the (possibly mutated) sources.
+// -D HISTORY_SIZE=K [-D IN_FLOAT64 | -D PACKED_PAIRS], with -I to the folder of the (possibly mutated) sources.
 #include "cuda_host_shim.h"
 
 #include "two_loop.cuh"
+#include "packed.cuh"
 
 #include "lqn.cu"
 #include "noise.cu"

@@ -6,6 +6,7 @@ several times faster on them than on [N, D]. `curvature` holds the same things f
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
@@ -21,9 +22,13 @@ class Pair(NamedTuple):
     cosine: Tensor  # [N] s.y / (|s| |y|); 0 where s or y is zero, NaN where they are not finite
 
 
-def dot(a: Tensor, b: Tensor) -> Tensor:
-    """a.b of every point, [N]."""
-    return (a * b).sum(-2)
+def dot(a: Iterable[Tensor], b: Iterable[Tensor]) -> Tensor:
+    """a.b of every point, [N]; a and b are [D, N], or the D coordinates."""
+    (first_a, first_b), *others = zip(a, b, strict=True)
+    total = first_a * first_b
+    for x, y in others:
+        total = torch.addcmul(total, x, y)
+    return total
 
 
 def length(x: Tensor) -> Tensor:
@@ -60,20 +65,32 @@ def two_loop(grad: Tensor, s: Tensor, y: Tensor, gamma_clamp: tuple[float, float
         y: [K, D, N], unit length where there is a pair.
         gamma_clamp: see `curvature.two_loop`.
     """
-    sy = dot(s, y)
-    inverse_sy = threshold(sy, 0.0, torch.inf).reciprocal()  # no pair: 1 / inf = 0
-    q = grad
-    alphas = []
-    for s_j, y_j, inverse in zip(s, y, inverse_sy, strict=True):
+    # One [N] tensor per coordinate: a compiler makes a single loop of it, and torch alone is no
+    # slower than on [D, N].
+    pairs = [(s_j.unbind(), y_j.unbind()) for s_j, y_j in zip(s, y, strict=True)]
+    q = list(grad.unbind())
+    alphas, inverses = [], []
+    for s_j, y_j in pairs:
+        # No pair: 1 / inf = 0.
+        inverse = threshold(dot(s_j, y_j), 0.0, torch.inf).reciprocal()
         alpha = dot(s_j, q) * inverse
-        q = torch.addcmul(q, alpha, y_j, value=-1)
+        q = [torch.addcmul(a, alpha, b, value=-1) for a, b in zip(q, y_j, strict=True)]
         alphas.append(alpha)
-    # |y| = 1, hence gamma = s.y / y.y = s.y. No pair: gamma = 1, and r stays the gradient.
-    gamma = threshold(sy[0], 0.0, 1.0)
-    if gamma_clamp is not None:
-        gamma = torch.where(sy[0] > 0, gamma.clamp(*gamma_clamp), gamma)
-    r = q * gamma
-    for j in reversed(range(s.shape[0])):
-        beta = dot(y[j], r) * inverse_sy[j]
-        r = torch.addcmul(r, alphas[j] - beta, s[j])
-    return r
+        inverses.append(inverse)
+    gamma = _initial_scaling(*pairs[0], gamma_clamp)
+    r = [a * gamma for a in q]
+    for (s_j, y_j), alpha, inverse in zip(
+        reversed(pairs), reversed(alphas), reversed(inverses), strict=True
+    ):
+        change = alpha - dot(y_j, r) * inverse
+        r = [torch.addcmul(a, change, b) for a, b in zip(r, s_j, strict=True)]
+    return torch.stack(r)
+
+
+def _initial_scaling(
+    s: Iterable[Tensor], y: Iterable[Tensor], gamma_clamp: tuple[float, float] | None
+) -> Tensor:
+    """|y| = 1, hence gamma = s.y / y.y = s.y. No pair: gamma = 1, and r stays the gradient."""
+    sy = dot(s, y)
+    gamma = threshold(sy, 0.0, 1.0)
+    return gamma if gamma_clamp is None else torch.where(sy > 0, gamma.clamp(*gamma_clamp), gamma)

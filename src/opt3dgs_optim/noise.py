@@ -9,60 +9,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from opt3dgs_optim._checks import check_number
+from opt3dgs_optim._checks import check_choice, check_number
+from opt3dgs_optim._covariance import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
+from opt3dgs_optim.backend import BACKENDS, Backend
+from opt3dgs_optim.ops import add_covariance_noise
 
-GATE_SHARPNESS = 100.0  # k of eq. 2's gate
-GATE_OPACITY = 0.005  # t of eq. 2's gate: the opacity under which a Gaussian counts as dead
+__all__ = [
+    "GATE_OPACITY",
+    "GATE_SHARPNESS",
+    "CovarianceNoise",
+    "GaussianTensors",
+    "IsotropicNoise",
+    "covariance_noise",
+]
 
 GaussianTensors = Mapping[str, Tensor]
-
-
-def covariance_noise(
-    scales: Tensor,
-    quats: Tensor,
-    opacities: Tensor,
-    eta: Tensor,
-    *,
-    sharpness: float = GATE_SHARPNESS,
-    threshold: float = GATE_OPACITY,
-) -> Tensor:
-    """Noise shaped by each Gaussian's covariance and gated by its opacity (eq. 2).
-
-        sigmoid(-k (o - t)) * Sigma @ eta,   Sigma = R diag(s)^2 R^T
-
-    Nearly transparent Gaussians wander along their own shape, opaque ones stand still.
-
-    Args:
-        scales: [N, 3] log of the standard deviations, world units.
-        quats: [N, 4] rotations, wxyz, need not be normalised.
-        opacities: [N] or [N, 1] logits.
-        eta: [N, 3] standard normal.
-        sharpness: k, per unit of opacity.
-        threshold: t, opacity in 0..1.
-
-    Returns:
-        [N, 3] in squared world units; the caller multiplies by noise scale and learning rate.
-    """
-    # Component-wise on [N]: several times faster than batched 3x3 matrices on any device.
-    gate = torch.sigmoid(-sharpness * (torch.sigmoid(opacities.reshape(-1)) - threshold))
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    variance = torch.exp(2 * scales)
-    # R^T eta: rotation by the conjugate quaternion; then the variances; then R.
-    local = _rotate(w, -x, -y, -z, *eta.unbind(-1))
-    shaped = [axis * component for axis, component in zip(variance.unbind(-1), local, strict=True)]
-    return torch.stack(_rotate(w, x, y, z, *shaped), dim=-1) * gate.unsqueeze(-1)
-
-
-def _rotate(
-    w: Tensor, x: Tensor, y: Tensor, z: Tensor, a: Tensor, b: Tensor, c: Tensor
-) -> list[Tensor]:
-    """Rotate (a, b, c) by the unit quaternion (w, x, y, z): v + w t + q x t with t = 2 q x v."""
-    tx, ty, tz = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
-    return [
-        a + w * tx + (y * tz - z * ty),
-        b + w * ty + (z * tx - x * tz),
-        c + w * tz + (x * ty - y * tx),
-    ]
 
 
 @dataclass(frozen=True)
@@ -75,14 +36,17 @@ class CovarianceNoise:
             tensors in it.
         scale: noise_lr of 3DGS-MCMC.
         generator: random generator of the parameters' device, or None for torch's own.
+        backend: `"auto"`, `"cuda"` or `"torch"`; see `backend_info`.
     """
 
     gaussians: GaussianTensors | Callable[[], GaussianTensors]
     scale: float = 5e5
     generator: torch.Generator | None = None
+    backend: Backend = "auto"
 
     def __post_init__(self) -> None:
         check_number("CovarianceNoise", "scale", self.scale, 0.0)
+        check_choice("CovarianceNoise", "backend", self.backend, BACKENDS)
 
     def add_to(self, means: Tensor, lr: float | Tensor) -> None:
         """Add the noise to `means` [N, 3] in place; lr is their present learning rate."""
@@ -99,8 +63,14 @@ class CovarianceNoise:
                 "must hold the tensors that belong to the means being stepped"
             )
         eta = _normal_like(means, self.generator)
-        noise = covariance_noise(scales.detach(), quats.detach(), opacities.detach(), eta)
-        means.add_(noise * (lr * self.scale))
+        add_covariance_noise(
+            means,
+            *(tensor.detach() for tensor in (scales, quats, opacities)),
+            eta=eta,
+            lr=lr if isinstance(lr, Tensor) else torch.tensor(lr, dtype=torch.float64),
+            noise_scale=self.scale,
+            backend=self.backend,
+        )
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,17 @@
 // Per-point L-BFGS step: store the new pair, then the two-loop direction. One thread per point.
-// Compiled by NVRTC for one history size, -D HISTORY_SIZE=K; `two_loop.cuh` goes in front.
+// Compiled by NVRTC for one history size, -D HISTORY_SIZE=K; `two_loop.cuh` and `packed.cuh` go in
+// front. With -D PACKED_PAIRS, the pairs are half-size ones.
 #ifndef HISTORY_SIZE
 #error "HISTORY_SIZE, the number of pairs, must be defined"
+#endif
+#if defined(PACKED_PAIRS) && defined(IN_FLOAT64)
+#error "half-size pairs are for float32"
+#endif
+
+#ifdef PACKED_PAIRS
+template <typename T> using Stored = PackedHistory<HISTORY_SIZE>;
+#else
+template <typename T> using Stored = History<T, HISTORY_SIZE>;
 #endif
 
 template <typename T>
@@ -13,8 +23,8 @@ POINT void lqn_row(const T* positions, const T* grads, T* histories, T* directio
   const T* g = grads + 3 * row;
   Vec3<T> fed;
   const Flags flags =
-      lqn_point<T, HISTORY_SIZE>({p[0], p[1], p[2]}, {g[0], g[1], g[2]},
-                                 histories + History<T, HISTORY_SIZE>::slots * 8 * row, options, &fed);
+      lqn_point<T, HISTORY_SIZE, Stored<T>>({p[0], p[1], p[2]}, {g[0], g[1], g[2]},
+                                            histories + Stored<T>::lanes * row, options, &fed);
   T* out = directions + 3 * row;
   out[0] = fed.x;
   out[1] = fed.y;

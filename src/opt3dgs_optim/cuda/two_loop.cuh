@@ -91,6 +91,7 @@ template <typename T, int K> struct History {
   static constexpr bool kept = K <= 5;  // more pairs than that are read again in the second loop
   static constexpr int slots = K > 3 ? K : K + 1;
   static constexpr int in_registers = kept ? K : 1;
+  static constexpr int lanes = 8 * slots;
 
   T* row;
   Lanes<T> s[in_registers], y[in_registers];
@@ -134,6 +135,8 @@ template <typename T, int K> struct History {
     if constexpr (kept) return y[j].v;
     return load(row + 8 * j + 4).v;
   }
+
+  static POINT Pair<T> as_stored(Pair<T> pair) { return pair; }
 
   // The spare lane of half `half` of slot `slot`, as the header has it now.
   POINT T spare(int slot, int half, T unused) const {
@@ -187,12 +190,12 @@ template <typename T, int K> struct History {
 template <typename T> POINT T inverse(T sy) { return sy <= T(0) ? T(0) : T(1) / sy; }
 
 // Nocedal and Wright (2006), algorithm 7.4, for pairs with |y| = 1; an empty slot is zero.
-template <typename T, int K>
-POINT Vec3<T> two_loop(Vec3<T> q, const History<T, K>& history, bool clamp, T low, T high) {
+template <int K, typename T, typename Pairs>
+POINT Vec3<T> two_loop(Vec3<T> q, const Pairs& history, bool clamp, T low, T high) {
   T alpha[K];
 #pragma unroll
   for (int j = 0; j < K; ++j) {
-    if constexpr (!History<T, K>::kept) read_again();
+    if constexpr (!Pairs::kept) read_again();
     const Vec3<T> s = history.pair_s(j), y = history.pair_y(j);
     alpha[j] = dot(s, q) * inverse(dot(s, y));
     q = along(q, -alpha[j], y);
@@ -204,7 +207,7 @@ POINT Vec3<T> two_loop(Vec3<T> q, const History<T, K>& history, bool clamp, T lo
   Vec3<T> r = times(q, gamma);
 #pragma unroll
   for (int j = K - 1; j >= 0; --j) {
-    if constexpr (!History<T, K>::kept) read_again();
+    if constexpr (!Pairs::kept) read_again();
     const Vec3<T> s = history.pair_s(j), y = history.pair_y(j);
     const T beta = dot(y, r) * inverse(dot(s, y));
     r = along(r, alpha[j] - beta, s);
@@ -220,15 +223,17 @@ template <typename T> struct Options {
 struct Flags { bool accepted, candidate; };
 
 // One step of one point: accept a pair, update the header, and say what Adam is fed.
-template <typename T, int K>
+// Pairs is how they are stored: History, or PackedHistory of packed.cuh.
+template <typename T, int K, typename Pairs>
 POINT Flags lqn_point(Vec3<T> position, Vec3<T> grad, T* row, const Options<T>& options, Vec3<T>* fed) {
   *fed = grad;  // what every point without a usable result keeps, bit for bit
   const T scale = largest(grad);
   if (!finite(grad) || scale == T(0)) return {false, false};  // not visible: nothing changes
-  History<T, K> history(row);
+  Pairs history(row);
   Pair<T> pair = normalised(along(position, T(-1), history.position), along(grad, T(-1), history.gradient));
   const bool candidate = history.counter > T(0);
   if (options.powell) pair = damped(pair, dot(history.pair_s(0), history.pair_y(0)));
+  pair = Pairs::as_stored(pair);
   const bool accepted = candidate && pair.cosine > options.min_cosine;  // false where not finite
   history.position = position;
   history.gradient = grad;
@@ -238,7 +243,7 @@ POINT Flags lqn_point(Vec3<T> position, Vec3<T> grad, T* row, const Options<T>& 
   if (history.counter <= T(1)) return {accepted, candidate};
 
   const Vec3<T> unit = over(grad, scale);
-  Vec3<T> r = two_loop(unit, history, options.clamp, options.gamma_low, options.gamma_high);
+  Vec3<T> r = two_loop<K>(unit, history, options.clamp, options.gamma_low, options.gamma_high);
   const T size = length(r);
   const bool descent = dot(unit, over(r, size)) > T(0);  // false where not finite
   if (options.graft) r = times(r, sqrt(dot(unit, unit)) / size);

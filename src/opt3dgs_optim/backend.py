@@ -1,0 +1,93 @@
+"""Which implementation runs, the CUDA kernels or pure torch, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+
+from opt3dgs_optim import cuda
+from opt3dgs_optim._checks import check_choice
+
+Backend = Literal["auto", "cuda", "torch"]
+BACKENDS = ("auto", "cuda", "torch")
+KERNEL_DTYPES = (torch.float32, torch.float64)
+
+
+@dataclass(frozen=True)
+class BackendInfo:
+    """What runs for tensors of one kind; `reason` says why it is not the other.
+
+    The two give the same numbers, up to rounding.
+    """
+
+    device: str
+    dtype: torch.dtype
+    backend: Literal["cuda", "torch"]
+    reason: str
+
+    def __repr__(self) -> str:
+        return (
+            f"BackendInfo({self.backend!r} runs on {self.device} in "
+            f"{str(self.dtype).removeprefix('torch.')}: {self.reason})"
+        )
+
+
+def backend_info(
+    device: torch.device | str | None = None,
+    dtype: torch.dtype = torch.float32,
+    *,
+    backend: Backend = "auto",
+) -> BackendInfo:
+    """Which backend a `backend` option chooses for the curvature and the noise, and why.
+
+    Args:
+        device: that of the parameters; None for the GPU, if torch sees one, else the CPU.
+        dtype: that of the parameters.
+        backend: `"auto"` takes the CUDA kernels where they can run, pure torch otherwise;
+            `"cuda"` and `"torch"` insist.
+
+    The kernels are for points of three coordinates and consecutive curvature pairs; whatever else
+    `LQNAdam` can do is pure torch. A kernel that fails to compile or to launch raises: nothing is
+    replaced after an error.
+
+    Raises:
+        ValueError: `backend` is none of these.
+        RuntimeError: `backend="cuda"`, and the kernels cannot run.
+
+    Example:
+        >>> from opt3dgs_optim import backend_info
+        >>> backend_info("cpu")
+        BackendInfo('torch' runs on cpu in float32: the kernels need a CUDA device)
+    """
+    check_choice("backend_info", "backend", backend, BACKENDS)
+    if device is None:
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    place = torch.device(device)
+    if backend == "torch":
+        return BackendInfo(str(place), dtype, "torch", "backend='torch' was asked for")
+    obstacle = _obstacle(place, dtype)
+    if obstacle is None:
+        return BackendInfo(str(place), dtype, "cuda", "cuda.core and a CUDA device are present")
+    if backend == "cuda":
+        raise RuntimeError(
+            f"backend='cuda' was asked for on {place} in {dtype}, but {obstacle}; "
+            "backend='auto' takes pure torch then"
+        )
+    return BackendInfo(str(place), dtype, "torch", obstacle)
+
+
+def uses_kernel(backend: str, device: torch.device, dtype: torch.dtype) -> bool:
+    """Whether the kernels run; RuntimeError if they were asked for and cannot."""
+    if backend == "torch" or (backend == "auto" and device.type != "cuda"):
+        return False
+    return backend_info(device, dtype, backend=backend).backend == "cuda"  # pyright: ignore
+
+
+def _obstacle(device: torch.device, dtype: torch.dtype) -> str | None:
+    if device.type != "cuda":
+        return "the kernels need a CUDA device"
+    if dtype not in KERNEL_DTYPES:
+        return f"the kernels take float32 and float64, not {str(dtype).removeprefix('torch.')}"
+    return cuda.missing()
