@@ -265,8 +265,8 @@ def test_powell_damped_pair_has_a_fifth_of_the_model_curvature() -> None:
         torch.tensor([[[2.0, 0, 0]]], dtype=torch.float64),  # gamma 0.5, B = 2
     )
     pair = curvature.normalised_pair(
-        torch.tensor([[0.0, 1, 0]], dtype=torch.float64),
-        torch.tensor([[0.0, -1, 0]], dtype=torch.float64),
+        torch.tensor([[0.0, 1, 0]], dtype=torch.float64).T,  # coordinates first
+        torch.tensor([[0.0, -1, 0]], dtype=torch.float64).T,
     )
     damped = curvature.damped_pair(pair, curvature.newest_gamma(history, 1))
     ratio = float((damped.s * damped.y).sum() / (damped.s * damped.s).sum())

@@ -15,6 +15,8 @@ MODULES = [name for _, name, _ in pkgutil.walk_packages(opt3dgs_optim.__path__, 
 
 @pytest.mark.parametrize("name", [name for name in MODULES if not name.endswith("__main__")])
 def test_examples_run(name: str) -> None:
+    if name == "opt3dgs_optim.nerfstudio":
+        pytest.importorskip("nerfstudio", reason="nerfstudio is not installed: its users' module")
     result = doctest.testmod(importlib.import_module(name))
     assert result.failed == 0
 

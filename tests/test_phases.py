@@ -72,9 +72,10 @@ def test_learning_rate_schedule_made_before_the_upgrade_goes_on_working() -> Non
     optimizers = gsplat_optimizers(splats)
     decay = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], 0.9)
     phases = scheduler()
-    upgraded = phases.upgrade(optimizers)
+    with pytest.warns(UserWarning, match="build learning-rate schedulers on what upgrade"):
+        upgraded = phases.upgrade(optimizers)
     train(splats, upgraded, phases, 0, 3)
-    with pytest.warns(UserWarning, match="lr_scheduler"):  # torch watches the old object's step
+    with pytest.warns(UserWarning, match="lr_scheduler|learning rate scheduler"):
         decay.step()
     assert upgraded["means"].param_groups[0]["lr"] == pytest.approx(1e-2 * 0.9)
 
@@ -167,6 +168,14 @@ def test_moments_start_anew_at_the_switch_or_are_kept() -> None:
         train(splats, upgraded, phases, 0, SWITCH + 1)
         steps = {float(opt.state[p]["step"]) for opt, p in pairs(upgraded, splats)}
         assert steps == ({1.0} if reset else {SWITCH + 1.0})
+
+
+def test_moments_start_anew_by_themselves_where_the_phase_is_long_enough() -> None:
+    assert PhaseScheduler(30_000).reset_moments
+    assert PhaseScheduler(3_000).reset_moments
+    assert not PhaseScheduler(300).reset_moments
+    assert PhaseScheduler(300, 0.5).reset_moments
+    assert PhaseScheduler.paper(300).reset_moments
 
 
 def test_the_object_is_the_same_before_and_after_the_switch() -> None:
@@ -405,9 +414,9 @@ def test_optimizers_that_cannot_be_upgraded_are_named() -> None:
 
 
 class OwnStep(torch.optim.Adam):
-    """Like gsplat's SelectiveAdam: a subclass with a step of its own."""
+    """A subclass with a step of its own."""
 
-    def step(self, visibility: Any = None) -> None:  # type: ignore[override]
+    def step(self, closure: Any = None) -> None:  # type: ignore[override]
         """Do nothing."""
 
 

@@ -7,14 +7,19 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.optim.adam import Adam, adam
+from torch._compile import _disable_dynamo
+from torch.optim.adam import adam
 
+from opt3dgs_optim._checkpoint import check_keys, check_optimizer_state
+from opt3dgs_optim._checks import check_flag
 from opt3dgs_optim._nonfinite import FrozenRows
+from opt3dgs_optim._rowwise import RowwiseAdam
+from opt3dgs_optim._visible import check_visible
 
 STATE_KEY = "opt3dgs"  # in param_groups[0] of a state_dict: plain floats, lists and dicts
 
 
-class HookedAdam(Adam):
+class HookedAdam(RowwiseAdam):
     """`torch.optim.Adam` whose subclasses override `_factor`, `_gradients` and `_after_group`.
 
     The arithmetic is torch's own functional `adam`; with nothing overridden, every code path
@@ -23,7 +28,8 @@ class HookedAdam(Adam):
     """
 
     def __init__(self, params: Any, lr: float | Tensor, *args: Any, **kwargs: Any) -> None:
-        self.skip_nonfinite = bool(kwargs.pop("skip_nonfinite", True))
+        skip = kwargs.pop("skip_nonfinite", True)
+        self.skip_nonfinite = check_flag(type(self).__name__, "skip_nonfinite", skip)
         self.skipped_rows: Tensor | int = 0  # so far, for a non-finite gradient; 0-d on a GPU
         super().__init__(params, lr, *args, **kwargs)
 
@@ -33,10 +39,15 @@ class HookedAdam(Adam):
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), **{name: getattr(self, name) for name in self._own}}
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._trust_rows()
+
     # -- checkpoints -------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
         """torch's, with what several optimizers share inside `param_groups[0]`."""
+        self._repair_rows()
         state_dict = super().state_dict()
         shared = self._shared_state()
         if shared is not None:
@@ -44,12 +55,19 @@ class HookedAdam(Adam):
         return state_dict
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """As torch's; also takes the `state_dict()` of a plain Adam."""
+        """As torch's; also takes the `state_dict()` of a plain Adam.
+
+        Raises:
+            ValueError: it does not fit; then nothing has been loaded.
+        """
+        call = f"{type(self).__name__}.load_state_dict"
+        check_optimizer_state(call, state_dict, self.param_groups)
         groups = [dict(group) for group in state_dict["param_groups"]]
         shared = groups[0].pop(STATE_KEY, None) if groups else None
-        super().load_state_dict({**state_dict, "param_groups": groups})
         if shared is not None:
-            self._load_shared_state(shared)
+            check_keys(f"{call}: {STATE_KEY}", shared, ())
+            self._load_shared_state(shared)  # checks, then loads: before torch, which checks less
+        super().load_state_dict({**state_dict, "param_groups": groups})
 
     def _shared_state(self) -> dict[str, Any] | None:
         """What a checkpoint must hold besides torch's state, as plain numbers, or None."""
@@ -82,20 +100,54 @@ class HookedAdam(Adam):
 
     # -- the step ----------------------------------------------------------------------------
 
-    def step(self, closure: Callable[[], Any] | None = None) -> Any:  # pyright: ignore
-        """One step; `closure`, if given, evaluates the model and returns the loss."""
+    # Under torch.compile a step runs as it is: dynamo loses what it writes to an optimizer's
+    # attributes. (torch decorates its own optimizers' methods in this way.)
+    @_disable_dynamo
+    def step(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self,
+        closure: Callable[[], Any] | Tensor | None = None,
+        num_points: int | None = None,
+        *,
+        visible: Tensor | None = None,
+        visibility: Tensor | None = None,
+    ) -> Any:
+        """One step: of all rows, or only of those that a camera saw.
+
+        With a mask, the other rows keep parameters, moments and curvature pairs, no noise reaches
+        them, and every row has the bias correction of its own number of steps (4 bytes per row,
+        from the first masked step on).
+
+        Args:
+            closure: evaluates the model and returns the loss; or the mask, as gsplat
+                (`step(mask)`) and INRIA (`step(mask, N)`) pass it.
+            num_points: number of rows, which must be the mask's.
+            visible: [N] mask; anything but 0 is visible.
+            visibility: another name of `visible`, gsplat's.
+        """
+        masks = [m for m in (visible, visibility) if m is not None]
+        if isinstance(closure, Tensor):
+            masks, closure = [closure, *masks], None
+        if len(masks) > 1:
+            raise ValueError(f"{type(self).__name__}.step: {len(masks)} masks, but one is needed")
+        mask = check_visible(type(self).__name__, masks[0], num_points) if masks else None
         loss = None
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
         with torch.set_grad_enabled(self.defaults["differentiable"]):
+            self._check_mask(mask)
             self._begin_step(loss)
             bad = self._bad_step()
             if bad is not None and bad.device.type == "cpu" and bool(bad):
                 return loss
             for group in self.param_groups:
-                self._step_group(group, bad)
+                if self._counts_rows(group, mask):
+                    self._step_rows(group, mask, bad)
+                else:
+                    self._step_group(group, bad)
         return loss
+
+    # -- all rows ----------------------------------------------------------------------------
 
     def _step_group(self, group: dict[str, Any], bad: Tensor | None) -> None:
         params: list[Tensor] = []

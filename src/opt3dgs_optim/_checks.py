@@ -56,6 +56,13 @@ def check_flag(call: str, name: str, value: Any) -> bool:
     return value
 
 
+def check_part(call: str, name: str, value: Any, kind: str, *methods: str) -> Any:
+    """Return `value`, or raise ValueError unless it is None or has the attributes of a `kind`."""
+    if value is not None and not all(hasattr(value, method) for method in methods):
+        raise ValueError(f"{call}: {name}={value!r}, but {kind} or None is needed")
+    return value
+
+
 def check_interval(call: str, name: str, value: Any) -> tuple[float, float]:
     """Return `value` as (low, high) floats, or raise ValueError unless low < high, finite."""
     pair = isinstance(value, (tuple, list)) and len(value) == 2

@@ -11,7 +11,10 @@ from torch import Tensor
 from torch.optim import Adam, Optimizer
 
 from opt3dgs_optim._adam import STATE_KEY, HookedAdam, fused_on_cuda
+from opt3dgs_optim._checkpoint import check_keys
 from opt3dgs_optim._groups import canonical_name, is_positions
+from opt3dgs_optim._mistakes import FrozenWatch, Replaced, has_own_mask
+from opt3dgs_optim._visible import ROW_STEPS
 from opt3dgs_optim.awsgld import EnergyWatch
 from opt3dgs_optim.lqnadam import LQNAdam
 
@@ -38,7 +41,8 @@ class PhasedAdam(LQNAdam):
     dicts: a learning-rate scheduler built on the old optimizer goes on working) and the state.
     """
 
-    _own = (*LQNAdam._own, "scheduler", "switched", "_energy_watch")
+    _own = (*LQNAdam._own, "scheduler", "switched", "_energy_watch", "_frozen_watch")
+    _replaced: Replaced | None = None
 
     def __init__(self, optimizer: Adam, scheduler: PhaseScheduler) -> None:
         defaults = {key: optimizer.defaults[key] for key in CONSTRUCTOR_OPTIONS}
@@ -56,10 +60,15 @@ class PhasedAdam(LQNAdam):
         self.scheduler = scheduler
         self.switched = False
         self._energy_watch = EnergyWatch("PhaseScheduler")
+        self._frozen_watch = FrozenWatch()
         self.state.update(optimizer.state)
         self._trust_present()
+        self._trust_rows()
+        if has_own_mask(optimizer):
+            self._count_rows()
         if fused:
             self._use_fused()
+        self._replaced = Replaced(optimizer)
         if shared is not None:
             self._load_shared_state(shared)
 
@@ -70,10 +79,20 @@ class PhasedAdam(LQNAdam):
             if "step" in state:
                 state["step"] = state["step"].to(param.device, torch.float32)
 
+    # -- visible rows only -------------------------------------------------------------------
+
+    def _takes_mask(self, group: dict[str, Any], num_points: int) -> bool:
+        return self._is_points(group)
+
+    def _is_points(self, group: Mapping[str, Any]) -> bool:
+        return canonical_name(group.get("name")) is not None
+
     # -- phases ------------------------------------------------------------------------------
 
     def _begin_step(self, loss: Any) -> None:
         super()._begin_step(loss)
+        if self._replaced is not None:
+            self._replaced.check()
         if loss is not None:
             self.scheduler.observe(loss)
         self._energy_watch.check(self.scheduler)
@@ -81,11 +100,16 @@ class PhasedAdam(LQNAdam):
             self.switched = True
             if self.scheduler.reset_moments:
                 self._reset_moments()
+        if self.switched:
+            positions = [p for g in self.param_groups if is_positions(g) for p in g["params"]]
+            if positions:
+                self._frozen_watch.check(positions)
 
     def _reset_moments(self) -> None:
         """Loss and direction change scale at the switch: old second moments would stall it."""
+        self._repair_rows()
         for state in self.state.values():
-            for key in ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq"):
+            for key in ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq", ROW_STEPS):
                 if key in state:
                     state[key].zero_()
 
@@ -105,8 +129,7 @@ class PhasedAdam(LQNAdam):
     def _after_group(self, group: dict[str, Any], params: list[Tensor]) -> None:
         noise = self.scheduler.noise
         if noise is not None and is_positions(group):
-            for param in params:
-                noise.add_to(param, group["lr"])
+            self._add_noise(noise, group, params)
 
     # -- checkpoints -------------------------------------------------------------------------
 
@@ -114,8 +137,9 @@ class PhasedAdam(LQNAdam):
         return {"scheduler": self.scheduler.state_dict(), "switched": self.switched}
 
     def _load_shared_state(self, shared: Mapping[str, Any]) -> None:
-        self.switched = bool(shared["switched"])
+        check_keys(f"{type(self).__name__}.load_state_dict", shared, ("scheduler", "switched"))
         self.scheduler.load_state_dict(shared["scheduler"])
+        self.switched = bool(shared["switched"])
 
 
 def check_upgradable(optimizer: Any, name: str) -> Adam:
@@ -129,11 +153,11 @@ def check_upgradable(optimizer: Any, name: str) -> Adam:
     same_step = isinstance(optimizer, Adam) and (
         inspect.unwrap(type(optimizer).step) is inspect.unwrap(Adam.step)
     )
-    if not same_step:
+    if not same_step and not has_own_mask(optimizer):
         kind = f"{type(optimizer).__module__}.{type(optimizer).__qualname__}"
         raise TypeError(
             f"{call}: {name} is a {kind}, but torch.optim.Adam (or a subclass with Adam's own "
-            "step) is needed"
+            "step, or one of its own that takes a visibility mask) is needed"
         )
     return optimizer
 

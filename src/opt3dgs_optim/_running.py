@@ -1,4 +1,7 @@
-"""Running means on the device, updated without a host synchronisation."""
+"""Running means on the device, updated in place and without a host synchronisation.
+
+In place, so that a CUDA graph which has captured an update goes on from the last one.
+"""
 
 from __future__ import annotations
 
@@ -24,10 +27,10 @@ class RunningMoments:
         change = value - self.mean
         mean = self.mean + change / weight
         square = self.decay * self._square + change * (value - mean)
-        self.weight = torch.where(valid, weight, self.weight)
-        self.mean = torch.where(valid, mean, self.mean)
-        self._square = torch.where(valid, square, self._square)
-        self.low = torch.where(valid, torch.minimum(self.low, value), self.low)
+        self.weight.copy_(torch.where(valid, weight, self.weight))
+        self.mean.copy_(torch.where(valid, mean, self.mean))
+        self._square.copy_(torch.where(valid, square, self._square))
+        self.low.copy_(torch.where(valid, torch.minimum(self.low, value), self.low))
 
     @property
     def variance(self) -> Tensor:

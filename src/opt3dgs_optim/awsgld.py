@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim._adam import HookedAdam, fused_on_cuda
-from opt3dgs_optim._checks import check_choice
+from opt3dgs_optim._checks import check_choice, check_part
 from opt3dgs_optim._groups import is_positions
+from opt3dgs_optim._visible import shaped
 from opt3dgs_optim.energy import EnergyHistogram
 from opt3dgs_optim.noise import CovarianceNoise, IsotropicNoise
 
@@ -85,6 +86,8 @@ class AWSGLD(HookedAdam):
         fused: bool | None = None,
     ) -> None:
         check_choice("AWSGLD", "preconditioner", preconditioner, ("adam", "none"))
+        check_part("AWSGLD", "histogram", histogram, "an EnergyHistogram", "observe", "multiplier")
+        check_part("AWSGLD", "noise", noise, "IsotropicNoise or CovarianceNoise", "add_to")
         params = list(params)
         if histogram is not None:
             fused = fused_on_cuda(params, fused, foreach, capturable)
@@ -141,21 +144,32 @@ class AWSGLD(HookedAdam):
         if self.preconditioner == "adam":
             super()._update(group, params, grads, moments, found_inf, has_complex)
             return
-        lr = self._scaled_lr(group, params[0].device)
-        sign = 1.0 if group["maximize"] else -1.0
         for param, grad in zip(params, grads, strict=True):
-            drift = grad + group["weight_decay"] * param if group["weight_decay"] else grad
-            if found_inf is not None:
-                drift = torch.where(found_inf > 0, 0.0, drift)
-            param.add_(drift * (sign * lr))
+            self._drift(group, param, grad, None if found_inf is None else found_inf <= 0)
+
+    def _update_rows(
+        self, group: dict[str, Any], param: Tensor, grad: Tensor, rows: Tensor
+    ) -> None:
+        if self.preconditioner == "adam":
+            super()._update_rows(group, param, grad, rows)
+        else:
+            self._drift(group, param, grad, shaped(rows, param))
+
+    def _drift(
+        self, group: dict[str, Any], param: Tensor, grad: Tensor, moving: Tensor | None
+    ) -> None:
+        drift = grad + group["weight_decay"] * param if group["weight_decay"] else grad
+        if moving is not None:
+            drift = torch.where(moving, drift, 0.0)
+        sign = 1.0 if group["maximize"] else -1.0
+        param.add_(drift * (sign * self._scaled_lr(group, param.device)))
 
     def _after_group(self, group: dict[str, Any], params: list[Tensor]) -> None:
         if self.noise is None:
             return
         if isinstance(self.noise, CovarianceNoise) and not self._holds_positions(group):
             return
-        for param in params:
-            self.noise.add_to(param, group["lr"])
+        self._add_noise(self.noise, group, params)
 
     def _holds_positions(self, group: dict[str, Any]) -> bool:
         return is_positions(group) or (len(self.param_groups) == 1 and "name" not in group)

@@ -7,19 +7,21 @@ for word; where this module differs, the comment at the line says why.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Hashable, Mapping
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from opt3dgs_optim._checkpoint import check_histogram_state
 from opt3dgs_optim._checks import check_choice, check_count, check_interval, check_number
+from opt3dgs_optim._ranks import RankMean
 from opt3dgs_optim._running import RunningMoments, ViewMeans
 
 PAPER_TEMPERATURE = 2e-3  # not given in the paper; zeta * tau / du = 1.5 at its zeta and du
 PAPER_RANGE = (0.0, 0.2)
 CALL = "EnergyHistogram"
+LARGEST = {torch.float64: 1e150, torch.float32: 1e15}  # energies whose squares can be summed
 
 
 class EnergyHistogram:
@@ -57,6 +59,9 @@ class EnergyHistogram:
             an easy view is not taken for a good state; `observe` then needs `view`).
         ema_decay: decay per energy of the running means above.
         floor: smallest weight before renormalisation; log theta never sees 0.
+        process_group: a `torch.distributed` process group over whose ranks every energy is
+            averaged; every rank must call `observe` as often. (Of a `PhaseScheduler` give it to
+            that instead.)
 
     Raises:
         ValueError: an option is outside what is allowed.
@@ -77,6 +82,7 @@ class EnergyHistogram:
         energy: Literal["raw", "ema", "view_centered"] = "raw",
         ema_decay: float = 0.9,
         floor: float = 1e-8,
+        process_group: Any = None,
     ) -> None:
         self.num_partitions = check_count(CALL, "num_partitions", num_partitions, 3)
         self.energy_range = _check_auto_or_interval(energy_range)
@@ -90,6 +96,7 @@ class EnergyHistogram:
         self.energy = check_choice(CALL, "energy", energy, ("raw", "ema", "view_centered"))
         self.ema_decay = check_number(CALL, "ema_decay", ema_decay, 0.0, 1.0, open_high=True)
         self.floor = check_number(CALL, "floor", floor, 0.0, 1 / num_partitions, open_low=True)
+        self._over_ranks = None if process_group is None else RankMean(CALL, process_group)
         needs_calibration = "auto" in (self.energy_range, self.temperature)
         if needs_calibration and self.warmup < 4:
             raise ValueError(
@@ -117,6 +124,7 @@ class EnergyHistogram:
     def _allocate(self, device: torch.device) -> None:
         # MPS has no float64.
         dtype = torch.float32 if device.type == "mps" else torch.float64
+        self._largest = LARGEST[dtype]
         m = self.num_partitions
         fixed_range = (0.0, 1.0) if self.energy_range == "auto" else self.energy_range
         low, high = float(fixed_range[0]), float(fixed_range[1])
@@ -180,7 +188,7 @@ class EnergyHistogram:
 
         Args:
             energy: the training loss of this iteration, 0-d (or one element). A non-finite
-                energy changes nothing.
+                energy, or one beyond 1e150 (1e15 on MPS), changes nothing.
             view: which view it belongs to (an int or str); needed for `energy="view_centered"`.
 
         Returns:
@@ -192,18 +200,23 @@ class EnergyHistogram:
                 "index or name (an int or str)"
             )
         value = self._on_device(energy)
+        if self._over_ranks is not None:
+            value = self._over_ranks(value)
         self.num_observed += 1
-        valid = self._last_finite = torch.isfinite(value)
+        # False for NaN too. Beyond the bound a loss has diverged, and its variance is infinite.
+        valid = self._last_finite.copy_(value.abs() <= self._largest)
         # From here on `value` is finite, so that no where() has to guard against NaN again.
         value = self._transform(torch.where(valid, value, self._recent.mean), valid, view)
         if self._calibration:
             self._calibrate(value, valid)
         index = self._partition(value)
-        self._nu = torch.where(valid, self._warmed_up(self._multiplier(index)), self._nu)
+        nu = self._warmed_up(self._multiplier(index))
+        # All state is updated in place: a CUDA graph of a step reads nu where it was captured.
+        self._nu.copy_(torch.where(valid, nu, self._nu))
         self._nu_moments.update(self._nu, valid & (self._count >= self.warmup))
         self._update_weights(index, valid)
-        self._count = self._count + valid
-        return self._nu
+        self._count.add_(valid)
+        return self._nu.clone()
 
     def _on_device(self, energy: Tensor | float) -> Tensor:
         if not isinstance(energy, Tensor):
@@ -234,16 +247,19 @@ class EnergyHistogram:
         measuring = valid & (self._count < self._calibration)
         self._recent.update(value, measuring)
         mean = self._recent.mean
-        # A constant energy has no deviation: keep the width above what float64 resolves.
-        deviation = self._recent.variance.sqrt().clamp(min=1e-12).maximum(mean.abs() * 1e-12)
+        # A constant energy has no deviation: keep the width above what float64 resolves, whatever
+        # the loss's unit.
+        deviation = self._recent.variance.sqrt().maximum(mean.abs() * 1e-12)
+        deviation = deviation.clamp(min=1 / self._largest)
         if self.energy_range == "auto":
             low, high = mean - 30 * deviation, mean + 4 * deviation
             low = torch.where(self._recent.low >= 0, low.clamp(min=0.0), low)
-            self._low = torch.where(measuring, low, self._low)
-            self._width = torch.where(measuring, (high - low) / self.num_partitions, self._width)
+            width = (high - low) / self.num_partitions
+            self._low.copy_(torch.where(measuring, low, self._low))
+            self._width.copy_(torch.where(measuring, width, self._width))
         if self.temperature == "auto":
             tau = (1 - self.zeta) / (2 * self.zeta) * deviation
-            self._tau = torch.where(measuring, tau, self._tau)
+            self._tau.copy_(torch.where(measuring, tau, self._tau))
 
     def _partition(self, value: Tensor) -> Tensor:
         """J of eq. 13, counted from 0: u[J-1] < energy <= u[J], the end partitions open."""
@@ -277,7 +293,7 @@ class EnergyHistogram:
         rate = self._lambda() * theta[index] ** self.zeta * counting
         theta = theta - rate * theta
         theta = theta.index_add(0, index, rate).clamp(min=self.floor)
-        self._weights = torch.where(counting, theta / theta.sum(), self._weights)
+        self._weights.copy_(torch.where(counting, theta / theta.sum(), self._weights))
 
     def _lambda(self) -> Tensor | float:
         if self.step_size != "decay":
@@ -301,27 +317,20 @@ class EnergyHistogram:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore `state_dict()`; ValueError if it belongs to another number of partitions."""
-        missing = sorted({"num_observed", "weights", "scalars"} - set(state))
-        if missing:
-            raise ValueError(f"{CALL}.load_state_dict: keys {missing} are missing")
-        weights = state["weights"]
-        if len(weights) != self.num_partitions:
-            raise ValueError(
-                f"{CALL}.load_state_dict: {len(weights)} weights, but this histogram has "
-                f"num_partitions={self.num_partitions}"
-            )
-        positive = all(math.isfinite(w) and w > 0 for w in weights)
-        if not positive or abs(sum(weights) - 1) > 1e-6:
-            raise ValueError(f"{CALL}.load_state_dict: weights must be positive with sum 1")
+        """Restore `state_dict()`, of this or an older version.
+
+        Raises:
+            ValueError: it is damaged, or of another number of partitions; nothing is changed then.
+        """
+        check_histogram_state(f"{CALL}.load_state_dict", state, self.num_partitions)
+        self._allocate(self._weights.device)
         like = {"dtype": self._weights.dtype, "device": self._weights.device}
         scalars = torch.tensor(state["scalars"], **like)
         self._low, self._width, self._tau, self._count, self._nu = scalars.unbind()
-        self._weights = torch.tensor(weights, **like)
-        self._recent.load(state["recent"])
-        self._nu_moments.load(state["nu_moments"])
-        self._smooth.load(state["smooth"])
-        self._views.load(state["views"])
+        self._weights = torch.tensor(state["weights"], **like)
+        for name in ("recent", "nu_moments", "smooth", "views"):
+            if name in state:
+                getattr(self, f"_{name}").load(state[name])
         self.num_observed = int(state["num_observed"])
 
     def __repr__(self) -> str:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from opt3dgs_optim import curvature
 from opt3dgs_optim._adam import HookedAdam
+from opt3dgs_optim._checkpoint import drop_foreign_rows
 from opt3dgs_optim._checks import (
     check_choice,
     check_count,
@@ -19,6 +20,8 @@ from opt3dgs_optim._checks import (
     check_interval,
     check_number,
 )
+from opt3dgs_optim.backend import BACKENDS, Backend, uses_kernel
+from opt3dgs_optim.ops import lqn_direction
 
 HISTORY = "history"  # state keys: float tensors, points first, an all-zero row means "nothing"
 EPOCH = "epoch"
@@ -35,9 +38,13 @@ class CurvatureOptions:
     powell: bool = False
     graft: bool = True
     gamma_clamp: tuple[float, float] | None = None
+    backend: Backend = "auto"
+    pair_dtype: curvature.PairDtype = "float32"
 
     def __post_init__(self) -> None:
         call = "LQNAdam"
+        check_choice(call, "backend", self.backend, BACKENDS)
+        check_choice(call, "pair_dtype", self.pair_dtype, curvature.PAIR_DTYPES)
         check_count(call, "history_size", self.history_size, 1, curvature.MAX_HISTORY)
         check_choice(call, "pairs", self.pairs, ("consecutive", "epoch"))
         if self.pairs == "epoch":
@@ -75,6 +82,11 @@ class LQNAdam(HookedAdam):
         powell: damp pairs of too little curvature instead of rejecting them.
         graft: give the pseudo-gradient of each point the length of its gradient.
         gamma_clamp: (low, high) bounds of gamma = s.y / y.y, parameter units per gradient unit.
+        backend: `"auto"` runs consecutive pairs of points in three dimensions as a CUDA kernel
+            where it can, and all else as pure torch; `"cuda"` and `"torch"` insist. See
+            `backend_info`.
+        pair_dtype: `"bfloat16"` stores the pairs rounded to 2^-8, in 96 bytes per point instead
+            of 160 (K = 5, D = 3), for parameters of float32 or less; the arithmetic stays float32.
         skip_nonfinite: rows with a non-finite gradient keep parameters, moments and pairs for a
             step (those rows of `.grad` are set to zero).
 
@@ -83,7 +95,8 @@ class LQNAdam(HookedAdam):
     last step: a trainer's density control has moved the rows. A row that it sets to zero starts
     anew.
 
-    Memory: 32 K bytes per point beyond Adam's (K > 3, D = 3, float32), 32 more with epoch pairs.
+    Memory: 32 K bytes per point beyond Adam's (K > 3, D = 3, float32; with bfloat16
+    pairs 12 K + 32 and up to 12 more for alignment), 32 more with epoch pairs.
 
     Example:
         >>> import torch
@@ -98,7 +111,9 @@ class LQNAdam(HookedAdam):
         True
 
     Raises:
-        ValueError: an option is outside what is allowed, or a parameter is complex.
+        ValueError: an option is outside what is allowed, or a parameter is complex, or float64
+            with bfloat16 pairs (raised by `step`).
+        RuntimeError: `backend="cuda"`, and the kernel cannot run (raised by `step`).
     """
 
     _own = (*HookedAdam._own, "curvature_options")
@@ -124,6 +139,8 @@ class LQNAdam(HookedAdam):
         powell: bool = False,
         graft: bool = True,
         gamma_clamp: tuple[float, float] | None = None,
+        backend: Backend = "auto",
+        pair_dtype: curvature.PairDtype = "float32",
         skip_nonfinite: bool = True,
         foreach: bool | None = None,
         maximize: bool = False,
@@ -132,7 +149,15 @@ class LQNAdam(HookedAdam):
         fused: bool | None = None,
     ) -> None:
         options = CurvatureOptions(
-            history_size, pairs, epoch_steps, min_cosine, powell, graft, gamma_clamp
+            history_size,
+            pairs,
+            epoch_steps,
+            min_cosine,
+            powell,
+            graft,
+            gamma_clamp,
+            backend,
+            pair_dtype,
         )
         super().__init__(
             params,
@@ -152,6 +177,7 @@ class LQNAdam(HookedAdam):
 
     def _init_curvature(self, options: CurvatureOptions) -> None:
         self.curvature_options = options
+        self._held: list[tuple[weakref.ref[Tensor], weakref.ref[Tensor]]] = []
         self._seen: dict[int, tuple[weakref.ref[Tensor], int]] = {}
         self._tally: list[Tensor] = []  # [accepted, candidates] per parameter of the last step
 
@@ -164,8 +190,13 @@ class LQNAdam(HookedAdam):
         return accepted / candidates.clamp(min=1)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """As torch's; a loaded history is used if its shape fits the parameters."""
+        """As torch's; a loaded history is used if its shape fits the parameters.
+
+        Raises:
+            ValueError: the state does not fit; then nothing has been loaded.
+        """
         super().load_state_dict(state_dict)
+        drop_foreign_rows(f"{type(self).__name__}.load_state_dict", self)
         self._trust_present()
 
     def state_dict(self) -> dict[str, Any]:
@@ -176,6 +207,24 @@ class LQNAdam(HookedAdam):
                 state.pop(EPOCH, None)
         return super().state_dict()
 
+    def reset_points(self, rows: Tensor, *, moments: bool = False) -> None:
+        """Say which points have moved by other means than `step()`: their pairs are dropped.
+
+        For a trainer that knows what its density control did. Call it after each edit of the
+        parameters: the pairs of all other points stay in use, where they would otherwise be
+        dropped with the exchanged Parameter object. The state's rows must have been edited along
+        (gsplat does; INRIA's edits leave the pairs behind, and they are dropped if their number
+        does not fit).
+
+        Args:
+            rows: [N] bool mask or a vector of indices, of the points as they are now.
+            moments: whether to start their Adam moments anew too.
+
+        Raises:
+            ValueError: a mask fits no parameter.
+        """
+        self._reset_rows(rows, moments)
+
     def _trust_present(self) -> None:
         """Take the histories in the state as those of the parameters' present rows."""
         self._seen.clear()
@@ -184,9 +233,44 @@ class LQNAdam(HookedAdam):
                 if HISTORY in self.state.get(param, {}):
                     self._remember(param)
 
+    def _reset_rows(self, rows: Tensor, moments: bool) -> None:
+        mask = rows.dtype == torch.bool
+        every = [p for g in self.param_groups if self._is_points(g) for p in g["params"]]
+        fitting = [p for p in every if p.dim() > 0 and (not mask or rows.shape == p.shape[:1])]
+        if not fitting:
+            raise ValueError(
+                f"{type(self).__name__}.reset_points: rows has shape {tuple(rows.shape)}, but a "
+                f"mask of the first dimension of {[tuple(p.shape) for p in every]} is needed"
+            )
+        for param in fitting:
+            state = self.state.get(param, {})
+            if not self._pairs_follow(param, state):
+                state.pop(HISTORY, None)
+                state.pop(EPOCH, None)
+            kept = moments and {key for key in state if key != "step"}
+            for key in kept or {HISTORY, EPOCH} & set(state):
+                if state[key].shape[:1] == param.shape[:1]:
+                    state[key][rows.to(param.device)] = 0
+            if HISTORY in state:
+                self._remember(param)
+
+    def _pairs_follow(self, param: Tensor, state: Mapping[str, Any]) -> bool:
+        """Whether the history was edited with the rows: not where the moments alone were."""
+        history, moment = state.get(HISTORY), state.get("exp_avg")
+        if history is None or history.shape[0] != param.shape[0]:
+            return False
+        return not any(h() is history and m() is not moment for h, m in self._held)
+
+    def _is_points(self, group: Mapping[str, Any]) -> bool:
+        return True
+
     def _remember(self, param: Tensor) -> None:
         rows = param.shape[0] if param.dim() else 1
         self._seen[id(param)] = (weakref.ref(param), rows)
+        # The history and the moment that belong together: an edit of one alone shows.
+        state = self.state[param]
+        held = [(h, m) for h, m in self._held if h() is not None and h() is not state[HISTORY]]
+        self._held = [*held, (weakref.ref(state[HISTORY]), weakref.ref(state["exp_avg"]))]
 
     def _is_known(self, param: Tensor) -> bool:
         seen = self._seen.get(id(param))
@@ -238,6 +322,25 @@ class LQNAdam(HookedAdam):
         rows = param.shape[0] if param.dim() else 1
         position, gradient = param.detach().reshape(rows, -1), grad.reshape(rows, -1)
         history = self._history(param, position)
+        if self._has_operator(position):
+            fed, accepted, candidates = lqn_direction(
+                position,
+                gradient,
+                history,
+                options.history_size,
+                min_cosine=options.min_cosine,
+                powell=options.powell,
+                graft=options.graft,
+                gamma_clamp=options.gamma_clamp,
+                backend=options.backend,
+            )
+            self._tally.append(torch.stack([accepted.sum(), candidates.sum()]))
+            return fed.reshape(grad.shape)
+        if options.backend == "cuda":
+            raise RuntimeError(
+                f"LQNAdam: backend='cuda' with pairs={options.pairs!r} and points of shape "
+                f"{tuple(position.shape)}, but the kernel is for consecutive pairs and [N, 3]"
+            )
         visible = (gradient != 0).any(dim=1) & torch.isfinite(gradient).all(dim=1)
         if options.pairs == "epoch":
             recorded = self._average_epoch(param, position, gradient, visible, epoch_ends)
@@ -260,6 +363,9 @@ class LQNAdam(HookedAdam):
             gamma_clamp=options.gamma_clamp,
         ).reshape(grad.shape)
 
+    def _has_operator(self, position: Tensor) -> bool:
+        return self.curvature_options.pairs == "consecutive" and position.shape[1] == 3
+
     def _average_epoch(
         self,
         param: Tensor,
@@ -281,13 +387,20 @@ class LQNAdam(HookedAdam):
     def _history(self, param: Tensor, position: Tensor) -> Tensor:
         """This parameter's history; a new one if somebody has exchanged or resized its rows."""
         state = self.state[param]
-        size = self.curvature_options.history_size
-        slots = curvature.num_slots(size, position.shape[1])
-        shape = (position.shape[0], slots, 2 * (position.shape[1] + 1))
+        size, packing = self.curvature_options.history_size, self.curvature_options.pair_dtype
+        shape = curvature.history_shape(position, size, packing)
         fits = HISTORY in state and tuple(state[HISTORY].shape) == shape
+        if packing == "bfloat16" and fits:  # a cast to another dtype has destroyed the bits
+            fits = state[HISTORY].dtype == torch.float32
+        kernel = self._has_operator(position) and uses_kernel(
+            self.curvature_options.backend, position.device, position.dtype
+        )
         if not fits or not self._is_known(param):
-            state[HISTORY] = curvature.new_history(position, size)
+            state[HISTORY] = curvature.new_history(
+                position, size, contiguous=kernel, pair_dtype=packing
+            )
             state.pop(EPOCH, None)
+        state[HISTORY] = curvature.laid_out(state[HISTORY], contiguous=kernel)
         self._seen = {key: entry for key, entry in self._seen.items() if entry[0]() is not None}
         self._remember(param)
         return state[HISTORY]

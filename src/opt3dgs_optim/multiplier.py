@@ -8,7 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from opt3dgs_optim._checks import check_number
+from opt3dgs_optim._checkpoint import check_keys, check_whole
+from opt3dgs_optim._checks import check_count, check_number
 
 
 class ConstantMultiplier:
@@ -25,7 +26,7 @@ class ConstantMultiplier:
 
     def __init__(self, value: float, warmup: int = 0) -> None:
         self.value = check_number("ConstantMultiplier", "value", value)
-        self.warmup = int(check_number("ConstantMultiplier", "warmup", warmup, 0))
+        self.warmup = check_count("ConstantMultiplier", "warmup", warmup, 0)
         self.num_observed = 0
         self.last_finite = torch.ones((), dtype=torch.bool)
 
@@ -52,5 +53,7 @@ class ConstantMultiplier:
         return {"num_observed": self.num_observed}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore `state_dict()`."""
-        self.num_observed = int(state["num_observed"])
+        """Restore `state_dict()`; ValueError if it is damaged."""
+        call = "ConstantMultiplier.load_state_dict"
+        check_keys(call, state, ("num_observed",))
+        self.num_observed = check_whole(call, "num_observed", state["num_observed"])

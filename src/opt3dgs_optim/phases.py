@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Hashable, Mapping
-from typing import Any, Literal, TypeVar, overload
+import warnings
+from collections.abc import Hashable, Mapping
+from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-from opt3dgs_optim._checks import check_count, check_flag, check_number
-from opt3dgs_optim._groups import GAUSSIAN_NAMES, canonical_name
-from opt3dgs_optim._phased import PhasedAdam, check_upgradable, named_groups
+from opt3dgs_optim._checkpoint import check_keys, check_whole
+from opt3dgs_optim._checks import check_count, check_flag, check_number, check_part
+from opt3dgs_optim._ranks import RankMean
+from opt3dgs_optim._upgrading import Upgrading
 from opt3dgs_optim.energy import EnergyHistogram
 from opt3dgs_optim.lqnadam import CurvatureOptions
 from opt3dgs_optim.multiplier import ConstantMultiplier
@@ -23,7 +25,8 @@ CALL = "PhaseScheduler"
 PAPER_STEPS = 30_000
 PAPER_SWITCH = 29_000 / PAPER_STEPS
 PAPER_WARMUP = 2_500 / PAPER_STEPS
-SPLATS = TypeVar("SPLATS", bound=Mapping[str, Tensor])
+SETTLING_STEPS = 100  # of Adam's second moment over views, after a restart
+OPTIMIZERS = TypeVar("OPTIMIZERS", bound="dict[str, Optimizer] | Optimizer")
 
 
 class Phase(enum.Enum):
@@ -33,7 +36,7 @@ class Phase(enum.Enum):
     EXPLOITATION = "exploitation"
 
 
-class PhaseScheduler:
+class PhaseScheduler(Upgrading):
     """Put Opt3DGS's two phases into the optimizers of an existing 3DGS trainer.
 
     Exploration: Adam's step on every Gaussian parameter is multiplied by nu. Exploitation: the
@@ -49,12 +52,18 @@ class PhaseScheduler:
             twelfth of the run; an `EnergyHistogram`; a number, for a constant (the control); or
             None, for off.
         curvature: `CurvatureOptions(...)` for the positions while exploiting, or None, for off.
+            Its `backend` is that of the position noise too.
         squared_loss: whether `pixel_loss` turns to L2 in exploitation.
-        reset_moments: whether Adam's moments start anew at the switch, in all groups.
+        reset_moments: whether Adam's moments start anew at the switch, in all groups; `"auto"`:
+            where at least 100 iterations are left for them to settle (a restarted second moment
+            is that of a few views, and its first steps are long).
         noise_scale: noise_lr of 3DGS-MCMC's position noise. 0 (the default) where the trainer
             injects it itself, as gsplat's MCMCStrategy and 3dgs-mcmc do; never both.
         noise_in_exploitation: whether that noise stays on after the switch.
         log: a `RunLog` that gets one line per `observe`.
+        process_group: a `torch.distributed` process group over whose ranks the energy is averaged,
+            so that nu is the same on all; every rank must call `observe` as often. A loss that is
+            not finite on one rank skips the step on all.
 
     Call order in each iteration: `pixel_loss`, backward, `observe(loss)`, `step()` of every
     optimizer. The state travels inside `param_groups[0]` of every upgraded optimizer's
@@ -96,28 +105,44 @@ class PhaseScheduler:
         | None = "histogram",
         curvature: CurvatureOptions | None = CurvatureOptions(),  # noqa: B008 (immutable)
         squared_loss: bool = True,
-        reset_moments: bool = True,
+        reset_moments: bool | Literal["auto"] = "auto",
         noise_scale: float = 0.0,
         noise_in_exploitation: bool = True,
         log: RunLog | None = None,
+        process_group: Any = None,
     ) -> None:
+        super().__init__()
         self.total_steps = check_count(CALL, "total_steps", total_steps, 1)
         self.switch_step = _switch_step(switch, self.total_steps)
         self.multiplier = _as_multiplier(multiplier, self.total_steps)
+        check_part(CALL, "curvature", curvature, "CurvatureOptions", "history_size")
         self.curvature = curvature is not None
         self.curvature_options = curvature or CurvatureOptions()
         self.squared_loss = check_flag(CALL, "squared_loss", squared_loss)
-        self.reset_moments = check_flag(CALL, "reset_moments", reset_moments)
+        self.reset_moments = _resets(reset_moments, self.total_steps - self.switch_step)
         self.noise_scale = check_number(CALL, "noise_scale", noise_scale, 0.0)
         self.noise_in_exploitation = check_flag(
             CALL, "noise_in_exploitation", noise_in_exploitation
         )
-        self.log = log
+        self.log = check_part(CALL, "log", log, "a RunLog", "step")
+        self._over_ranks = None if process_group is None else RankMean(CALL, process_group)
+        self._overrun = False
         self.num_observed = 0
         self.last_finite = torch.ones((), dtype=torch.bool)
         self._current = -1  # the iteration observed last, whose step comes next
-        self._noise: CovarianceNoise | None = None
-        self._positions: PhasedAdam | None = None
+
+    @classmethod
+    def install(
+        cls, optimizers: OPTIMIZERS, total_steps: int, **options: Any
+    ) -> tuple[PhaseScheduler, OPTIMIZERS]:
+        """A scheduler and the upgraded optimizers in one line: `(phases, optimizers)`.
+
+        Args:
+            optimizers: see `upgrade`.
+            total_steps, options: those of the class.
+        """
+        phases = cls(total_steps, **options)
+        return phases, phases.upgrade(optimizers)  # pyright: ignore
 
     @classmethod
     def paper(cls, total_steps: int = PAPER_STEPS, **overrides: Any) -> PhaseScheduler:
@@ -129,6 +154,7 @@ class PhaseScheduler:
         check_count(f"{CALL}.paper", "total_steps", total_steps, 1)
         settings: dict[str, Any] = {
             "switch": PAPER_SWITCH,
+            "reset_moments": True,
             "multiplier": EnergyHistogram.paper(warmup=round(total_steps * PAPER_WARMUP)),
             **overrides,
         }
@@ -167,71 +193,6 @@ class PhaseScheduler:
 
     # -- the lines in a trainer ----------------------------------------------------------------
 
-    @overload
-    def upgrade(
-        self, optimizers: dict[str, Any], gaussians: Any = None
-    ) -> dict[str, Optimizer]: ...
-    @overload
-    def upgrade(self, optimizers: Optimizer, gaussians: Any = None) -> Optimizer: ...
-    def upgrade(
-        self,
-        optimizers: dict[str, Any] | Optimizer,
-        gaussians: Mapping[str, Tensor] | Callable[[], Mapping[str, Tensor]] | None = None,
-    ) -> dict[str, Optimizer] | Optimizer:
-        """Return the trainer's optimizer(s) with both phases inside.
-
-        Learning rates, betas, eps, names and state are kept; learning rates are never changed.
-
-        Args:
-            optimizers: a dict of `torch.optim.Adam`, one per parameter (gsplat, nerfstudio), or
-                one Adam with named groups (INRIA, 3dgs-mcmc). Those that hold no Gaussian
-                parameter (camera poses, exposures) come back as they are, or stay plain Adam.
-            gaussians: the trainer's dict of raw tensors (`scales, quats, opacities`), or a
-                function returning it; needed with `noise_scale > 0`.
-
-        Raises:
-            TypeError: an optimizer of Gaussian parameters is not torch's Adam.
-            ValueError: no group holds positions, a name occurs twice, or `gaussians` is missing.
-        """
-        self._noise = self._make_noise(gaussians)
-        if isinstance(optimizers, Optimizer):
-            names = named_groups(optimizers)
-            _require_positions(names)
-            return self._take(check_upgradable(optimizers, "the optimizer"))
-        if not isinstance(optimizers, Mapping):
-            raise TypeError(
-                f"{CALL}.upgrade: optimizers is a {type(optimizers).__name__}, but a dict of "
-                "optimizers, or one optimizer with named groups, is needed"
-            )
-        _require_positions(list(optimizers))
-        upgraded: dict[str, Optimizer] = {}
-        for name, optimizer in optimizers.items():
-            if canonical_name(name) is None:
-                upgraded[name] = optimizer
-                continue
-            adam = check_upgradable(optimizer, f"optimizers[{name!r}]")
-            named_groups(adam)
-            for group in adam.param_groups:
-                group.setdefault("name", name)
-            upgraded[name] = self._take(adam)
-        return upgraded
-
-    def _take(self, optimizer: Any) -> PhasedAdam:
-        phased = PhasedAdam(optimizer, self)
-        if any(canonical_name(group.get("name")) == "means" for group in phased.param_groups):
-            self._positions = phased
-        return phased
-
-    def _make_noise(self, gaussians: Any) -> CovarianceNoise | None:
-        if self.noise_scale == 0:
-            return None
-        if gaussians is None:
-            raise ValueError(
-                f"{CALL}.upgrade: gaussians=None, but noise_scale={self.noise_scale} needs the "
-                "trainer's dict of scales, quats and opacities (or a function returning it)"
-            )
-        return CovarianceNoise(gaussians, self.noise_scale)
-
     def observe(
         self,
         loss: Tensor | float,
@@ -245,7 +206,8 @@ class PhaseScheduler:
         steps that follow it are skipped.
 
         Args:
-            loss: the total training loss, 0-d; detached here.
+            loss: the total training loss, 0-d; detached here. With gradient accumulation, once
+                per optimizer step, with the mean over its batches; with a GradScaler, unscaled.
             iteration: the trainer's own count, where it may differ from the number of calls.
             view: which view was rendered, for `energy="view_centered"`.
         """
@@ -253,9 +215,23 @@ class PhaseScheduler:
             check_count(f"{CALL}.observe", "iteration", iteration, 0)
         self._current = self.iteration if iteration is None else iteration
         self.num_observed += 1
+        # Trainers that count from 1 end at total_steps.
+        if self._current > self.total_steps and not self._overrun:
+            self._overrun = True
+            warnings.warn(
+                f"{CALL}: iteration {self._current} of total_steps={self.total_steps}: the switch "
+                "came too early for this run; pass the training's number of iterations",
+                stacklevel=2,
+            )
         value = loss if isinstance(loss, Tensor) else torch.tensor(float(loss))
         value = value.detach().reshape(())
-        self.last_finite = torch.isfinite(value)
+        if self._over_ranks is not None:
+            value = self._over_ranks(value)
+        finite = torch.isfinite(value)
+        if self.last_finite.device == finite.device:
+            self.last_finite.copy_(finite)  # in place: a CUDA graph of a step reads it
+        else:
+            self.last_finite = finite
         # In exploitation nu is off, and the loss is another one: it would spoil the histogram.
         if self.multiplier is not None and not self.exploiting:
             self.multiplier.observe(value, view=view)
@@ -306,14 +282,15 @@ class PhaseScheduler:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore `state_dict()`; ValueError if its histogram does not fit this scheduler's."""
-        missing = sorted({"iteration", "num_observed", "multiplier"} - set(state))
-        if missing:
-            raise ValueError(f"{CALL}.load_state_dict: keys {missing} are missing")
+        call = f"{CALL}.load_state_dict"
+        check_keys(call, state, ("iteration", "num_observed", "multiplier"))
+        iteration = check_whole(call, "iteration", state["iteration"])
+        num_observed = check_whole(call, "num_observed", state["num_observed"])
         saved = state["multiplier"]
         if self.multiplier is not None and saved is not None:
             self.multiplier.load_state_dict(saved)
-        self._current = int(state["iteration"]) - 1
-        self.num_observed = int(state["num_observed"])
+        self._current = iteration - 1
+        self.num_observed = num_observed
 
     def __repr__(self) -> str:
         return (
@@ -331,6 +308,14 @@ def _switch_step(switch: float | int, total_steps: int) -> int:
     return round(fraction * total_steps)
 
 
+def _resets(value: bool | str, steps_left: int) -> bool:
+    if isinstance(value, bool):
+        return value
+    if value != "auto":
+        raise ValueError(f"{CALL}: reset_moments={value!r}, but True, False or 'auto' is needed")
+    return steps_left >= SETTLING_STEPS
+
+
 def _as_multiplier(value: Any, total_steps: int) -> EnergyHistogram | ConstantMultiplier | None:
     if value is None or isinstance(value, (EnergyHistogram, ConstantMultiplier)):
         return value
@@ -338,16 +323,8 @@ def _as_multiplier(value: Any, total_steps: int) -> EnergyHistogram | ConstantMu
         # An automatic range needs a few energies even in the shortest run.
         return EnergyHistogram(warmup=max(4, round(total_steps * PAPER_WARMUP)))
     if isinstance(value, (int, float)) and not isinstance(value, bool):
-        return ConstantMultiplier(value)
+        return ConstantMultiplier(check_number(CALL, "multiplier", value))
     raise ValueError(
         f"{CALL}: multiplier={value!r}, but 'histogram', an EnergyHistogram, a number or None is "
         "needed"
     )
-
-
-def _require_positions(names: list[str]) -> None:
-    if not any(canonical_name(name) == "means" for name in names):
-        raise ValueError(
-            f"{CALL}.upgrade: none of the names {names} stands for positions; "
-            f"{' or '.join(GAUSSIAN_NAMES['means'])} is needed"
-        )

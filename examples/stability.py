@@ -1,0 +1,287 @@
+"""Stiff problems with known minima: how far, how fast and up to which condition each method gets.
+
+    python examples/stability.py            # writes docs/results/stability/
+
+torch's Adam and LBFGS, AWSGLD, LQNAdam, and the two-loop recursion of LQNAdam with a line search
+instead of Adam. Every problem is a batch of rows in axes of their own; torch's LBFGS, which knows
+one vector only, gets an optimizer per row. Adam, AWSGLD and LQNAdam get the best of three learning
+rates (1, 10 and 100 thousandths of the distance to the minimum), decayed to 1e-6 of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import sys
+import time
+from collections.abc import Callable
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests"))  # the problems are the tests' own
+
+from line_search import minimise  # noqa: E402
+from problems import (  # noqa: E402
+    SMOOTH,
+    Problem,
+    gradient,
+    hessians,
+    placed,
+    quadratic,
+    rotations,
+    to_world,
+)
+
+Function = Callable[[Tensor], Tensor]
+Course = list[tuple[int, float, float]]  # iteration, seconds, error
+Step = Callable[[], Tensor]  # takes one iteration, returns the rows' points
+SHARES = (1e-3, 1e-2, 1e-1)
+ARMS = ("Adam", "AWSGLD", "LQNAdam", "LBFGS (torch)", "two-loop + line search")
+COLORS = dict(zip(ARMS, ("#4c72b0", "#8c8c8c", "#c44e52", "#dd8452", "#55a868"), strict=True))
+CONDITIONS = (1.0, 1e1, 1e2, 1e3, 1e4, 1e6, 1e8, 1e12)
+LBFGS_ROWS = 4
+
+
+def adam_like(arm: str, value: Function, start: Tensor, lr: float, steps: int) -> Step:
+    """One step of an Adam over all rows, its learning rate decayed to 1e-6 of `lr`."""
+    x = torch.nn.Parameter(start.clone())
+    histogram = EnergyHistogram(warmup=max(4, steps // 12))
+    optimizer: torch.optim.Optimizer = {
+        "Adam": lambda: torch.optim.Adam([x], lr=lr, eps=1e-30),
+        "AWSGLD": lambda: AWSGLD([x], lr=lr, eps=1e-30, histogram=histogram),
+        "LQNAdam": lambda: LQNAdam([x], lr=lr, eps=1e-30),
+    }[arm]()
+    decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, 1e-6 ** (1 / steps))
+
+    def step() -> Tensor:
+        loss = value(x)
+        (x.grad,) = torch.autograd.grad(loss.sum(), x)
+        if arm == "AWSGLD":
+            histogram.observe(loss.detach().mean())
+        optimizer.step()
+        decay.step()
+        return x.detach()
+
+    return step
+
+
+def torch_lbfgs(value: Function, start: Tensor) -> Step:
+    """One iteration of torch's LBFGS (history 5, strong Wolfe) for each of the first rows."""
+    rows = [torch.nn.Parameter(start[i : i + 1].clone()) for i in range(LBFGS_ROWS)]
+    optimizers = [
+        torch.optim.LBFGS([x], max_iter=1, history_size=5, line_search_fn="strong_wolfe")
+        for x in rows
+    ]
+
+    def step() -> Tensor:
+        for i, (x, optimizer) in enumerate(zip(rows, optimizers, strict=True)):
+
+            def closure(x: Tensor = x, i: int = i) -> Tensor:
+                everything = torch.cat([start[:i], x, start[i + 1 :]])
+                loss = value(everything)[i]
+                (x.grad,) = torch.autograd.grad(loss, x)
+                return loss
+
+            optimizer.step(closure)  # pyright: ignore[reportArgumentType]
+        return torch.cat([x.detach() for x in rows])
+
+    return step
+
+
+def timed(step: Step, error: Callable[[Tensor], float], steps: int) -> Course:
+    """The error after each of `steps` iterations, and the seconds of the iterations alone."""
+    course, seconds = [], 0.0
+    for iteration in range(1, steps + 1):
+        begin = time.perf_counter()
+        x = step()
+        seconds += time.perf_counter() - begin
+        if iteration <= 20 or iteration % 10 == 0:
+            course.append((iteration, seconds, error(x)))
+    return course
+
+
+def line_searched(
+    value: Function, start: Tensor, error: Callable[[Tensor], float], steps: int
+) -> Course:
+    begin = time.perf_counter()
+    points = minimise(value, start, min(steps, 150))
+    each = (time.perf_counter() - begin) / len(points)
+    return [(i, i * each, error(x)) for i, x in enumerate(points, start=1)]
+
+
+def compare(
+    value: Function, start: Tensor, distance: float, error: Callable[[Tensor], float], steps: int
+) -> dict[str, Course]:
+    """The course of every arm; of the three learning rates, the one that ends best."""
+    courses: dict[str, Course] = {}
+    for arm in ARMS[:3]:
+        tried = [
+            timed(adam_like(arm, value, start, share * distance, steps), error, steps)
+            for share in SHARES
+        ]
+        courses[arm] = min(tried, key=lambda course: course[-1][2])
+    courses[ARMS[3]] = timed(torch_lbfgs(value, start), error, min(steps, 150))
+    courses[ARMS[4]] = line_searched(value, start, error, steps)
+    return courses
+
+
+def problem_courses(problem: Problem, rows: int, steps: int) -> dict[str, Course]:
+    turn, scale = rotations(rows, problem.dim), torch.ones(rows, dtype=torch.float64)
+    value = placed(problem, scale, turn)
+    start = to_world(problem.starts(rows), scale, turn)
+    distance = float((problem.minima(1) - problem.starts(1)).norm())
+
+    def error(x: Tensor) -> float:
+        many = len(x)
+        found = placed(problem, scale[:many], turn[:many])(x)
+        return max(float((found - problem.minimum_value).median()) / problem.start_value, 1e-40)
+
+    return compare(value, start, distance, error, steps)
+
+
+def condition_courses(condition: float, rows: int, steps: int) -> dict[str, Course]:
+    start = torch.ones(rows, 3, dtype=torch.float64)
+
+    def error(x: Tensor) -> float:
+        return max(float((x.norm(dim=1) / 3**0.5).median()), 1e-40)
+
+    return compare(quadratic(hessians(rows, condition)), start, 3**0.5, error, steps)
+
+
+def range_survived() -> dict[str, float]:
+    """Decades of gradient size over which one step in float32 is that at size 1, to 1 %."""
+    found = {}
+    for arm in ("Adam", "LQNAdam"):
+        good = 0
+        for exponent in range(-44, 38):
+            ends = []
+            for size in (1.0, 10.0**exponent):
+                x = torch.nn.Parameter(torch.ones(100, 3))
+                cls: Any = torch.optim.Adam if arm == "Adam" else LQNAdam
+                optimizer = cls([x], lr=0.01, eps=0.0)
+                for _ in range(5):
+                    x.grad = gradient(lambda p: (p**2).sum(1), x) / 2 * size
+                    optimizer.step()
+                ends.append(x.detach())
+            good += bool(((ends[0] - ends[1]).abs().max() < 1e-4).item())
+        found[arm] = good
+    return found
+
+
+# -- what is written -------------------------------------------------------------------------------
+
+
+def digits(error: float) -> str:
+    return f"{-torch.tensor(error, dtype=torch.float64).log10().item():.1f}"
+
+
+def first_below(course: Course, bound: float, column: int) -> str:
+    hits = [entry[column] for entry in course if entry[2] < bound]
+    return "-" if not hits else (f"{hits[0]:.2f}" if column == 1 else str(hits[0]))
+
+
+def table(title: str, results: dict[str, dict[str, Course]], cell: Callable[[Course], str]) -> str:
+    lines = [f"### {title}", "", "| problem | " + " | ".join(ARMS) + " |"]
+    lines.append("|---" * (len(ARMS) + 1) + "|")
+    for name, courses in results.items():
+        lines.append(f"| {name} | " + " | ".join(cell(courses[arm]) for arm in ARMS) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def survived(quadratics: dict[str, dict[str, Course]]) -> dict[str, float]:
+    """The largest condition at which the median row lost 3 digits of its error."""
+    best = dict.fromkeys(ARMS, 0.0)
+    for name, courses in quadratics.items():
+        for arm in ARMS:
+            if courses[arm][-1][2] < 1e-3:
+                best[arm] = max(best[arm], float(name.split()[-1]))
+    return best
+
+
+def report(results: dict[str, Any]) -> str:
+    about = results["about"]
+    problems, quadratics = results["problems"], results["quadratics"]
+    parts = [
+        f"Made by `{about['command']}` on {about['date']}: {about['machine']}, {about['rows']} "
+        f"rows, {about['steps']} steps (line searches: up to 150).\n",
+        table(
+            "Digits of f lost (-log10 of f over its start)", problems, lambda c: digits(c[-1][2])
+        ),
+        table("Iterations to 1e-6 of f", problems, lambda c: first_below(c, 1e-6, 0)),
+        table("Seconds to 1e-6 of f (LBFGS: 4 rows)", problems, lambda c: first_below(c, 1e-6, 1)),
+        table("Quadratics: digits of |x| lost", quadratics, lambda c: digits(c[-1][2])),
+        "### Worst condition at which the median row loses 3 digits of |x|\n",
+        "| " + " | ".join(ARMS) + " |\n" + "|---" * len(ARMS) + "|",
+        "| " + " | ".join(f"{v:.0e}" for v in results["survived"].values()) + " |\n",
+        "### Decades of gradient size (of 82, 1e-44 to 1e37; float32) with the same steps\n",
+        *(f"- {arm}: {decades}" for arm, decades in results["decades"].items()),
+    ]
+    return "\n".join(parts) + "\n"
+
+
+def plot(results: dict[str, dict[str, Course]], column: int, label: str, path: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    wide = 4
+    tall = -(-len(results) // wide)
+    figure, axes = plt.subplots(tall, wide, figsize=(3.4 * wide, 2.9 * tall), squeeze=False)
+    for axis, (name, courses) in zip(axes.flat, results.items(), strict=False):
+        for arm in ARMS:
+            at = [entry[column] for entry in courses[arm]]
+            axis.plot(at, [entry[2] for entry in courses[arm]], color=COLORS[arm], label=arm)
+        axis.set(title=name, xscale="log", yscale="log", xlabel=label)
+        axis.set_ylim(bottom=1e-32, top=30)
+        axis.grid(alpha=0.3)
+    for axis in axes.flat[len(results) :]:
+        axis.axis("off")
+    for row in axes:
+        row[0].set_ylabel("median error / start")
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="lower center", ncols=len(ARMS), frameon=False)
+    figure.tight_layout(rect=(0, 0.06, 1, 1))
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs/results/stability")
+    parser.add_argument("--rows", type=int, default=50)
+    parser.add_argument("--steps", type=int, default=1000)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    options.output.mkdir(parents=True, exist_ok=True)
+    sizes = (options.rows, options.steps)
+    problems = {p.name: problem_courses(p, *sizes) for p in tqdm(SMOOTH, desc="problems")}
+    quadratics = {
+        f"condition {c:.0e}": condition_courses(c, *sizes)
+        for c in tqdm(CONDITIONS, desc="quadratics")
+    }
+    about = {
+        "command": "python examples/stability.py",
+        "date": date.today().isoformat(),
+        "machine": f"{platform.system()} {platform.machine()}, 1 thread, torch {torch.__version__}",
+        "rows": options.rows,
+        "steps": options.steps,
+    }
+    results: dict[str, Any] = {"about": about, "problems": problems, "quadratics": quadratics}
+    results |= {"survived": survived(quadratics), "decades": range_survived()}
+    (options.output / "stability.json").write_text(json.dumps(results) + "\n")
+    (options.output / "stability.md").write_text(report(results))
+    plot(problems, 0, "iterations", options.output / "iterations.png")
+    plot(problems, 1, "seconds", options.output / "seconds.png")
+    plot(quadratics, 0, "iterations", options.output / "conditions.png")
+    print(f"wrote {options.output}")
+
+
+if __name__ == "__main__":
+    main()

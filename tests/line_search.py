@@ -1,0 +1,68 @@
+"""The two-loop recursion with a line search, on many rows at once: what it can do without Adam."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from problems import gradient
+from torch import Tensor
+
+from opt3dgs_optim.curvature import header, new_history, record, two_loop
+
+Function = Callable[[Tensor], Tensor]  # [N, D] -> [N]
+
+
+def minimise(
+    value: Function, x: Tensor, iterations: int, *, history_size: int = 5, first: float = 0.1
+) -> list[Tensor]:
+    """L-BFGS on every row of `x` [N, D]; the points after each iteration.
+
+    It ends early where no row can go down any further.
+
+    Args:
+        value: the function of every row.
+        x: the starts.
+        iterations: line searches, of up to 50 evaluations each.
+        history_size: K.
+        first: length of the first step, as a share of the start's own length: rows may be in any
+            units, and the method has to go the same way in all of them.
+    """
+    history = new_history(x, history_size)
+    length = x.norm(dim=1, keepdim=True) * first
+    course = []
+    for _ in range(iterations):
+        g = gradient(value, x)
+        visible = torch.isfinite(g).all(1) & (g != 0).any(1)
+        record(history, history_size, x, g, visible, min_cosine=1e-14)
+        down = -two_loop(g, history, history_size)
+        empty = header(history, history_size).counter <= 1
+        unit = g / g.abs().amax(1, keepdim=True).clamp(min=1e-300)
+        steepest = -unit / unit.norm(dim=1, keepdim=True).clamp(min=1e-300) * length
+        bad = empty | ((down * unit).sum(1) >= 0) | ~torch.isfinite(down).all(1)
+        down = torch.where(bad[:, None], steepest, down)
+        step = weak_wolfe(value, x, g, down)
+        x = x + step[:, None] * down
+        course.append(x)
+        if not bool(step.any()):
+            break
+    return course
+
+
+def weak_wolfe(value: Function, x: Tensor, g: Tensor, down: Tensor) -> Tensor:
+    """Steps [N] of sufficient decrease and rising slope, by bisection (Lewis and Overton 2013)."""
+    start, slope = value(x), (g * down).sum(1)
+    step = torch.ones_like(start)
+    low, high = torch.zeros_like(step), torch.full_like(step, torch.inf)
+    for _ in range(50):
+        at = x + step[:, None] * down
+        long = ~(value(at) <= start + 1e-4 * step * slope)
+        short = ~long & ~((gradient(value, at) * down).sum(1) >= 0.9 * slope)
+        if not bool((long | short).any()):
+            break
+        high = torch.where(long, step, high)
+        low = torch.where(short, step, low)
+        middle = torch.where(torch.isinf(high), 2 * low, (low + high) / 2)
+        step = torch.where(long | short, middle, step)
+    # Not found within rounding: where the function does not fall any more, stay.
+    return torch.where(value(x + step[:, None] * down) <= start, step, torch.zeros_like(step))

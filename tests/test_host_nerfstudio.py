@@ -1,0 +1,320 @@
+"""nerfstudio: our configs in its Optimizers class (real where present) and its call sequence."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import sys
+import types
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+import torch
+from gsplat_host import HOSTS
+from torch.nn import Parameter
+from trainers import edit_rows, make_splats
+
+from opt3dgs_optim import Phase
+
+TOTAL = 40
+NAMES = {"sh0": "features_dc", "shN": "features_rest"}
+REAL = HOSTS / "nerfstudio/nerfstudio/engine/optimizers.py"
+
+
+# -- stand-ins for nerfstudio ------------------------------------------------------------------
+
+
+@dataclass
+class AdamConfig:
+    _target: Any = torch.optim.Adam
+    lr: float = 5e-4
+    eps: float = 1e-8
+    max_norm: float | None = None
+    weight_decay: float = 0
+
+    def setup(self, params: Any) -> torch.optim.Optimizer:
+        options = {k: v for k, v in vars(self).items() if k not in ("_target", "max_norm")}
+        return self._target(params, **options)
+
+
+class CallSequence:
+    """What nerfstudio's Optimizers does with the configs, in its order."""
+
+    def __init__(self, config: dict, param_groups: dict) -> None:
+        self.config = config
+        self.optimizers, self.schedulers, self.parameters = {}, {}, {}
+        for name, params in param_groups.items():
+            self.optimizers[name] = config[name]["optimizer"].setup(params=params)
+            self.parameters[name] = params
+            if config[name]["scheduler"]:
+                make = config[name]["scheduler"].setup().get_scheduler
+                rate = config[name]["optimizer"].lr
+                self.schedulers[name] = make(optimizer=self.optimizers[name], lr_init=rate)
+
+    def zero_grad_some(self, names: list[str]) -> None:
+        for name in names:
+            self.optimizers[name].zero_grad()
+
+    def optimizer_scaler_step_some(self, scaler: Any, names: list[str]) -> None:
+        for name in names:
+            optimizer, norm = self.optimizers[name], self.config[name]["optimizer"].max_norm
+            if norm is not None:
+                scaler.unscale_(optimizer)
+                torch.nn.utils.clip_grad_norm_(self.parameters[name], norm)
+            if any(p.grad is not None for g in optimizer.param_groups for p in g["params"]):
+                scaler.step(optimizer)
+
+    def scheduler_step_all(self, step: int) -> None:
+        for scheduler in self.schedulers.values():
+            scheduler.step()
+
+    def load_optimizers(self, loaded: dict) -> None:
+        for name, state in loaded.items():
+            self.optimizers[name].load_state_dict(state)
+
+
+class Decay:
+    """ExponentialDecaySchedulerConfig's two calls."""
+
+    def setup(self) -> Decay:
+        return self
+
+    def get_scheduler(self, optimizer: Any, lr_init: float) -> Any:
+        return torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 0.01 ** (step / TOTAL))
+
+
+@dataclass
+class ModelConfig:
+    _target: Any = None
+    ssim_lambda: float = 0.2
+    strategy: str = "default"
+
+
+class Model(torch.nn.Module):
+    """Splatfacto without a renderer."""
+
+    def __init__(self, config: Any) -> None:
+        super().__init__()
+        self.config, self.step = config, 0
+        self.populate_modules()
+
+    def populate_modules(self) -> None:
+        splats = make_splats()
+        opacities = Parameter(splats.pop("opacities").detach()[:, None])
+        splats["sh0"] = Parameter(splats["sh0"].detach()[:, 0])
+        parameters = {NAMES.get(name, name): p for name, p in splats.items()}
+        self.gauss_params = torch.nn.ParameterDict({**parameters, "opacities": opacities})
+
+    def get_gaussian_param_groups(self) -> dict:
+        return {name: [p] for name, p in self.gauss_params.items()}
+
+    def get_gt_img(self, image: Any) -> Any:
+        return image
+
+    def composite_with_background(self, image: Any, background: Any) -> Any:
+        return image
+
+    def _downscale_if_required(self, image: Any) -> Any:
+        return image
+
+    def forward(self) -> dict:
+        rgb = sum(p.reshape(p.shape[0], -1).mean(1) for p in self.gauss_params.values())
+        return {"rgb": rgb.reshape(-1, 1), "background": None}  # type: ignore[union-attr]
+
+    def get_loss_dict(self, outputs: Any, batch: Any, metrics_dict: Any = None) -> dict:
+        target, render = batch["image"], outputs["rgb"]
+        if "mask" in batch:
+            target, render = target * batch["mask"], render * batch["mask"]
+        loss = (1 - self.config.ssim_lambda) * (target - render).abs().mean()
+        return {"main_loss": 0.1 * loss, "scale_reg": torch.tensor(0.0)}
+
+
+@dataclass
+class Spec:
+    config: Any
+    description: str
+
+
+def method(name: str, strategy: str) -> Any:
+    slots: dict = {
+        n: {"optimizer": AdamConfig(lr=5e-3, eps=1e-15), "scheduler": None} for n in GROUPS
+    }
+    slots["means"]["scheduler"] = Decay()
+    slots["camera_opt"] = {"optimizer": AdamConfig(lr=1e-4), "scheduler": None}
+    pipeline = types.SimpleNamespace(model=ModelConfig(strategy=strategy))
+    return types.SimpleNamespace(
+        method_name=name, max_num_iterations=TOTAL, pipeline=pipeline, optimizers=slots
+    )
+
+
+GROUPS = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
+
+
+def modules(which: str, bases: dict) -> dict[str, Any]:
+    names = ("", ".engine", ".engine.optimizers", ".models", ".models.splatfacto", ".configs")
+    names += (".configs.method_configs", ".configs.base_config", ".plugins", ".plugins.types")
+    names += (".utils", ".utils.writer")
+    made: dict[str, Any] = {f"nerfstudio{n}": types.ModuleType(f"nerfstudio{n}") for n in names}
+    made["nerfstudio.configs.base_config"].PrintableConfig = object
+    made["nerfstudio.utils.writer"].put_scalar = lambda **_: None
+    made["nerfstudio.utils"].writer = made["nerfstudio.utils.writer"]
+    made["nerfstudio.configs"].base_config = made["nerfstudio.configs.base_config"]
+    optimizers = made["nerfstudio.engine.optimizers"]
+    optimizers.AdamOptimizerConfig, optimizers.Optimizers = AdamConfig, CallSequence
+    made["nerfstudio.models.splatfacto"].SplatfactoModel = Model
+    made["nerfstudio.models.splatfacto"].SplatfactoModelConfig = ModelConfig
+    made["nerfstudio.plugins.types"].MethodSpecification = Spec
+    made["nerfstudio.configs.method_configs"].method_configs = bases
+    return made
+
+
+@pytest.fixture(params=["call sequence", "real Optimizers"])
+def ours(request: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The module opt3dgs_optim.nerfstudio and the Optimizers class in use."""
+    bases = {name: method(name, kind) for name, kind in BASES.items()}
+    for name, module in modules(request.param, bases).items():
+        monkeypatch.setitem(sys.modules, name, module)
+    if request.param == "real Optimizers":
+        if not REAL.is_file():
+            pytest.skip(f"no {REAL}: unpack nerfstudio's wheel there, or set OPT3DGS_HOSTS")
+        source = compile(REAL.read_text(), str(REAL), "exec")
+        exec(source, sys.modules["nerfstudio.engine.optimizers"].__dict__)
+        monkeypatch.setitem(globals(), "AdamConfig", optimizers_module().AdamOptimizerConfig)
+    monkeypatch.delitem(sys.modules, "opt3dgs_optim.nerfstudio", raising=False)
+    yield importlib.import_module("opt3dgs_optim.nerfstudio")
+    sys.modules.pop("opt3dgs_optim.nerfstudio", None)
+
+
+BASES = {"splatfacto": "default", "splatfacto-mcmc": "mcmc"}
+
+
+def optimizers_module() -> Any:
+    return sys.modules["nerfstudio.engine.optimizers"]
+
+
+class Training:
+    """nerfstudio's Trainer: set-up, and one iteration with its GradScaler."""
+
+    def __init__(self, ours: Any, spec: Any) -> None:
+        config = spec.config.pipeline.model
+        config._target = ours.Opt3DGSSplatfactoModel
+        self.model = config._target(config)
+        groups = self.model.get_gaussian_param_groups()
+        groups["camera_opt"] = [Parameter(torch.zeros(1, 6))]
+        self.optimizers = optimizers_module().Optimizers(spec.config.optimizers.copy(), groups)
+        self.scaler = torch.amp.GradScaler("cpu", enabled=False)  # pyright: ignore
+
+    def run(self, first: int, last: int) -> None:
+        """Iterations first .. last - 1; mixed_precision is off for splatfacto."""
+        names = list(self.optimizers.parameters)
+        for step in range(first, last):
+            self.model.step = step
+            self.optimizers.zero_grad_some(names)
+            outputs = self.model()
+            losses = self.model.get_loss_dict(
+                outputs, {"image": torch.full((len(outputs["rgb"]), 1), 0.3)}
+            )
+            loss = torch.stack(list(losses.values())).sum()
+            self.scaler.scale(loss).backward()  # type: ignore[union-attr]
+            self.optimizers.optimizer_scaler_step_some(self.scaler, names)
+            self.scaler.update()
+            self.optimizers.scheduler_step_all(step)
+
+
+def bare(optimizers: dict) -> dict:
+    return {name: o for name, o in optimizers.items() if name != "camera_opt"}
+
+
+@pytest.mark.parametrize("attribute", ["splatfacto_opt3dgs", "splatfacto_mcmc_opt3dgs"])
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+def test_a_run_with_the_switch_and_row_edits(ours: Any, attribute: str) -> None:
+    training = Training(ours, getattr(ours, attribute))
+    model, phases = training.model, training.model.phases
+    training.run(0, 20)
+    own = bare(training.optimizers.optimizers)
+    assert all(o.scheduler is phases for o in own.values())
+    assert type(training.optimizers.optimizers["camera_opt"]) is torch.optim.Adam
+    edit_rows(model.gauss_params, own, torch.arange(2, 12), 5)
+    training.run(20, TOTAL)
+    assert phases.phase is Phase.EXPLOITATION
+    assert phases.iteration == TOTAL
+    assert own["means"].param_groups[0]["lr"] == pytest.approx(5e-3 * 0.01)
+    assert own["scales"].param_groups[0]["lr"] == 5e-3
+    assert own["means"].state[model.gauss_params["means"]]["history"].shape[0] == 15
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+def test_resume(ours: Any) -> None:
+    whole = Training(ours, ours.splatfacto_opt3dgs)
+    whole.run(0, TOTAL)
+    for at in (12, 39):
+        first = Training(ours, ours.splatfacto_opt3dgs)
+        first.run(0, at)
+        second = Training(ours, ours.splatfacto_opt3dgs)
+        second.model.load_state_dict(first.model.state_dict())
+        states = {name: o.state_dict() for name, o in first.optimizers.optimizers.items()}
+        second.optimizers.load_optimizers(states)
+        for name, scheduler in second.optimizers.schedulers.items():
+            scheduler.load_state_dict(first.optimizers.schedulers[name].state_dict())
+        second.run(at, TOTAL)
+        for name, p in whole.model.gauss_params.items():
+            assert torch.equal(p, second.model.gauss_params[name]), (at, name)
+
+
+def test_the_pixel_loss_is_squared_in_exploitation_only(ours: Any) -> None:
+    model = Training(ours, ours.splatfacto_opt3dgs).model
+    outputs = {"rgb": torch.full((4, 1), 0.5), "background": None}
+    for mask in ({}, {"mask": torch.tensor([[1.0], [1], [0], [0]])}):
+        batch = {"image": torch.zeros(4, 1), **mask}
+        size = 0.25 if mask else 0.5
+        model.step = 3
+        first = model.get_loss_dict(outputs, batch)["main_loss"]
+        assert float(first) == pytest.approx(0.1 * 0.8 * size)
+        model.phases.observe(0.1, iteration=TOTAL - 1)
+        model.step = TOTAL - 1
+        last = model.get_loss_dict(outputs, batch)["main_loss"]
+        assert float(last) == pytest.approx(0.8 * (0.1 * size + size / 2 - size))
+        model.phases.observe(0.1, iteration=3)
+    model.eval()
+    before = model.phases.num_observed
+    model.get_loss_dict(outputs, batch)
+    assert model.phases.num_observed == before
+
+
+def test_methods_keep_what_nerfstudio_set(ours: Any) -> None:
+    spec = ours.splatfacto_mcmc_opt3dgs
+    assert isinstance(spec, Spec)
+    assert spec.config.method_name == "splatfacto-mcmc-opt3dgs"
+    assert spec.config.pipeline.model.strategy == "mcmc"
+    assert spec.config.pipeline.model.total_steps == TOTAL
+    assert spec.config.optimizers["means"]["optimizer"].lr == 5e-3
+    assert spec.config.optimizers["means"]["optimizer"].eps == 1e-15
+    del sys.modules["nerfstudio.configs.method_configs"].method_configs["splatfacto-mcmc"]
+    assert "needs a nerfstudio" in ours.splatfacto_mcmc_opt3dgs  # 1.1.5: said, and skipped
+    with pytest.raises(AttributeError, match="nerfacto"):
+        _ = ours.nerfacto
+
+
+def test_parameters_of_another_model_are_refused(ours: Any) -> None:
+    with pytest.raises(ValueError, match=r"set pipeline\.model to Opt3DGSSplatfactoModelConfig"):
+        ours.Opt3DGSAdamOptimizerConfig(lr=1e-3).setup([Parameter(torch.zeros(3))])
+
+
+def test_without_nerfstudio_the_import_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "opt3dgs_optim.nerfstudio", raising=False)
+    monkeypatch.setitem(sys.modules, "nerfstudio.engine.optimizers", None)
+    with pytest.raises(ImportError, match="pip install nerfstudio"):
+        importlib.import_module("opt3dgs_optim.nerfstudio")
+
+
+def test_entry_points_are_registered() -> None:
+    found = importlib.metadata.entry_points(group="nerfstudio.method_configs")
+    ours = {e.name: e.value for e in found if e.value.startswith("opt3dgs_optim.")}
+    if not ours:
+        pytest.skip("opt3dgs_optim was installed before it had entry points: pip install -e .")
+    assert ours == {
+        "splatfacto-opt3dgs": "opt3dgs_optim.nerfstudio:splatfacto_opt3dgs",
+        "splatfacto-mcmc-opt3dgs": "opt3dgs_optim.nerfstudio:splatfacto_mcmc_opt3dgs",
+    }

@@ -1,0 +1,133 @@
+"""The test problems have the values, minima and gradients that the literature gives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from problems import (
+    MUELLER_BROWN_OTHERS,
+    MULTIMODAL,
+    SMOOTH,
+    Problem,
+    double_well,
+    gradient,
+    hessians,
+    kramers_rate,
+    mueller_brown,
+    nine_modes,
+    placed,
+    quadratic,
+    rotations,
+    to_world,
+)
+from torch import Tensor
+
+EVERY = [*SMOOTH, *MULTIMODAL]
+
+
+@pytest.mark.parametrize("problem", EVERY, ids=lambda p: p.name)
+def test_known_answers(problem: Problem) -> None:
+    start, minimum = problem.starts(1), problem.minima(1)
+    # the starts' values are printed with five or six digits
+    assert float(problem.value(start)) == pytest.approx(problem.start_value, rel=1e-5, abs=1e-9)
+    # the minima are printed with ten to thirteen; Brown's and Powell's slopes there are 1e6, 1e5
+    value = float(problem.value(minimum))
+    assert value == pytest.approx(problem.minimum_value, rel=1e-8, abs=1e-11)
+    if problem.name not in ("Ackley",):  # a cusp: no gradient at its minimum
+        slope = float(problem.gradient(minimum).abs().max())
+        assert slope < 1e-4 * max(1.0, float(problem.gradient(start).abs().max()))
+
+
+@pytest.mark.parametrize("problem", EVERY, ids=lambda p: p.name)
+def test_no_row_knows_another(problem: Problem) -> None:
+    generator = torch.Generator().manual_seed(0)
+    x = problem.starts(5) + 0.1 * torch.randn(5, problem.dim, generator=generator).double()
+    together = torch.cat([problem.value(x)[:, None], problem.gradient(x)], dim=1)
+    alone = [torch.cat([problem.value(r)[:, None], problem.gradient(r)], 1) for r in x.split(1)]
+    torch.testing.assert_close(together, torch.cat(alone), rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize("problem", EVERY, ids=lambda p: p.name)
+def test_gradients_are_the_differences(problem: Problem) -> None:
+    generator = torch.Generator().manual_seed(1)
+    x = problem.starts(1) + 0.05 * torch.rand(1, problem.dim, generator=generator).double()
+    found = problem.gradient(x)[0]
+    for axis in range(problem.dim):
+        h = torch.zeros(1, problem.dim, dtype=torch.float64)
+        h[0, axis] = 1e-6
+        difference = float(problem.value(x + h) - problem.value(x - h)) / 2e-6
+        # rounding of the values over 2 h, which for Brown's 1e12 is 1e-4 * 1e6
+        slack = 1e-9 * abs(problem.start_value) + 1e-5
+        assert float(found[axis]) == pytest.approx(difference, rel=1e-5, abs=slack)
+
+
+def hessian_of(value: Callable[[Tensor], Tensor], point: Tensor) -> Tensor:
+    found = torch.autograd.functional.hessian(lambda p: value(p[None])[0], point)
+    assert isinstance(found, Tensor)
+    return found
+
+
+def test_stationary_points_of_mueller_brown() -> None:
+    table = torch.tensor(MUELLER_BROWN_OTHERS, dtype=torch.float64)
+    points, values = table[:, :2], table[:, 2]
+    torch.testing.assert_close(mueller_brown(points), values, rtol=1e-6, atol=0)
+    # six printed digits at curvatures of about 1,000
+    assert float(gradient(mueller_brown, points).abs().max()) < 2e-3
+    signs = []
+    for point in points:
+        hessian = hessian_of(mueller_brown, point)
+        signs.append(int((torch.linalg.eigvalsh(hessian) < 0).sum()))
+    assert signs == [0, 0, 1, 1]
+
+
+def test_double_well_and_its_rate() -> None:
+    for barrier in (0.5, 3.0):
+        at = torch.tensor([[-1.0], [0.0], [1.0]], dtype=torch.float64)
+        assert double_well(at, barrier).tolist() == [0.0, barrier, 0.0]
+        curvatures = [
+            float(hessian_of(lambda x, h=barrier: double_well(x, h), point)) for point in at
+        ]
+        assert curvatures == pytest.approx([8 * barrier, -4 * barrier, 8 * barrier])
+    expected = math.sqrt(32) * 3 / (2 * math.pi) * math.exp(-3 / 0.5)
+    assert kramers_rate(3.0, 0.5) == pytest.approx(expected, rel=1e-12)
+
+
+def test_nine_modes_has_nine_minima() -> None:
+    axis = torch.linspace(-2.5, 2.5, 501, dtype=torch.float64)
+    grid = nine_modes(torch.cartesian_prod(axis, axis)).reshape(501, 501)
+    inner = grid[1:-1, 1:-1]
+    low = torch.ones_like(inner, dtype=torch.bool)
+    for i in range(3):
+        for j in range(3):
+            if (i, j) != (1, 1):
+                low &= inner < grid[i : i + 499, j : j + 499]
+    assert int(low.sum()) == 9
+    assert float(grid.max()) == pytest.approx(16.3333, abs=1e-4)
+
+
+def test_placed_rows_have_their_own_units_and_axes() -> None:
+    problem = SMOOTH[0]
+    scale = torch.tensor([1e-8, 1.0, 1e8], dtype=torch.float64)
+    turn = rotations(3, 2)
+    value = placed(problem, scale, turn)
+    start = to_world(problem.starts(3), scale, turn)
+    torch.testing.assert_close(value(start), problem.value(problem.starts(3)), rtol=1e-12, atol=0)
+    minimum = to_world(problem.minima(3), scale, turn)
+    assert float(value(minimum).max()) < 1e-25
+
+
+def test_quadratics_have_the_condition_asked_for() -> None:
+    for condition in (1.0, 1e3, 1e6):
+        hessian = hessians(20, condition)
+        eigenvalues = torch.linalg.eigvalsh(hessian)
+        found = eigenvalues[:, -1] / eigenvalues[:, 0]
+        # the smallest eigenvalue is known to eps * condition
+        torch.testing.assert_close(
+            found, torch.full_like(found, condition), rtol=1e-14 * condition + 1e-12, atol=0
+        )
+        x = torch.ones(20, 3, dtype=torch.float64)
+        expected = torch.einsum("nij,nj->ni", hessian, x)
+        torch.testing.assert_close(gradient(quadratic(hessian), x), expected)
