@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from bench_subjects import SUBJECTS, Case, gpu_only, kernel_bandwidth_share
+from bench_subjects import SUBJECTS, Case, gpu_only, history_bytes, kernel_bandwidth_share
 
 BASELINE = "six Adams + gsplat's noise"
 Rounds = dict[str, list[float]]
@@ -171,6 +171,7 @@ def main(arguments: list[str] | None = None) -> int:
         **machine(device),
         "repeats": options.repeats,
         "baseline": BASELINE,
+        "history_bytes_per_point": history_bytes(),
         "results": results,
         **extra,
     }

@@ -61,11 +61,11 @@ class Case:
             for name, param in splats.items()
         }
 
-    def history(self) -> tuple[Tensor, Tensor, Tensor]:
+    def history(self, pair_dtype: Any = "float32") -> tuple[Tensor, Tensor, Tensor]:
         """Position, gradient, and a history full of pairs."""
         s = torch.stack([self.draw(3) for _ in range(HISTORY_SIZE)])
         y = 2 * s + 0.3 * torch.stack([self.draw(3) for _ in range(HISTORY_SIZE)])
-        history = curvature.history_from_pairs(s, y)
+        history = curvature.history_from_pairs(s, y, pair_dtype=pair_dtype)
         return self.draw(3), self.draw(3), history
 
 
@@ -156,8 +156,8 @@ def noise_alone(case: Case) -> Callable[[], Any]:
     return add
 
 
-def curvature_alone(case: Case) -> Callable[[], Any]:
-    _, _, history = case.history()
+def curvature_alone(case: Case, pair_dtype: str = "float32") -> Callable[[], Any]:
+    _, _, history = case.history(pair_dtype)
     history = curvature.laid_out(history, contiguous=case.device.type == "cuda")
     # Gradients of one quadratic: every pair is accepted, so that every step stores one.
     positions = [case.draw(3) for _ in range(4)]
@@ -209,11 +209,21 @@ SUBJECTS: dict[str, Callable[[Case], Callable[[], Any]]] = {
     "exploitation step": lambda case: phased(case, exploit=True),
     "noise alone": noise_alone,
     "record + direction alone": curvature_alone,
+    "record + direction alone, half-size pairs": lambda case: curvature_alone(case, "bfloat16"),
     "two-loop, [N, 3] in and out": two_loop_rows,
     "two-loop on columns": lambda case: two_loop_columns(case, compiled=False),
     "two-loop on columns, compiled": lambda case: two_loop_columns(case, compiled=True),
     "copy of 144 bytes": copy_144,
 }
+
+
+def history_bytes() -> dict[str, int]:
+    """Bytes of curvature history per point, for each `pair_dtype`."""
+    point = torch.zeros(1, 3)
+    return {
+        name: curvature.new_history(point, HISTORY_SIZE, pair_dtype=name).nbytes
+        for name in curvature.PAIR_DTYPES
+    }
 
 
 def kernel_bandwidth_share(kernel: float, copy: float) -> float:

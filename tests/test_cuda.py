@@ -65,6 +65,24 @@ def test_single_step_in_float32(rows: int) -> None:
     assert relative_difference(result[0].cpu()[same], expected[0][same]) < 1e-5
 
 
+@pytest.mark.parametrize("size", [1, 3, 5, 8, 9, 16])
+@pytest.mark.parametrize("rows", [0, 1, 257, 1000])
+def test_half_size_pairs(rows: int, size: int) -> None:
+    """Storage differs at most where rounding is at a tie, and then the direction may."""
+    x, grad = Problem(rows).start.float(), Problem(rows, 1).start.float()
+    history = curvature.new_history(x, size, pair_dtype="bfloat16")
+    twin = history.cuda().contiguous()
+    for k in range(4):
+        options = {**OPTIONS, "min_cosine": 0.1}
+        moved, turned = x + 0.1 * k * grad, grad * (1 + k)
+        expected = curvature.step(moved, turned, history, size, **options)  # pyright: ignore
+        options["backend"] = "cuda"
+        result = ops.lqn_direction(moved.cuda(), turned.cuda(), twin, size, **options)  # pyright: ignore
+        same = (twin.cpu().view(torch.int32) == history.view(torch.int32)).all(1)
+        assert float((~same).float().sum()) <= 1e-2 * rows
+        assert relative_difference(result[0].cpu()[same], expected[0][same]) < 1e-5
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize("rows", ROWS)
 def test_noise(rows: int, dtype: torch.dtype) -> None:

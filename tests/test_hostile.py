@@ -38,6 +38,7 @@ def test_broken_rows_stand_still_and_the_others_do_not_notice(cls: Any, path: di
     generator = torch.Generator().manual_seed(1)
     touched = torch.zeros(ROWS, dtype=torch.bool)
     count = 0
+    broken, before = torch.zeros(0), (torch.zeros(0), {})
     for step in range(12):
         x.grad, y.grad = [2 * p.detach() + noise(ROWS, step) * 0.1 for p in (x, y)]
         if step % 3 == 1:

@@ -19,6 +19,7 @@ ARCHITECTURES = ("75", "80", "86", "89", "90", "100", "120")
 MAX_REGISTERS = 96
 # The short history in registers at both ends of its range, the long one that is read twice.
 SIZES = (1, 3, 4, 5, 6, 8, 16)
+PACKED_SIZES = (1, 5, 8, 9, 12, 16)
 
 
 class Compiled(NamedTuple):
@@ -28,10 +29,12 @@ class Compiled(NamedTuple):
     ptx: str
 
 
-def with_nvcc(name: str, arch: str, dtype: torch.dtype, size: int | None, folder: Path) -> Compiled:
+def with_nvcc(
+    name: str, arch: str, dtype: torch.dtype, size: int | None, folder: Path, packed: bool = False
+) -> Compiled:
     source = folder / "kernel.cu"
     source.write_text(cuda.source(name))
-    defines = [f"-D{key}={value}" for key, value in cuda.macros(dtype, size)]
+    defines = [f"-D{key}={value}" for key, value in cuda.macros(dtype, size, packed)]
     command = ["nvcc", "-std=c++17", *defines, str(source), "-o"]
     usage = subprocess.run(
         [*command, str(folder / "k.cubin"), "-cubin", f"-arch=sm_{arch}", "-Xptxas=-v"],
@@ -45,22 +48,26 @@ def with_nvcc(name: str, arch: str, dtype: torch.dtype, size: int | None, folder
 
 
 def with_nvrtc(
-    name: str, arch: str, dtype: torch.dtype, size: int | None, folder: Path
+    name: str,
+    arch: str,
+    dtype: torch.dtype,
+    size: int | None,
+    folder: Path,
+    packed: bool = False,
 ) -> Compiled:
     log = io.StringIO()
-    code = cuda.compile_cubin(
-        name, dtype, f"sm_{arch}", history_size=size, logs=log, ptxas_options=["-v"]
-    )
+    options = {"history_size": size, "packed": packed, "ptxas_options": ["-v"]}
+    code = cuda.compile_cubin(name, dtype, f"sm_{arch}", logs=log, **options)
     assert code.get_kernel is not None
-    return Compiled(log.getvalue(), nvrtc_ptx(name, arch, dtype, size))
+    return Compiled(log.getvalue(), nvrtc_ptx(name, arch, dtype, size, packed))
 
 
-def nvrtc_ptx(name: str, arch: str, dtype: torch.dtype, size: int | None) -> str:
+def nvrtc_ptx(name: str, arch: str, dtype: torch.dtype, size: int | None, packed: bool) -> str:
     """cuda.core asks the driver before it gives PTX; NVRTC itself does not."""
     from cuda.bindings import nvrtc  # pyright: ignore[reportMissingImports]
 
     options = ["-std=c++17", f"-arch=compute_{arch}"]
-    options += [f"-D{key}={value}" for key, value in cuda.macros(dtype, size)]
+    options += [f"-D{key}={value}" for key, value in cuda.macros(dtype, size, packed)]
     _, program = nvrtc.nvrtcCreateProgram(cuda.source(name).encode(), b"kernel.cu", 0, [], [])
     (error,) = nvrtc.nvrtcCompileProgram(program, len(options), [o.encode() for o in options])
     assert int(error) == 0
@@ -125,6 +132,15 @@ def test_float32_kernels(tool, arch: str, tmp_path: Path) -> None:
         compiled = tool("lqn.cu", arch, torch.float32, size, tmp_path)
         check(compiled, torch.float32, 2 * size)
     check(tool("noise.cu", arch, torch.float32, None, tmp_path), torch.float32, 1)
+
+
+@pytest.mark.parametrize("tool", TOOLS)
+@pytest.mark.parametrize("arch", ARCHITECTURES)
+def test_kernels_of_half_size_pairs(tool, arch: str, tmp_path: Path) -> None:
+    for size in PACKED_SIZES if tool is with_nvrtc else (5, 16):
+        compiled = tool("lqn.cu", arch, torch.float32, size, tmp_path, True)
+        # The header, and all pairs of a history that is kept in registers.
+        check(compiled, torch.float32, 2 + (-(-3 * size // 4) if size <= 8 else 0))
 
 
 @pytest.mark.parametrize("tool", TOOLS)

@@ -43,7 +43,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_wheel_holds_the_kernels(wheel: Path) -> None:
     assert wheel.name.endswith("py3-none-any.whl")
     names = zipfile.ZipFile(wheel).namelist()
-    for name in ("two_loop.cuh", "lqn.cu", "noise.cu", "__init__.py"):
+    for name in ("two_loop.cuh", "packed.cuh", "lqn.cu", "noise.cu", "__init__.py"):
         assert f"opt3dgs_optim/cuda/{name}" in names
 
 

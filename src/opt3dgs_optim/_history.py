@@ -35,7 +35,7 @@ from opt3dgs_optim._pairs import Pair
 MAX_HISTORY = 16
 
 PairDtype = Literal["float32", "bfloat16"]
-PAIR_DTYPES = ("float32", "bfloat16")
+PAIR_DTYPES: tuple[PairDtype, ...] = ("float32", "bfloat16")
 
 
 def num_slots(history_size: int, dim: int) -> int:

@@ -49,8 +49,8 @@ def compile_cubin(name: str, dtype: torch.dtype, arch: str, **options: Any) -> A
         name: a key of `KERNELS`.
         dtype: torch.float32 or torch.float64.
         arch: without one, cuda.core would ask the driver.
-        options: `history_size`; `packed`, for half-size pairs; `cache`, a cuda.core program cache; `logs`, an object with
-            `write`; `ptxas_options`.
+        options: `history_size`; `packed`, for half-size pairs; `cache`, a cuda.core program
+            cache; `logs`, an object with `write`; `ptxas_options`.
 
     Returns:
         cuda.core's ObjectCode.

@@ -69,17 +69,25 @@ template <int K> struct PackedHistory {
     store(row + 4, Lanes<float>{gradient, 0.0f});
     if (!accepted) return;
     const float newest[3] = {packed(pair.s.x, pair.y.x), packed(pair.s.y, pair.y.y), packed(pair.s.z, pair.y.z)};
+    if constexpr (kept) {
 #pragma unroll
-    for (int i = groups - 1; i >= 0; --i) {
-      if constexpr (!kept) read_again();
-      float four[4];
-#pragma unroll
-      for (int k = 3; k >= 0; --k) {  // lanes move by a pair, the last ones first
-        const int to = 4 * i + k;
-        four[k] = to < 3 ? newest[to < 3 ? to : 0] : to < 3 * K ? lane(to < 3 ? 0 : to - 3) : 0.0f;
-        if constexpr (kept) pairs[to] = four[k];
-      }
-      store(row + 8 + 4 * i, Lanes<float>{{four[0], four[1], four[2]}, four[3]});
+      for (int i = groups - 1; i >= 0; --i) move(i, newest);
+    } else {
+#pragma unroll 1
+      for (int i = groups - 1; i >= 0; --i) move(i, newest);
     }
+  }
+
+  // Four lanes move by a pair, the last ones first.
+  POINT void move(int i, const float (&newest)[3]) {
+    float four[4];
+#pragma unroll
+    for (int k = 3; k >= 0; --k) {
+      const int to = 4 * i + k;
+      four[k] = to < 3 ? (to == 0 ? newest[0] : to == 1 ? newest[1] : newest[2])
+                       : to < 3 * K ? lane(to < 3 ? 0 : to - 3) : 0.0f;
+      if constexpr (kept) pairs[to] = four[k];
+    }
+    store(row + 8 + 4 * i, Lanes<float>{{four[0], four[1], four[2]}, four[3]});
   }
 };
