@@ -64,7 +64,7 @@ def with_nvrtc(
 
 def nvrtc_ptx(name: str, arch: str, dtype: torch.dtype, size: int | None, packed: bool) -> str:
     """cuda.core asks the driver before it gives PTX; NVRTC itself does not."""
-    from cuda.bindings import nvrtc  # pyright: ignore[reportMissingImports]
+    from cuda.bindings import nvrtc  # pyright: ignore[reportMissingImports, reportAttributeAccessIssue]
 
     options = ["-std=c++17", f"-arch=compute_{arch}"]
     options += [f"-D{key}={value}" for key, value in cuda.macros(dtype, size, packed)]

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import copy
 import re
+import warnings
 from argparse import Namespace
 from typing import Any
 
 import pytest
 import torch
 from torch.optim.lr_scheduler import ExponentialLR
-from trainers import gsplat_optimizers, inria_optimizer, make_splats, train, view_loss
+from trainers import (
+    edit_rows,
+    gsplat_optimizers,
+    inria_optimizer,
+    make_splats,
+    train,
+    view_loss,
+)
 
 from opt3dgs_optim import PhaseScheduler
 from opt3dgs_optim._mistakes import FROZEN_STEPS
@@ -130,3 +138,31 @@ def test_an_unknown_slot() -> None:
     optimizer = gsplat_optimizers(make_splats())["means"]
     with pytest.raises(ValueError, match="name='pose'"):
         PhaseScheduler(10).upgrade_slot("pose", optimizer)
+
+
+@pytest.mark.parametrize("host_adds_noise", [True, False])
+def test_noise_of_a_trainer_that_nobody_told_us_of(host_adds_noise: bool) -> None:
+    """The trainer writes noise into the positions after every step, as ours does."""
+    splats = make_splats()
+    phases = PhaseScheduler(60, multiplier=None, noise_scale=1.0)
+    upgraded = phases.upgrade(gsplat_optimizers(splats), splats)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        for iteration in range(20):
+            train(splats, upgraded, phases, iteration, iteration + 1)
+            if host_adds_noise:
+                with torch.no_grad():
+                    splats["means"].add_(0.01 * torch.randn(splats["means"].shape))
+            if iteration % 7 == 0:
+                edit_rows(splats, upgraded, torch.arange(len(splats["means"])), 1)
+    said = [str(warning.message) for warning in told if "noise_lr to 0" in str(warning.message)]
+    assert len(said) == host_adds_noise
+
+
+def test_a_trainers_noise_is_fine_where_ours_is_off() -> None:
+    splats, phases = make_splats(), PhaseScheduler(60, multiplier=None)
+    upgraded = phases.upgrade(gsplat_optimizers(splats))
+    for iteration in range(10):
+        train(splats, upgraded, phases, iteration, iteration + 1)
+        with torch.no_grad():
+            splats["means"].add_(0.01)

@@ -81,6 +81,9 @@ class HookedAdam(RowwiseAdam):
     def _begin_step(self, loss: Any) -> None:
         """Called once per step, with the closure's value or None."""
 
+    def _end_step(self) -> None:
+        """Called once per step that was not dropped, after all groups."""
+
     def _bad_step(self) -> Tensor | None:
         """0-d bool: drop this step (a non-finite loss); None where nobody can tell."""
         return None
@@ -145,6 +148,7 @@ class HookedAdam(RowwiseAdam):
                     self._step_rows(group, mask, bad)
                 else:
                     self._step_group(group, bad)
+            self._end_step()
         return loss
 
     # -- all rows ----------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.optim import Adam, Optimizer
 
 CALL = "PhaseScheduler"
+NOISE_STEPS = 5  # steps in a row with positions changed by somebody else before it is said
 FROZEN_STEPS = 20  # exploitation steps without a gradient of the positions before it is said
 
 
@@ -110,5 +111,36 @@ class FrozenWatch:
                 f"{CALL}: exploitation has begun but the positions are frozen ({why}), so it "
                 "changes nothing; move the switch to before the Gaussians are frozen, "
                 f"{CALL}(switch=...), or leave them trainable",
+                stacklevel=5,
+            )
+
+
+class NoiseTwiceWatch:
+    """Says once that somebody else moves the positions too, as a trainer's own noise does."""
+
+    def __init__(self) -> None:
+        self._left: tuple[weakref.ref[Tensor], int] | None = None
+        self._moved = 0
+
+    def leave(self, positions: Tensor) -> None:
+        """Call after a step of ours: remember the tensor and how often it was written to."""
+        self._left = (weakref.ref(positions), positions._version)
+
+    def check(self, positions: Tensor) -> None:
+        """Call before a step of ours that adds noise.
+
+        Density control puts another Parameter in place; noise writes into this one, after every
+        step. A clamp now and then is not noise, hence several steps in a row.
+        """
+        if self._left is None or self._moved > NOISE_STEPS:
+            return
+        same = self._left[0]() is positions
+        written = same and positions._version != self._left[1]
+        self._moved = self._moved + 1 if written else 0
+        if self._moved > NOISE_STEPS:
+            warnings.warn(
+                f"{CALL}: the positions were changed in place between {NOISE_STEPS} steps in a "
+                "row, while noise_scale > 0 adds position noise in every step; if the trainer "
+                "injects its own noise, set its noise_lr to 0, or leave noise_scale at 0",
                 stacklevel=5,
             )

@@ -13,7 +13,7 @@ from torch.optim import Adam, Optimizer
 from opt3dgs_optim._adam import STATE_KEY, HookedAdam, fused_on_cuda
 from opt3dgs_optim._checkpoint import check_keys
 from opt3dgs_optim._groups import canonical_name, is_positions
-from opt3dgs_optim._mistakes import FrozenWatch, Replaced, has_own_mask
+from opt3dgs_optim._mistakes import FrozenWatch, NoiseTwiceWatch, Replaced, has_own_mask
 from opt3dgs_optim._visible import ROW_STEPS
 from opt3dgs_optim.awsgld import EnergyWatch
 from opt3dgs_optim.lqnadam import LQNAdam
@@ -43,6 +43,7 @@ class PhasedAdam(LQNAdam):
 
     _own = (*LQNAdam._own, "scheduler", "switched", "_energy_watch", "_frozen_watch")
     _replaced: Replaced | None = None
+    _noise_watch: NoiseTwiceWatch | None = None  # a copy starts to watch anew
 
     def __init__(self, optimizer: Adam, scheduler: PhaseScheduler) -> None:
         defaults = {key: optimizer.defaults[key] for key in CONSTRUCTOR_OPTIONS}
@@ -100,10 +101,21 @@ class PhasedAdam(LQNAdam):
             self.switched = True
             if self.scheduler.reset_moments:
                 self._reset_moments()
-        if self.switched:
-            positions = [p for g in self.param_groups if is_positions(g) for p in g["params"]]
-            if positions:
-                self._frozen_watch.check(positions)
+        positions = self._positions()
+        if self.switched and positions:
+            self._frozen_watch.check(positions)
+        if self._noise_watch is not None and positions:
+            self._noise_watch.check(positions[0])
+
+    def _end_step(self) -> None:
+        positions = self._positions()
+        if self.scheduler.noise is not None and positions:
+            if self._noise_watch is None:
+                self._noise_watch = NoiseTwiceWatch()
+            self._noise_watch.leave(positions[0])
+
+    def _positions(self) -> list[Tensor]:
+        return [p for g in self.param_groups if is_positions(g) for p in g["params"]]
 
     def _reset_moments(self) -> None:
         """Loss and direction change scale at the switch: old second moments would stall it."""
