@@ -98,7 +98,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ]
         _refuse_other_options(trainings, args, scene.name)
         command = recorded_command("error_vs_time.py", parser, args)
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        for kind in (signal.SIGINT, signal.SIGTERM):  # a shell's background job ignores the first
+            signal.signal(kind, signal.default_int_handler)
         _train_all(trainings, args, command)
     except (OSError, ValueError) as error:
         print(f"error_vs_time: {error}", file=sys.stderr)
