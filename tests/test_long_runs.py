@@ -28,6 +28,11 @@ def launch(folder: Path, steps: int) -> subprocess.Popen[bytes]:
     return subprocess.Popen([*command, "--every", str(max(20, steps // 500))])
 
 
+def written(path: Path) -> int:
+    """When a file was last replaced, or 0 where there is none."""
+    return path.stat().st_mtime_ns if path.exists() else 0
+
+
 def memory(folder: Path) -> list[list[int]]:
     """[iteration, resident bytes, tensor bytes] of every tenth of a run."""
     lines = (folder / "memory.txt").read_text().splitlines()
@@ -40,18 +45,17 @@ def test_killed_and_resumed_it_ends_bit_for_bit_where_it_would(
 ) -> None:
     """SIGKILL, which no handler sees, at random points, also while a checkpoint is written."""
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    begin = time.perf_counter()
     assert launch(whole, steps).wait() == 0
-    seconds = time.perf_counter() - begin
-    chance = random.Random(0)
-    stopped = 0
+    chance, checkpoint, stopped = random.Random(0), killed / "checkpoint.pt", 0
     for _ in range(kills):
+        before = written(checkpoint)
         process = launch(killed, steps)
-        try:
-            process.wait(timeout=chance.uniform(0.5, 1.0) * seconds / (1 + (kills > 5) * 10))
-        except subprocess.TimeoutExpired:
-            process.send_signal(signal.SIGKILL)
-            stopped += process.wait() == -signal.SIGKILL
+        # How long a process takes to start says nothing: wait for a checkpoint of its own.
+        while process.poll() is None and written(checkpoint) == before:
+            time.sleep(0.001)
+        time.sleep(chance.uniform(0.0, 0.03))
+        process.send_signal(signal.SIGKILL)
+        stopped += process.wait() == -signal.SIGKILL
     assert stopped > 0
     assert launch(killed, steps).wait() == 0
     ends = [torch.load(f / "checkpoint.pt", weights_only=True) for f in (whole, killed)]
