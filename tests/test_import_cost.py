@@ -44,7 +44,7 @@ def measure() -> dict:
 
 
 def test_import_costs_less_than_50_ms_beyond_torch() -> None:
-    runs = [measure() for _ in range(3)]
+    runs = [measure() for _ in range(7)]
     assert min(run["seconds"] for run in runs) < 0.05, runs
     assert statistics.median(run["seconds"] for run in runs) < 0.15  # a busy machine
 
