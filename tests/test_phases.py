@@ -328,6 +328,7 @@ def test_noise_can_stop_at_the_switch() -> None:
     assert phases.noise is not None
     train(splats, upgraded, phases, SWITCH, SWITCH + 1)
     assert phases.noise is None
+    train(splats, upgraded, phases, SWITCH + 1, TOTAL)  # our own steps are nobody else's noise
 
 
 def test_accepted_share_is_reported() -> None:

@@ -101,15 +101,18 @@ class PhasedAdam(LQNAdam):
             self.switched = True
             if self.scheduler.reset_moments:
                 self._reset_moments()
-        positions = self._positions()
+        adds_noise = self.scheduler.noise is not None
+        positions = self._positions() if self.switched or adds_noise else []
         if self.switched and positions:
             self._frozen_watch.check(positions)
-        if self._noise_watch is not None and positions:
+        if adds_noise and positions and self._noise_watch is not None:
             self._noise_watch.check(positions[0])
 
     def _end_step(self) -> None:
+        if self.scheduler.noise is None:
+            return
         positions = self._positions()
-        if self.scheduler.noise is not None and positions:
+        if positions:
             if self._noise_watch is None:
                 self._noise_watch = NoiseTwiceWatch()
             self._noise_watch.leave(positions[0])
