@@ -61,7 +61,8 @@ def _opt3dgs(iterations: int, switch: float, _nu: float | None) -> PhaseSchedule
     return PhaseScheduler(iterations, switch, noise_scale=NOISE_LR)
 
 
-def _paper(iterations: int, switch: float, _nu: float | None) -> PhaseScheduler:
+def paper_scheduler(iterations: int, switch: float, _nu: float | None) -> PhaseScheduler:
+    """Everything on, with the paper's settings."""
     histogram = EnergyHistogram.paper(warmup=round(iterations * PAPER_WARMUP))
     return PhaseScheduler.paper(
         iterations, switch=switch, multiplier=histogram, noise_scale=NOISE_LR
@@ -90,7 +91,7 @@ _ARMS = (
         make=_scheduler(squared_loss=True, reset_moments=True, curvature=CurvatureOptions()),
     ),
     Arm("opt3dgs", "everything, the package's defaults", make=_opt3dgs),
-    Arm("opt3dgs-paper", "everything, the paper's settings", make=_paper),
+    Arm("opt3dgs-paper", "everything, the paper's settings", make=paper_scheduler),
 )
 ARMS = {arm.name: arm for arm in _ARMS}
 

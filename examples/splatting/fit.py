@@ -129,13 +129,11 @@ class Fit:
         pixel_loss = None if self.phases is None else self.phases.pixel_loss
         loss = photometric_loss(image, view.image, pixel_loss)
         if self.arm.mcmc:
-            loss = loss + regularisers(self.gaussians)
+            loss = loss + self._regularisers()
         loss.backward()
         if self.phases is not None:
             self.phases.observe(loss, view=index)
-        for optimizer in self.optimizers.values():
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
+        self._step_optimizers()
         self._inject_noise()
         if self.density is not None:
             self.density.step(self.iteration, self.gaussians, self.optimizers)
@@ -143,6 +141,14 @@ class Fit:
         decay = LR_DECAY ** (self.iteration / self.options.iterations)
         self.optimizers["means"].param_groups[0]["lr"] = self.rates["means"] * decay
         return loss.detach()
+
+    def _regularisers(self) -> Tensor:
+        return regularisers(self.gaussians)
+
+    def _step_optimizers(self) -> None:
+        for optimizer in self.optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
 
     @torch.no_grad()
     def _inject_noise(self) -> None:
@@ -218,10 +224,16 @@ class Fit:
         torch.save(state, partial)
         os.replace(partial, path)
 
-    def load(self, path: Path) -> None:
-        """Go on from a checkpoint; ValueError if it is of another scene, arm or options."""
+    def load(self, path: Path, trunk: str | None = None) -> None:
+        """Go on from a checkpoint; ValueError if it is of another scene, arm or options.
+
+        Args:
+            path: the file.
+            trunk: the arm that it is of, where this run branches off another arm's.
+        """
         state = torch.load(path, weights_only=True)
-        mine = (self.scene.name, self.arm.name, asdict(self.options), CHECKPOINT_FORMAT)
+        arm = trunk or self.arm.name
+        mine = (self.scene.name, arm, asdict(self.options), CHECKPOINT_FORMAT)
         its = (state["scene"], state["arm"], state["options"], state["format"])
         if mine != its:
             raise ValueError(
@@ -236,6 +248,9 @@ class Fit:
         torch.set_rng_state(state["random"][0])
         self.order.set_state(state["random"][1])
         self.density_draws.set_state(state["random"][2])
+        if trunk is not None and self.phases is not None:
+            done = {"iteration": self.iteration, "num_observed": self.iteration}
+            self.phases.load_state_dict({**done, "multiplier": None})
 
 
 def run(

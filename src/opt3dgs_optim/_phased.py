@@ -14,6 +14,13 @@ from opt3dgs_optim._adam import STATE_KEY, HookedAdam, fused_on_cuda
 from opt3dgs_optim._checkpoint import check_keys
 from opt3dgs_optim._groups import canonical_name, is_positions
 from opt3dgs_optim._mistakes import FrozenWatch, NoiseTwiceWatch, Replaced, has_own_mask
+from opt3dgs_optim._repr import (
+    block,
+    curvature_line,
+    group_lines,
+    scheduler_lines,
+    skipped_lines,
+)
 from opt3dgs_optim._visible import ROW_STEPS
 from opt3dgs_optim.awsgld import EnergyWatch
 from opt3dgs_optim.lqnadam import LQNAdam
@@ -101,6 +108,7 @@ class PhasedAdam(LQNAdam):
             self.switched = True
             if self.scheduler.reset_moments:
                 self._reset_moments()
+        self._fade()
         adds_noise = self.scheduler.noise is not None
         positions = self._positions() if self.switched or adds_noise else []
         if self.switched and positions:
@@ -128,14 +136,33 @@ class PhasedAdam(LQNAdam):
                 if key in state:
                     state[key].zero_()
 
+    def _fade(self) -> None:
+        """The fading events since the last iteration, in the Gaussian parameters only."""
+        fading, scheduler = self.scheduler.fading, self.scheduler
+        if fading is None or scheduler.num_observed == 0:
+            return
+        now, total = scheduler.iteration, scheduler.total_steps
+        events = range(fading.events_before(now - 1, total), fading.events_before(now, total))
+        if events:
+            groups = [g for g in self.param_groups if self._is_points(g)]
+            fading.fade(
+                {p: self.state[p] for g in groups for p in g["params"] if p in self.state}, events
+            )
+
     def _bad_step(self) -> Tensor | None:
         return ~self.scheduler.last_finite if self.scheduler.num_observed else None
 
-    def _factor(self, group: dict[str, Any]) -> Tensor | None:
-        multiplier = self.scheduler.multiplier
-        if multiplier is None or self.scheduler.exploiting or self.scheduler.num_observed == 0:
+    def _factor(self, group: dict[str, Any]) -> Tensor | float | None:
+        """Annealing over the whole run, times nu while exploring."""
+        scheduler = self.scheduler
+        if canonical_name(group.get("name")) is None or scheduler.num_observed == 0:
             return None
-        return multiplier.multiplier if canonical_name(group.get("name")) else None
+        factor = scheduler.annealing_factor(group.get("name"))
+        multiplier = scheduler.multiplier
+        if multiplier is None or scheduler.exploiting:
+            return factor
+        nu = multiplier.multiplier
+        return nu if factor is None else nu * factor
 
     def _uses_curvature(self, group: Mapping[str, Any]) -> bool:
         scheduler = self.scheduler
@@ -145,6 +172,13 @@ class PhasedAdam(LQNAdam):
         noise = self.scheduler.noise
         if noise is not None and is_positions(group):
             self._add_noise(noise, group, params)
+
+    def __repr__(self) -> str:
+        lines = scheduler_lines(self.scheduler)
+        if self._positions() and self.scheduler.curvature:
+            lines.append(curvature_line(self.curvature_options, self.accepted_share))
+        lines += skipped_lines(self.skipped_rows) + group_lines(self.param_groups)
+        return block(type(self).__name__, lines)
 
     # -- checkpoints -------------------------------------------------------------------------
 

@@ -14,8 +14,11 @@ from torch.optim import Optimizer
 from opt3dgs_optim._checkpoint import check_keys, check_whole
 from opt3dgs_optim._checks import check_count, check_flag, check_number, check_part
 from opt3dgs_optim._ranks import RankMean
+from opt3dgs_optim._repr import block, curvature_line, scheduler_lines
 from opt3dgs_optim._upgrading import Upgrading
+from opt3dgs_optim.annealing import Annealing
 from opt3dgs_optim.energy import EnergyHistogram
+from opt3dgs_optim.fading import Fading
 from opt3dgs_optim.lqnadam import CurvatureOptions
 from opt3dgs_optim.multiplier import ConstantMultiplier
 from opt3dgs_optim.noise import CovarianceNoise
@@ -60,6 +63,9 @@ class PhaseScheduler(Upgrading):
         noise_scale: noise_lr of 3DGS-MCMC's position noise. 0 (the default) where the trainer
             injects it itself, as gsplat's MCMCStrategy and 3dgs-mcmc do; never both.
         noise_in_exploitation: whether that noise stays on after the switch.
+        annealing: `Annealing(...)` for steps that start longer and end shorter than the trainer's
+            learning rates alone would have them, in all phases; or None, for off.
+        fading: `Fading(...)` for shrinking Adam's moments of random points, or None, for off.
         log: a `RunLog` that gets one line per `observe`.
         process_group: a `torch.distributed` process group over whose ranks the energy is averaged,
             so that nu is the same on all; every rank must call `observe` as often. A loss that is
@@ -108,6 +114,8 @@ class PhaseScheduler(Upgrading):
         reset_moments: bool | Literal["auto"] = "auto",
         noise_scale: float = 0.0,
         noise_in_exploitation: bool = True,
+        annealing: Annealing | None = None,
+        fading: Fading | None = None,
         log: RunLog | None = None,
         process_group: Any = None,
     ) -> None:
@@ -124,6 +132,8 @@ class PhaseScheduler(Upgrading):
         self.noise_in_exploitation = check_flag(
             CALL, "noise_in_exploitation", noise_in_exploitation
         )
+        self.annealing = check_part(CALL, "annealing", annealing, "Annealing(...)", "factor")
+        self.fading = check_part(CALL, "fading", fading, "Fading(...)", "fade")
         self.log = check_part(CALL, "log", log, "a RunLog", "step")
         self._over_ranks = None if process_group is None else RankMean(CALL, process_group)
         self._overrun = False
@@ -176,6 +186,12 @@ class PhaseScheduler(Upgrading):
     def exploiting(self) -> bool:
         """Whether the iteration observed last, whose step comes next, is exploitation."""
         return self._phase_of(self._current) is Phase.EXPLOITATION
+
+    def annealing_factor(self, name: str | None) -> float | None:
+        """The factor on the next step of a parameter of that name; None where annealing is off."""
+        if self.annealing is None:
+            return None
+        return self.annealing.factor(name, max(self._current, 0) / self.total_steps)
 
     @property
     def noise(self) -> CovarianceNoise | None:
@@ -293,12 +309,13 @@ class PhaseScheduler(Upgrading):
         self.num_observed = num_observed
 
     def __repr__(self) -> str:
-        return (
-            f"{CALL}(iteration={self.iteration}, total_steps={self.total_steps}, "
-            f"phase={self.phase.value}, switch_step={self.switch_step}, "
-            f"multiplier={self.multiplier!r}, "
-            f"curvature={self.curvature_options if self.curvature else None!r})"
-        )
+        lines = [f"total_steps={self.total_steps}, switch_step={self.switch_step}"]
+        lines += scheduler_lines(self)
+        if self.curvature:
+            lines.append(curvature_line(self.curvature_options, self.accepted_share))
+        else:
+            lines.append("curvature=None")
+        return block(CALL, lines)
 
 
 def _switch_step(switch: float | int, total_steps: int) -> int:

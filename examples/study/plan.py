@@ -1,0 +1,112 @@
+"""What the study trains, in the order in which it matters most."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from study.arms import STUDY_ARMS, core, histograms, last_phases, leads, on_top
+from study.training import Spec
+
+SCENES = ("plush", "banana", "lund_door", "brighton_beach", "embedded")
+QUICK_SCENES = ("banana", "embedded")  # for the options of a part
+POINTS = 4_000
+EMBEDDED_POINTS = 2_000
+FIRST_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "annealed-8-0.4", "faded")
+
+
+@dataclass(frozen=True)
+class Training:
+    """A training of the plan and where it lives."""
+
+    spec: Spec
+    folder: Path
+    needs: tuple[Path, ...] = field(default=())  # folders of trainings that come first
+    trunk: Path | None = None
+    nu_from: Path | None = None
+
+
+def stages(seeds: int = 3) -> dict[str, list[tuple[str, str, int, int, int, str]]]:
+    """(scene, arm, seed, iterations, points, init) of every stage."""
+    parts = [arm.name for arm in core()]
+    later = [name for name in parts if name not in FIRST_ARMS]
+    tails = [arm.name for arm in (*last_phases(), *on_top())]
+    options = [arm.name for arm in histograms()]
+    beyond = [arm.name for arm in leads()]
+
+    def cross(
+        scenes: Sequence[str],
+        arms: Sequence[str],
+        count: int,
+        iterations: int,
+        share: float = 1.0,
+        init: str = "sfm",
+    ) -> list[tuple[str, str, int, int, int, str]]:
+        return [
+            (scene, arm, seed, iterations, round(points_of(scene) * share), init)
+            for seed in range(count)
+            for scene in scenes
+            for arm in arms
+        ]
+
+    two = ["mcmc", "annealed-8-0.4"]
+    return {
+        "core": cross(SCENES, FIRST_ARMS, seeds, 3_000),
+        "long": cross(SCENES, two, 2, 7_500),
+        "core-more": cross(SCENES, later, seeds, 3_000),
+        "tails": cross(SCENES, tails, seeds, 3_000),
+        "leads": cross(QUICK_SCENES, beyond, seeds, 3_000),
+        "options": cross(QUICK_SCENES, options, seeds, 3_000),
+        "random": cross(SCENES, two, seeds, 3_000, init="random"),
+        "small": cross(SCENES, two, seeds, 3_000, share=0.25),
+        "full": cross(SCENES, two, 1, 30_000),
+        "long-more": cross(SCENES, [*two, "faded"], seeds, 7_500),
+    }
+
+
+def points_of(scene: str) -> int:
+    """The most Gaussians of a scene."""
+    return EMBEDDED_POINTS if scene == "embedded" else POINTS
+
+
+def plan(root: Path, out: Path, only: list[str] | None = None, seeds: int = 3) -> list[Training]:
+    """The trainings of the named stages, or of all.
+
+    Args:
+        root: folder that holds the scenes' folders.
+        out: folder for the trainings.
+    """
+    chosen = stages(seeds)
+    unknown = set(only or ()) - set(chosen)
+    if unknown:
+        raise ValueError(f"--stages {sorted(unknown)}: unknown; there are {', '.join(chosen)}")
+    trainings: dict[Path, Training] = {}
+    for stage in only or list(chosen):
+        for scene, arm, seed, iterations, points, init in chosen[stage]:
+            source = scene if scene == "embedded" else str(root / scene)
+            spec = Spec(source, arm, seed, iterations, points, init)
+            for training in _with_needs(spec, out):
+                trainings.setdefault(training.folder, training)
+    return list(trainings.values())
+
+
+def _with_needs(spec: Spec, out: Path) -> list[Training]:
+    arm = STUDY_ARMS[spec.arm]
+    needed: list[Training] = []
+    folders: dict[str, Path | None] = {"trunk": None, "nu": None}
+    for key, name in (("trunk", arm.trunk), ("nu", arm.needs)):
+        if name is not None:
+            other = Spec(**{**vars(spec), "arm": name})
+            needed += _with_needs(other, out)
+            folders[key] = folder_of(other, out)
+    first = tuple(folder for folder in folders.values() if folder is not None)
+    own = Training(spec, folder_of(spec, out), first, folders["trunk"], folders["nu"])
+    return [*needed, own]
+
+
+def folder_of(spec: Spec, out: Path) -> Path:
+    """Where a training lives."""
+    kind = f"{spec.points}-{spec.iterations}-{spec.init}"
+    arm = spec.arm.replace("/", "_")
+    return out / Path(spec.scene).name / kind / arm / f"seed-{spec.seed}"

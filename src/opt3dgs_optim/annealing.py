@@ -1,0 +1,66 @@
+"""Annealing: all learning rates start above the trainer's own and end below them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from opt3dgs_optim._checks import check_number
+from opt3dgs_optim._groups import GAUSSIAN_NAMES, canonical_name
+
+CALL = "Annealing"
+
+
+@dataclass(frozen=True)
+class Annealing:
+    """Multiply the step of every Gaussian parameter by a factor that falls geometrically.
+
+        factor(t) = peak^(1 - t) * final^t,    t = iteration / total_steps in 0..1
+
+    3DGS lets the positions' learning rate decay to 1 % and keeps the others constant: too small
+    to get far in the first iterations, too large to settle in the last. The factor comes on top
+    of the trainer's own schedule; the learning rates in `param_groups`, which 3DGS-MCMC's noise is
+    proportional to, stay as they are. It costs no memory.
+
+    Args:
+        peak: factor at the first iteration, above 0: a number for all parameters, or a dict by
+            parameter (gsplat's or INRIA's names; those left out are not annealed).
+        final: factor at the last iteration, above 0.
+
+    Raises:
+        ValueError: an option is outside what is allowed.
+    """
+
+    peak: float | Mapping[str, float] = 8.0
+    final: float = 0.4
+
+    def __post_init__(self) -> None:
+        check_number(CALL, "final", self.final, 0.0, open_low=True)
+        if not isinstance(self.peak, Mapping):
+            check_number(CALL, "peak", self.peak, 0.0, open_low=True)
+            return
+        peaks: dict[str, float] = {}
+        for name, value in self.peak.items():
+            known = canonical_name(name)
+            if known is None:
+                raise ValueError(
+                    f"{CALL}: peak has {name!r}, which is no Gaussian parameter's name; allowed "
+                    f"are {', '.join(GAUSSIAN_NAMES)}"
+                )
+            peaks[known] = check_number(CALL, f"peak[{name!r}]", value, 0.0, open_low=True)
+        object.__setattr__(self, "peak", MappingProxyType(peaks))
+
+    def factor(self, name: str | None, progress: float) -> float:
+        """The factor on a parameter's step.
+
+        Args:
+            name: its name, gsplat's or INRIA's; 1 where it is no Gaussian parameter.
+            progress: share of the run that is over; taken as 0..1.
+        """
+        known = canonical_name(name)
+        peak = self.peak.get(known or "") if isinstance(self.peak, Mapping) else self.peak
+        if known is None or peak is None:
+            return 1.0
+        t = min(max(progress, 0.0), 1.0)
+        return peak ** (1.0 - t) * self.final**t
