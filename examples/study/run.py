@@ -22,10 +22,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from tqdm import tqdm
 
+from study.arms import STUDY_ARMS
 from study.plan import Training, plan
 
 POLL_SECONDS = 0.2
-BRANCH_FILES = "at-*.pt"
 
 
 def finished(folder: Path) -> dict[str, object] | None:
@@ -64,34 +64,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _train_all(trainings: list[Training], jobs: int) -> list[Path]:
     done = {t.folder for t in trainings if finished(t.folder)}
-    waiting = [t for t in trainings if t.folder not in done]
-    running: dict[Path, subprocess.Popen[bytes]] = {}
+    waiting = _batches([t for t in trainings if t.folder not in done])
+    running: dict[Path, tuple[list[Training], subprocess.Popen[bytes]]] = {}
     failed: list[Path] = []
-    total = sum(t.spec.iterations for t in waiting)
-    bar = tqdm(total=total, unit="it", desc=f"{len(waiting)} trainings", smoothing=0.02)
-    length = {t.folder: t.spec.iterations for t in trainings}
+    total = sum(_iterations(t) for batch in waiting for t in batch)
+    count = sum(map(len, waiting))
+    bar = tqdm(total=total, unit="it", desc=f"{count} trainings", smoothing=0.02)
     try:
         while waiting or running:
-            ready = [t for t in waiting if all(n in done for n in t.needs)]
-            for training in ready[: max(jobs - len(running), 0)]:
-                waiting.remove(training)
-                running[training.folder] = _start(training)
-            if not running and not ready:  # what they need has failed
-                failed += [t.folder for t in waiting]
+            ready = [b for b in waiting if all(n in done for t in b for n in t.needs)]
+            for batch in ready[: max(jobs - len(running), 0)]:
+                waiting.remove(batch)
+                running[batch[0].folder] = (batch, _start(batch))
+            if not running:  # what the others need has failed
+                failed += [t.folder for batch in waiting for t in batch]
                 break
             time.sleep(POLL_SECONDS)
-            for folder, process in list(running.items()):
-                code = process.poll()
-                if code is None:
+            for folder, (batch, process) in list(running.items()):
+                if process.poll() is None:
                     continue
                 del running[folder]
-                bar.update(length[folder])
-                if code == 0:
-                    done.add(folder)
-                else:
-                    failed.append(folder)
+                bar.update(sum(map(_iterations, batch)))
+                done |= {t.folder for t in batch if finished(t.folder)}
+                failed += [t.folder for t in batch if t.folder not in done]
     except BaseException:
-        for process in running.values():
+        for _, process in running.values():
             process.terminate()
         raise
     finally:
@@ -99,7 +96,35 @@ def _train_all(trainings: list[Training], jobs: int) -> list[Path]:
     return failed
 
 
-def _start(training: Training) -> subprocess.Popen[bytes]:
+def _iterations(training: Training) -> int:
+    """What a training costs: a branch runs from its switch on."""
+    arm, total = STUDY_ARMS[training.spec.arm], training.spec.iterations
+    return total if arm.trunk is None else total - round(arm.switch * total)
+
+
+def _batches(trainings: list[Training]) -> list[list[Training]]:
+    """Branches of one trunk share a process, since starting one costs as much as they do."""
+    batches: dict[Path, list[Training]] = {}
+    for training in trainings:
+        batches.setdefault(training.trunk or training.folder, []).append(training)
+    # A trunk's own training is not among its branches: it comes first.
+    apart = []
+    for key, batch in batches.items():
+        own = [t for t in batch if t.folder == key]
+        branches = [t for t in batch if t.folder != key]
+        apart += [group for group in (own, branches) if group]
+    return apart
+
+
+def _start(batch: list[Training]) -> subprocess.Popen[bytes]:
+    calls = [str(_write_call(training)) for training in batch]
+    words = [sys.executable, str(Path(__file__).with_name("training.py")), *calls]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    with (batch[0].folder / "error.txt").open("wb") as errors:
+        return subprocess.Popen(words, env=environment, stderr=errors, start_new_session=True)
+
+
+def _write_call(training: Training) -> Path:
     training.folder.mkdir(parents=True, exist_ok=True)
     nu = None
     if training.nu_from is not None:
@@ -114,10 +139,7 @@ def _start(training: Training) -> subprocess.Popen[bytes]:
     }
     path = training.folder / "call.json"
     path.write_text(json.dumps(call), encoding="utf-8")
-    words = [sys.executable, str(Path(__file__).with_name("training.py")), str(path)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-    with (training.folder / "error.txt").open("wb") as errors:
-        return subprocess.Popen(words, env=environment, stderr=errors, start_new_session=True)
+    return path
 
 
 if __name__ == "__main__":

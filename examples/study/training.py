@@ -1,4 +1,4 @@
-"""One training of the study: python examples/study/training.py SPEC.json (made by run.py).
+"""Trainings of the study: python examples/study/training.py CALL.json... (made by run.py).
 
 Writes `record.json` (the curve and what the training was), a checkpoint at every evaluation, and
 the last renders of the test views. A second start goes on from the checkpoint.
@@ -12,6 +12,7 @@ import resource
 import sys
 import time
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 import torch
 from splatting.fit import FitOptions
-from splatting.scenes import load_scene
+from splatting.scenes import Scene, load_scene
 
 from study.arms import find_study_arm
 from study.fitting import StudyFit
@@ -49,7 +50,7 @@ class Spec:
 def train(spec: Spec, folder: Path, trunk: Path | None, mean_nu: float | None) -> dict[str, Any]:
     """Train to the end; return the record that is also in `folder/record.json`."""
     torch.set_num_threads(1)
-    scene, arm = load_scene(spec.scene), find_study_arm(spec.arm)
+    scene, arm = _scene(spec.scene), find_study_arm(spec.arm)
     fit = StudyFit(scene, arm, spec.options(), mean_nu)
     checkpoint, path = folder / "checkpoint.pt", folder / "record.json"
     total, marks = spec.iterations, _marks(spec.iterations)
@@ -57,6 +58,9 @@ def train(spec: Spec, folder: Path, trunk: Path | None, mean_nu: float | None) -
     if checkpoint.exists() and path.exists():
         fit.load(checkpoint)
         record = json.loads(path.read_text(encoding="utf-8"))
+        # The record is written first, so it may be one evaluation ahead of the checkpoint.
+        record["curve"] = [r for r in record["curve"] if r["iteration"] <= fit.iteration]
+        record["seconds"] = record["curve"][-1]["seconds"]
     elif arm.trunk is not None:
         assert trunk is not None
         at = round(arm.switch * total)
@@ -82,8 +86,8 @@ def train(spec: Spec, folder: Path, trunk: Path | None, mean_nu: float | None) -
         record["curve"].append(now)
         if fit.iteration in (round(share * total) for share in BRANCH_SHARES):
             fit.save(folder / f"at-{fit.iteration}.pt")
-        fit.save(checkpoint)
         _write(path, record)
+        fit.save(checkpoint)
     record["mean_nu"] = fit.mean_nu
     record["state_bytes"] = fit.state_bytes()
     record["peak_rss_bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
@@ -92,6 +96,11 @@ def train(spec: Spec, folder: Path, trunk: Path | None, mean_nu: float | None) -
     np.savez_compressed(folder / "renders.npz", *images)
     _write(path, record)
     return record
+
+
+@cache
+def _scene(source: str) -> Scene:
+    return load_scene(source)
 
 
 def _marks(total: int) -> set[int]:
@@ -111,10 +120,11 @@ def _write(path: Path, record: dict[str, Any]) -> None:
 
 
 def main() -> int:
-    """Run what a spec file says."""
-    call = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
-    trunk = Path(call["trunk"]) if call["trunk"] else None
-    train(Spec(**call["spec"]), Path(call["folder"]), trunk, call["mean_nu"])
+    """Run what the call files say, one after the other."""
+    for path in sys.argv[1:]:
+        call = json.loads(Path(path).read_text(encoding="utf-8"))
+        trunk = Path(call["trunk"]) if call["trunk"] else None
+        train(Spec(**call["spec"]), Path(call["folder"]), trunk, call["mean_nu"])
     return 0
 
 

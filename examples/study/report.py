@@ -1,0 +1,149 @@
+"""Tables, plots and decisions of the study: python examples/study/report.py [--runs runs/study]
+
+With `--runs`, first gathers the finished trainings into docs/results/study/records.json. Then
+everything is made from that file alone: the plots beside it, `decisions.json`, and the tables
+between the markers of docs/evidence.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from study import arms as groups
+from study.analysis import Gain, Study, baseline_of
+from study.decisions import decide
+from study.plots import plot_curves, plot_gains
+from study.records import gather, read, write
+from study.tables import gains_table, goals_table, nu_table, scenes_table
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+FOLDER = REPOSITORY / "docs" / "results" / "study"
+PAGE = REPOSITORY / "docs" / "evidence.md"
+SHORT = 3_000
+CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4")
+BEST = "annealed-8-0.4"
+MARKER = re.compile(r"(<!-- study:([a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def tables(study: Study) -> dict[str, str]:
+    """Every generated piece of the page, by the name in its marker."""
+    short = study.settings(SHORT)
+    names = {kind: [arm.name for arm in make()] for kind, make in _KINDS.items()}
+    gains = {kind: study.gains(short, arms) for kind, arms in names.items()}
+    long = {
+        "7,500 iterations": study.settings(7_500),
+        "30,000 iterations": study.settings(30_000),
+    }
+    made = {
+        "core": gains_table(gains["core"]),
+        "scenes": scenes_table(study, short, names["core"]),
+        "nu": nu_table(study, short, [*names["core"], *names["options"]]),
+        "tails": gains_table(gains["tails"]),
+        "on-top": gains_table(gains["on-top"]),
+        "options": gains_table(gains["options"]),
+        "leads": gains_table(gains["leads"]),
+        "long": goals_table(study, {"3,000 iterations": short, **long}, BEST, groups.BASELINE),
+        "random": gains_table(study.gains(study.settings(SHORT, "random"), [BEST])),
+        "small": gains_table(study.gains(study.settings(SHORT, share=0.25), [BEST])),
+        "decisions": _decisions_table(study),
+    }
+    return made
+
+
+_KINDS: dict[str, Callable[[], list[groups.StudyArm]]] = {
+    "core": groups.core,
+    "tails": groups.last_phases,
+    "on-top": groups.on_top,
+    "options": groups.histograms,
+    "leads": groups.leads,
+}
+
+
+def _decisions_table(study: Study) -> str:
+    lines = [
+        "| part | decided by | gain at equal seconds (dB) | scenes, seeds | default |",
+        "|---|---|---:|---|---|",
+    ]
+    for part, decision in decide(study).items():
+        gain = decision.gain
+        shown, count = "-", "-"
+        if gain is not None:
+            shown = f"{gain.equal_seconds:+.2f} ± {gain.spread:.2f}"
+            count = f"{len(gain.scenes)}, {gain.seeds}"
+        on = "on" if decision.on else "off"
+        lines.append(
+            f"| {part} | `{decision.arm}` against `{decision.control}` | {shown} | {count} | {on} |"
+        )
+    return "\n".join(lines)
+
+
+def plots(study: Study, folder: Path) -> list[Path]:
+    """Draw everything; return the files."""
+    short, drawn = study.settings(SHORT), []
+    for name, settings, arms in (
+        ("curves.png", short, CURVE_ARMS),
+        ("curves_long.png", study.settings(7_500), ("mcmc", "faded", BEST)),
+        ("curves_full.png", study.settings(30_000), ("mcmc", BEST)),
+    ):
+        if settings:
+            plot_curves(study, settings, arms, folder / name)
+            drawn.append(folder / name)
+    title = f"scenes together, {SHORT:,} iterations; baseline {baseline_of(study, short):.2f} dB"
+    for name, kinds in (("gains.png", ("core", "leads")), ("gains_tails.png", ("tails", "on-top"))):
+        gains: list[Gain] = []
+        for kind in kinds:
+            gains += study.gains(short, [arm.name for arm in _KINDS[kind]()])
+        if gains:
+            plot_gains(gains, folder / name, title)
+            drawn.append(folder / name)
+    return drawn
+
+
+def fill(page: str, made: dict[str, str]) -> str:
+    """The page with every table between its markers; ValueError for an unknown marker."""
+
+    def put(match: re.Match[str]) -> str:
+        if match[2] not in made:
+            raise ValueError(f"marker study:{match[2]} is unknown; there are {', '.join(made)}")
+        return f"{match[1]}{made[match[2]]}\n{match[3]}"
+
+    return MARKER.sub(put, page)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line; 0, or 2 after one line that says what is wrong."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--runs", type=Path, metavar="DIR", help="folder of study/run.py")
+    args = parser.parse_args(arguments)
+    records = FOLDER / "records.json"
+    try:
+        if args.runs is not None:
+            found = gather(args.runs)
+            if not found:
+                raise ValueError(f"--runs {args.runs}: holds no finished training")
+            FOLDER.mkdir(parents=True, exist_ok=True)
+            write(found, records)
+        study = Study(read(records))
+        made = tables(study)
+        PAGE.write_text(fill(PAGE.read_text(encoding="utf-8"), made), encoding="utf-8")
+        decisions = {part: decision.on for part, decision in decide(study).items()}
+        text = json.dumps(decisions, indent=1) + "\n"
+        (FOLDER / "decisions.json").write_text(text, encoding="utf-8")
+        drawn = plots(study, FOLDER)
+    except (OSError, ValueError) as error:
+        print(f"report: {error}", file=sys.stderr)
+        return 2
+    for path in [records, FOLDER / "decisions.json", *drawn, PAGE]:
+        print(path)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

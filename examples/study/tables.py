@@ -1,0 +1,92 @@
+"""The study's tables, as Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from statistics import fmean, stdev
+
+from study.analysis import Gain, Study
+from study.arms import STUDY_ARMS
+from study.records import Record, Setting
+
+
+def gains_table(gains: Sequence[Gain]) -> str:
+    """One line per arm: what it gains over its control, and the rule's verdict."""
+    lines = [
+        "| arm | what it is | against | scenes, seeds | dB at equal iterations "
+        "| dB at equal seconds | dB on training views | seconds | verdict |",
+        "|---|---|---|---|---:|---:|---:|---:|---|",
+    ]
+    for g in gains:
+        lines.append(
+            f"| `{g.arm}` | {STUDY_ARMS[g.arm].what} | `{g.control}` | {len(g.scenes)}, {g.seeds} "
+            f"| {g.equal_iterations:+.2f} | {g.equal_seconds:+.2f} ± {g.spread:.2f} "
+            f"| {g.train:+.2f} | x{g.seconds:.2f} | {g.verdict} |"
+        )
+    return "\n".join(lines)
+
+
+def scenes_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) -> str:
+    """Test PSNR of every arm on every scene; the last columns are means over the scenes."""
+    names = [setting.scene for setting in settings]
+    lines = [
+        f"| arm | {' | '.join(names)} | SSIM | LPIPS | state, bytes per point |",
+        f"|---|{'---:|' * (len(names) + 3)}",
+    ]
+    for arm in arms:
+        runs = [list(study.runs(setting, arm).values()) for setting in settings]
+        if not any(runs):
+            continue
+        cells = [_mean_and_spread([r.final for r in of_scene]) for of_scene in runs]
+        every = [record for of_scene in runs for record in of_scene]
+        complete = all(runs)
+        ssim = f"{fmean(r.curve['ssim'][-1] for r in every):.4f}" if complete else "-"
+        lpips = [r.lpips for r in every if r.lpips is not None]
+        shown = f"{fmean(lpips):.4f}" if complete and len(lpips) == len(every) else "-"
+        state = fmean(r.state_bytes / r.curve["num_points"][-1] for r in every)
+        lines.append(f"| `{arm}` | {' | '.join(cells)} | {ssim} | {shown} | {state:.0f} |")
+    return "\n".join(lines)
+
+
+def goals_table(study: Study, kinds: dict[str, list[Setting]], arm: str, control: str) -> str:
+    """The gain in long trainings, and when the control's last PSNR is reached."""
+    lines = [
+        "| training | scenes, seeds | control, dB | gain at equal iterations "
+        "| gain at equal seconds | seconds until the control's last PSNR |",
+        "|---|---|---:|---:|---:|---:|",
+    ]
+    for name, settings in kinds.items():
+        gain = study.gain(settings, arm, control)
+        if gain is None:
+            continue
+        reach = "not on every scene" if gain.reach is None else f"x{gain.reach:.2f}"
+        lines.append(
+            f"| {name} | {', '.join(gain.scenes)}; {gain.seeds} "
+            f"| {gain.psnr - gain.equal_iterations:.2f} | {gain.equal_iterations:+.2f} "
+            f"| {gain.equal_seconds:+.2f} ± {gain.spread:.2f} | {reach} |"
+        )
+    return "\n".join(lines)
+
+
+def nu_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) -> str:
+    """Mean of nu by scene, of the arms that have one."""
+    lines = [
+        f"| arm | {' | '.join(setting.scene for setting in settings)} |",
+        f"|---|{'---:|' * len(settings)}",
+    ]
+    for arm in arms:
+        cells = []
+        for setting in settings:
+            records: list[Record] = list(study.runs(setting, arm).values())
+            values = [r.mean_nu for r in records if r.mean_nu is not None]
+            cells.append(_mean_and_spread(values))
+        if any(cell != "-" for cell in cells):
+            lines.append(f"| `{arm}` | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _mean_and_spread(values: Sequence[float]) -> str:
+    if not values:
+        return "-"
+    spread = f" ± {stdev(values):.2f}" if len(values) > 1 else ""
+    return f"{fmean(values):.2f}{spread}"
