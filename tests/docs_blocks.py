@@ -1,0 +1,94 @@
+"""The fenced blocks of a Markdown page, and what an excerpt of a trainer needs to run."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+FENCE = re.compile(
+    r"^(?P<indent> *)```(?P<language>\w*) *(?:title=\"(?P<title>[^\"]*)\")?[^\n]*\n"
+    r"(?P<text>.*?)^(?P=indent)```[ \t]*$",
+    re.M | re.S,
+)
+
+
+@dataclass(frozen=True)
+class Block:
+    """One fenced block."""
+
+    language: str
+    title: str  # a path: an excerpt of it; "prints": what the block before it prints
+    text: str
+    line: int  # of the fence, from 1
+
+
+def pages() -> list[Path]:
+    """The READMEs, CONTRIBUTING and the pages of docs/ that people write (not tables of runs)."""
+    written = [p for p in DOCS.rglob("*.md") if not {"results", "benchmarks"} & set(p.parts)]
+    others = ("README.md", "CONTRIBUTING.md", "examples/hosts/README.md")
+    return [*(ROOT / page for page in others), *sorted(written)]
+
+
+def name(page: Path) -> str:
+    """The page's path in the repository."""
+    return page.relative_to(ROOT).as_posix()
+
+
+def blocks(page: Path, *languages: str) -> list[Block]:
+    """The page's fenced blocks, of those languages or of all."""
+    text = page.read_text(encoding="utf-8")
+    found = [
+        Block(m["language"], m["title"] or "", m["text"], text.count("\n", 0, m.start()) + 1)
+        for m in FENCE.finditer(text)
+    ]
+    return [b for b in found if not languages or b.language in languages]
+
+
+def unfenced(text: str) -> str:
+    """A page without its fenced blocks and inline code, in which links and pictures are looked for.
+
+    Fences keep their number of lines.
+    """
+    text = FENCE.sub(lambda m: "\n" * m[0].count("\n"), text)
+    return re.sub(r"`[^`\n]*`", "", text)
+
+
+def adams(names: dict[str, int]) -> dict[str, torch.optim.Adam]:
+    """One Adam per parameter, of that many columns."""
+    return {
+        name: torch.optim.Adam(
+            [{"params": torch.nn.Parameter(torch.ones(4, columns)), "lr": 1e-3, "name": name}],
+            eps=1e-15,
+        )
+        for name, columns in names.items()
+    }
+
+
+def trainer_names() -> dict[str, Any]:
+    """What the excerpts of gsplat's and INRIA's trainers find around them."""
+    names = {"xyz": 3, "scaling": 3, "rotation": 4, "opacity": 1}
+    groups = [o.param_groups[0] for o in adams(names).values()]
+    image = torch.rand(3, 8, 8, requires_grad=True)
+    # What the trainers say before the line that is shown.
+    loss = image.square().mean()
+    loss.backward()
+    return {
+        "torch": torch,
+        "self": SimpleNamespace(optimizers=adams({"means": 3, "scales": 3, "quats": 4})),
+        "cfg": SimpleNamespace(max_steps=100),
+        "world_size": 1,
+        "gaussians": SimpleNamespace(optimizer=torch.optim.Adam(groups, lr=0.0, eps=1e-15)),
+        "opt": SimpleNamespace(iterations=100),
+        "colors": image,
+        "pixels": torch.rand(3, 8, 8),
+        "image": image,
+        "gt_image": torch.rand(3, 8, 8),
+        "loss": loss,
+    }

@@ -1,0 +1,256 @@
+"""What README and docs/ say is true: code runs, commands exist, pictures have makers, links."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import html
+import importlib.util
+import io
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+from docs_blocks import DOCS, ROOT, Block, blocks, name, pages, trainer_names, unfenced
+from docs_commands import SHELL, check_command, commands
+from docs_links import anchors, makes
+from test_hosts_cli import SYNTHETIC, added
+
+import opt3dgs_optim
+from opt3dgs_optim import hosts
+
+PAGES = pages()
+
+
+def of_pages(*languages: str) -> list[Any]:
+    """The pages that have blocks of these languages, as test parameters."""
+    return [pytest.param(p, id=name(p)) for p in PAGES if blocks(p, *languages)]
+
+
+def is_excerpt(block: Block) -> bool:
+    """Whether a block quotes a file instead of being a program."""
+    return "/" in block.title
+
+
+# -- code ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("page", of_pages("python"))
+def test_python_blocks_run_and_print_what_is_shown(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The blocks of a page run one after the other, in one namespace and an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    namespace: dict[str, Any] = {**trainer_names(), "__name__": "docs"}
+    printed = None
+    try:
+        for block in blocks(page):
+            if block.language == "python" and not is_excerpt(block):
+                printed = io.StringIO()
+                code = compile("\n" * block.line + block.text, name(page), "exec")
+                with contextlib.redirect_stdout(printed):
+                    exec(code, namespace)
+            elif block.title == "prints":
+                assert printed is not None, f"line {block.line}: no program before what it prints"
+                assert printed.getvalue() == block.text, f"line {block.line}"
+                printed = None
+    finally:
+        if "log" in namespace:
+            namespace["log"].close()
+
+
+@pytest.mark.parametrize("page", of_pages("python"))
+def test_what_a_program_prints_is_shown(page: Path) -> None:
+    """A block with a bare print() at its margin is followed by what it prints."""
+    found = blocks(page)
+    for block, following in zip(found, [*found[1:], None], strict=True):
+        prints = block.language == "python" and re.search(r"^print\(", block.text, re.M)
+        if prints:
+            assert following is not None
+            assert following.title == "prints", f"{name(page)}, line {block.line}"
+
+
+@pytest.mark.parametrize("page", of_pages("python"))
+def test_excerpts_stand_in_the_source(page: Path) -> None:
+    for block in filter(is_excerpt, blocks(page, "python")):
+        source = [line.strip() for line in (ROOT / block.title).read_text().splitlines()]
+        for part in re.split(r"^\.\.\.\n", block.text, flags=re.M):
+            lines = [line.strip() for line in part.strip().splitlines()]
+            starts = range(len(source) - len(lines) + 1)
+            assert any(source[i : i + len(lines)] == lines for i in starts), (
+                f"{name(page)}, line {block.line}: not in {block.title}:\n{part}"
+            )
+
+
+def test_the_algorithm_pages_quote_the_source() -> None:
+    for page in ("awsgld", "lqnadam", "two-loop", "phases"):
+        assert any(map(is_excerpt, blocks(DOCS / "algorithms" / f"{page}.md", "python"))), page
+
+
+HOST_PAGES = {"gsplat": "gsplat", "gsplat 1.6": "gsplat", "inria": "inria"}
+
+
+def statements(page: Path) -> set[str]:
+    """The lines of a page's Python blocks, without comments."""
+    lines = "\n".join(block.text for block in blocks(page, "python")).splitlines()
+    return {re.sub(r"\s*#.*", "", line).strip() for line in lines} - {""}
+
+
+@pytest.mark.parametrize("kind", SYNTHETIC)
+def test_host_pages_show_the_lines_that_the_command_writes(kind: str, tmp_path: Path) -> None:
+    trainer = tmp_path / "trainer.py"
+    trainer.write_text(SYNTHETIC[kind])
+    lines = added(hosts.diff(trainer)[1])
+    assert len(lines) == 4
+    assert set(lines) <= statements(DOCS / "hosts" / f"{HOST_PAGES[kind]}.md")
+
+
+def test_host_pages_show_no_other_lines(tmp_path: Path) -> None:
+    written: dict[str, set[str]] = {}
+    for kind, text in SYNTHETIC.items():
+        trainer = tmp_path / "trainer.py"
+        trainer.write_text(text)
+        written.setdefault(HOST_PAGES[kind], set()).update(added(hosts.diff(trainer)[1]))
+    for page, lines in written.items():
+        assert statements(DOCS / "hosts" / f"{page}.md") == lines
+
+
+# -- commands --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("page", of_pages(*SHELL))
+def test_commands_exist_with_their_options(page: Path) -> None:
+    for block in blocks(page, *SHELL):
+        for words in commands(block):
+            check_command(words)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "python -m opt3dgs_optim.no_such_module",
+        "python -m opt3dgs_optim.hosts diff PATH --no-such-option",
+        "python examples/no_such_file.py",
+        "python examples/train.py --no-such-option",
+        "pip install .[no_such_extra]",
+        "pip install another_package",
+        "ns-train no-such-method",
+        "no-such-program",
+    ],
+)
+def test_wrong_commands_are_noticed(line: str) -> None:
+    with pytest.raises((AssertionError, ModuleNotFoundError)):
+        check_command(shlex.split(line))
+
+
+def test_every_block_is_checked_by_something() -> None:
+    for page in PAGES:
+        for block in blocks(page):
+            known = block.language in ("python", *SHELL) or block.title == "prints"
+            assert known, f"{name(page)}, line {block.line}: nothing checks a {block.language!r}"
+
+
+# -- pictures and links ----------------------------------------------------------------------------
+
+NEAR = 60  # lines between a picture and the command that makes it
+
+
+@pytest.mark.parametrize("page", [pytest.param(p, id=name(p)) for p in PAGES])
+def test_pictures_exist_and_their_command_is_named(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    lines = text.splitlines()
+    for match in re.finditer(r"!\[[^\]]*\]\(([^)\s]+)\)", unfenced(text)):
+        picture = page.parent / match[1]
+        assert picture.is_file(), match[1]
+        at = unfenced(text).count("\n", 0, match.start())
+        near = "\n".join(lines[max(0, at - NEAR) : at + NEAR])
+        named = re.findall(r"\bexamples/[\w/]+\.py\b", near)
+        makers = [maker for maker in named if (ROOT / maker).is_file()]  # or a trainer's own
+        assert makers, f"{match[1]}: no command of examples/ within {NEAR} lines"
+        assert any(makes(maker, picture) for maker in makers), f"{match[1]}: not by {makers}"
+
+
+@pytest.mark.parametrize("page", [pytest.param(p, id=name(p)) for p in PAGES])
+def test_relative_links_lead_somewhere(page: Path) -> None:
+    text = unfenced(page.read_text(encoding="utf-8"))
+    for target in re.findall(r"\]\((?!\w+:)([^)\s]+)\)", text):
+        file, _, anchor = target.partition("#")
+        found = page.parent / file if file else page
+        assert found.exists(), f"{name(page)}: {target}"
+        is_object = anchor.startswith("opt3dgs_optim.")  # mkdocstrings'; the strict build looks
+        if anchor and found.suffix == ".md" and not is_object:
+            assert anchor in anchors(found), f"{name(page)}: {target}"
+
+
+def test_pages_of_the_site_link_within_docs() -> None:
+    """mkdocs knows docs/ only: other files are named, not linked."""
+    for page in PAGES:
+        if DOCS in page.parents:
+            for target in re.findall(r"\]\((?!\w+:)([^)#\s]+)", unfenced(page.read_text())):
+                assert DOCS in (page.parent / target).resolve().parents, f"{name(page)}: {target}"
+
+
+def test_every_public_name_is_in_the_reference() -> None:
+    shown = re.findall(r"^::: (\S+)$", (DOCS / "api.md").read_text(encoding="utf-8"), re.M)
+    names = {f"opt3dgs_optim.{public}" for public in opt3dgs_optim.__all__}
+    assert names - set(shown) == {"opt3dgs_optim.__version__"}
+
+
+# -- what the build does besides Markdown ----------------------------------------------------------
+
+
+@functools.cache
+def build_hooks() -> Any:
+    """docs/hooks.py, which is no package's."""
+    spec = importlib.util.spec_from_file_location("docs_hooks", DOCS / "hooks.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_what_the_pages_ask_the_build_for_is_there() -> None:
+    asked = 0
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for heading in re.findall(r"<!-- readme: (.+?) -->", text):
+            assert len(build_hooks().readme_section(heading).splitlines()) > 10
+            asked += 1
+        for included in re.findall(r'^--8<-- "(.+)"$', text, re.M):
+            assert (ROOT / included).is_file()
+            asked += 1
+    assert asked >= 3
+    assert "exploitation step" in build_hooks().step_costs()
+
+
+def test_a_section_that_is_gone_is_an_error() -> None:
+    with pytest.raises(ValueError, match="0 sections '## No such heading'"):
+        build_hooks().readme_section("No such heading")
+
+
+@pytest.mark.parametrize(
+    ("text", "bad"),
+    [
+        ('<script src="https://cdn.example/x.js"></script>', True),
+        ('<link rel="stylesheet" href="//fonts.example/css">', True),
+        ("<link href=https://fonts.example rel=preconnect>", True),
+        ("@import 'https://x.example/a.css';", True),
+        ("a { background: url(//x.example/a.png) }", True),
+        ('<img src="https://x.example/a.png">', True),
+        ('<a href="https://arxiv.org/abs/2511.13571">', False),
+        ('<link rel="canonical" href="https://x.example/">', False),
+        ('<img src="results/a.png"><script src="assets/a.js"></script>', False),
+    ],
+)
+def test_what_would_come_from_the_net_is_found(text: str, bad: bool) -> None:
+    assert bool(build_hooks().fetched(text)) is bad
+
+
+def test_formulas_become_mathml() -> None:
+    pytest.importorskip("latex2mathml", reason="latex2mathml is not installed: the extra docs")
+    made = build_hooks().on_page_content('<p><span class="arithmatex">\\(a &lt; b\\)</span></p>')
+    assert made.startswith("<p><math")
+    assert "<mo><</mo>" in html.unescape(made)
