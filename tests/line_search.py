@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from problems import gradient
 from torch import Tensor
 
-from opt3dgs_optim.curvature import header, new_history, record, two_loop
+from opt3dgs_optim import curvature
 
 Function = Callable[[Tensor], Tensor]  # [N, D] -> [N]
 
 
 def minimise(
-    value: Function, x: Tensor, iterations: int, *, history_size: int = 5, first: float = 0.1
+    value: Function,
+    x: Tensor,
+    iterations: int,
+    *,
+    history_size: int = 5,
+    first: float = 0.1,
+    step: Callable[..., Any] = curvature.step,
 ) -> list[Tensor]:
     """L-BFGS on every row of `x` [N, D]; the points after each iteration.
 
@@ -27,24 +34,23 @@ def minimise(
         history_size: K.
         first: length of the first step, as a share of the start's own length: rows may be in any
             units, and the method has to go the same way in all of them.
+        step: the recursion, `curvature.step` or another backend's.
     """
-    history = new_history(x, history_size)
+    history = curvature.new_history(x, history_size)
+    options = {"min_cosine": 1e-14, "powell": False, "graft": False, "gamma_clamp": None}
     length = x.norm(dim=1, keepdim=True) * first
     course = []
     for _ in range(iterations):
         g = gradient(value, x)
-        visible = torch.isfinite(g).all(1) & (g != 0).any(1)
-        record(history, history_size, x, g, visible, min_cosine=1e-14)
-        down = -two_loop(g, history, history_size)
-        empty = header(history, history_size).counter <= 1
+        found = step(x, g, history, history_size, **options)[0]
         unit = g / g.abs().amax(1, keepdim=True).clamp(min=1e-300)
         steepest = -unit / unit.norm(dim=1, keepdim=True).clamp(min=1e-300) * length
-        bad = empty | ((down * unit).sum(1) >= 0) | ~torch.isfinite(down).all(1)
-        down = torch.where(bad[:, None], steepest, down)
-        step = weak_wolfe(value, x, g, down)
-        x = x + step[:, None] * down
+        own = (found == g).all(1)  # no pair, or no descent: the length of g says nothing
+        down = torch.where(own[:, None], steepest, -found)
+        lengths = weak_wolfe(value, x, g, down)
+        x = x + lengths[:, None] * down
         course.append(x)
-        if not bool(step.any()):
+        if not bool(lengths.any()):
             break
     return course
 

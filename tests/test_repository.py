@@ -22,6 +22,59 @@ def test_version_is_the_same_everywhere() -> None:
     assert newest[1] == opt3dgs_optim.__version__
 
 
+def test_version_is_written_once() -> None:
+    version = f'"{opt3dgs_optim.__version__}"'
+    files = [*(ROOT / "src").rglob("*.py"), ROOT / "pyproject.toml"]
+    holding = [path.name for path in files if version in path.read_text(encoding="utf-8")]
+    assert holding == ["_version.py"]
+
+
+def test_citation_is_complete() -> None:
+    """The keys that Citation File Format 1.2.0 asks for, and the paper."""
+    lines = (ROOT / "CITATION.cff").read_text(encoding="utf-8").splitlines()
+    top = dict(re.findall(r"^([a-z-]+):[ ]?(.*)$", "\n".join(lines), re.M))
+    assert top["cff-version"] == "1.2.0"
+    assert top["type"] == "software"
+    for key in ("message", "title", "abstract"):
+        assert top[key].strip("\"'"), key
+    assert re.fullmatch(r"\d{4}-\d{2}-\d{2}", top["date-released"])
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    assert f'license = "{top["license"]}"' in project
+    assert f'name = "{top["title"]}"' in project
+    assert [line for line in lines if line.startswith("  - name:")]  # an author
+    assert any("2511.13571" in line for line in lines)
+    # Every line is a key, a list item or a comment, and no plain value holds ": ", so that any
+    # YAML reader takes it for what it is meant to be.
+    for line in lines:
+        found = re.fullmatch(r"[ ]*(?:- )?[a-z-]+:(?: (.*))?", line)
+        assert found, line
+        value = found[1] or ""
+        assert value[:1] in ("'", '"') or ": " not in value, line
+
+
+def test_citation_parses_as_yaml() -> None:
+    yaml = pytest.importorskip("yaml", reason="PyYAML is not installed")
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert str(cited["version"]) == opt3dgs_optim.__version__
+    assert cited["authors"]
+    (paper,) = cited["references"]
+    assert [author["family-names"] for author in paper["authors"]] == ["Huang", "Chen", "Liu", "Ji"]
+
+
+def test_the_declared_torch_is_the_oldest_tested() -> None:
+    """`docs/torch_versions.json` is what examples/check_torch_versions.py last found."""
+    record = json.loads((ROOT / "docs" / "torch_versions.json").read_text(encoding="utf-8"))
+    results = record["results"]
+    assert all(result["failed"] == result["error"] == 0 for result in results)
+    assert all(result["passed"] > 1000 for result in results)
+    tested = [tuple(map(int, r["torch"].split("+")[0].split(".")))[:2] for r in results]
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    declared = re.search(r'"torch>=(\d+)\.(\d+)"', project)
+    assert declared is not None
+    assert min(tested) == (int(declared[1]), int(declared[2]))
+    assert max(tested) > min(tested)
+
+
 def test_public_names() -> None:
     for name in (
         "AWSGLD",

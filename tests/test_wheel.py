@@ -1,10 +1,12 @@
-"""The wheel holds the kernels' sources, and works where it is all there is of the project."""
+"""Wheel and sdist: small, complete, and working where they are all there is of the project."""
 
 from __future__ import annotations
 
 import importlib.util
+import json
 import subprocess
 import sys
+import tarfile
 import venv
 import zipfile
 from pathlib import Path
@@ -12,10 +14,13 @@ from pathlib import Path
 import pytest
 import torch
 
+import opt3dgs_optim
+
 ROOT = Path(__file__).parent.parent
-STEP = """
-import torch, opt3dgs_optim
-from opt3dgs_optim import LQNAdam, backend_info, cuda
+MOST_BYTES = 200_000
+SMOKE = """
+import sys, torch, opt3dgs_optim
+from opt3dgs_optim import LQNAdam, PhaseScheduler, backend_info, cuda
 assert {place!r} in opt3dgs_optim.__file__, opt3dgs_optim.__file__
 x = torch.nn.Parameter(torch.ones(300, 3))
 optimizer = LQNAdam([x], lr=0.1)
@@ -24,6 +29,22 @@ for _ in range(5):
     optimizer.step()
 assert float(optimizer.accepted_share) > 0.9
 assert "HISTORY_SIZE" in cuda.source("lqn.cu")
+
+splats = {{name: torch.nn.Parameter(torch.ones(50, 3)) for name in ("means", "scales")}}
+adams = {{k: torch.optim.Adam([dict(params=[p], lr=0.01, name=k)]) for k, p in splats.items()}}
+phases, optimizers = PhaseScheduler.install(adams, 10, switch=6)
+losses = []
+for _ in range(10):
+    loss = phases.pixel_loss(splats["means"] * splats["scales"].exp(), torch.zeros(50, 3))
+    loss.backward()
+    phases.observe(loss)
+    for optimizer in optimizers.values():
+        optimizer.step()
+        optimizer.zero_grad()
+    losses.append(float(loss))
+assert losses[5] < losses[0] and losses[-1] < losses[6], losses
+assert phases.phase.value == "exploitation"
+assert not {{"matplotlib", "numba", "tqdm", "gsplat"}} & set(sys.modules)
 print(backend_info("cpu"))
 """
 
@@ -32,35 +53,96 @@ pytestmark = pytest.mark.skipif(
 )
 
 
+def build(root: Path, kind: str, folder: Path) -> Path:
+    """The wheel or the sdist of the project at `root`."""
+    command = [sys.executable, "-m", "hatchling", "build", "-t", kind, "-d", str(folder)]
+    subprocess.run(command, cwd=root, check=True, capture_output=True, text=True)
+    return next(folder.glob("*.whl" if kind == "wheel" else "*.tar.gz"))
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
-    subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True)
-    return next(folder.glob("*.whl"))
+    return build(ROOT, "wheel", tmp_path_factory.mktemp("wheel"))
 
 
-def test_wheel_holds_the_kernels(wheel: Path) -> None:
-    assert wheel.name.endswith("py3-none-any.whl")
-    names = zipfile.ZipFile(wheel).namelist()
-    for name in ("two_loop.cuh", "packed.cuh", "lqn.cu", "noise.cu", "__init__.py"):
-        assert f"opt3dgs_optim/cuda/{name}" in names
-
-
-def test_wheel_steps_in_an_empty_environment(wheel: Path, tmp_path: Path) -> None:
-    """An environment with the wheel and, on its path, torch: nothing is downloaded."""
-    venv.create(tmp_path / "env", with_pip=False)
-    python = tmp_path / "env" / "bin" / "python"
-    site = next((tmp_path / "env" / "lib").glob("python*")) / "site-packages"
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Python of an environment with the wheel and, on its path, torch: nothing is downloaded."""
+    env = tmp_path_factory.mktemp("env")
+    venv.create(env, with_pip=False)
     install = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index", "-q"]
-    subprocess.run([*install, "--target", str(site), str(wheel)], check=True)
-    (site / "torch.pth").write_text(str(Path(torch.__file__).parent.parent) + "\n")
-    run = subprocess.run(
-        [str(python), "-W", "error", "-c", STEP.format(place=str(site))],
-        cwd=tmp_path,
+    subprocess.run([*install, "--target", str(site_of(env)), str(wheel)], check=True)
+    (site_of(env) / "torch.pth").write_text(str(Path(torch.__file__).parent.parent) + "\n")
+    return env / "bin" / "python"
+
+
+def site_of(env: Path) -> Path:
+    return next((env / "lib").glob("python*")) / "site-packages"
+
+
+def run(python: Path, folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run Python in a folder that has nothing of the project."""
+    return subprocess.run(
+        [str(python), "-W", "error", *words],
+        cwd=folder,
         capture_output=True,
         text=True,
         check=False,
     )
-    assert run.returncode == 0, run.stderr
-    assert "the kernels need a CUDA device" in run.stdout
+
+
+def contents(wheel: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(wheel) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def test_wheel_is_small_and_holds_the_package_alone(wheel: Path) -> None:
+    assert wheel.name == f"opt3dgs_optim-{opt3dgs_optim.__version__}-py3-none-any.whl"
+    assert wheel.stat().st_size < MOST_BYTES
+    names = set(contents(wheel))
+    for name in ("two_loop.cuh", "packed.cuh", "lqn.cu", "noise.cu", "__init__.py"):
+        assert f"opt3dgs_optim/cuda/{name}" in names
+    for name in ("py.typed", "__main__.py", "doctor.py", "follow.py"):
+        assert f"opt3dgs_optim/{name}" in names
+    tops = {name.split("/")[0] for name in names}
+    assert tops == {"opt3dgs_optim", f"opt3dgs_optim-{opt3dgs_optim.__version__}.dist-info"}
+
+
+def test_wheel_needs_torch_and_numpy_alone(wheel: Path) -> None:
+    (metadata,) = (text for name, text in contents(wheel).items() if name.endswith("/METADATA"))
+    lines = metadata.decode().splitlines()
+    needed = [
+        line for line in lines if line.startswith("Requires-Dist:") and "extra ==" not in line
+    ]
+    assert sorted(line.split()[1].split(">")[0] for line in needed) == ["numpy", "torch"]
+    extras = {line.split()[1] for line in lines if line.startswith("Provides-Extra:")}
+    assert {"cuda", "cuda12", "report", "examples", "test"} <= extras
+    assert f"Version: {opt3dgs_optim.__version__}" in lines
+
+
+def test_sdist_builds_the_same_wheel(wheel: Path, tmp_path: Path) -> None:
+    sdist = build(ROOT, "sdist", tmp_path / "sdist")
+    with tarfile.open(sdist) as archive:
+        archive.extractall(tmp_path / "source", filter="data")
+    (source,) = (tmp_path / "source").iterdir()
+    for name in ("tests/test_wheel.py", "examples/quickstart.py", "CITATION.cff", "LICENSE"):
+        assert (source / name).exists(), name
+    again = build(source, "wheel", tmp_path / "again")
+    assert again.name == wheel.name
+    assert contents(again) == contents(wheel)
+
+
+def test_wheel_trains_in_an_empty_environment(installed: Path, tmp_path: Path) -> None:
+    place = str(site_of(installed.parent.parent))
+    done = run(installed, tmp_path, "-c", SMOKE.format(place=place))
+    assert done.returncode == 0, done.stderr
+    assert "the kernels need a CUDA device" in done.stdout
+
+
+def test_doctor_finds_the_wheel_in_order(installed: Path, tmp_path: Path) -> None:
+    words = ("-m", "opt3dgs_optim", "doctor", "--json", "--points", "500", "--device", "cpu")
+    done = run(installed, tmp_path, *words)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["passed"] is True
+    assert found["versions"]["opt3dgs_optim"] == opt3dgs_optim.__version__

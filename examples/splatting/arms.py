@@ -37,6 +37,7 @@ def _scheduler(**options: Any) -> MakeScheduler:
         "curvature": None,
         "squared_loss": False,
         "reset_moments": False,
+        "annealing": None,
         "noise_scale": NOISE_LR,
     }
 
@@ -57,8 +58,18 @@ def _constant(iterations: int, switch: float, nu: float | None) -> PhaseSchedule
     return _scheduler(multiplier=constant)(iterations, switch, None)
 
 
-def _opt3dgs(iterations: int, switch: float, _nu: float | None) -> PhaseScheduler:
+def _defaults(iterations: int, switch: float, _nu: float | None) -> PhaseScheduler:
     return PhaseScheduler(iterations, switch, noise_scale=NOISE_LR)
+
+
+def _opt3dgs(iterations: int, switch: float, _nu: float | None) -> PhaseScheduler:
+    parts = _scheduler(
+        multiplier="histogram",
+        curvature=CurvatureOptions(),
+        squared_loss=True,
+        reset_moments="auto",
+    )
+    return parts(iterations, switch, None)
 
 
 def paper_scheduler(iterations: int, switch: float, _nu: float | None) -> PhaseScheduler:
@@ -90,8 +101,9 @@ _ARMS = (
         "the same with L-BFGS directions for the positions",
         make=_scheduler(squared_loss=True, reset_moments=True, curvature=CurvatureOptions()),
     ),
-    Arm("opt3dgs", "everything, the package's defaults", make=_opt3dgs),
-    Arm("opt3dgs-paper", "everything, the paper's settings", make=paper_scheduler),
+    Arm("opt3dgs", "every part of the paper, settings measured on the run", make=_opt3dgs),
+    Arm("opt3dgs-paper", "every part of the paper, its settings", make=paper_scheduler),
+    Arm("annealed", "all steps times 8 falling to 0.4: the package's defaults", make=_defaults),
 )
 ARMS = {arm.name: arm for arm in _ARMS}
 

@@ -1,9 +1,8 @@
-"""The landscapes: energies with their gradients, their exact laws and their exact escape rates."""
+"""What is known of the landscapes: minima, exact laws and exact escape rates."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -14,13 +13,10 @@ BOUNDARY = 2.5
 CELL_EDGE = 0.82
 
 
-def nine_modes(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Energy [C] and gradient [C, 2] of CSGLD's landscape (Deng, Lin and Liang 2020)."""
+def nine_modes(x: Tensor) -> Tensor:
+    """Energy [C] at x [C, 2] on CSGLD's landscape (Deng, Lin and Liang 2020)."""
     square = (x * x).sum(1)
-    phase = WAVE * x
-    energy = (square / 10 - phase.cos().sum(1)) / 0.3 + (square - 7).clamp(min=0)
-    gradient = (x / 5 + WAVE * phase.sin()) / 0.3
-    return energy, gradient + 2 * x * (square > 7)[:, None]
+    return (square / 10 - (WAVE * x).cos().sum(1)) / 0.3 + (square - 7).clamp(min=0)
 
 
 def cell_of(x: Tensor) -> Tensor:
@@ -42,28 +38,9 @@ def nine_masses(bins: int = 1000) -> Tensor:
     """[9]: the share of exp(-energy) in each cell, by the midpoint rule."""
     axis = (torch.arange(bins, dtype=torch.float64) + 0.5) / bins * 2 * BOUNDARY - BOUNDARY
     points = torch.cartesian_prod(axis, axis)
-    density = (-nine_modes(points)[0]).exp()
+    density = (-nine_modes(points)).exp()
     masses = torch.zeros(9, dtype=torch.float64).index_add_(0, cell_of(points), density)
     return masses / masses.sum()
-
-
-def double_well(height: float | Tensor) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
-    """h (x^2 - 1)^2 of [C, 1]; `height` may differ from chain to chain ([C])."""
-
-    def landscape(x: Tensor) -> tuple[Tensor, Tensor]:
-        inner = x[:, 0] ** 2 - 1
-        return height * inner**2, (4 * height * inner * x[:, 0])[:, None]
-
-    return landscape
-
-
-def gaussian(curvature: float) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
-    """k x^2 / 2, summed over the columns of [C, D]."""
-
-    def landscape(x: Tensor) -> tuple[Tensor, Tensor]:
-        return curvature * (x * x).sum(1) / 2, curvature * x
-
-    return landscape
 
 
 def kl(counts: Tensor, truth: Tensor) -> float:
@@ -93,8 +70,8 @@ def exact_rate(potential: Tensor) -> float:
 
 
 def well_potential(height: float) -> Tensor:
-    """The double well on `GRID`."""
-    return double_well(height)(GRID[:, None])[0]
+    """The double well h (x^2 - 1)^2 on `GRID`."""
+    return height * (GRID**2 - 1) ** 2
 
 
 def flattened_potential(

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from opt3dgs_optim import AWSGLD
 from opt3dgs_optim.noise import IsotropicNoise
-from study.landscape_chains import ChainAWSGLD, ChainHistograms, Landscape, run_chains
+from study.landscape_chains import Chains, Dynamics, Samples
 from study.landscape_energies import (
     GRID,
-    double_well,
     exact_rate,
     flattened_potential,
-    gaussian,
     kl,
     kramers_rate,
     well_potential,
@@ -24,19 +24,10 @@ from study.landscape_energies import (
 Progress = Callable[[int], Any]
 Options = dict[str, Any]
 CURVATURE, GAUSSIAN_TEMPERATURE = 4.0, 0.5
-PARTITIONS, WELL_RANGE, CLAMP = 100, (-0.5, 12.0), (-5.0, 5.0)
+# The range starts at the minimum: empty partitions below it would pull the chain down. 25: at the
+# bottom a narrower partition would be no wider than one step of the noise.
+PARTITIONS, WELL_RANGE, CLAMP = 25, (0.0, 12.5), (-5.0, 5.0)
 WELL_BINS, WELL_EDGE = 60, 1.8
-
-
-def chains_at(
-    start: Tensor, landscape: Landscape, steps: int, watch: Any, options: Options
-) -> ChainAWSGLD:
-    """Run AWSGLD from `start` [C, D]; `options` go to it, those named here to the driver."""
-    driver = {name: options.pop(name) for name in ("every", "progress") if name in options}
-    x = torch.nn.Parameter(start.clone())
-    optimizer = ChainAWSGLD([x], skip_nonfinite=False, **options)
-    run_chains(optimizer, landscape, steps, watch, **driver)
-    return optimizer
 
 
 def gaussian_law(
@@ -59,33 +50,39 @@ def gaussian_law(
         relaxation = 1 / (lr * CURVATURE) if arm == "sgld" else GAUSSIAN_TEMPERATURE / lr
         burn = round(10 * relaxation)
         if arm == "adam":  # until the second moment has forgotten the start
-            burn += min(round(8 / (1 - betas[1])), 20_000)
+            burn += min(round(8 / (1 - betas[1])), 10_000)
         every = max(round(2 * relaxation), 1)
         per_seed = []
         for seed in range(seeds):
-            sums: list[float] = []
-
-            def watch(step: int, x: Tensor, energy: Tensor, burn: int = burn, sums: Any = sums):
-                if step >= burn:
-                    sums.append(float(x.square().mean()))
-
-            generator = torch.Generator().manual_seed(seed)
-            options: Options = {
-                "lr": lr,
-                "betas": tuple(betas),
-                "noise": IsotropicNoise(temperature=GAUSSIAN_TEMPERATURE, generator=generator),
-                "preconditioner": "none" if arm == "sgld" else "adam",
-                "every": every,
-            }
-            start = torch.zeros(chains, 1, dtype=torch.float64)
-            chains_at(start, gaussian(CURVATURE), burn + 20 * every, watch, options)
-            per_seed.append(sum(sums) / len(sums))
+            per_seed.append(_variance(arm, lr, betas, chains, seed, burn, every))
             progress(1)
         theory = GAUSSIAN_TEMPERATURE / (CURVATURE * (1 - lr * CURVATURE / 2))
         expected = theory if arm == "sgld" else GAUSSIAN_TEMPERATURE**2
         found.append({"lr": lr, "variance": per_seed, "expected": expected})
     target = GAUSSIAN_TEMPERATURE / CURVATURE
     return {"arm": arm, "target": target, "rows": found}
+
+
+def _variance(
+    arm: str, lr: float, betas: list[float], chains: int, seed: int, burn: int, every: int
+) -> float:
+    """Mean of x^2 over `chains` rows and 20 times, `every` steps apart, after `burn` steps."""
+    x = torch.nn.Parameter(torch.zeros(chains, 1, dtype=torch.float64))
+    generator = torch.Generator().manual_seed(seed)
+    optimizer = AWSGLD(  # one for all rows: without a histogram they do not meet
+        [x],
+        lr=lr,
+        betas=(betas[0], betas[1]),
+        noise=IsotropicNoise(temperature=GAUSSIAN_TEMPERATURE, generator=generator),
+        preconditioner="none" if arm == "sgld" else "adam",
+    )
+    squares = []
+    for step in range(burn + 20 * every):
+        x.grad = CURVATURE * x.detach()
+        optimizer.step()
+        if step >= burn and (step - burn) % every == 0:
+            squares.append(float(x.detach().square().mean()))
+    return sum(squares) / len(squares)
 
 
 def well_truth(height: float) -> Tensor:
@@ -100,9 +97,10 @@ def _binned(x: Tensor, weight: Tensor) -> Tensor:
     return mass
 
 
-def histograms(chains: int) -> ChainHistograms:
-    """The flat histogram of the double wells: temperature 1, the package's default clamp."""
-    return ChainHistograms(chains, PARTITIONS, WELL_RANGE, temperature=1.0, warmup=0, clamp=CLAMP)
+def well_dynamics(arm: str, lr: float) -> Dynamics:
+    """Temperature 1; "awsgld" with the package's default clamp."""
+    partitions = PARTITIONS if arm == "awsgld" else 0
+    return Dynamics("well", lr, partitions=partitions, energy_range=WELL_RANGE, clamp=CLAMP)
 
 
 def well_law(
@@ -117,33 +115,23 @@ def well_law(
 ) -> Options:
     """The law of the double well at temperature 1; every chain starts in the left well.
 
-    A tenth of the steps is dropped. The flat histogram's samples are weighed by theta_J^zeta.
+    A tenth of the steps is dropped. The flat histogram's samples are re-weighted.
     """
-    generator = torch.Generator().manual_seed(round(height))
     rows = chains * seeds
-    flat = histograms(rows) if arm == "awsgld" else None
     raw = torch.zeros(seeds, WELL_BINS, dtype=torch.float64)
     weighted = torch.zeros_like(raw)
 
-    def watch(step: int, x: Tensor, energy: Tensor) -> None:
-        if step < steps // 10:
-            return
-        weight = flat.importance(energy) if flat is not None else torch.ones_like(energy)
+    def watch(samples: Samples) -> None:
+        counted = samples.steps >= steps // 10
         for seed in range(seeds):
             part = slice(seed * chains, (seed + 1) * chains)
-            raw[seed] += _binned(x[part], torch.ones_like(weight[part]))
-            weighted[seed] += _binned(x[part], weight[part])
+            x = torch.from_numpy(samples.positions[counted, part]).reshape(-1, 1)
+            weight = torch.from_numpy(samples.weights[counted, part]).reshape(-1)
+            raw[seed] += _binned(x, torch.ones_like(weight))
+            weighted[seed] += _binned(x, weight)
 
-    options: Options = {
-        "lr": lr,
-        "noise": IsotropicNoise(temperature=1.0, generator=generator),
-        "preconditioner": "none",
-        "histogram": flat,
-        "every": 20,
-        "progress": progress,
-    }
-    start = torch.full((rows, 1), -1.0, dtype=torch.float64)
-    chains_at(start, double_well(height), steps, watch, options)
+    run = Chains(well_dynamics(arm, lr), np.full((rows, 1), -1.0), 0, np.full(rows, height))
+    run.run(steps, watch, every=20, progress=progress)
     truth = well_truth(height)
     truth /= truth.sum()
     middle = WELL_BINS // 2
@@ -162,17 +150,16 @@ def well_law(
 class Crossings:
     """Passages between the wells: from one minimum all the way to the other one."""
 
-    def __init__(self, chains: int, after: int) -> None:
-        self._side = -torch.ones(chains, dtype=torch.float64)
-        self._after = after
-        self.count = torch.zeros(chains, dtype=torch.float64)
+    def __init__(self, chains: int) -> None:
+        self._side = -np.ones(chains)
+        self.count = np.zeros(chains)
 
-    def __call__(self, step: int, x: Tensor, energy: Tensor) -> None:
-        """Take the positions before step `step`."""
-        arrived = x[:, 0] * self._side <= -1
-        if step >= self._after:
+    def __call__(self, samples: Samples) -> None:
+        """Take a block of states."""
+        for x in samples.positions[:, :, 0]:
+            arrived = x * self._side <= -1
             self.count += arrived
-        self._side = torch.where(arrived, -self._side, self._side)
+            self._side[arrived] *= -1
 
 
 def escape_rates(
@@ -190,39 +177,27 @@ def escape_rates(
     All barriers and seeds are rows of one batch. A tenth of the steps is dropped; half of them
     with a histogram, which has to learn first.
     """
-    generator = torch.Generator().manual_seed(7)
     per_height = chains * seeds
     rows = per_height * len(heights)
-    height = torch.tensor(heights, dtype=torch.float64).repeat_interleave(per_height)
-    flat = histograms(rows) if arm == "awsgld" else None
-    after = steps // 2 if flat is not None else steps // 10
-    crossings = Crossings(rows, after)
-    nu_sum = torch.zeros(rows, dtype=torch.float64)
-
-    def watch(step: int, x: Tensor, energy: Tensor) -> None:
-        crossings(step, x, energy)
-        if flat is not None and step > after:
-            nu_sum.add_(flat.multiplier)
-
-    options: Options = {
-        "lr": lr,
-        "noise": IsotropicNoise(temperature=1.0, generator=generator),
-        "preconditioner": "none",
-        "histogram": flat,
-        "progress": progress,
-    }
-    start = torch.full((rows, 1), -1.0, dtype=torch.float64)
-    chains_at(start, double_well(height), steps, watch, options)
-    time = chains * (steps - after) * lr
+    dynamics = well_dynamics(arm, lr)
+    run = Chains(dynamics, np.full((rows, 1), -1.0), 7, np.repeat(heights, per_height))
+    crossings = Crossings(rows)
+    flat = dynamics.partitions > 0
+    dropped = steps // 2 if flat else steps // 10
+    run.run(dropped, crossings, progress=progress)
+    crossings.count[:] = 0
+    nu_before = run.nu_sum.copy()
+    run.run(steps - dropped, crossings, progress=progress)
+    time = chains * (steps - dropped) * lr
     counts = crossings.count.reshape(len(heights), seeds, chains).sum(2)
-    nus = nu_sum.reshape(len(heights), -1).mean(1) / max(steps - after - 1, 1)
+    nus = (run.nu_sum - nu_before).reshape(len(heights), -1).mean(1) / (steps - dropped)
     found = []
     for i, h in enumerate(heights):
         row: Options = {"height": h, "rate": (counts[i] / time).tolist()}
         row |= {"crossings": int(counts[i].sum()), "kramers": kramers_rate(h)}
         row["exact"] = exact_rate(well_potential(h))
-        if flat is not None:
-            potential, _ = flattened_potential(h, PARTITIONS, *WELL_RANGE, flat.zeta, CLAMP)
+        if flat:
+            potential, _ = flattened_potential(h, PARTITIONS, *WELL_RANGE, dynamics.zeta, CLAMP)
             nu = float(nus[i])
             row |= {"mean_nu": nu, "flattened": exact_rate(potential)}
             row["constant"] = exact_rate(nu * well_potential(h))

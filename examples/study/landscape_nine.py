@@ -6,22 +6,14 @@ import math
 import statistics
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from opt3dgs_optim import AWSGLD
-from opt3dgs_optim.noise import IsotropicNoise
-from study.landscape_chains import ChainAWSGLD, ChainHistograms, ConstantFactor, run_chains
-from study.landscape_energies import (
-    BOUNDARY,
-    cell_of,
-    kl,
-    nine_masses,
-    nine_minima,
-    nine_modes,
-)
+from study.landscape_chains import Chains, Dynamics, Samples
+from study.landscape_energies import BOUNDARY, cell_of, kl, nine_masses, nine_minima
 
 START = 2.0  # both coordinates
 ENERGY_RANGE = (-7.667, 17.333)  # one beyond the least and the highest energy of the domain
@@ -50,7 +42,7 @@ class Arm:
     label: str
     steps: int = 200_000
     lr: float = 1e-3
-    drift: str = "none"
+    drift: Literal["none", "adam"] = "none"
     cycles: int = 0
     nu: str = "off"
     constant: float = 1.0
@@ -85,71 +77,57 @@ ARMS = {
 }
 
 
-def make_optimizer(arm: Arm, chains: int, generator: torch.Generator) -> AWSGLD:
-    """The package's optimizer with its noise, over `chains` rows at the start."""
-    x = torch.nn.Parameter(torch.full((chains, 2), START, dtype=torch.float64))
-    histogram: Any = None
-    if arm.nu == "constant":
-        histogram = ConstantFactor(chains, arm.constant)
-    elif arm.nu == "histogram":
-        histogram = ChainHistograms(
-            chains,
-            PARTITIONS,
-            ENERGY_RANGE,
-            temperature=TEMPERATURE,
-            warmup=0,
-            clamp=arm.clamp,
-        )
-    if arm.drift == "adam":
-        noise = IsotropicNoise(std=math.sqrt(2e-3 * TEMPERATURE), generator=generator)
-    else:
-        noise = IsotropicNoise(temperature=TEMPERATURE, generator=generator)
-    drift: Any = arm.drift
-    return ChainAWSGLD(
-        [x],
-        lr=arm.lr,
-        histogram=histogram,
-        noise=noise,
-        preconditioner=drift,
-        skip_nonfinite=False,  # the driver refuses non-finite energies
+def dynamics_of(arm: Arm) -> Dynamics:
+    """The arm in the words of AWSGLD and EnergyHistogram."""
+    flat = arm.nu == "histogram"
+    return Dynamics(
+        "nine",
+        arm.lr,
+        drift=arm.drift,
+        std=math.sqrt(2e-3 * TEMPERATURE) if arm.drift == "adam" else None,
+        temperature=TEMPERATURE,
+        constant=arm.constant,
+        partitions=PARTITIONS if flat else 0,
+        energy_range=ENERGY_RANGE,
+        clamp=arm.clamp,
+        boundary=BOUNDARY,
+        stream_noise=STREAM_NOISE,
     )
 
 
 class Census:
     """What is counted of the chains: first visits, time in each cell, weights, one path."""
 
-    def __init__(self, arm: Arm, optimizer: AWSGLD, steps: int, chains: int) -> None:
-        self._arm, self._histogram, self._steps = arm, optimizer.histogram, steps
-        self._warm = steps // 40
+    def __init__(self, arm: Arm, steps: int, chains: int) -> None:
+        self._arm, self._warm = arm, steps // 40
         self._minima = nine_minima()
         self.first = torch.full((chains, 9), math.inf, dtype=torch.float64)
         self.raw = torch.zeros(chains, 9, dtype=torch.float64)
         self.weighted = torch.zeros(chains, 9, dtype=torch.float64)
         self.path: list[list[float]] = []
         self._path_every = max(steps // PATH_POINTS // EVERY, 1) * EVERY
-        self._rows = torch.arange(chains)
 
-    def __call__(self, step: int, x: Tensor, energy: Tensor) -> None:
-        """Take the positions and energies before step `step`."""
-        cell = cell_of(x)
-        close = ((x - self._minima[cell]) ** 2).sum(1) < REACHED**2
-        known = self.first[self._rows, cell]
-        now = torch.where(close, float(step), math.inf)
-        self.first[self._rows, cell] = torch.minimum(known, now)
-        if step % self._path_every == 0:
-            self.path.append([round(v, 3) for v in x[0].tolist()])
-        if step < self._warm:
-            return
-        self.raw[self._rows, cell] += 1
-        self.weighted[self._rows, cell] += self._weight(energy)
+    def __call__(self, samples: Samples) -> None:
+        """Take a block of states."""
+        steps = torch.from_numpy(samples.steps)
+        x = torch.from_numpy(samples.positions)
+        cell = cell_of(x.reshape(-1, 2)).reshape(x.shape[:2])
+        close = ((x - self._minima[cell]) ** 2).sum(2) < REACHED**2
+        now = torch.where(close, steps[:, None].double(), math.inf)
+        self.first.scatter_reduce_(1, cell.T, now.T, "amin")
+        on_path = steps % self._path_every == 0
+        self.path += [[round(v, 3) for v in point] for point in x[on_path, 0].tolist()]
+        counted = steps >= self._warm
+        cell = cell[counted].T
+        self.raw.scatter_add_(1, cell, torch.ones(cell.shape, dtype=torch.float64))
+        self.weighted.scatter_add_(1, cell, self._weights(samples)[counted].T)
 
-    def _weight(self, energy: Tensor) -> Tensor:
-        if isinstance(self._histogram, ChainHistograms):
-            return self._histogram.importance(energy)
+    def _weights(self, samples: Samples) -> Tensor:
         if self._arm.nu == "constant" and self._arm.drift == "none":
             # The chain's law is exp(-c U / T): the rest of the exponent is its weight.
-            return (-(1 - self._arm.constant) * energy / TEMPERATURE).exp()
-        return torch.ones_like(energy)
+            left = 1 - self._arm.constant
+            return (-left * torch.from_numpy(samples.energies) / TEMPERATURE).exp()
+        return torch.from_numpy(samples.weights)
 
 
 def seed_result(census: Census, rows: slice, truth: Tensor) -> dict[str, Any]:
@@ -173,41 +151,24 @@ def run_arm(
 ) -> dict[str, Any]:
     """All chains of all seeds of one arm at once; a seed is a batch of `chains` rows."""
     arm, rows = ARMS[name], chains * seeds
-    generator = torch.Generator().manual_seed(0)
-    optimizer = make_optimizer(arm, rows, generator)
-    census = Census(arm, optimizer, steps, rows)
+    census = Census(arm, steps, rows)
     cycle = steps / max(arm.cycles, 1)
 
     def cosine(k: int) -> float:
         return 2.5 * arm.lr * (math.cos(math.pi * (k % cycle) / cycle) + 1)
 
-    run_chains(
-        optimizer,
-        nine_modes,
-        steps,
-        census,
-        every=EVERY,
-        boundary=BOUNDARY,
-        noise=STREAM_NOISE,
-        generator=generator,
-        schedule=cosine if arm.cycles else None,
-        progress=progress,
-    )
+    run = Chains(dynamics_of(arm), np.full((rows, 2), START), seed=0)
+    schedule = cosine if arm.cycles else None
+    run.run(steps, census, every=EVERY, schedule=schedule, progress=progress)
     truth = nine_masses()
     marks = [round(steps * i / 50) for i in range(51)]
     found = [float((census.first <= mark).sum(1).double().mean()) for mark in marks]
-    histogram = optimizer.histogram
-    nu = (
-        float(histogram.mean_multiplier.mean())
-        if isinstance(histogram, ChainHistograms)
-        else (arm.constant if arm.nu == "constant" else 1.0)
-    )
     return {
         "arm": asdict(arm),
         "seeds": [
             seed_result(census, slice(i * chains, (i + 1) * chains), truth) for i in range(seeds)
         ],
-        "mean_nu": nu,
+        "mean_nu": float(run.mean_nu.mean()),
         "curve": {"iterations": marks, "modes": found},
         "path": census.path,
     }

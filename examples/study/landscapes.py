@@ -47,10 +47,10 @@ def experiments(quick: bool) -> dict[str, Experiment]:
         found[f"nine-{name}"] = (landscape_nine.run_arm, name, settings, steps)
     for name, rates, betas in (
         ("sgld", [0.02, 0.1, 0.25, 0.4], [0.9, 0.999]),
-        ("adam", [0.001, 0.005, 0.02], [0.9, 0.999]),
-        ("adam-slow", [0.002, 0.005], [0.0, 0.9999]),
+        ("adam", [0.005, 0.02], [0.9, 0.999]),
+        ("adam-slow", [0.005], [0.0, 0.9999]),
     ):
-        settings = {"chains": 64 if quick else 2048, "rates": rates, "betas": betas, **seeds}
+        settings = {"chains": 64 if quick else 1024, "rates": rates, "betas": betas, **seeds}
         if quick:
             settings["rates"] = rates[-1:] if name == "sgld" else []
         run = landscape_laws.gaussian_law
@@ -63,7 +63,7 @@ def experiments(quick: bool) -> dict[str, Experiment]:
             run = landscape_laws.well_law
             found[f"well-{arm_name}-{height:.0f}"] = (run, arm_name, {**settings, **seeds}, steps)
     heights = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]
-    for arm_name, chains, length in (("sgld", 512, 60_000), ("awsgld", 32, 100_000)):
+    for arm_name, chains, length in (("sgld", 192, 60_000), ("awsgld", 32, 100_000)):
         steps = 200 if quick else length
         settings = {"heights": heights, "chains": 4 if quick else chains, "steps": steps}
         settings |= {"lr": 1e-3, **seeds}

@@ -11,7 +11,7 @@ from study.training import Spec
 
 SCENES = ("plush", "banana", "lund_door", "brighton_beach", "embedded")
 QUICK_SCENES = ("banana", "embedded")  # for the options of a part
-FULL_SCENES = ("embedded", "banana", "plush")  # 30,000 iterations take minutes
+FULL_SCENES = ("plush", "banana")  # 30,000 iterations take minutes
 POINTS = 4_000
 EMBEDDED_POINTS = 2_000
 FIRST_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "annealed-8-0.4", "faded")
@@ -55,13 +55,16 @@ def stages(seeds: int = 3) -> dict[str, list[tuple[str, str, int, int, int, str]
     return {
         "core": cross(SCENES, FIRST_ARMS, seeds, 3_000),
         "tails": cross(SCENES, tails, seeds, 3_000),
-        "long": cross(SCENES, two, seeds, 7_500),
-        "leads": cross(QUICK_SCENES, beyond, seeds, 3_000),
+        "faded-on-top": cross(QUICK_SCENES, ["annealed-4-0.4+faded"], seeds, 3_000),
+        "long-first": cross(SCENES, two, 1, 7_500),
         "full": cross(FULL_SCENES, two, 1, 30_000),
-        "core-more": cross(SCENES, later, seeds, 3_000),
+        "long": cross(SCENES, two, seeds, 7_500),
+        "rest": cross(QUICK_SCENES, later, seeds, 3_000),
+        "leads": cross(QUICK_SCENES, beyond, seeds, 3_000),
         "options": cross(QUICK_SCENES, options, seeds, 3_000),
         "random": cross(SCENES, two, seeds, 3_000, init="random"),
         "small": cross(SCENES, two, seeds, 3_000, share=0.25),
+        "rest-all": cross(SCENES, later, seeds, 3_000),
         "long-faded": cross(SCENES, ["faded"], seeds, 7_500),
     }
 

@@ -83,7 +83,7 @@ def plot_gains(gains: Sequence[Gain], path: Path, title: str) -> None:
     axis.axvline(0.0, color="black", linewidth=0.8)
     axis.set_yticks(places, [f"{g.arm}  (vs {g.control})" for g in gains], fontsize=8)
     axis.set_ylim(-0.7, len(gains) - 0.3)
-    axis.set_xlabel("gain in test PSNR at equal seconds (dB), ± twice the deviation over seeds")
+    axis.set_xlabel("gain at equal seconds (dB), ± 2 deviations over seeds")
     axis.grid(axis="x", alpha=0.3)
     axis.set_title(title, fontsize=10)
     for verdict, colour in VERDICT_COLOURS.items():

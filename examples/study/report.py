@@ -2,7 +2,7 @@
 
 With `--runs`, first gathers the finished trainings into docs/results/study/records.json. Then
 everything is made from that file alone: the plots beside it, `decisions.json`, and the tables
-between the markers of docs/evidence.md.
+between the markers of docs/evidence.md and the README.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from study.tables import gains_table, goals_table, nu_table, scenes_table
 REPOSITORY = Path(__file__).resolve().parents[2]
 FOLDER = REPOSITORY / "docs" / "results" / "study"
 PAGE = REPOSITORY / "docs" / "evidence.md"
+PAGES = (PAGE, REPOSITORY / "README.md")  # that have tables
 SHORT = 3_000
 CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4")
 BEST = "annealed-8-0.4"
@@ -132,7 +133,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             write(found, records)
         study = Study(read(records))
         made = tables(study)
-        PAGE.write_text(fill(PAGE.read_text(encoding="utf-8"), made), encoding="utf-8")
+        for page in PAGES:
+            page.write_text(fill(page.read_text(encoding="utf-8"), made), encoding="utf-8")
         decisions = {part: decision.on for part, decision in decide(study).items()}
         text = json.dumps(decisions, indent=1) + "\n"
         (FOLDER / "decisions.json").write_text(text, encoding="utf-8")
@@ -140,7 +142,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (OSError, ValueError) as error:
         print(f"report: {error}", file=sys.stderr)
         return 2
-    for path in [records, FOLDER / "decisions.json", *drawn, PAGE]:
+    for path in [records, FOLDER / "decisions.json", *drawn, *PAGES]:
         print(path)
     return 0
 

@@ -117,6 +117,8 @@ class PhasedAdam(LQNAdam):
             self._noise_watch.check(positions[0])
 
     def _end_step(self) -> None:
+        if self.scheduler._adaptive is not None:
+            self.scheduler._adaptive.count_pairs(self._tally)
         if self.scheduler.noise is None:
             return
         positions = self._positions()
@@ -124,6 +126,13 @@ class PhasedAdam(LQNAdam):
             if self._noise_watch is None:
                 self._noise_watch = NoiseTwiceWatch()
             self._noise_watch.leave(positions[0])
+
+    def _foresee(
+        self, history: Tensor, position: Tensor, gradient: Tensor, visible: Tensor | None = None
+    ) -> None:
+        if self.scheduler._adaptive is not None:
+            size = self.curvature_options.history_size
+            self.scheduler._adaptive.foresee(history, size, position, gradient, visible)
 
     def _positions(self) -> list[Tensor]:
         return [p for g in self.param_groups if is_positions(g) for p in g["params"]]
@@ -188,6 +197,7 @@ class PhasedAdam(LQNAdam):
     def _load_shared_state(self, shared: Mapping[str, Any]) -> None:
         check_keys(f"{type(self).__name__}.load_state_dict", shared, ("scheduler", "switched"))
         self.scheduler.load_state_dict(shared["scheduler"])
+        self.curvature_options = self.scheduler.curvature_options
         self.switched = bool(shared["switched"])
 
 

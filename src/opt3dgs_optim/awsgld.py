@@ -12,6 +12,7 @@ from torch import Tensor
 from opt3dgs_optim._adam import HookedAdam, fused_on_cuda
 from opt3dgs_optim._checks import check_choice, check_part
 from opt3dgs_optim._groups import is_positions
+from opt3dgs_optim._repr import block, group_lines, noise_line, nu_line, skipped_lines
 from opt3dgs_optim._visible import shaped
 from opt3dgs_optim.energy import EnergyHistogram
 from opt3dgs_optim.noise import CovarianceNoise, IsotropicNoise
@@ -29,10 +30,10 @@ class AWSGLD(HookedAdam):
     peak. With `histogram=None` and `noise=None` this is `torch.optim.Adam`, bit for bit.
 
     Args:
-        params, lr, betas, eps, weight_decay, amsgrad, foreach, maximize, capturable,
-        differentiable, fused: as in `torch.optim.Adam`. With CUDA parameters and no path asked
-            for, the fused one is used: it alone takes nu from the device without a
-            synchronisation.
+        params, lr, betas, eps, weight_decay, amsgrad: as in `torch.optim.Adam`.
+        foreach, maximize, capturable, differentiable, fused: as in `torch.optim.Adam`. With CUDA
+            parameters and no path asked for, the fused one is used: it alone takes nu from the
+            device without a synchronisation.
         histogram: where nu comes from; several optimizers may share one. None: nu is off.
         noise: `IsotropicNoise` for any parameters, `CovarianceNoise` for the positions of
             Gaussians (the group named `means` or `xyz`, or the only group), or None.
@@ -45,7 +46,7 @@ class AWSGLD(HookedAdam):
     iteration before `step()`. A non-finite energy skips the step. The histogram's state travels
     inside `state_dict()`. Memory: Adam's.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from opt3dgs_optim import AWSGLD, EnergyHistogram
         >>> x = torch.nn.Parameter(torch.tensor([2.0, 2.0]))
@@ -109,6 +110,11 @@ class AWSGLD(HookedAdam):
         self.noise = noise
         self.preconditioner = preconditioner
         self._energy_watch = EnergyWatch("AWSGLD")
+
+    def __repr__(self) -> str:
+        lines = [nu_line(self.histogram), noise_line(self.noise)]
+        lines += skipped_lines(self.skipped_rows) + group_lines(self.param_groups)
+        return block(type(self).__name__, lines)
 
     def _shared_state(self) -> dict[str, Any] | None:
         return None if self.histogram is None else {"histogram": self.histogram.state_dict()}

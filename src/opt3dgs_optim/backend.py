@@ -56,7 +56,7 @@ def backend_info(
         ValueError: `backend` is none of these.
         RuntimeError: `backend="cuda"`, and the kernels cannot run.
 
-    Example:
+    Examples:
         >>> from opt3dgs_optim import backend_info
         >>> backend_info("cpu")
         BackendInfo('torch' runs on cpu in float32: the kernels need a CUDA device)

@@ -20,6 +20,7 @@ from opt3dgs_optim._checks import (
     check_interval,
     check_number,
 )
+from opt3dgs_optim._repr import block, curvature_line, group_lines, skipped_lines
 from opt3dgs_optim.backend import BACKENDS, Backend, uses_kernel
 from opt3dgs_optim.ops import lqn_direction
 
@@ -71,8 +72,8 @@ class LQNAdam(HookedAdam):
     bit.
 
     Args:
-        params, lr, betas, eps, weight_decay, amsgrad, foreach, maximize, capturable,
-        differentiable, fused: as in `torch.optim.Adam`.
+        params, lr, betas, eps, weight_decay, amsgrad: as in `torch.optim.Adam`.
+        foreach, maximize, capturable, differentiable, fused: as in `torch.optim.Adam`.
         history_size: K, number of pairs, 1 to 16 (the paper: 5).
         pairs: `"consecutive"` takes a pair between two consecutive visible steps of a point
             (paper). `"epoch"` takes it between the means over two whole epochs of views, so that
@@ -98,7 +99,7 @@ class LQNAdam(HookedAdam):
     Memory: 32 K bytes per point beyond Adam's (K > 3, D = 3, float32; with bfloat16
     pairs 12 K + 32 and up to 12 more for alignment), 32 more with epoch pairs.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from opt3dgs_optim import LQNAdam
         >>> points = torch.nn.Parameter(torch.ones(4, 3))
@@ -189,6 +190,11 @@ class LQNAdam(HookedAdam):
         accepted, candidates = torch.stack(self._tally).sum(0).unbind()
         return accepted / candidates.clamp(min=1)
 
+    def __repr__(self) -> str:
+        lines = [curvature_line(self.curvature_options, self.accepted_share)]
+        lines += skipped_lines(self.skipped_rows) + group_lines(self.param_groups)
+        return block(type(self).__name__, lines)
+
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """As torch's; a loaded history is used if its shape fits the parameters.
 
@@ -224,6 +230,14 @@ class LQNAdam(HookedAdam):
             ValueError: a mask fits no parameter.
         """
         self._reset_rows(rows, moments)
+
+    def drop_pairs(self) -> None:
+        """Free all curvature pairs; they are collected anew where they are used."""
+        for state in self.state.values():
+            state.pop(HISTORY, None)
+            state.pop(EPOCH, None)
+        self._seen.clear()
+        self._held, self._tally = [], []
 
     def _trust_present(self) -> None:
         """Take the histories in the state as those of the parameters' present rows."""
@@ -323,6 +337,7 @@ class LQNAdam(HookedAdam):
         position, gradient = param.detach().reshape(rows, -1), grad.reshape(rows, -1)
         history = self._history(param, position)
         if self._has_operator(position):
+            self._foresee(history, position, gradient)
             fed, accepted, candidates = lqn_direction(
                 position,
                 gradient,
@@ -347,6 +362,7 @@ class LQNAdam(HookedAdam):
         else:
             recorded = (position, gradient, visible)
         if recorded is not None:
+            self._foresee(history, *recorded)
             accepted, candidates = curvature.record(
                 history,
                 options.history_size,
@@ -362,6 +378,11 @@ class LQNAdam(HookedAdam):
             graft=options.graft,
             gamma_clamp=options.gamma_clamp,
         ).reshape(grad.shape)
+
+    def _foresee(
+        self, history: Tensor, position: Tensor, gradient: Tensor, visible: Tensor | None = None
+    ) -> None:
+        """Called before a step's pairs are stored; [N, D] and [N]."""
 
     def _has_operator(self, position: Tensor) -> bool:
         return self.curvature_options.pairs == "consecutive" and position.shape[1] == 3

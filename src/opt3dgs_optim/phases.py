@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
+from opt3dgs_optim._adaptive import Adaptive, check_loadable
 from opt3dgs_optim._checkpoint import check_keys, check_whole
 from opt3dgs_optim._checks import check_count, check_flag, check_number, check_part
 from opt3dgs_optim._ranks import RankMean
@@ -66,6 +67,8 @@ class PhaseScheduler(Upgrading):
         annealing: `Annealing(...)` for steps that start longer and end shorter than the trainer's
             learning rates alone would have them, in all phases; or None, for off.
         fading: `Fading(...)` for shrinking Adam's moments of random points, or None, for off.
+        adaptive: whether parts that this training shows to do nothing for it are switched off, see
+            `switched_off`. Every 100 iterations that is one synchronisation with the GPU.
         log: a `RunLog` that gets one line per `observe`.
         process_group: a `torch.distributed` process group over whose ranks the energy is averaged,
             so that nu is the same on all; every rank must call `observe` as often. A loss that is
@@ -75,7 +78,7 @@ class PhaseScheduler(Upgrading):
     optimizer. The state travels inside `param_groups[0]` of every upgraded optimizer's
     `state_dict()`, so that a trainer which saves its optimizers resumes bit for bit.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from opt3dgs_optim import PhaseScheduler
         >>> splats = {"means": torch.nn.Parameter(torch.ones(4, 3)),
@@ -116,6 +119,7 @@ class PhaseScheduler(Upgrading):
         noise_in_exploitation: bool = True,
         annealing: Annealing | None = None,
         fading: Fading | None = None,
+        adaptive: bool = False,
         log: RunLog | None = None,
         process_group: Any = None,
     ) -> None:
@@ -140,6 +144,7 @@ class PhaseScheduler(Upgrading):
         self.num_observed = 0
         self.last_finite = torch.ones((), dtype=torch.bool)
         self._current = -1  # the iteration observed last, whose step comes next
+        self._adaptive = Adaptive(self) if check_flag(CALL, "adaptive", adaptive) else None
 
     @classmethod
     def install(
@@ -196,7 +201,17 @@ class PhaseScheduler(Upgrading):
     @property
     def noise(self) -> CovarianceNoise | None:
         """The position noise of the next step, or None."""
-        return None if self.exploiting and not self.noise_in_exploitation else self._noise
+        off = self.exploiting and not self.noise_in_exploitation
+        return None if off or "noise" in self.switched_off else self._noise
+
+    @property
+    def switched_off(self) -> Mapping[str, str]:
+        """Parts that `adaptive=True` has switched off, with the reason of each.
+
+        `multiplier` and `curvature` for good; `noise` and `view_centering` until they are of use
+        again; `epoch_pairs`: pairs are taken between consecutive steps instead.
+        """
+        return {} if self._adaptive is None else self._adaptive.reasons
 
     @property
     def accepted_share(self) -> Tensor | None:
@@ -254,6 +269,8 @@ class PhaseScheduler(Upgrading):
         if self.log is not None:
             phase = self._phase_of(self._current).value
             self.log.step(self._current, phase=phase, energy=value, **self.log_values())
+        if self._adaptive is not None:
+            self._adaptive.observed(value, view)
 
     def log_values(self) -> dict[str, Tensor]:
         """What this step's line of a run log should hold, 0-d: nu and the accepted share.
@@ -294,6 +311,7 @@ class PhaseScheduler(Upgrading):
             "iteration": self.iteration,
             "num_observed": self.num_observed,
             "multiplier": None if self.multiplier is None else self.multiplier.state_dict(),
+            **({} if self._adaptive is None else {"adaptive": self._adaptive.state_dict()}),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -303,6 +321,9 @@ class PhaseScheduler(Upgrading):
         iteration = check_whole(call, "iteration", state["iteration"])
         num_observed = check_whole(call, "num_observed", state["num_observed"])
         saved = state["multiplier"]
+        check_loadable(call, state, self._adaptive)
+        if self._adaptive is not None:
+            self._adaptive.load_state_dict(state.get("adaptive"))
         if self.multiplier is not None and saved is not None:
             self.multiplier.load_state_dict(saved)
         self._current = iteration - 1

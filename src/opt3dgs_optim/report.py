@@ -2,11 +2,13 @@
 
 Writes ``report.md``, ``report.csv``, ``report.json`` and, with matplotlib (the extra
 ``opt3dgs_optim[report]``), ``report.png``, or ``report-SCENE.png`` for each of several scenes.
+With ``--follow`` it watches runs that are still training instead; see :mod:`opt3dgs_optim.follow`.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import sys
 from collections.abc import Sequence
@@ -95,16 +97,57 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m opt3dgs_optim.report", description="Compare runs from their run logs."
     )
     parser.add_argument("runs", nargs="+", metavar="RUN", help="run log, or folder of *.jsonl")
-    parser.add_argument("-o", "--out", required=True, metavar="DIR", help="folder to write into")
+    parser.add_argument(
+        "-o",
+        "--out",
+        default="report",
+        metavar="DIR",
+        help="folder to write into (default: report)",
+    )
     parser.add_argument("--metric", default="psnr", help="metric to compare (default: psnr)")
     parser.add_argument("--baseline", metavar="ARM", help="reference arm (default: mcmc, or first)")
+    live = parser.add_argument_group(
+        "live view",
+        "DIR/live.html, one file that opens offline, and DIR/live.png; logs may not exist yet. "
+        "Ends with 0 when all runs have finished, with 130 after Ctrl-C; the last page stays.",
+    )
+    live.add_argument("--follow", action="store_true", help="redraw while the runs train")
+    live.add_argument(
+        "--every", type=float, default=10.0, metavar="SECONDS", help="between looks (default: 10)"
+    )
+    live.add_argument(
+        "--patience",
+        type=float,
+        default=900.0,
+        metavar="SECONDS",
+        help="a run that has written nothing for so long counts as over (default: 900)",
+    )
     return parser
 
 
+def _follow(options: argparse.Namespace) -> int:
+    from opt3dgs_optim.follow import follow
+
+    for name in ("every", "patience"):
+        value = getattr(options, name)
+        if not 0 < value < math.inf:
+            raise ValueError(f"--{name} {value}: must be a number of seconds above 0")
+    print(Path(options.out) / "live.html", flush=True)
+    return follow(
+        options.runs,
+        options.out,
+        metric=options.metric,
+        every=options.every,
+        patience=options.patience,
+    )
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; 0, or 2 after one line on stderr that says what is wrong."""
+    """The command line; 0, 2 after one line that says what is wrong, 130 if a view is stopped."""
     options = _parser().parse_args(arguments)
     try:
+        if options.follow:
+            return _follow(options)
         runs = [read_run(path) for path in find_logs(options.runs)]
         written = write_report(runs, options.out, metric=options.metric, baseline=options.baseline)
     except (OSError, ValueError) as error:

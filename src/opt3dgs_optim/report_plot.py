@@ -9,16 +9,12 @@ from typing import Any
 import numpy as np
 
 from opt3dgs_optim.report_stats import Arm, Comparison, higher_is_better
+from opt3dgs_optim.report_style import FAINT, INK, binned, label_of, look, plain_style
+from opt3dgs_optim.runread import Run
 
 __all__ = ["draw"]
 
-# Okabe and Ito's colour-blind-safe palette, without the yellow that white swallows.
-COLOURS = ("#333333", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-STYLES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))  # one for each round through the colours
-INK, FAINT = "#222222", "#8a8a8a"
-NAMES = {"psnr": "PSNR (dB)", "train_psnr": "training PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS"}
 AXES = ("seconds", "iteration")
-BINS = 50
 LEGEND_COLUMNS = 4
 
 
@@ -64,18 +60,11 @@ def draw(comparison: Comparison, path: Path, footer: str) -> None:
         _phases(grid[:, column], comparison, axis)
     for row, name in enumerate(["metric", *extras]):
         labels = {"nu": "nu", "accepted": "accepted\npairs (share)"}
-        grid[row, 0].set_ylabel(labels.get(name, NAMES.get(comparison.metric, comparison.metric)))
+        grid[row, 0].set_ylabel(labels.get(name, label_of(comparison.metric)))
     for panel in grid.flat:
-        _plain_style(panel)
+        plain_style(panel)
     _texts(figure, comparison, footer)
     figure.savefig(path)
-
-
-def _look(index: int) -> dict[str, Any]:
-    return {
-        "color": COLOURS[index % len(COLOURS)],
-        "linestyle": STYLES[index // len(COLOURS) % len(STYLES)],
-    }
 
 
 def _has_step(comparison: Comparison, name: str) -> bool:
@@ -89,7 +78,7 @@ def _metric_panel(panel: Any, comparison: Comparison, axis: str) -> None:
         if curves:
             x, table = _on_common_grid(curves)
             _line_and_band(panel, x, table, i)
-            panel.plot(x[-1:], table.mean(axis=0)[-1:], "o", ms=4, color=_look(i)["color"])
+            panel.plot(x[-1:], table.mean(axis=0)[-1:], "o", ms=4, color=look(i)["color"])
             seen += curves
     if not seen:
         text = f"no finite evaluation of {comparison.metric}"
@@ -120,11 +109,11 @@ def _on_common_grid(curves: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.nda
 
 
 def _line_and_band(panel: Any, x: np.ndarray, table: np.ndarray, index: int) -> None:
-    look = _look(index)
+    style = look(index)
     if len(table) > 1:
         low, high = table.min(axis=0), table.max(axis=0)
-        panel.fill_between(x, low, high, color=look["color"], alpha=0.16, lw=0)
-    panel.plot(x, table.mean(axis=0), lw=1.8, solid_capstyle="round", **look)
+        panel.fill_between(x, low, high, color=style["color"], alpha=0.16, lw=0)
+    panel.plot(x, table.mean(axis=0), lw=1.8, solid_capstyle="round", **style)
 
 
 def _zoom(panel: Any, curves: list[tuple[np.ndarray, np.ndarray]]) -> None:
@@ -138,7 +127,7 @@ def _zoom(panel: Any, curves: list[tuple[np.ndarray, np.ndarray]]) -> None:
 
 def _step_panel(panel: Any, comparison: Comparison, axis: str, name: str) -> None:
     for i, arm in enumerate(comparison.arms):
-        curves = [_binned(run.series(name, "step"), axis) for run in arm.runs]
+        curves = [_binned_steps(run, name, axis) for run in arm.runs]
         curves = [curve for curve in curves if len(curve[0])]
         if curves:
             _line_and_band(panel, *_on_common_grid(curves), i)
@@ -148,17 +137,9 @@ def _step_panel(panel: Any, comparison: Comparison, axis: str, name: str) -> Non
         panel.set_ylim(-0.04, 1.04)
 
 
-def _binned(series: tuple[np.ndarray, ...], axis: str) -> tuple[np.ndarray, np.ndarray]:
-    """Means over equal stretches of the run: single steps are too noisy to look at."""
-    iteration, seconds, values = series
-    x = seconds if axis == "seconds" else iteration.astype(float)
-    finite = np.isfinite(values)
-    x, values = x[finite], values[finite]
-    parts = np.array_split(np.arange(len(x)), min(BINS, len(x))) if len(x) else []
-    return (
-        np.array([x[part].mean() for part in parts]),
-        np.array([values[part].mean() for part in parts]),
-    )
+def _binned_steps(run: Run, name: str, axis: str) -> tuple[np.ndarray, np.ndarray]:
+    iteration, seconds, values = run.series(name, "step")
+    return binned(seconds if axis == "seconds" else iteration.astype(float), values)
 
 
 def _phases(panels: Any, comparison: Comparison, axis: str) -> None:
@@ -169,7 +150,7 @@ def _phases(panels: Any, comparison: Comparison, axis: str) -> None:
     agree = len(places) == max((len(switches) for _, switches in found), default=0)
     for i, switches in found[:1] if agree else found:
         for x, name in switches:
-            colour = FAINT if agree else _look(i)["color"]
+            colour = FAINT if agree else look(i)["color"]
             for panel in panels:
                 panel.axvline(x, lw=1.0, ls=(0, (1, 1.5)), color=colour, zorder=1)
             if agree:
@@ -193,25 +174,11 @@ def _switches(arm: Arm, axis: str) -> list[tuple[float, str]]:
     return [(float(np.mean(where)), name) for name, where in places.items()]
 
 
-def _plain_style(panel: Any) -> None:
-    panel.set_facecolor("white")
-    panel.grid(True, axis="y", lw=0.6, color="#e4e4e4")
-    panel.set_axisbelow(True)
-    for side, spine in panel.spines.items():
-        spine.set_visible(side in ("left", "bottom"))
-        spine.set_color("#999999")
-    panel.tick_params(labelsize=9, colors=INK, length=3)
-    for label in (panel.xaxis.label, panel.yaxis.label):
-        label.set_fontsize(10)
-        label.set_color(INK)
-    panel.margins(x=0.02)
-
-
 def _texts(figure: Any, comparison: Comparison, footer: str) -> None:
     from matplotlib.lines import Line2D
 
     height = figure.get_figheight()
-    metric = NAMES.get(comparison.metric, comparison.metric)
+    metric = label_of(comparison.metric)
     title = f"{metric} against run time and iterations"
     if comparison.scene is not None:
         title += f", {comparison.scene}"
@@ -219,7 +186,7 @@ def _texts(figure: Any, comparison: Comparison, footer: str) -> None:
     figure.text(0.075, 1 - 0.22 / height, title, **place)
     handles, labels = [], []
     for i, arm in enumerate(comparison.arms):
-        handles.append(Line2D([], [], lw=2.4, **_look(i)))
+        handles.append(Line2D([], [], lw=2.4, **look(i)))
         seeds = f"{len(arm.runs)} seeds" if len(arm.runs) > 1 else "1 seed"
         role = ", baseline" if arm.name == comparison.baseline else ""
         labels.append(f" {arm.name} ({seeds}{role})")

@@ -1,10 +1,10 @@
 """The run log: one JSON object a line, written while a trainer runs, without slowing it down.
 
-Lines are ``{"kind": "start" | "step" | "evaluation" | "event", "iteration": ..., "seconds": ...}``
-plus whatever the call adds; :func:`read_run` reads them back. ``seconds`` are run seconds: wall
-clock since the log was opened, without what :meth:`RunLog.paused` enclosed, carried on over a
-resume. JSON has no NaN or infinity: they are written as the strings ``"nan"``, ``"inf"`` and
-``"-inf"`` and read back as floats.
+Lines are `{"kind": "start" | "step" | "evaluation" | "event", "iteration": ..., "seconds": ...}`
+plus whatever the call adds; `read_run` reads them back. `seconds` are run seconds: wall
+clock since the log was opened, without what `RunLog.paused` enclosed, carried on over a
+resume. JSON has no NaN or infinity: they are written as the strings `"nan"`, `"inf"` and
+`"-inf"` and read back as floats.
 """
 
 from __future__ import annotations
@@ -42,32 +42,32 @@ class _Pending(NamedTuple):
 
 
 class RunLog:
-    """Append the course of one training run to the JSON-lines file ``path``.
+    """Append the course of one training run to the JSON-lines file `path`.
 
     Every line goes out in one unbuffered write, so a killed process loses at most the line it was
     writing (and, on a GPU, the few step lines whose numbers the GPU had not delivered yet). An
     existing log is continued: a torn last line is closed off, the clock goes on from the last
-    recorded second. To continue from a checkpoint use :meth:`resume`.
+    recorded second. To continue from a checkpoint use `resume`.
 
     A step line costs no host synchronisation: 0-d CUDA tensors are copied to pinned memory in
     stream order and written at a later call, once the copy has completed. CPU tensors and floats
-    are written at once; tensors of other devices are read with ``item()``. No autograd graph is
-    kept. Evaluations, events, :meth:`paused`, :meth:`flush` and :meth:`close` do wait for the GPU.
+    are written at once; tensors of other devices are read with `item()`. No autograd graph is
+    kept. Evaluations, events, `paused`, `flush` and `close` do wait for the GPU.
 
     Args:
         path: the log file; missing parent folders are made.
-        metadata: what describes the run (``arm``, ``seed``, ``scene``, options): strings, numbers,
-            booleans, None, lists and mappings of these. The report groups by ``arm`` and pairs
-            by ``seed``. ``command`` replaces the command line recorded otherwise (base names only).
-        every: write step lines only at iterations that are multiples of ``every``.
+        metadata: what describes the run (`arm`, `seed`, `scene`, options): strings, numbers,
+            booleans, None, lists and mappings of these. The report groups by `arm` and pairs
+            by `seed`. `command` replaces the command line recorded otherwise (base names only).
+        every: write step lines only at iterations that are multiples of `every`.
 
     Raises:
-        ValueError: ``every`` < 1, or ``path`` holds something else than a run log.
+        ValueError: `every` < 1, or `path` holds something else than a run log.
         TypeError: metadata that JSON cannot hold.
         BlockingIOError: another RunLog, here or in another process, has the file open (checked
-            where ``fcntl`` exists and the file system can lock).
+            where `fcntl` exists and the file system can lock).
 
-    Example:
+    Examples:
         >>> import os, tempfile
         >>> path = os.path.join(tempfile.mkdtemp(), "mcmc-0.jsonl")
         >>> with RunLog(path, metadata={"arm": "mcmc", "seed": 0}) as log:
@@ -114,11 +114,11 @@ class RunLog:
         metadata: Mapping[str, Any] | None = None,
         every: int = 1,
     ) -> RunLog:
-        """Continue the log of a run that goes on from a checkpoint taken at ``iteration``.
+        """Continue the log of a run that goes on from a checkpoint taken at `iteration`.
 
-        The clock goes on from the last second recorded at an iteration <= ``iteration``, and a
+        The clock goes on from the last second recorded at an iteration <= `iteration`, and a
         "resumed" event tells readers to drop what was logged past it. Arguments and errors are
-        those of the class, and FileNotFoundError if there is no log at ``path``.
+        those of the class, and FileNotFoundError if there is no log at `path`.
         """
         iteration = index("RunLog.resume", iteration)
         if not Path(path).is_file():
@@ -137,10 +137,10 @@ class RunLog:
         return self._base + running
 
     def step(self, iteration: int, *, phase: str, **values: float | int | Tensor) -> None:
-        """Log one optimization step; ``values`` are numbers or one-element tensors.
+        """Log one optimization step; `values` are numbers or one-element tensors.
 
-        The report knows ``nu``, ``accepted`` (share of curvature pairs, 0 to 1) and ``phase``
-        ("exploration", "exploitation"); every other name (``energy``, ``loss``, ``skipped_rows``)
+        The report knows `nu`, `accepted` (share of curvature pairs, 0 to 1) and `phase`
+        ("exploration", "exploitation"); every other name (`energy`, `loss`, `skipped_rows`)
         is kept as well.
 
         Raises:
@@ -155,10 +155,10 @@ class RunLog:
         self._drain(wait=False)
 
     def evaluation(self, iteration: int, **metrics: float | int | Tensor) -> None:
-        """Log metrics (``psnr`` in dB, ``ssim``, ``train_psnr``, ``num_points``, ...).
+        """Log metrics (`psnr` in dB, `ssim`, `train_psnr`, `num_points`, ...).
 
-        Adds ``peak_cuda_bytes`` (torch's peak of the current device) if CUDA is in use, else
-        ``peak_host_bytes`` (peak resident set of the process). Errors as in :meth:`step`.
+        Adds `peak_cuda_bytes` (torch's peak of the current device) if CUDA is in use, else
+        `peak_host_bytes` (peak resident set of the process). Errors as in `step`.
         """
         line = self._line("evaluation", index("RunLog.evaluation", iteration)) | _peak_memory()
         self._pending.append(_pack("RunLog.evaluation", line, metrics))
@@ -167,7 +167,7 @@ class RunLog:
     def event(self, kind: str, iteration: int, **info: Any) -> None:
         """Log that something happened: "switch", "interrupted", "finished", ...
 
-        ``info`` may hold what ``metadata`` may, and one-element tensors. Raises as :meth:`step`.
+        `info` may hold what `metadata` may, and one-element tensors. Raises as `step`.
         """
         _refuse_reserved("RunLog.event", info)
         line = self._line("event", index("RunLog.event", iteration)) | {"event": kind}
@@ -236,7 +236,7 @@ class RunLog:
 
 
 def _pack(call: str, line: dict[str, Any], values: Mapping[str, Any]) -> _Pending:
-    """Put host numbers into ``line`` and send CUDA ones on their way to pinned memory."""
+    """Put host numbers into `line` and send CUDA ones on their way to pinned memory."""
     _refuse_reserved(call, values)
     on_gpu = {}
     for name, value in values.items():

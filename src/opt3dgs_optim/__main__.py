@@ -1,0 +1,54 @@
+"""The commands: `python -m opt3dgs_optim`."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+from opt3dgs_optim._version import __version__
+
+COMMANDS = {
+    "doctor": "versions, which backend runs and why, a self-test, and what a step costs here",
+    "report": "compare runs from their logs, or watch them while they train (--follow)",
+    "hosts": "the lines to change in your trainer, as a diff or applied",
+}
+
+
+def usage() -> str:
+    """The list of commands."""
+    width = max(map(len, COMMANDS))
+    rows = [f"  {name:<{width}}  {what}" for name, what in COMMANDS.items()]
+    return "\n".join(
+        [
+            f"opt3dgs_optim {__version__}",
+            "",
+            "python -m opt3dgs_optim COMMAND ...",
+            "",
+            *rows,
+            "",
+            "python -m opt3dgs_optim COMMAND --help says more.",
+        ]
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command and return its status; 2 for one that does not exist, 130 after Ctrl-C."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or words[0] in ("-h", "--help"):
+        print(usage())
+        return 0
+    if words[0] in ("-V", "--version"):
+        print(__version__)
+        return 0
+    if words[0] not in COMMANDS:
+        print(f"opt3dgs_optim: no command {words[0]!r}\n\n{usage()}", file=sys.stderr)
+        return 2
+    try:
+        return importlib.import_module(f"opt3dgs_optim.{words[0]}").main(words[1:])
+    except KeyboardInterrupt:
+        return 130
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

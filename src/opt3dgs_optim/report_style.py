@@ -1,0 +1,55 @@
+"""How the report's pictures look: colours, names, plain axes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+__all__ = ["FAINT", "INK", "binned", "label_of", "look", "plain_style"]
+
+# Okabe and Ito's colour-blind-safe palette, without the yellow that white swallows.
+COLOURS = ("#333333", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+STYLES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))  # one for each round through the colours
+INK, FAINT = "#222222", "#8a8a8a"
+NAMES = {"psnr": "PSNR (dB)", "train_psnr": "training PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS"}
+BINS = 50
+
+
+def look(index: int) -> dict[str, Any]:
+    """Colour and line style of the arm or run number `index`."""
+    return {
+        "color": COLOURS[index % len(COLOURS)],
+        "linestyle": STYLES[index // len(COLOURS) % len(STYLES)],
+    }
+
+
+def label_of(metric: str) -> str:
+    """A metric's name, with its unit where it is known."""
+    return NAMES.get(metric, metric)
+
+
+def binned(x: np.ndarray, values: np.ndarray, bins: int = BINS) -> tuple[np.ndarray, np.ndarray]:
+    """Means over equal stretches of the run: single steps are too noisy to look at."""
+    finite = np.isfinite(values)
+    x, values = x[finite], values[finite]
+    parts = np.array_split(np.arange(len(x)), min(bins, len(x))) if len(x) else []
+    return (
+        np.array([x[part].mean() for part in parts]),
+        np.array([values[part].mean() for part in parts]),
+    )
+
+
+def plain_style(panel: Any) -> None:
+    """White, two spines, a faint grid."""
+    panel.set_facecolor("white")
+    panel.grid(True, axis="y", lw=0.6, color="#e4e4e4")
+    panel.set_axisbelow(True)
+    for side, spine in panel.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color("#999999")
+    panel.tick_params(labelsize=9, colors=INK, length=3)
+    for label in (panel.xaxis.label, panel.yaxis.label):
+        label.set_fontsize(10)
+        label.set_color(INK)
+    panel.margins(x=0.02)

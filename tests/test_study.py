@@ -1,0 +1,177 @@
+"""The study: its page equals its records, its rule the defaults, and its trainings can resume."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from study import report
+from study.analysis import Study
+from study.arms import BASELINE, STUDY_ARMS, find_study_arm
+from study.decisions import COMPARISONS, decide
+from study.plan import plan
+from study.records import COLUMNS, Record, Setting, gather, read, write
+from study.run import main as run_study
+from study.training import Spec, train
+
+from opt3dgs_optim import Annealing, PhaseScheduler
+
+RECORDS = report.FOLDER / "records.json"
+
+
+def record(arm: str, scene: str, seed: int, psnr: float, seconds: float = 10.0) -> Record:
+    """A straight curve from 10 dB at 0 s."""
+    curve = {name: np.array([0.0, 1.0]) for name in COLUMNS}
+    curve["seconds"] = np.array([0.0, seconds])
+    curve["psnr"] = np.array([10.0, psnr])
+    return Record(Setting(scene, 100, 3000, "sfm"), arm, seed, curve, None, 1, 1, None)
+
+
+def test_the_pages_are_made_from_the_records() -> None:
+    made = report.tables(Study(read(RECORDS)))
+    for path in report.PAGES:
+        page = path.read_text(encoding="utf-8")
+        assert "<!-- study:decisions -->" in page
+        assert report.fill(page, made) == page, path
+
+
+def test_the_defaults_are_what_the_page_concludes() -> None:
+    decided = {part: decision.on for part, decision in decide(Study(read(RECORDS))).items()}
+    committed = json.loads((report.FOLDER / "decisions.json").read_text(encoding="utf-8"))
+    assert committed == decided
+    parameters = inspect.signature(PhaseScheduler.__init__).parameters
+    assert set(decided) <= set(parameters)
+    for part, on in decided.items():
+        assert bool(parameters[part].default) == on, part
+
+
+def test_the_default_annealing_is_the_measured_one() -> None:
+    arm = COMPARISONS["annealing"][0]
+    assert arm == f"annealed-{Annealing().peak:g}-{Annealing().final:g}" == report.BEST
+
+
+def test_gain_at_equal_seconds_and_its_spread() -> None:
+    records = [
+        record(arm, scene, seed, psnr + 0.1 * seed * (arm != BASELINE), seconds)
+        for scene in ("a", "b")
+        for seed in range(3)
+        for arm, psnr, seconds in ((BASELINE, 20.0, 10.0), ("faded", 22.0, 20.0))
+    ]
+    study = Study(records)
+    gain = study.gain(study.settings(3000), "faded")
+    assert gain is not None
+    # At 10 s the slower arm is half-way: 10 + 12 / 2 = 16 dB, 0.05 more for each seed.
+    assert gain.equal_seconds == pytest.approx(-4.0 + 0.05)
+    assert gain.spread == pytest.approx(0.05)
+    assert gain.equal_iterations == pytest.approx(2.1)
+    assert gain.seconds == pytest.approx(2.0)
+    assert gain.reach == pytest.approx(np.mean([20 * 10 / (12 + 0.1 * s) / 10 for s in range(3)]))
+    assert gain.verdict == "does not pay"
+
+
+@pytest.mark.parametrize(
+    ("seeds", "gains", "verdict"),
+    [
+        (3, (0.5, 0.6, 0.7), "pays"),
+        (3, (0.1, 0.9, -0.3), "does not pay"),
+        (2, (5.0, 5.0), "undecided"),
+    ],
+)
+def test_the_rule(seeds: int, gains: tuple[float, ...], verdict: str) -> None:
+    records = [
+        record(arm, scene, seed, 20.0 + (gains[seed] if arm != BASELINE else 0.0))
+        for scene in ("a", "b")
+        for seed in range(seeds)
+        for arm in (BASELINE, "faded")
+    ]
+    study = Study(records)
+    gain = study.gain(study.settings(3000), "faded")
+    assert gain is not None
+    assert gain.verdict == verdict
+
+
+def test_the_plan_names_known_arms_and_puts_what_is_needed_first() -> None:
+    trainings = plan(Path("scenes"), Path("runs"))
+    seen: set[Path] = set()
+    for training in trainings:
+        assert training.spec.arm in STUDY_ARMS
+        assert set(training.needs) <= seen, training
+        seen.add(training.folder)
+    assert len(seen) == len(trainings)
+    assert all(arm.control in STUDY_ARMS for arm in STUDY_ARMS.values())
+    with pytest.raises(ValueError, match="nonsense"):
+        plan(Path("scenes"), Path("runs"), ["nonsense"])
+
+
+def test_a_training_resumes_and_branches(tmp_path: Path) -> None:
+    spec = Spec("embedded", BASELINE, 0, 40, 120)
+    whole = train(spec, _made(tmp_path / "whole"), None, None)
+    # Stopped after the evaluation at 20: the record is ahead of the checkpoint, as when killed.
+    stopped = _made(tmp_path / "stopped")
+    train(spec, stopped, None, None)
+    cut = json.loads((stopped / "record.json").read_text(encoding="utf-8"))
+    del cut["finished"]
+    (stopped / "record.json").write_text(json.dumps(cut), encoding="utf-8")
+    (tmp_path / "whole" / "at-30.pt").rename(stopped / "checkpoint.pt")
+    again = train(spec, stopped, None, None)
+    assert _psnr(again) == _psnr(whole)
+
+    branch = Spec("embedded", "l2@1/4", 0, 40, 120)
+    tail = train(branch, _made(tmp_path / "branch"), stopped_trunk(tmp_path, spec), None)
+    assert (
+        _psnr(tail)[: _iterations(tail).index(30) + 1]
+        == (_psnr(whole)[: _iterations(whole).index(30) + 1])
+    )
+    assert _psnr(tail)[-1] != _psnr(whole)[-1]
+
+
+def stopped_trunk(tmp_path: Path, spec: Spec) -> Path:
+    trunk = _made(tmp_path / "trunk")
+    train(spec, trunk, None, None)
+    return trunk
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+def _psnr(made: dict[str, object]) -> list[float]:
+    curve = made["curve"]
+    assert isinstance(curve, list)
+    return [row["psnr"] for row in curve]
+
+
+def _iterations(made: dict[str, object]) -> list[int]:
+    curve = made["curve"]
+    assert isinstance(curve, list)
+    return [row["iteration"] for row in curve]
+
+
+@pytest.mark.parametrize("host", ["visible", "annealed+decoupled", "annealed+average"])
+def test_host_options_train(tmp_path: Path, host: str) -> None:
+    made = train(Spec("embedded", host, 0, 20, 80), tmp_path, None, None)
+    assert np.isfinite(_psnr(made)).all()
+
+
+def test_records_survive_writing(tmp_path: Path) -> None:
+    train(Spec("embedded", "faded", 1, 20, 80), tmp_path, None, None)
+    path = tmp_path / "records.json"
+    write(gather(tmp_path), path)
+    (one,) = read(path)
+    assert (one.arm, one.seed, one.setting.iterations) == ("faded", 1, 20)
+    assert one.seconds > 0
+
+
+def test_bad_calls_say_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_study(["--scenes", str(tmp_path), "--stages", "nonsense"]) == 2
+    assert "nonsense" in capsys.readouterr().err
+    assert report.main(["--runs", str(tmp_path)]) == 2
+    assert "no finished training" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="unknown; there are mcmc"):
+        find_study_arm("nonsense")
+    with pytest.raises(ValueError, match="marker study:nonsense"):
+        report.fill("<!-- study:nonsense -->\n<!-- end -->", {})
