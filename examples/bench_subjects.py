@@ -11,6 +11,7 @@ from torch import Tensor
 
 from opt3dgs_optim import PhaseScheduler, _pairs, curvature, ops
 from opt3dgs_optim.energy import EnergyHistogram
+from opt3dgs_optim.lqnadam import CurvatureOptions
 
 HISTORY_SIZE = 5
 NOISE_LR = 5e5
@@ -125,6 +126,8 @@ def phased(case: Case, *, exploit: bool) -> Callable[[], None]:
         1_000_000,
         switch=0 if exploit else 1_000_000,
         multiplier=EnergyHistogram(energy_range=(0.0, 0.2), warmup=4),
+        curvature=CurvatureOptions(),
+        squared_loss=True,
         noise_scale=NOISE_LR,
     )
     optimizers: Any = phases.upgrade(case.adams(splats), splats)

@@ -5,8 +5,10 @@
 
 import os
 
-from hypothesis import settings
+from hypothesis import Phase, settings
 
 settings.register_profile("fixed", derandomize=True)
 settings.register_profile("random", derandomize=False)
+# For mutants.py: a failure is enough, nobody reads the smallest one.
+settings.register_profile("mutants", derandomize=True, phases=(Phase.explicit, Phase.generate))
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.nn import Parameter
+from trainers import everything
 
 from opt3dgs_optim import PhaseScheduler
 from opt3dgs_optim.lqnadam import CurvatureOptions
@@ -26,7 +27,7 @@ PAIRS = ("history", "epoch")
 
 
 def make_phases() -> PhaseScheduler:
-    return PhaseScheduler(TOTAL, SWITCH, multiplier=1.5, curvature=CurvatureOptions(history_size=3))
+    return everything(TOTAL, SWITCH, multiplier=1.5, curvature=CurvatureOptions(history_size=3))
 
 
 def build(kind: str, splats: dict[str, Parameter]) -> Any:

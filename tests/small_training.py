@@ -16,8 +16,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 from torch.nn import Parameter
+from trainers import everything
 
-from opt3dgs_optim import EnergyHistogram, PhaseScheduler
+from opt3dgs_optim import EnergyHistogram
 
 POINTS, SIZE, VIEWS = 24, 12, 6
 RATES = {"means": 5e-3, "scales": 5e-3, "quats": 1e-3, "opacities": 2e-2, "sh0": 1e-2}
@@ -55,7 +56,7 @@ class Training:
     def __init__(self, folder: Path, steps: int) -> None:
         self.folder, self.steps = folder, steps
         self.checkpoint = folder / "checkpoint.pt"
-        self.phases = PhaseScheduler(
+        self.phases = everything(
             steps, steps * 2 // 3, multiplier=EnergyHistogram(warmup=max(8, steps // 12))
         )
         saved = None

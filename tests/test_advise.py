@@ -19,6 +19,7 @@ from advising.verdicts import (
     PAYS,
     UNDECIDED,
     Row,
+    as_json,
     as_row,
     best_peak,
     caveats,
@@ -108,6 +109,12 @@ def test_the_settings_can_be_pasted(paying: tuple[str, ...], peak: float) -> Non
     assert (phases.switch_step < 6000) == bool(last)
 
 
+def test_a_pilot_that_is_too_short_chooses_no_peak() -> None:
+    assert "Annealing()," in settings(16.0, [row("annealing, peak 16", PAYS, 2.1)])
+    assert "peak=16" in settings(16.0, [row("annealing, peak 16", PAYS, 1.9)])
+    assert "peak=4" in settings(4.0, [row("annealing, peak 16", UNDECIDED, 2.1)])
+
+
 def test_the_caveats_are_those_of_this_pilot() -> None:
     advice: dict[str, Any] = {
         "options": {"iterations": 400},
@@ -115,11 +122,15 @@ def test_the_caveats_are_those_of_this_pilot() -> None:
         "views": 2,
         "peaks": [2.0, 16.0],
         "peak": 16.0,
-        "rows": [{"part": "noise", "verdict": UNDECIDED}],
+        "rows": as_json([row("noise", UNDECIDED)]),
     }
     text = "\n".join(caveats(advice))
     for words in ("400 iterations", "30,000", "3 seeds", "2 held-out", "largest peak", "noise"):
         assert words in text
+    advice["rows"] = as_json([row("annealing, peak 16", PAYS, 2.5)])
+    text = "\n".join(caveats(advice))
+    assert "largest peak" not in text
+    assert "the pilot was short" in text
     advice |= {"peak": 0.0, "rows": []}
     text = "\n".join(caveats(advice))
     assert "largest peak" not in text

@@ -8,8 +8,9 @@ import re
 
 import pytest
 import torch
+from trainers import everything
 
-from opt3dgs_optim import LQNAdam, PhaseScheduler, backend_info, cuda
+from opt3dgs_optim import LQNAdam, backend_info, cuda
 from opt3dgs_optim.backend import uses_kernel
 from opt3dgs_optim.lqnadam import CurvatureOptions
 from opt3dgs_optim.noise import CovarianceNoise
@@ -120,7 +121,7 @@ def test_cuda_is_refused_where_there_is_no_kernel() -> None:
 
 
 def test_scheduler_hands_the_backend_to_the_noise() -> None:
-    phases = PhaseScheduler(10, curvature=CurvatureOptions(backend="torch"), noise_scale=1.0)
+    phases = everything(10, curvature=CurvatureOptions(backend="torch"), noise_scale=1.0)
     adam = torch.optim.Adam([{"params": [torch.nn.Parameter(torch.ones(4, 3))], "name": "means"}])
     phases.upgrade({"means": adam}, {"scales": torch.ones(4, 3)})
     assert phases.noise is not None

@@ -11,7 +11,12 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from trainers import gsplat_optimizers, make_splats, train
+from trainers import (
+    everything,
+    gsplat_optimizers,
+    make_splats,
+    train,
+)
 
 from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam, PhaseScheduler
 from opt3dgs_optim.multiplier import ConstantMultiplier
@@ -153,7 +158,7 @@ def test_a_truncated_file_raises_before_it_reaches_us(cut: float) -> None:
 
 def scheduler_state(change: Callable[[Any], Any]) -> tuple[PhaseScheduler, Any, dict]:
     splats = make_splats()
-    phases = PhaseScheduler(60, 40, multiplier=EnergyHistogram(warmup=10))
+    phases = everything(60, 40, multiplier=EnergyHistogram(warmup=10))
     optimizers = phases.upgrade(gsplat_optimizers(splats))
     train(splats, optimizers, phases, 0, 45)
     saved = copy.deepcopy(optimizers["means"].state_dict())

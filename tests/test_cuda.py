@@ -8,8 +8,9 @@ import pytest
 import torch
 from kernel_host import OPTIONS, Problem, free_run, noise_case, relative_difference
 from torch import Tensor
+from trainers import everything
 
-from opt3dgs_optim import AWSGLD, LQNAdam, PhaseScheduler, backend_info, curvature, ops
+from opt3dgs_optim import AWSGLD, LQNAdam, backend_info, curvature, ops
 from opt3dgs_optim.lqnadam import CurvatureOptions
 from opt3dgs_optim.noise import CovarianceNoise
 
@@ -214,9 +215,7 @@ def test_phase_scheduler_steps_without_synchronisation() -> None:
         name: torch.optim.Adam([{"params": [p], "lr": 1e-3, "name": name}], fused=True)
         for name, p in splats.items()
     }
-    phases = PhaseScheduler(
-        40, switch=20, noise_scale=1.0, curvature=CurvatureOptions(backend="cuda")
-    )
+    phases = everything(40, switch=20, noise_scale=1.0, curvature=CurvatureOptions(backend="cuda"))
     optimizers = phases.upgrade(adams, splats)
     loss = torch.tensor(0.1, device="cuda")
     for step in range(40):

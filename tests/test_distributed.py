@@ -13,7 +13,13 @@ import torch
 import torch.multiprocessing as mp
 from torch import distributed
 from torch.nn import Parameter
-from trainers import gsplat_optimizers, make_splats, train, view_loss
+from trainers import (
+    everything,
+    gsplat_optimizers,
+    make_splats,
+    train,
+    view_loss,
+)
 
 from opt3dgs_optim import AWSGLD, EnergyHistogram, PhaseScheduler
 
@@ -32,7 +38,7 @@ def rank_main(rank: int, port: int, folder: str) -> None:
     address = f"tcp://127.0.0.1:{port}"
     distributed.init_process_group("gloo", init_method=address, rank=rank, world_size=WORLD)
     histogram = EnergyHistogram(warmup=8, step_size=0.1)
-    phases = PhaseScheduler(TOTAL, 30, multiplier=histogram, process_group=distributed.group.WORLD)
+    phases = everything(TOTAL, 30, multiplier=histogram, process_group=distributed.group.WORLD)
     splats = make_splats(9 + 5 * rank, seed=rank)  # uneven shards
     optimizers = phases.upgrade(gsplat_optimizers(splats))
     nus, stood_still = [], []
@@ -79,7 +85,7 @@ def test_a_group_without_torch_distributed() -> None:
 def scaled(fused: bool | None) -> tuple[Any, dict, Any, PhaseScheduler, EnergyHistogram]:
     splats = make_splats()
     histogram = EnergyHistogram(warmup=4)
-    phases = PhaseScheduler(100, 50, multiplier=histogram)
+    phases = everything(100, 50, multiplier=histogram)
     optimizers = phases.upgrade(gsplat_optimizers(splats, fused=fused))
     # like nerfstudio's Trainer; a first scale at which nothing overflows
     scaler = torch.amp.GradScaler("cpu", init_scale=8.0)  # pyright: ignore
@@ -129,7 +135,7 @@ def test_grad_scaler_gives_the_unscaled_steps(fused: bool | None) -> None:
     """A power of two as scale changes no bit, in both phases."""
     scaler, splats, optimizers, phases, _ = scaled(fused)
     plain = make_splats()
-    other = PhaseScheduler(100, 50, multiplier=EnergyHistogram(warmup=4))
+    other = everything(100, 50, multiplier=EnergyHistogram(warmup=4))
     own = other.upgrade(gsplat_optimizers(plain, fused=fused))
     for _ in range(60):
         scaled_step(scaler, splats, optimizers, phases)
@@ -151,7 +157,7 @@ def test_gradient_accumulation_observes_the_mean_once() -> None:
     results = []
     for together in (True, False):
         splats, histogram = make_splats(), EnergyHistogram(warmup=4)
-        phases = PhaseScheduler(20, 12, multiplier=histogram)
+        phases = everything(20, 12, multiplier=histogram)
         optimizers = phases.upgrade(gsplat_optimizers(splats))
         for _ in range(20):
             if together:
@@ -198,7 +204,7 @@ def test_compiled_step_in_both_phases() -> None:
     results = []
     for compiled in (False, True):
         splats = make_splats()
-        phases = PhaseScheduler(12, 6, multiplier=EnergyHistogram(num_partitions=20, warmup=4))
+        phases = everything(12, 6, multiplier=EnergyHistogram(num_partitions=20, warmup=4))
         optimizers: Any = phases.upgrade(gsplat_optimizers(splats))
         if compiled:
             with warnings.catch_warnings():

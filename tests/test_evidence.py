@@ -8,7 +8,7 @@ import torch
 from opt3dgs_optim import LQNAdam, lqnadam
 from opt3dgs_optim._adaptive import MIN_FORESIGHT
 from opt3dgs_optim._evidence import foresight
-from opt3dgs_optim.curvature import history_from_pairs
+from opt3dgs_optim.curvature import header, history_from_pairs
 
 POINTS, VIEWS, STEPS = 300, 30, 150
 
@@ -32,10 +32,11 @@ def trained(disagree: float, own_curvature: float) -> tuple[float, float]:
     for _ in range(STEPS):
         view = int(torch.randint(VIEWS, (), generator=draw))
         off = points.detach() - minima[view]
-        points.grad = (hessians[view] @ off[..., None])[..., 0]
+        gradient = (hessians[view] @ off[..., None])[..., 0]
+        points.grad = gradient
         history = optimizer.state[points].get(lqnadam.HISTORY)
         if history is not None:
-            seen += foresight(history, 5, points.detach(), points.grad)
+            seen += foresight(history, 5, points.detach(), gradient)
         optimizer.step()
         if optimizer.accepted_share is not None:
             shares.append(optimizer.accepted_share)
@@ -58,7 +59,7 @@ def test_pairs_between_views_do_not(disagree: float, own_curvature: float) -> No
 
 
 def test_exact_pairs_foretell_exactly() -> None:
-    """K = D conjugate-free pairs in D = 3: H y = s for every y in their span."""
+    """With the newest pair once more, H y = s (the secant equation)."""
     draw = torch.Generator().manual_seed(1)
     half = torch.randn(20, 3, 3, generator=draw, dtype=torch.float64)
     hessian = half @ half.mT + torch.eye(3)
@@ -66,10 +67,9 @@ def test_exact_pairs_foretell_exactly() -> None:
     moves = torch.randn(4, 20, 3, generator=draw, dtype=torch.float64)
     gradient = lambda x: (hessian @ x[..., None])[..., 0]  # noqa: E731
     history = history_from_pairs(moves[:3], torch.stack([gradient(m) for m in moves[:3]]))
-    head = lqnadam.curvature.header(history, 3)
+    head = header(history, 3)
     head.position.copy_(start)
     head.gradient.copy_(gradient(start))
-    # The newest pair once more: H y = s exactly, whatever the others are.
     position = start + moves[2]
     total, points = foresight(history, 3, position, gradient(position))
     y, s = gradient(moves[2]), moves[2]

@@ -8,9 +8,14 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from trainers import gsplat_optimizers, make_splats, view_loss
+from trainers import (
+    everything,
+    gsplat_optimizers,
+    make_splats,
+    view_loss,
+)
 
-from opt3dgs_optim import AWSGLD, EnergyHistogram, PhaseScheduler
+from opt3dgs_optim import AWSGLD, EnergyHistogram
 
 
 def points(rows: int = 8) -> Tensor:
@@ -86,7 +91,7 @@ def test_energy_jumps_by_1e12_at_the_switch() -> None:
     """Another loss after the switch: the histogram does not look, the step goes on."""
     splats = make_splats()
     histogram = EnergyHistogram(warmup=10)
-    phases = PhaseScheduler(40, 20, multiplier=histogram)
+    phases = everything(40, 20, multiplier=histogram)
     optimizers = phases.upgrade(gsplat_optimizers(splats))
     before: dict = {}
     for iteration in range(40):

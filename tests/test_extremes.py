@@ -8,9 +8,15 @@ import pytest
 import torch
 from problems import SMOOTH, gradient, hessians, quadratic
 from torch import Tensor
-from trainers import gsplat_optimizers, make_splats, train, view_loss
+from trainers import (
+    everything,
+    gsplat_optimizers,
+    make_splats,
+    train,
+    view_loss,
+)
 
-from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam, PhaseScheduler
+from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam
 from opt3dgs_optim.curvature import header
 from opt3dgs_optim.lqnadam import CurvatureOptions
 
@@ -243,7 +249,7 @@ def test_one_view_only() -> None:
     for curvature in (CurvatureOptions(), CurvatureOptions(pairs="epoch", epoch_steps=1)):
         splats = make_splats()
         histogram = EnergyHistogram(warmup=10, energy="view_centered")
-        phases = PhaseScheduler(60, 30, multiplier=histogram, curvature=curvature)
+        phases = everything(60, 30, multiplier=histogram, curvature=curvature)
         optimizers = phases.upgrade(gsplat_optimizers(splats))
         for _ in range(60):
             loss = view_loss(splats, 0, phases)
@@ -282,7 +288,7 @@ def test_both_phases_with_a_constant_image() -> None:
     """Loss 0 and gradient 0 from the first step to the last: nothing moves, nothing is NaN."""
     splats = make_splats()
     before = {k: v.detach().clone() for k, v in splats.items()}
-    phases = PhaseScheduler(50, 20, multiplier=EnergyHistogram(warmup=10))
+    phases = everything(50, 20, multiplier=EnergyHistogram(warmup=10))
     optimizers = phases.upgrade(gsplat_optimizers(splats))
     for _ in range(40):
         for param in splats.values():

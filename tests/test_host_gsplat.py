@@ -10,7 +10,12 @@ import pytest
 import torch
 from gsplat_host import ORDERS, VERSIONS, Trainer, scene_of_main, strategies
 from torch.nn import Parameter, ParameterDict
-from trainers import RATES, gsplat_optimizers, make_splats
+from trainers import (
+    RATES,
+    everything,
+    gsplat_optimizers,
+    make_splats,
+)
 
 from opt3dgs_optim import EnergyHistogram, PhaseScheduler
 
@@ -46,7 +51,7 @@ def start(seed: int = 0) -> Any:
 
 def phased(**options: Any) -> PhaseScheduler:
     options = {"multiplier": EnergyHistogram(warmup=8, step_size=0.1), **options}
-    return PhaseScheduler(TOTAL, SWITCH, **options)
+    return everything(TOTAL, SWITCH, **options)
 
 
 def build(version: str, kind: str, order: str, phases: PhaseScheduler | None) -> Trainer:

@@ -10,7 +10,10 @@ import torch
 from inria_host import ATTRIBUTES, OPTIONS, SimulatedModel, fill, real_model
 from torch import Tensor
 from torch.nn import Parameter
-from trainers import make_splats
+from trainers import (
+    everything,
+    make_splats,
+)
 
 from opt3dgs_optim import EnergyHistogram, PhaseScheduler
 
@@ -32,7 +35,7 @@ def make_model(kind: str) -> Any:
 
 def phased(**options: Any) -> PhaseScheduler:
     options = {"multiplier": EnergyHistogram(warmup=8, step_size=0.1), **options}
-    return PhaseScheduler(TOTAL, SWITCH, **options)
+    return everything(TOTAL, SWITCH, **options)
 
 
 def upgrade(model: Any, **options: Any) -> PhaseScheduler:

@@ -16,7 +16,7 @@ from gsplat_host import HOSTS
 from torch.nn import Parameter
 from trainers import edit_rows, make_splats
 
-from opt3dgs_optim import Phase
+from opt3dgs_optim import Annealing, Phase
 
 TOTAL = 40
 NAMES = {"sh0": "features_dc", "shN": "features_rest"}
@@ -197,8 +197,9 @@ def optimizers_module() -> Any:
 class Training:
     """nerfstudio's Trainer: set-up, and one iteration with its GradScaler."""
 
-    def __init__(self, ours: Any, spec: Any) -> None:
+    def __init__(self, ours: Any, spec: Any, *, paper: bool = True) -> None:
         config = spec.config.pipeline.model
+        config.paper = paper
         config._target = ours.Opt3DGSSplatfactoModel
         self.model = config._target(config)
         groups = self.model.get_gaussian_param_groups()
@@ -243,6 +244,16 @@ def test_a_run_with_the_switch_and_row_edits(ours: Any, attribute: str) -> None:
     assert own["means"].param_groups[0]["lr"] == pytest.approx(5e-3 * 0.01)
     assert own["scales"].param_groups[0]["lr"] == 5e-3
     assert own["means"].state[model.gauss_params["means"]]["history"].shape[0] == 15
+
+
+def test_the_package_defaults_unless_the_paper_is_asked_for(ours: Any) -> None:
+    assert ours.splatfacto_opt3dgs.config.pipeline.model.paper is False
+    ask = Training(ours, ours.splatfacto_opt3dgs)
+    plain = Training(ours, ours.splatfacto_opt3dgs, paper=False)
+    assert ask.model.phases.curvature
+    assert ask.model.phases.annealing is None
+    assert not plain.model.phases.curvature
+    assert plain.model.phases.annealing == Annealing()
 
 
 @pytest.mark.filterwarnings("ignore::FutureWarning")

@@ -8,9 +8,15 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from trainers import gsplat_optimizers, inria_optimizer, make_splats, view_loss
+from trainers import (
+    everything,
+    gsplat_optimizers,
+    inria_optimizer,
+    make_splats,
+    view_loss,
+)
 
-from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam, PhaseScheduler
+from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam
 
 BAD = [math.nan, math.inf, -math.inf]
 BOTH = [AWSGLD, LQNAdam]
@@ -124,7 +130,7 @@ def test_broken_loss_skips_the_step_and_leaves_the_histogram(make: Any, bad: flo
     for hostile in (False, True):
         splats = make_splats()
         histogram = EnergyHistogram(warmup=10, step_size=0.1)
-        phases = PhaseScheduler(60, 40, multiplier=histogram)
+        phases = everything(60, 40, multiplier=histogram)
         optimizers: Any = phases.upgrade(make(splats))
         every = list(optimizers.values()) if isinstance(optimizers, dict) else [optimizers]
         for iteration in range(60):

@@ -14,7 +14,16 @@ from typing import Any
 import pytest
 import torch
 
-from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam, PhaseScheduler, backend_info, two_loop
+from opt3dgs_optim import (
+    AWSGLD,
+    Annealing,
+    EnergyHistogram,
+    Fading,
+    LQNAdam,
+    PhaseScheduler,
+    backend_info,
+    two_loop,
+)
 from opt3dgs_optim.curvature import history_from_pairs
 from opt3dgs_optim.lqnadam import CurvatureOptions
 from opt3dgs_optim.multiplier import ConstantMultiplier
@@ -116,8 +125,32 @@ TABLE: dict[str, tuple[Callable[..., Any], type, dict[str, Any]]] = {
             "reset_moments": ["always", None, 1],
             "noise_scale": [*NOT_NUMBERS, -1.0],
             "noise_in_exploitation": FLAGS,
+            "annealing": [2.0, True, "annealing", {"peak": 2.0}],
+            "fading": [0.2, True, {"share": 0.2}],
+            "adaptive": FLAGS,
             "log": ["run.jsonl", 1],
             "process_group": ["world", 3],
+        },
+    ),
+    "Annealing": (
+        Annealing,
+        Annealing,
+        {
+            "peak": [*NOT_NUMBERS, 0.0, -1.0],
+            "final": [*NOT_NUMBERS, 0.0, -1.0],
+        },
+    ),
+    "Fading": (
+        Fading,
+        Fading,
+        {
+            "share": [*NOT_NUMBERS, 0.0, 1.1],
+            "exp_avg": [*NOT_NUMBERS, -0.1, 1.1],
+            "exp_avg_sq": [*NOT_NUMBERS, -0.1, 1.1],
+            "events": [*COUNTS, 0],
+            "start": [*NOT_NUMBERS, -0.1, 1.1],
+            "stop": [*NOT_NUMBERS, 0.03, 1.1],
+            "seed": COUNTS,
         },
     ),
     "ConstantMultiplier": (

@@ -11,6 +11,7 @@ import torch
 from trainers import (
     INRIA_NAMES,
     edit_rows,
+    everything,
     gsplat_optimizers,
     inria_optimizer,
     make_splats,
@@ -26,7 +27,7 @@ TOTAL, SWITCH = 60, 40
 
 def scheduler(**options: Any) -> PhaseScheduler:
     options.setdefault("multiplier", EnergyHistogram(warmup=10, step_size=0.1))
-    return PhaseScheduler(TOTAL, SWITCH, **options)
+    return everything(TOTAL, SWITCH, **options)
 
 
 def snapshot(splats: dict) -> dict:
@@ -156,7 +157,7 @@ def test_phase_and_pixel_loss() -> None:
 
 
 def test_pixel_loss_stays_l1_when_told() -> None:
-    phases = PhaseScheduler(10, 0, squared_loss=False)
+    phases = everything(10, 0, squared_loss=False)
     assert float(phases.pixel_loss(torch.full((2,), 0.5), torch.zeros(2))) == 0.5
 
 
@@ -171,10 +172,10 @@ def test_moments_start_anew_at_the_switch_or_are_kept() -> None:
 
 
 def test_moments_start_anew_by_themselves_where_the_phase_is_long_enough() -> None:
-    assert PhaseScheduler(30_000).reset_moments
-    assert PhaseScheduler(3_000).reset_moments
-    assert not PhaseScheduler(300).reset_moments
-    assert PhaseScheduler(300, 0.5).reset_moments
+    assert everything(30_000).reset_moments
+    assert everything(3_000).reset_moments
+    assert not everything(300).reset_moments
+    assert everything(300, 0.5).reset_moments
     assert PhaseScheduler.paper(300).reset_moments
 
 
@@ -385,7 +386,7 @@ def test_inria_names() -> None:
 )
 def test_bad_options(options: dict, message: str) -> None:
     with pytest.raises(ValueError, match=re.escape(message)) as error:
-        PhaseScheduler(**{"total_steps": 10, **options})
+        everything(**{"total_steps": 10, **options})
     assert "PhaseScheduler" in str(error.value)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 from torch.optim import Optimizer
+from trainers import everything
 
 from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam, PhaseScheduler
 from opt3dgs_optim.noise import CovarianceNoise, IsotropicNoise
@@ -117,7 +118,7 @@ def test_learning_rates_of_all_kinds_and_many_groups(rate: Any) -> None:
 
 
 def test_the_phases_of_a_training() -> None:
-    scheduler = PhaseScheduler(12, 8)
+    scheduler = everything(12, 8)
     assert (
         only(repr(scheduler), "phase:")
         == "phase: exploration, iteration 0 of 12, switch at 8 (in 8)"
@@ -150,11 +151,11 @@ def test_a_scheduler_with_everything_off_or_everything_on() -> None:
 
 @pytest.mark.parametrize("steps", [0, 3, 11])
 def test_copies_and_lines_stay_short(steps: int) -> None:
-    scheduler = PhaseScheduler(12, 8)
+    scheduler = everything(12, 8)
     optimizers = upgraded(scheduler)
     train(scheduler, optimizers, steps)
-    everything: list[Any] = [scheduler, *optimizers.values()]
-    for item in everything:
+    all_of_them: list[Any] = [scheduler, *optimizers.values()]
+    for item in all_of_them:
         said = repr(item)
         assert max(map(len, said.splitlines())) <= 100
         assert said.splitlines()[0] == f"{type(item).__name__}("
@@ -167,7 +168,7 @@ def test_the_repr_changes_nothing() -> None:
     states = []
     for look in (False, True):
         torch.manual_seed(0)
-        scheduler = PhaseScheduler(12, 8)
+        scheduler = everything(12, 8)
         optimizers = upgraded(scheduler)
         for _ in range(11):
             train(scheduler, optimizers, 1)

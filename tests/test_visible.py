@@ -11,7 +11,14 @@ import pytest
 import torch
 from torch import Tensor
 from torch.nn import Parameter
-from trainers import edit_rows, gsplat_optimizers, inria_optimizer, make_splats, train
+from trainers import (
+    edit_rows,
+    everything,
+    gsplat_optimizers,
+    inria_optimizer,
+    make_splats,
+    train,
+)
 
 from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam, PhaseScheduler
 from opt3dgs_optim.noise import IsotropicNoise
@@ -107,7 +114,7 @@ def test_pairs_of_rows_are_those_of_rows_alone() -> None:
 @pytest.mark.parametrize("call", ["visible", "positional", "sparse_adam", "visibility"])
 def test_invisible_rows_stand_still_in_both_phases(kind: str, exploiting: bool, call: str) -> None:
     splats = make_splats()
-    phases = PhaseScheduler(40, 10, multiplier=EnergyHistogram(warmup=4), noise_scale=1.0)
+    phases = everything(40, 10, multiplier=EnergyHistogram(warmup=4), noise_scale=1.0)
     make: Any = gsplat_optimizers if kind == "gsplat" else inria_optimizer
     optimizers: Any = phases.upgrade(make(splats), splats)
     train(splats, optimizers, phases, 0, 15 if exploiting else 5)
@@ -136,7 +143,7 @@ def test_invisible_rows_stand_still_in_both_phases(kind: str, exploiting: bool, 
 
 
 def test_without_a_mask_nothing_is_stored() -> None:
-    splats, phases = make_splats(), PhaseScheduler(20)
+    splats, phases = make_splats(), everything(20)
     optimizers = phases.upgrade(gsplat_optimizers(splats))
     train(splats, optimizers, phases, 0, 5)
     assert set(optimizers["means"].state[splats["means"]]) == {"step", "exp_avg", "exp_avg_sq"}
@@ -187,7 +194,7 @@ def test_a_non_finite_row_stands_still_and_is_counted() -> None:
 
 
 def test_counts_follow_gsplats_row_edits_and_checkpoints() -> None:
-    splats, phases = make_splats(), PhaseScheduler(60)
+    splats, phases = make_splats(), everything(60)
     optimizers: Any = phases.upgrade(gsplat_optimizers(splats))
 
     def step(mask: Tensor) -> None:
@@ -249,7 +256,7 @@ def test_an_optimizer_with_a_mask_of_its_own_is_upgraded(steps_before: int) -> N
         own.grad, twin.grad = gradients(own, step), gradients(twin, step)
         stock.step(mask)
         other.step(mask)
-    phases = PhaseScheduler(100, multiplier=None, curvature=None, reset_moments=False)
+    phases = everything(100, multiplier=None, curvature=None, reset_moments=False)
     ours = phases.upgrade({"means": stock})["means"]
     own.grad, twin.grad = gradients(own, 9), gradients(twin, 9)
     phases.observe(0.1)
@@ -282,7 +289,7 @@ def test_other_groups_ride_along_without_the_mask() -> None:
     splats, exposure = make_splats(), Parameter(torch.ones(3, 4))
     optimizer = inria_optimizer(splats)
     optimizer.add_param_group({"params": [exposure], "lr": 0.1, "name": "exposure"})
-    phases = PhaseScheduler(10, multiplier=None)
+    phases = everything(10, multiplier=None)
     upgraded: Any = phases.upgrade(optimizer)
     twin = Parameter(torch.ones(3, 4))
     plain = torch.optim.Adam([twin], lr=0.1, eps=1e-15)
@@ -300,7 +307,7 @@ def test_other_groups_ride_along_without_the_mask() -> None:
 
 
 def exploited(steps: int = 8) -> tuple[dict, Any, PhaseScheduler]:
-    splats, phases = make_splats(), PhaseScheduler(40, 0, squared_loss=True)
+    splats, phases = make_splats(), everything(40, 0, squared_loss=True)
     optimizers = phases.upgrade(gsplat_optimizers(splats))
     train(splats, optimizers, phases, 0, steps)
     return splats, optimizers, phases
@@ -396,4 +403,4 @@ def exchange_after(splats: dict, optimizers: Any) -> None:
 
 def test_an_object_without_hooks_is_refused() -> None:
     with pytest.raises(TypeError, match=r"gsplat 1\.6"):
-        PhaseScheduler(10).follow_scene(object())
+        everything(10).follow_scene(object())

@@ -41,7 +41,7 @@ for _ in range(10):
     for optimizer in optimizers.values():
         optimizer.step()
         optimizer.zero_grad()
-    losses.append(float(loss))
+    losses.append(loss.item())
 assert losses[5] < losses[0] and losses[-1] < losses[6], losses
 assert phases.phase.value == "exploitation"
 assert not {{"matplotlib", "numba", "tqdm", "gsplat"}} & set(sys.modules)

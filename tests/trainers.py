@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 from torch.nn import Parameter
 
 from opt3dgs_optim import PhaseScheduler
+from opt3dgs_optim.lqnadam import CurvatureOptions
+from opt3dgs_optim.phases import PAPER_SWITCH
 
 RATES = {
     "means": 1e-2,
@@ -32,6 +36,29 @@ INRIA_NAMES = {
     "scales": "scaling",
     "quats": "rotation",
 }
+
+
+EVERYTHING: dict[str, Any] = {
+    "multiplier": "histogram",
+    "curvature": CurvatureOptions(),
+    "squared_loss": True,
+    "reset_moments": "auto",
+    "annealing": None,
+}
+NOTHING: dict[str, Any] = {
+    "multiplier": None,
+    "curvature": None,
+    "squared_loss": False,
+    "reset_moments": False,
+    "annealing": None,
+}
+
+
+def everything(
+    total_steps: int, switch: float | int = PAPER_SWITCH, **options: Any
+) -> PhaseScheduler:
+    """Both phases of the paper on, which the defaults leave off, and no annealing."""
+    return PhaseScheduler(total_steps, switch, **{**EVERYTHING, **options})
 
 
 def make_splats(n: int = 12, seed: int = 0) -> dict[str, Parameter]:

@@ -29,6 +29,8 @@ OFF: dict[str, Any] = {
     "curvature": None,
     "squared_loss": False,
     "reset_moments": False,
+    "annealing": None,
+    "fading": None,
     "noise_scale": NOISE_LR,
 }
 
@@ -119,7 +121,7 @@ def train(
     options: PilotOptions,
     folder: Path,
     mean_nu: float | None = None,
-    count: Callable[[int], None] = lambda _steps: None,
+    count: Callable[[int], object] = lambda _steps: None,
 ) -> dict[str, Any]:
     """Train one pilot to its end and write its result; a base leaves a checkpoint to branch off."""
     torch.set_num_threads(1)

@@ -10,6 +10,7 @@ from typing import Any
 from opt3dgs_optim.annealing import Annealing
 
 PAYS, DOES_NOT, UNDECIDED = "pays", "does not pay", "undecided"
+TOO_SHORT = 2.0  # dB: annealing that gains more than this shows how short the pilot was
 SMALLEST_GAIN = 0.05  # dB: less is not worth having, however certain
 
 
@@ -71,6 +72,11 @@ def best_peak(rows: Mapping[float, Row]) -> float:
     return max(paying, key=lambda peak: paying[peak]) if paying else 0.0
 
 
+def too_short(peak: float, rows: Sequence[Row]) -> bool:
+    """Whether stock rates do not get far enough in the pilot for it to choose a peak."""
+    return any(row.part == f"annealing, peak {peak:g}" and row.gain > TOO_SHORT for row in rows)
+
+
 def settings(peak: float, rows: Sequence[Row], total_steps: int = 30_000) -> str:
     """The call to paste: on is what pays."""
     on = {row.part for row in rows if row.verdict == PAYS}
@@ -82,10 +88,13 @@ def settings(peak: float, rows: Sequence[Row], total_steps: int = 30_000) -> str
     lines.append("curvature=CurvatureOptions()," if "curvature" in last else "curvature=None,")
     lines.append(f"squared_loss={'squared loss' in last},")
     lines.append(f"reset_moments={bool(last)},")
-    if peak:
+    if peak and too_short(peak, rows):
+        lines.append("annealing=Annealing(),  # the pilot was too short to choose a peak")
+    elif peak:
         lines.append(f"annealing=Annealing(peak={peak:g}, final={Annealing().final:g}),")
-    if "fading" in on:
-        lines.append("fading=Fading(),")
+    else:
+        lines.append("annealing=None,")
+    lines.append("fading=Fading()," if "fading" in on else "fading=None,")
     if {"multiplier", "curvature"} & on:
         lines.append("adaptive=True,")
     imports = ["from opt3dgs_optim import PhaseScheduler"]
@@ -127,7 +136,13 @@ def caveats(advice: Mapping[str, Any]) -> list[str]:
         "All parts but the annealing were tried on top of "
         + (f"annealing from {advice['peak']:g}." if advice["peak"] else "stock learning rates."),
     ]
-    if advice["peak"] == max(advice["peaks"]):
+    if too_short(advice["peak"], [as_row(row) for row in advice["rows"]]):
+        said.append(
+            f"Annealing gained more than {TOO_SHORT:g} dB: in so few iterations stock rates do not "
+            "get far, so this shows that the pilot was short, not which peak a long training "
+            "needs; the settings take the default. Repeat with more --iterations to choose one."
+        )
+    elif advice["peak"] == max(advice["peaks"]):
         said.append("The largest peak that was tried won: a larger one may be better still.")
     if any(row["part"] == "noise" and row["verdict"] == UNDECIDED for row in advice["rows"]):
         said.append(

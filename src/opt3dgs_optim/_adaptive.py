@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from opt3dgs_optim._checkpoint import check_floats, check_keys, check_whole
+from opt3dgs_optim._adaptive_state import NO_EVIDENCE
 from opt3dgs_optim._evidence import (
     accurate,
     empty,
@@ -32,7 +32,6 @@ from opt3dgs_optim.noise import CovarianceNoise
 if TYPE_CHECKING:
     from opt3dgs_optim.phases import PhaseScheduler
 
-PARTS = ("multiplier", "curvature", "noise", "view_centering", "epoch_pairs")
 CHECK_STEPS = 100  # iterations between two checks, at most
 # nu is judged over so many energies at least, and over such a share of the run.
 NU_WINDOW, NU_WINDOW_SHARE = 300, 1 / 30
@@ -46,17 +45,6 @@ MIN_ACCEPTED = 0.1  # share of the candidate pairs
 MIN_FORESIGHT = 0.1
 NOISE_EFFECT = 1e-3  # of the noise's deviation along a Gaussian's longest axis, in learning rates
 ONE_VIEW = 200  # energies, all of one view
-
-NO_EVIDENCE: dict[str, Any] = {
-    "switched_off": {},
-    "constant": None,
-    "windows": [],
-    "probes": 0,
-    "pairs": [0.0] * 4,
-    "view": None,
-    "views": 0,
-    "edited": False,
-}
 
 LOGGER = logging.getLogger("opt3dgs_optim")
 
@@ -348,29 +336,3 @@ def _between(old: list[float], now: list[float]) -> tuple[float, float, float]:
     mean = (now[0] * now[1] - old[0] * old[1]) / count
     square = now[2] - old[2] - old[0] * count / now[0] * (mean - old[1]) ** 2
     return count, mean, (max(square, 0.0) / count) ** 0.5
-
-
-def check_loadable(call: str, state: Mapping[str, Any], adaptive: Adaptive | None) -> None:
-    """ValueError unless a scheduler's `state` can be loaded into one with or without `adaptive`."""
-    saved = state.get("adaptive")
-    if saved is None:
-        return
-    name = f"{call}: adaptive"
-    check_keys(name, saved, tuple(NO_EVIDENCE))
-    off = saved["switched_off"]
-    check_keys(f"{name}: switched_off", off, ())
-    if set(off) - set(PARTS):
-        raise ValueError(f"{name}: parts {sorted(off)}, but there are {', '.join(PARTS)}")
-    if off and adaptive is None:
-        raise ValueError(
-            f"{call}: of a run that has switched off {', '.join(off)}, but this scheduler is not "
-            "adaptive; adaptive=True is needed"
-        )
-    check_whole(name, "probes", saved["probes"])
-    check_floats(name, "pairs", saved["pairs"], 4)
-    if not isinstance(saved["windows"], list):
-        raise ValueError(f"{name}: windows={saved['windows']!r}, but a list is needed")
-    for each in saved["windows"]:
-        check_floats(name, "windows", each, 3)
-    if "multiplier" in off:
-        check_floats(name, "constant", [saved["constant"]], 1)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from opt3dgs_optim import curvature, ops
 from opt3dgs_optim.energy import EnergyHistogram
+from opt3dgs_optim.lqnadam import CurvatureOptions
 from opt3dgs_optim.phases import PhaseScheduler
 
 HISTORY_SIZE = 5
@@ -124,6 +125,8 @@ def _step(points: int, device: torch.device, *, exploit: bool | None) -> _Subjec
             1_000_000,
             switch=0 if exploit else 1_000_000,
             multiplier=EnergyHistogram(energy_range=(0.0, 1.0), temperature=0.1, warmup=0),
+            curvature=CurvatureOptions(),
+            squared_loss=True,
             noise_scale=NOISE_SCALE,
         )
         optimizers = scheduler.upgrade(optimizers, splats)

@@ -67,8 +67,8 @@ class Opt3DGSSplatfactoModelConfig(SplatfactoModelConfig):
     """iterations of the training: give the same number as --max-num-iterations"""
     switch: float = PAPER_SWITCH
     """where exploitation starts, as a fraction of total_steps"""
-    squared_loss: bool = True
-    """whether the pixel loss turns to L2 in exploitation"""
+    paper: bool = False
+    """all parts and settings of the paper instead of the package's defaults"""
 
 
 class Opt3DGSSplatfactoModel(SplatfactoModel):
@@ -82,7 +82,9 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
         config = self.config
         # Held in a tuple: a Module must not take it for one of its parts.
         self._phases = (
-            PhaseScheduler(config.total_steps, config.switch, squared_loss=config.squared_loss),
+            PhaseScheduler.paper(config.total_steps, switch=config.switch)
+            if config.paper
+            else PhaseScheduler(config.total_steps, config.switch),
         )
 
     @property
@@ -105,7 +107,7 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
         losses = super().get_loss_dict(outputs, batch, metrics_dict)
         if not self.training:
             return losses
-        if self.config.squared_loss and self.phases.phase is Phase.EXPLOITATION:
+        if self.phases.squared_loss and self.phases.phase is Phase.EXPLOITATION:
             render, target = self._images(outputs, batch)
             change = self.phases.pixel_loss(render, target) - (render - target).abs().mean()
             losses["main_loss"] = losses["main_loss"] + (1 - self.config.ssim_lambda) * change

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-from opt3dgs_optim._adaptive import Adaptive, check_loadable
+from opt3dgs_optim._adaptive import Adaptive
+from opt3dgs_optim._adaptive_state import check_loadable
 from opt3dgs_optim._checkpoint import check_keys, check_whole
 from opt3dgs_optim._checks import check_count, check_flag, check_number, check_part
 from opt3dgs_optim._ranks import RankMean
@@ -41,12 +42,13 @@ class Phase(enum.Enum):
 
 
 class PhaseScheduler(Upgrading):
-    """Put Opt3DGS's two phases into the optimizers of an existing 3DGS trainer.
+    """Put annealing and Opt3DGS's two phases into the optimizers of an existing 3DGS trainer.
 
-    Exploration: Adam's step on every Gaussian parameter is multiplied by nu. Exploitation: the
-    pixel loss turns from L1 to L2, Adam's moments start anew, nu is off, and the positions are
-    stepped along a per-point L-BFGS direction. Every part can be off by itself, and then costs
-    nothing.
+    By default, annealing alone: it is what paid against its control (docs/evidence.md). The two
+    phases of the paper are on with `PhaseScheduler.paper`, or part by part. Exploration: Adam's
+    step on every Gaussian parameter is multiplied by nu. Exploitation: the pixel loss turns from
+    L1 to L2, Adam's moments start anew, nu is off, and the positions are stepped along a per-point
+    L-BFGS direction. What is off costs nothing.
 
     Args:
         total_steps: iterations of the training.
@@ -111,13 +113,13 @@ class PhaseScheduler(Upgrading):
         | ConstantMultiplier
         | float
         | Literal["histogram"]
-        | None = "histogram",
-        curvature: CurvatureOptions | None = CurvatureOptions(),  # noqa: B008 (immutable)
-        squared_loss: bool = True,
-        reset_moments: bool | Literal["auto"] = "auto",
+        | None = None,
+        curvature: CurvatureOptions | None = None,
+        squared_loss: bool = False,
+        reset_moments: bool | Literal["auto"] = False,
         noise_scale: float = 0.0,
         noise_in_exploitation: bool = True,
-        annealing: Annealing | None = None,
+        annealing: Annealing | None = Annealing(),  # noqa: B008 (immutable)
         fading: Fading | None = None,
         adaptive: bool = False,
         log: RunLog | None = None,
@@ -169,6 +171,9 @@ class PhaseScheduler(Upgrading):
         check_count(f"{CALL}.paper", "total_steps", total_steps, 1)
         settings: dict[str, Any] = {
             "switch": PAPER_SWITCH,
+            "annealing": None,
+            "curvature": CurvatureOptions(),
+            "squared_loss": True,
             "reset_moments": True,
             "multiplier": EnergyHistogram.paper(warmup=round(total_steps * PAPER_WARMUP)),
             **overrides,
@@ -321,7 +326,7 @@ class PhaseScheduler(Upgrading):
         iteration = check_whole(call, "iteration", state["iteration"])
         num_observed = check_whole(call, "num_observed", state["num_observed"])
         saved = state["multiplier"]
-        check_loadable(call, state, self._adaptive)
+        check_loadable(call, state, self._adaptive is not None)
         if self._adaptive is not None:
             self._adaptive.load_state_dict(state.get("adaptive"))
         if self.multiplier is not None and saved is not None:
