@@ -12,10 +12,21 @@ from typing import Any
 import pytest
 import torch
 
+from opt3dgs_optim import (
+    AWSGLD,
+    EnergyHistogram,
+    LQNAdam,
+    __version__,
+    cuda,
+    curvature,
+    doctor,
+    doctor_checks,
+    doctor_costs,
+)
 from opt3dgs_optim import __main__ as commands
-from opt3dgs_optim import __version__, cuda, curvature, doctor, doctor_checks, doctor_costs
 from opt3dgs_optim._status import CLEAR, StatusLine
 from opt3dgs_optim.doctor_checks import CHECKS, run_checks
+from opt3dgs_optim.noise import covariance_noise
 
 CPU = torch.device("cpu")
 
@@ -53,18 +64,18 @@ def wrong_rotation(scales: Any, quats: Any, opacities: Any, eta: Any) -> torch.T
 
 
 TWO_LOOP = curvature.two_loop
-UPDATE = doctor_checks.EnergyHistogram._update_weights
-NOISE = doctor_checks.covariance_noise
+UPDATE = EnergyHistogram._update_weights
+NOISE = covariance_noise
 
 
 @pytest.mark.parametrize(
     ("place", "name", "broken", "caught"),
     [
         (curvature, "two_loop", turned, ["two-loop recursion", "secant equation"]),
-        (doctor_checks.EnergyHistogram, "_warmed_up", no_warm_up, ["energy histogram"]),
-        (doctor_checks.EnergyHistogram, "_update_weights", heavier, ["energy histogram"]),
-        (doctor_checks.AWSGLD, "_scaled_lr", slower, ["Adam with all off"]),
-        (doctor_checks.LQNAdam, "_scaled_lr", slower, ["Adam with all off"]),
+        (EnergyHistogram, "_warmed_up", no_warm_up, ["energy histogram"]),
+        (EnergyHistogram, "_update_weights", heavier, ["energy histogram"]),
+        (AWSGLD, "_scaled_lr", slower, ["Adam with all off"]),
+        (LQNAdam, "_scaled_lr", slower, ["Adam with all off"]),
         (doctor_checks, "covariance_noise", wrong_rotation, ["covariance noise"]),
     ],
 )

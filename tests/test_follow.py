@@ -26,7 +26,7 @@ from opt3dgs_optim import report
 from opt3dgs_optim.follow import NO_MATPLOTLIB, NOTHING_YET, Follower, follow
 from opt3dgs_optim.follow_page import duration, page
 from opt3dgs_optim.follow_state import Watched, stamp_of, watch
-from opt3dgs_optim.runlog import RunLog
+from opt3dgs_optim.runlog import RunLog, read_run
 
 needs_matplotlib = pytest.mark.skipif(
     importlib.util.find_spec("matplotlib") is None, reason="matplotlib is not installed"
@@ -278,8 +278,8 @@ def test_only_what_has_changed_is_read_again(
 ) -> None:
     from opt3dgs_optim import follow_state
 
-    real, reads = follow_state.read_run, []
-    monkeypatch.setattr(follow_state, "read_run", lambda p: (reads.append(p.name), real(p))[1])
+    reads: list[str] = []
+    monkeypatch.setattr(follow_state, "read_run", lambda p: (reads.append(p.name), read_run(p))[1])
     for name in ("a", "b"):
         write(tmp_path / f"{name}.jsonl", 5)
     follower = Follower([tmp_path], tmp_path, "psnr", 1, 1e9)

@@ -144,7 +144,7 @@ def caveats(advice: Mapping[str, Any]) -> list[str]:
         )
     elif advice["peak"] == max(advice["peaks"]):
         said.append("The largest peak that was tried won: a larger one may be better still.")
-    if any(row["part"] == "noise" and row["verdict"] == UNDECIDED for row in advice["rows"]):
+    if any(row["part"] == "noise" and row["verdict"] != PAYS for row in advice["rows"]):
         said.append(
             "The noise acts on nearly transparent Gaussians, of which a pilot has few: leave it "
             "as your trainer has it."

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -13,53 +12,15 @@ from torch import Tensor
 from opt3dgs_optim import curvature
 from opt3dgs_optim._adam import HookedAdam
 from opt3dgs_optim._checkpoint import drop_foreign_rows
-from opt3dgs_optim._checks import (
-    check_choice,
-    check_count,
-    check_flag,
-    check_interval,
-    check_number,
-)
 from opt3dgs_optim._repr import block, curvature_line, group_lines, skipped_lines
-from opt3dgs_optim.backend import BACKENDS, Backend, uses_kernel
+from opt3dgs_optim.backend import Backend, uses_kernel
+from opt3dgs_optim.curvature_options import CurvatureOptions
 from opt3dgs_optim.ops import lqn_direction
+
+__all__ = ["EPOCH", "HISTORY", "CurvatureOptions", "LQNAdam"]
 
 HISTORY = "history"  # state keys: float tensors, points first, an all-zero row means "nothing"
 EPOCH = "epoch"
-
-
-@dataclass(frozen=True)
-class CurvatureOptions:
-    """Options of the per-point L-BFGS; see `LQNAdam` for their meaning."""
-
-    history_size: int = 5
-    pairs: Literal["consecutive", "epoch"] = "consecutive"
-    epoch_steps: int | None = None
-    min_cosine: float = 1e-6
-    powell: bool = False
-    graft: bool = True
-    gamma_clamp: tuple[float, float] | None = None
-    backend: Backend = "auto"
-    pair_dtype: curvature.PairDtype = "float32"
-
-    def __post_init__(self) -> None:
-        call = "LQNAdam"
-        check_choice(call, "backend", self.backend, BACKENDS)
-        check_choice(call, "pair_dtype", self.pair_dtype, curvature.PAIR_DTYPES)
-        check_count(call, "history_size", self.history_size, 1, curvature.MAX_HISTORY)
-        check_choice(call, "pairs", self.pairs, ("consecutive", "epoch"))
-        if self.pairs == "epoch":
-            check_count(call, "epoch_steps (needed for pairs='epoch')", self.epoch_steps, 1)
-        elif self.epoch_steps is not None:
-            raise ValueError(
-                f"{call}: epoch_steps={self.epoch_steps!r}, but it is used with pairs='epoch' only"
-            )
-        check_number(call, "min_cosine", self.min_cosine, 0.0, 1.0, open_high=True)
-        check_flag(call, "powell", self.powell)
-        check_flag(call, "graft", self.graft)
-        if self.gamma_clamp is not None:
-            low, _ = check_interval(call, "gamma_clamp", self.gamma_clamp)
-            check_number(call, "gamma_clamp[0]", low, 0.0)
 
 
 class LQNAdam(HookedAdam):
