@@ -13,7 +13,7 @@ from study.records import Record, Setting
 
 Verdict = Literal["pays", "does not pay", "undecided"]
 MIN_SEEDS = 3
-MIN_SCENES = 2
+MIN_SCENES = 5  # all of the study's: a part may help one scene and harm the next
 
 
 @dataclass(frozen=True)

@@ -52,12 +52,15 @@ def stages(seeds: int = 3) -> dict[str, list[tuple[str, str, int, int, int, str]
         ]
 
     two = ["mcmc", "annealed-8-0.4"]
+    longer = ["annealed-4-0.4+faded", "annealed-4-0.4", "faded"]
     return {
         "core": cross(SCENES, FIRST_ARMS, seeds, 3_000),
         "tails": cross(SCENES, tails, seeds, 3_000),
         "faded-on-top": cross(QUICK_SCENES, ["annealed-4-0.4+faded"], seeds, 3_000),
         "long-first": cross(SCENES, two, 1, 7_500),
-        "full": cross(FULL_SCENES, two, 1, 30_000),
+        "faded-on-top-all": cross(SCENES, ["annealed-4-0.4+faded"], seeds, 3_000),
+        "long-parts": cross(SCENES, longer, 1, 7_500),
+        "full": cross(FULL_SCENES, [*two, "annealed-4-0.4+faded"], 1, 30_000),
         "long": cross(SCENES, two, seeds, 7_500),
         "rest": cross(QUICK_SCENES, later, seeds, 3_000),
         "leads": cross(QUICK_SCENES, beyond, seeds, 3_000),
@@ -65,7 +68,7 @@ def stages(seeds: int = 3) -> dict[str, list[tuple[str, str, int, int, int, str]
         "random": cross(SCENES, two, seeds, 3_000, init="random"),
         "small": cross(SCENES, two, seeds, 3_000, share=0.25),
         "rest-all": cross(SCENES, later, seeds, 3_000),
-        "long-faded": cross(SCENES, ["faded"], seeds, 7_500),
+        "long-all": cross(SCENES, longer, seeds, 7_500),
     }
 
 
