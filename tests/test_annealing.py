@@ -7,23 +7,15 @@ from typing import Any
 
 import pytest
 import torch
-from trainers import edit_rows, gsplat_optimizers, inria_optimizer, make_splats, train
+from trainers import NOTHING, edit_rows, gsplat_optimizers, inria_optimizer, make_splats, train
 
 from opt3dgs_optim import Annealing, Fading, PhaseScheduler
 
 TOTAL = 60
-OFF: dict[str, Any] = {
-    "multiplier": None,
-    "curvature": None,
-    "squared_loss": False,
-    "reset_moments": False,
-    "annealing": None,
-    "fading": None,
-}
 
 
 def phases_with(**options: Any) -> PhaseScheduler:
-    return PhaseScheduler(TOTAL, **OFF | options)
+    return PhaseScheduler(TOTAL, **NOTHING | options)
 
 
 @pytest.mark.parametrize(
@@ -61,7 +53,7 @@ def test_every_step_is_adams_times_the_factor() -> None:
 
 def test_annealing_multiplies_nu_and_goes_on_after_the_switch() -> None:
     phases = PhaseScheduler(
-        TOTAL, 30, **OFF | {"multiplier": 1.5, "annealing": Annealing(8.0, 0.5)}
+        TOTAL, 30, **NOTHING | {"multiplier": 1.5, "annealing": Annealing(8.0, 0.5)}
     )
     optimizer: Any = phases.upgrade(gsplat_optimizers(make_splats()))["means"]
     group = optimizer.param_groups[0]

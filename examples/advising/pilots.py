@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from splatting.arms import NOISE_LR, PAPER_WARMUP, Arm
+from splatting.arms import ALL_OFF, PAPER_WARMUP, Arm
 from splatting.fit import Fit, FitOptions
 from splatting.scenes import load_scene
 
@@ -24,15 +24,6 @@ from opt3dgs_optim.multiplier import ConstantMultiplier
 SWITCH = 0.75  # of a pilot: where the trainings of the last phase branch off
 PEAKS = (2.0, 4.0, 8.0, 16.0)
 COUNT_EVERY = 10
-OFF: dict[str, Any] = {
-    "multiplier": None,
-    "curvature": None,
-    "squared_loss": False,
-    "reset_moments": False,
-    "annealing": None,
-    "fading": None,
-    "noise_scale": NOISE_LR,
-}
 
 
 @dataclass(frozen=True)
@@ -79,7 +70,7 @@ LAST_PHASES: dict[str, dict[str, Any]] = {
 
 def _arm(pilot: Pilot) -> Arm:
     def make(iterations: int, switch: float, nu: float | None) -> PhaseScheduler:
-        options = dict(OFF)
+        options = dict(ALL_OFF)
         warmup = max(4, round(iterations * PAPER_WARMUP))
         if pilot.peak:
             options["annealing"] = Annealing(pilot.peak)

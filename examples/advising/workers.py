@@ -37,7 +37,13 @@ def _train_side_by_side(jobs: Sequence[Job], workers: int, bar: Any) -> None:
     os.environ.update({"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"})
     context = multiprocessing.get_context("spawn")
     steps = context.Value("q", 0)
-    with context.Pool(workers, _start, (steps,)) as pool:
+    # Ctrl-C reaches the workers too; what is ignored here they ignore from their very start.
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        pool = context.Pool(workers, _start, (steps,))
+    finally:
+        signal.signal(signal.SIGINT, before)
+    with pool:
         running = pool.map_async(_train, jobs, chunksize=1)
         while not running.ready():
             time.sleep(POLL_SECONDS)
@@ -49,7 +55,6 @@ def _train_side_by_side(jobs: Sequence[Job], workers: int, bar: Any) -> None:
 
 def _start(steps: Any) -> None:
     _shared.append(steps)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops us
 
 
 def _train(job: Job) -> None:

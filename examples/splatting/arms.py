@@ -30,19 +30,22 @@ class Arm:
     needs: str | None = None  # the arm whose mean nu it takes, seed by seed
 
 
+ALL_OFF: dict[str, Any] = {
+    "multiplier": None,
+    "curvature": None,
+    "squared_loss": False,
+    "reset_moments": False,
+    "annealing": None,
+    "fading": None,
+    "noise_scale": NOISE_LR,
+}
+
+
 def _scheduler(**options: Any) -> MakeScheduler:
     """A scheduler of which only the named parts are on; the noise is the package's."""
-    off: dict[str, Any] = {
-        "multiplier": None,
-        "curvature": None,
-        "squared_loss": False,
-        "reset_moments": False,
-        "annealing": None,
-        "noise_scale": NOISE_LR,
-    }
 
     def make(iterations: int, switch: float, _nu: float | None) -> PhaseScheduler:
-        return PhaseScheduler(iterations, switch, **{**off, **options})
+        return PhaseScheduler(iterations, switch, **ALL_OFF | options)
 
     return make
 

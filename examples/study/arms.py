@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from splatting.arms import NOISE_LR, PAPER_WARMUP, Arm, paper_scheduler
+from splatting.arms import ALL_OFF, PAPER_WARMUP, Arm, paper_scheduler
 from splatting.scenes import Scene
 
 from opt3dgs_optim import EnergyHistogram, PhaseScheduler
@@ -16,15 +16,6 @@ from opt3dgs_optim.lqnadam import CurvatureOptions
 from opt3dgs_optim.multiplier import ConstantMultiplier
 
 BASELINE = "mcmc"
-ALL_OFF: dict[str, Any] = {
-    "multiplier": None,
-    "curvature": None,
-    "squared_loss": False,
-    "reset_moments": False,
-    "annealing": None,
-    "fading": None,
-    "noise_scale": NOISE_LR,
-}
 # (scene, iterations, mean nu of the arm in `needs`) -> the options that differ from ALL_OFF
 Options = Callable[[Scene, int, float | None], dict[str, Any]]
 
