@@ -30,7 +30,7 @@ from train import add_fit_options, recorded_command
 from opt3dgs_optim.report import write_report
 from opt3dgs_optim.runlog import Run, read_run
 
-DEFAULT_ARMS = "adam,mcmc,mcmc+awsgld,mcmc+constant-multiplier,mcmc+l2+reset,opt3dgs,annealed"
+DEFAULT_ARMS = "adam,mcmc,mcmc+awsgld,mcmc+constant-multiplier,mcmc+l2+reset,opt3dgs,annealed+faded"
 POLL_SECONDS = 0.2
 
 

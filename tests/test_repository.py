@@ -95,7 +95,7 @@ def test_readme_has_the_two_commands() -> None:
     assert f'{setup}".[test]" && .venv/bin/python -m pytest\n' in README
 
 
-@pytest.mark.parametrize("study", ["embedded", "banana"])
+@pytest.mark.parametrize("study", ["embedded"])
 def test_readme_figures_are_those_of_the_committed_results(study: str) -> None:
     """Every row of README's table, against the report that its command wrote."""
     report = json.loads((ROOT / "docs" / "results" / study / "report.json").read_text())

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from splatting.arms import NOISE_LR
+from splatting.scenes import load_scene
 from study import report
 from study.analysis import Study
 from study.arms import BASELINE, STUDY_ARMS, find_study_arm
@@ -50,7 +52,12 @@ def test_the_defaults_are_what_the_page_concludes() -> None:
 
 def test_the_default_annealing_is_the_measured_one() -> None:
     arm = COMPARISONS["annealing"][0]
-    assert arm == f"annealed-{Annealing().peak:g}-{Annealing().final:g}" == report.BEST
+    assert arm == f"annealed-{Annealing().peak:g}-{Annealing().final:g}+faded" == report.BEST
+    measured = find_study_arm(arm).arm(load_scene("embedded")).make
+    assert measured is not None
+    phases, defaults = measured(300, 1.0, None), PhaseScheduler(300, noise_scale=NOISE_LR)
+    for part in ("annealing", "fading", "multiplier", "squared_loss", "reset_moments", "curvature"):
+        assert getattr(phases, part) == getattr(defaults, part), part
 
 
 def test_gain_at_equal_seconds_and_its_spread() -> None:

@@ -44,6 +44,7 @@ EVERYTHING: dict[str, Any] = {
     "squared_loss": True,
     "reset_moments": "auto",
     "annealing": None,
+    "fading": None,
 }
 NOTHING: dict[str, Any] = {
     "multiplier": None,
@@ -51,13 +52,14 @@ NOTHING: dict[str, Any] = {
     "squared_loss": False,
     "reset_moments": False,
     "annealing": None,
+    "fading": None,
 }
 
 
 def everything(
     total_steps: int, switch: float | int = PAPER_SWITCH, **options: Any
 ) -> PhaseScheduler:
-    """Both phases of the paper on, which the defaults leave off, and no annealing."""
+    """Both phases of the paper on, which the defaults leave off, and nothing else."""
     return PhaseScheduler(total_steps, switch, **{**EVERYTHING, **options})
 
 

@@ -106,7 +106,7 @@ _ARMS = (
     ),
     Arm("opt3dgs", "every part of the paper, settings measured on the run", make=_opt3dgs),
     Arm("opt3dgs-paper", "every part of the paper, its settings", make=paper_scheduler),
-    Arm("annealed", "all steps times 8 falling to 0.4: the package's defaults", make=_defaults),
+    Arm("annealed+faded", "annealed steps, faded moments: the package's defaults", make=_defaults),
 )
 ARMS = {arm.name: arm for arm in _ARMS}
 

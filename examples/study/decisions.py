@@ -9,7 +9,7 @@ from study.analysis import Gain, Study
 ITERATIONS = 3_000
 # part -> (the arm with it, the arm without it)
 COMPARISONS = {
-    "annealing": ("annealed-8-0.4", "mcmc"),
+    "annealing": ("annealed-4-0.4+faded", "faded"),
     "fading": ("annealed-4-0.4+faded", "annealed-8-0.4"),
     "multiplier": ("awsgld", "constant"),
     "squared_loss": ("l2@1/30", "mcmc"),
@@ -35,8 +35,9 @@ class Decision:
 def decide(study: Study) -> dict[str, Decision]:
     """The decision on every part.
 
-    Fading is judged on top of the best annealing, since both lengthen steps; the multiplier
-    against a constant of its mean, curvature against the same phase without it.
+    Annealing and fading are judged against each other alone, fading against the annealing that did
+    best by itself, since both lengthen steps; the multiplier against a constant of its mean,
+    curvature against the same phase without it.
     """
     settings = study.settings(ITERATIONS)
     return {

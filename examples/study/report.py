@@ -28,8 +28,9 @@ FOLDER = REPOSITORY / "docs" / "results" / "study"
 PAGE = REPOSITORY / "docs" / "evidence.md"
 PAGES = (PAGE, REPOSITORY / "README.md")  # that have tables
 SHORT = 3_000
-CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4")
-BEST = "annealed-8-0.4"
+LONG_ARMS = ("mcmc", "faded", "annealed-4-0.4", "annealed-8-0.4", "annealed-4-0.4+faded")
+BEST = "annealed-4-0.4+faded"  # the defaults
+CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4", BEST)
 MARKER = re.compile(r"(<!-- study:([a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -51,8 +52,10 @@ def tables(study: Study) -> dict[str, str]:
         "options": gains_table(gains["options"]),
         "leads": gains_table(gains["leads"]),
         "long": goals_table(study, {"3,000 iterations": short, **long}, BEST, groups.BASELINE),
-        "random": gains_table(study.gains(study.settings(SHORT, "random"), [BEST])),
-        "small": gains_table(study.gains(study.settings(SHORT, share=0.25), [BEST])),
+        "long-scenes": scenes_table(study, long["7,500 iterations"], LONG_ARMS),
+        "full-scenes": scenes_table(study, long["30,000 iterations"], LONG_ARMS),
+        "random": gains_table(study.gains(study.settings(SHORT, "random"), ["annealed-8-0.4"])),
+        "small": gains_table(study.gains(study.settings(SHORT, share=0.25), ["annealed-8-0.4"])),
         "decisions": _decisions_table(study),
     }
     return made
@@ -90,8 +93,8 @@ def plots(study: Study, folder: Path) -> list[Path]:
     short, drawn = study.settings(SHORT), []
     for name, settings, arms in (
         ("curves.png", short, CURVE_ARMS),
-        ("curves_long.png", study.settings(7_500), ("mcmc", "faded", BEST)),
-        ("curves_full.png", study.settings(30_000), ("mcmc", BEST)),
+        ("curves_long.png", study.settings(7_500), ("mcmc", "faded", "annealed-8-0.4", BEST)),
+        ("curves_full.png", study.settings(30_000), ("mcmc", "annealed-8-0.4", BEST)),
     ):
         if settings:
             plot_curves(study, settings, arms, folder / name)

@@ -32,7 +32,7 @@ class Annealing:
         ValueError: an option is outside what is allowed.
     """
 
-    peak: float | Mapping[str, float] = 8.0
+    peak: float | Mapping[str, float] = 4.0
     final: float = 0.4
 
     def __post_init__(self) -> None:

@@ -42,9 +42,9 @@ class Phase(enum.Enum):
 
 
 class PhaseScheduler(Upgrading):
-    """Put annealing and Opt3DGS's two phases into the optimizers of an existing 3DGS trainer.
+    """Put annealing, fading and Opt3DGS's two phases into a 3DGS trainer's optimizers.
 
-    By default, annealing alone: it is what paid against its control (docs/evidence.md). The two
+    By default, annealing and fading: what paid against a control (docs/evidence.md). The two
     phases of the paper are on with `PhaseScheduler.paper`, or part by part. Exploration: Adam's
     step on every Gaussian parameter is multiplied by nu. Exploitation: the pixel loss turns from
     L1 to L2, Adam's moments start anew, nu is off, and the positions are stepped along a per-point
@@ -120,7 +120,7 @@ class PhaseScheduler(Upgrading):
         noise_scale: float = 0.0,
         noise_in_exploitation: bool = True,
         annealing: Annealing | None = Annealing(),  # noqa: B008 (immutable)
-        fading: Fading | None = None,
+        fading: Fading | None = Fading(),  # noqa: B008 (immutable)
         adaptive: bool = False,
         log: RunLog | None = None,
         process_group: Any = None,
@@ -172,6 +172,7 @@ class PhaseScheduler(Upgrading):
         settings: dict[str, Any] = {
             "switch": PAPER_SWITCH,
             "annealing": None,
+            "fading": None,
             "curvature": CurvatureOptions(),
             "squared_loss": True,
             "reset_moments": True,
