@@ -100,8 +100,8 @@ def core() -> list[StudyArm]:
         StudyArm("faded", "moments of random points faded", BASELINE, _fixed(fading=Fading())),
         StudyArm(
             "annealed-4-0.4+faded",
-            "both",
-            "annealed-4-0.4",
+            "annealed from 4, and faded: the defaults",
+            "annealed-8-0.4",
             _fixed(annealing=both, fading=Fading()),
         ),
         StudyArm(
