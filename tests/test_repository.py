@@ -63,7 +63,10 @@ def test_citation_parses_as_yaml() -> None:
 
 def test_the_declared_torch_is_the_oldest_tested() -> None:
     """`docs/torch_versions.json` is what examples/check_torch_versions.py last found."""
-    record = json.loads((ROOT / "docs" / "torch_versions.json").read_text(encoding="utf-8"))
+    path = ROOT / "docs" / "torch_versions.json"
+    if not path.exists():
+        pytest.skip(f"no {path.name} yet: python examples/check_torch_versions.py")
+    record = json.loads(path.read_text(encoding="utf-8"))
     results = record["results"]
     assert all(result["failed"] == result["error"] == 0 for result in results)
     assert all(result["passed"] > 1000 for result in results)
