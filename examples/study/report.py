@@ -49,16 +49,25 @@ def tables(study: Study) -> dict[str, str]:
         "nu": nu_table(study, short, [*names["core"], *names["options"]]),
         "tails": gains_table(gains["tails"]),
         "on-top": gains_table(gains["on-top"]),
-        "options": gains_table(gains["options"]),
-        "leads": gains_table(gains["leads"]),
+        "options": gains_table(gains["options"]) if gains["options"] else _missing("options"),
+        "leads": gains_table(gains["leads"]) if gains["leads"] else _missing("leads"),
         "long": goals_table(study, {"3,000 iterations": short, **long}, BEST, groups.BASELINE),
         "long-scenes": scenes_table(study, long["7,500 iterations"], LONG_ARMS),
         "full-scenes": scenes_table(study, long["30,000 iterations"], LONG_ARMS),
-        "random": gains_table(study.gains(study.settings(SHORT, "random"), ["annealed-8-0.4"])),
-        "small": gains_table(study.gains(study.settings(SHORT, share=0.25), ["annealed-8-0.4"])),
         "decisions": _decisions_table(study),
     }
+    for stage, settings in (
+        ("random", study.settings(SHORT, "random")),
+        ("small", study.settings(SHORT, share=0.25)),
+    ):
+        found = study.gains(settings, ["annealed-8-0.4"])
+        made[stage] = gains_table(found) if found else _missing(stage)
     return made
+
+
+def _missing(stage: str) -> str:
+    """What stands where nothing has been trained yet."""
+    return f"Not measured yet: `python examples/study/run.py --scenes DIR --stages {stage}`."
 
 
 _KINDS: dict[str, Callable[[], list[groups.StudyArm]]] = {
