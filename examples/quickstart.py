@@ -20,7 +20,7 @@ from torch.nn import Parameter
 
 from opt3dgs_optim import PhaseScheduler
 
-SIZE, GAUSSIANS, STEPS, SWITCH = 40, 60, 240, 200
+SIZE, GAUSSIANS, STEPS = 40, 60, 240
 LEARNING_RATES = {"means": 0.01, "scales": 0.02, "opacities": 0.05, "sh0": 0.03}
 
 
@@ -31,7 +31,7 @@ class Training:
     name: str
     image: Tensor = field(default_factory=lambda: torch.zeros(SIZE, SIZE, 3))
     psnr: list[float] = field(default_factory=list)
-    nu: list[float] = field(default_factory=list)
+    factor: list[float] = field(default_factory=list)  # on Adam's step
     seconds: float = 0.0
 
 
@@ -91,7 +91,7 @@ def train(name: str, phases: PhaseScheduler | None, seed: int) -> Training:
         loss.backward()
         if phases is not None:
             phases.observe(loss)
-            result.nu.append(float(phases.log_values().get("nu", float("nan"))))
+            result.factor.append(phases.annealing_factor("means") or 1.0)
         for optimizer in optimizers.values():
             optimizer.step()
             optimizer.zero_grad()
@@ -106,14 +106,14 @@ def train(name: str, phases: PhaseScheduler | None, seed: int) -> Training:
 
 
 def draw(trainings: list[Training], path: Path) -> None:
-    """Pictures above, PSNR and nu over the steps below."""
+    """Pictures above, PSNR and the step's factor below."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 6.4), dpi=120, layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     axes = figure.subplot_mosaic(
-        [["target", "0", "1"], ["psnr"] * 3, ["nu"] * 3], height_ratios=[2.4, 1.7, 0.9]
+        [["target", "0", "1"], ["psnr"] * 3, ["factor"] * 3], height_ratios=[2.4, 1.7, 0.9]
     )
     shown = [("target", "target", target())]
     shown += [
@@ -126,18 +126,14 @@ def draw(trainings: list[Training], path: Path) -> None:
         axes[place].axis("off")
     for training, colour in zip(trainings, ("#333333", "#0072B2"), strict=True):
         axes["psnr"].plot(training.psnr, color=colour, label=training.name)
-        if training.nu:
-            axes["nu"].plot(training.nu, color=colour, lw=1)
+        if training.factor:
+            axes["factor"].plot(training.factor, color=colour, lw=1)
     axes["psnr"].set(ylabel="PSNR (dB)", xlim=(0, STEPS))
     axes["psnr"].legend(frameon=False, loc="lower right")
-    axes["nu"].set(ylabel="nu", xlabel="step", xlim=(0, STEPS))
-    axes["nu"].axhline(1, color="#8a8a8a", ls="--", lw=0.8)
-    for place in ("psnr", "nu"):
-        axes[place].axvline(SWITCH, color="#8a8a8a", ls=":")
+    axes["factor"].set(ylabel="step factor", xlabel="step", xlim=(0, STEPS))
+    axes["factor"].axhline(1, color="#8a8a8a", ls="--", lw=0.8)
+    for place in ("psnr", "factor"):
         axes[place].spines[["top", "right"]].set_visible(False)
-    axes["psnr"].annotate(
-        " exploitation", (SWITCH, 0.04), xycoords=("data", "axes fraction"), color="#666666"
-    )
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
 
@@ -151,7 +147,7 @@ def main(arguments: list[str] | None = None) -> int:
     torch.set_num_threads(1)
     trainings = [
         train("torch's Adam", None, options.seed),
-        train("upgraded", PhaseScheduler(STEPS, SWITCH), options.seed),
+        train("upgraded", PhaseScheduler(STEPS), options.seed),
     ]
     for training in trainings:
         print(f"{training.name}: {training.psnr[-1]:.2f} dB after {training.seconds:.1f} s")
