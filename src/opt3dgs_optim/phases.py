@@ -5,13 +5,12 @@ from __future__ import annotations
 import enum
 import warnings
 from collections.abc import Hashable, Mapping
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-from opt3dgs_optim._adaptive import Adaptive
 from opt3dgs_optim._adaptive_state import check_loadable
 from opt3dgs_optim._checkpoint import check_keys, check_whole
 from opt3dgs_optim._checks import check_count, check_flag, check_number, check_part
@@ -24,7 +23,10 @@ from opt3dgs_optim.fading import Fading
 from opt3dgs_optim.lqnadam import CurvatureOptions
 from opt3dgs_optim.multiplier import ConstantMultiplier
 from opt3dgs_optim.noise import CovarianceNoise
-from opt3dgs_optim.runlog import RunLog
+
+if TYPE_CHECKING:
+    from opt3dgs_optim._adaptive import Adaptive
+    from opt3dgs_optim.runlog import RunLog
 
 CALL = "PhaseScheduler"
 PAPER_STEPS = 30_000
@@ -146,7 +148,11 @@ class PhaseScheduler(Upgrading):
         self.num_observed = 0
         self.last_finite = torch.ones((), dtype=torch.bool)
         self._current = -1  # the iteration observed last, whose step comes next
-        self._adaptive = Adaptive(self) if check_flag(CALL, "adaptive", adaptive) else None
+        self._adaptive: Adaptive | None = None
+        if check_flag(CALL, "adaptive", adaptive):
+            from opt3dgs_optim._adaptive import Adaptive  # where it is off, it costs no import
+
+            self._adaptive = Adaptive(self)
 
     @classmethod
     def install(
