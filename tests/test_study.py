@@ -15,7 +15,7 @@ from study.analysis import Study
 from study.arms import BASELINE, STUDY_ARMS, find_study_arm
 from study.decisions import COMPARISONS, decide
 from study.plan import plan
-from study.records import COLUMNS, Record, Setting, gather, read, write
+from study.records import COLUMNS, Record, Setting, gather, merge, read, write
 from study.run import main as run_study
 from study.training import Spec, train
 
@@ -171,6 +171,15 @@ def test_records_survive_writing(tmp_path: Path) -> None:
     (one,) = read(path)
     assert (one.arm, one.seed, one.setting.iterations) == ("faded", 1, 20)
     assert one.seconds > 0
+
+
+def test_new_records_take_the_place_of_old_ones() -> None:
+    def one(seed: int, seconds: float) -> dict[str, object]:
+        key = {"scene": "a", "points": 1, "iterations": 2, "init": "sfm", "arm": "mcmc"}
+        return {**key, "seed": seed, "seconds": seconds}
+
+    merged = merge([one(0, 1.0), one(1, 1.0)], [one(2, 2.0), one(1, 2.0)])
+    assert merged == [one(0, 1.0), one(1, 2.0), one(2, 2.0)]
 
 
 def test_bad_calls_say_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

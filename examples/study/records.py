@@ -78,6 +78,13 @@ def gather(folder: Path) -> list[dict[str, Any]]:
     return found
 
 
+def merge(old: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """All of both; a training that both have is the new one."""
+    keys = ("scene", "points", "iterations", "init", "arm", "seed")
+    kept = {tuple(record[key] for key in keys): record for record in (*old, *new)}
+    return [kept[key] for key in sorted(kept)]
+
+
 def write(records: list[dict[str, Any]], path: Path) -> None:
     """One line per training, so that a change shows as the trainings that changed."""
     lines = ",\n".join(json.dumps(record) for record in records)

@@ -1,6 +1,6 @@
 """Tables, plots and decisions of the study: python examples/study/report.py [--runs runs/study]
 
-With `--runs`, first gathers the finished trainings into docs/results/study/records.json. Then
+With `--runs`, first adds the finished trainings to docs/results/study/records.json. Then
 everything is made from that file alone: the plots beside it, `decisions.json`, and the tables
 between the markers of docs/evidence.md and the README.
 """
@@ -20,7 +20,7 @@ from study import arms as groups
 from study.analysis import Gain, Study, baseline_of
 from study.decisions import decide
 from study.plots import plot_curves, plot_gains
-from study.records import gather, read, write
+from study.records import gather, merge, read, write
 from study.tables import gains_table, goals_table, nu_table, scenes_table
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -142,7 +142,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if not found:
                 raise ValueError(f"--runs {args.runs}: holds no finished training")
             FOLDER.mkdir(parents=True, exist_ok=True)
-            write(found, records)
+            old = json.loads(records.read_text(encoding="utf-8")) if records.exists() else {}
+            write(merge(old.get("records", []), found), records)
         study = Study(read(records))
         made = tables(study)
         for page in PAGES:
