@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from opt3dgs_optim.report_style import FAINT, INK, binned, label_of, look, plain_style
+from opt3dgs_optim.report_style import FAINT, binned, draw_legend, label_of, look, plain_style
 from opt3dgs_optim.runread import Run
 
 __all__ = ["draw_live"]
@@ -173,19 +173,5 @@ def _phase_bars(panel: Any, runs: Sequence[Run], axis: str) -> None:
 
 
 def _legend(figure: Any, labels: Sequence[str], height: float, columns: int, left: float) -> None:
-    from matplotlib.lines import Line2D
-
-    legend = figure.legend(
-        [Line2D([], [], lw=2.4, **look(i)) for i in range(len(labels))],
-        [f" {label}" for label in labels],  # a leading underscore would hide it
-        loc="upper left",
-        bbox_to_anchor=(left, 1 - 0.02 / height),
-        ncols=min(len(labels), columns),
-        frameon=False,
-        fontsize=8.5,
-        labelcolor=INK,
-        handlelength=1.8,
-        columnspacing=1.4,
-    )
-    for text in legend.get_texts():  # a dollar sign in an arm's name is no formula
-        text.set_parse_math(False)
+    anchor = (left, 1 - 0.02 / height)
+    draw_legend(figure, labels, anchor, columns, fontsize=8.5, spacing=1.4)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from opt3dgs_optim.report_stats import Arm, Comparison, higher_is_better
-from opt3dgs_optim.report_style import FAINT, INK, binned, label_of, look, plain_style
+from opt3dgs_optim.report_style import FAINT, INK, binned, draw_legend, label_of, look, plain_style
 from opt3dgs_optim.runread import Run
 
 __all__ = ["draw"]
@@ -175,8 +175,6 @@ def _switches(arm: Arm, axis: str) -> list[tuple[float, str]]:
 
 
 def _texts(figure: Any, comparison: Comparison, footer: str) -> None:
-    from matplotlib.lines import Line2D
-
     height = figure.get_figheight()
     metric = label_of(comparison.metric)
     title = f"{metric} against run time and iterations"
@@ -184,26 +182,13 @@ def _texts(figure: Any, comparison: Comparison, footer: str) -> None:
         title += f", {comparison.scene}"
     place = {"fontsize": 13, "weight": "bold", "color": INK, "va": "top", "parse_math": False}
     figure.text(0.075, 1 - 0.22 / height, title, **place)
-    handles, labels = [], []
-    for i, arm in enumerate(comparison.arms):
-        handles.append(Line2D([], [], lw=2.4, **look(i)))
+    labels = []
+    for arm in comparison.arms:
         seeds = f"{len(arm.runs)} seeds" if len(arm.runs) > 1 else "1 seed"
         role = ", baseline" if arm.name == comparison.baseline else ""
-        labels.append(f" {arm.name} ({seeds}{role})")
-    legend = figure.legend(
-        handles,
-        labels,
-        loc="upper left",
-        bbox_to_anchor=(0.068, 1 - 0.5 / height),
-        ncols=min(len(labels), LEGEND_COLUMNS),
-        frameon=False,
-        fontsize=9.5,
-        labelcolor=INK,
-        handlelength=1.8,
-        columnspacing=1.6,
-    )
-    for text in legend.get_texts():  # a dollar sign in an arm's name is no formula
-        text.set_parse_math(False)
+        labels.append(f"{arm.name} ({seeds}{role})")
+    anchor = (0.068, 1 - 0.5 / height)
+    draw_legend(figure, labels, anchor, LEGEND_COLUMNS, fontsize=9.5, spacing=1.6)
     better = "higher" if higher_is_better(comparison.metric) else "lower"
     caption = f"Lines: mean over seeds; bands: least to greatest; {better} is better. "
     caption += "Dashed: the baseline's final mean (above), nu = 1 (below). Dotted: next phase. "

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-__all__ = ["FAINT", "INK", "binned", "label_of", "look", "plain_style"]
+__all__ = ["FAINT", "INK", "binned", "draw_legend", "label_of", "look", "plain_style"]
 
 # Okabe and Ito's colour-blind-safe palette, without the yellow that white swallows.
 COLOURS = ("#333333", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
@@ -53,3 +54,31 @@ def plain_style(panel: Any) -> None:
         label.set_fontsize(10)
         label.set_color(INK)
     panel.margins(x=0.02)
+
+
+def draw_legend(
+    figure: Any,
+    labels: Sequence[str],
+    anchor: tuple[float, float],
+    columns: int,
+    *,
+    fontsize: float,
+    spacing: float,
+) -> None:
+    """A legend whose upper left is at `anchor` (0..1 of the figure), a line in each run's look."""
+    from matplotlib.lines import Line2D
+
+    legend = figure.legend(
+        [Line2D([], [], lw=2.4, **look(i)) for i in range(len(labels))],
+        [f" {label}" for label in labels],  # a leading underscore would hide it
+        loc="upper left",
+        bbox_to_anchor=anchor,
+        ncols=min(len(labels), columns),
+        frameon=False,
+        fontsize=fontsize,
+        labelcolor=INK,
+        handlelength=1.8,
+        columnspacing=spacing,
+    )
+    for text in legend.get_texts():  # a dollar sign in an arm's name is no formula
+        text.set_parse_math(False)
