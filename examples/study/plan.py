@@ -11,9 +11,9 @@ from study.training import Spec
 
 SCENES = ("plush", "banana", "lund_door", "brighton_beach", "embedded")
 QUICK_SCENES = ("banana", "embedded")  # for the options of a part
-FULL_SCENES = ("plush", "banana")  # 30,000 iterations take minutes
 POINTS = 4_000
 EMBEDDED_POINTS = 2_000
+DEFAULTS = "annealed-4-0.4+faded"  # the arm that `PhaseScheduler(total_steps)` is
 FIRST_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "annealed-8-0.4", "faded")
 
 
@@ -51,17 +51,15 @@ def stages(seeds: int = 3) -> dict[str, list[tuple[str, str, int, int, int, str]
             for arm in arms
         ]
 
-    two = ["mcmc", "annealed-8-0.4"]
-    longer = ["annealed-4-0.4+faded", "annealed-4-0.4", "faded"]
+    two = ["mcmc", DEFAULTS]
+    longer = ["annealed-8-0.4", "annealed-4-0.4", "faded"]
     return {
         "core": cross(SCENES, FIRST_ARMS, seeds, 3_000),
         "tails": cross(SCENES, tails, seeds, 3_000),
-        "faded-on-top": cross(QUICK_SCENES, ["annealed-4-0.4+faded"], seeds, 3_000),
-        "long-first": cross(SCENES, two, 1, 7_500),
-        "faded-on-top-all": cross(SCENES, ["annealed-4-0.4+faded"], seeds, 3_000),
-        "long-parts": cross(SCENES, longer, 1, 7_500),
-        "full": cross(FULL_SCENES, [*two, "annealed-4-0.4+faded"], 1, 30_000),
         "long": cross(SCENES, two, seeds, 7_500),
+        "defaults": cross(SCENES, [DEFAULTS], seeds, 3_000),
+        "long-parts": cross(SCENES, longer, 1, 7_500),
+        "full": cross(SCENES, two, 1, 30_000),
         "rest": cross(QUICK_SCENES, later, seeds, 3_000),
         "leads": cross(QUICK_SCENES, beyond, seeds, 3_000),
         "options": cross(QUICK_SCENES, options, seeds, 3_000),

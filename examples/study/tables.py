@@ -30,8 +30,8 @@ def scenes_table(study: Study, settings: Sequence[Setting], arms: Sequence[str])
     """Test PSNR of every arm on every scene; the last columns are means over the scenes."""
     names = [setting.scene for setting in settings]
     lines = [
-        f"| arm | {' | '.join(names)} | SSIM | LPIPS | state, bytes per point |",
-        f"|---|{'---:|' * (len(names) + 3)}",
+        f"| arm | {' | '.join(names)} | SSIM | LPIPS | state, bytes per point | peak memory, MB |",
+        f"|---|{'---:|' * (len(names) + 4)}",
     ]
     for arm in arms:
         runs = [list(study.runs(setting, arm).values()) for setting in settings]
@@ -44,7 +44,9 @@ def scenes_table(study: Study, settings: Sequence[Setting], arms: Sequence[str])
         lpips = [r.lpips for r in every if r.lpips is not None]
         shown = f"{fmean(lpips):.4f}" if complete and len(lpips) == len(every) else "-"
         state = fmean(r.state_bytes / r.curve["num_points"][-1] for r in every)
-        lines.append(f"| `{arm}` | {' | '.join(cells)} | {ssim} | {shown} | {state:.0f} |")
+        peak = f"{fmean(r.peak_rss_bytes for r in every) / 1e6:.0f}"
+        row = [f"`{arm}`", *cells, ssim, shown, f"{state:.0f}", peak]
+        lines.append(f"| {' | '.join(row)} |")
     return "\n".join(lines)
 
 
