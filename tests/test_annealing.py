@@ -34,6 +34,14 @@ def test_peaks_by_parameter_take_every_trainers_names() -> None:
     assert annealing.factor("camera_opt", 0.0) == Annealing().factor(None, 0.0) == 1.0
 
 
+def test_opacities_have_a_peak_of_their_own() -> None:
+    annealing = Annealing(8.0, 0.5)
+    assert annealing.factor("opacities", 0.0) == annealing.factor("opacity", 0.0) == 1.0
+    assert annealing.factor("opacities", 1.0) == annealing.factor("means", 1.0) == 0.5
+    assert Annealing(8.0, 0.5, opacity_peak=2.0).factor("opacities", 0.5) == pytest.approx(1.0)
+    assert Annealing({"means": 8.0}, 0.5, opacity_peak=2.0).factor("opacities", 0.5) == 1.0
+
+
 def test_every_step_is_adams_times_the_factor() -> None:
     """The same gradients with learning rates set by hand give the same bits."""
     annealing = Annealing(8.0, 0.4)

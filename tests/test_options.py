@@ -137,6 +137,7 @@ TABLE: dict[str, tuple[Callable[..., Any], type, dict[str, Any]]] = {
         Annealing,
         {
             "peak": [*NOT_NUMBERS, 0.0, -1.0],
+            "opacity_peak": [*NOT_NUMBERS, 0.0, -1.0],
             "final": [*NOT_NUMBERS, 0.0, -1.0],
         },
     ),

@@ -23,10 +23,17 @@ class Annealing:
     of the trainer's own schedule; the learning rates in `param_groups`, which 3DGS-MCMC's noise is
     proportional to, stay as they are. It costs no memory.
 
+    The opacities have a peak of their own. 3DGS-MCMC's regularisers pull at every point, and Adam
+    makes a full step of that where a view does not reach: at four times the rate, points which few
+    views see are transparent and relocated within a hundred iterations, and a scene with few views
+    is over-fitted.
+
     Args:
-        peak: factor at the first iteration, above 0: a number for all parameters, or a dict by
-            parameter (gsplat's or INRIA's names; those left out are not annealed).
+        peak: factor at the first iteration, above 0: a number for all parameters but the
+            opacities, or a dict by parameter (gsplat's or INRIA's names; those left out are not
+            annealed).
         final: factor at the last iteration, above 0.
+        opacity_peak: `peak` of the opacities, where that is a number.
 
     Raises:
         ValueError: an option is outside what is allowed.
@@ -34,9 +41,11 @@ class Annealing:
 
     peak: float | Mapping[str, float] = 4.0
     final: float = 0.4
+    opacity_peak: float = 1.0
 
     def __post_init__(self) -> None:
         check_number(CALL, "final", self.final, 0.0, open_low=True)
+        check_number(CALL, "opacity_peak", self.opacity_peak, 0.0, open_low=True)
         if not isinstance(self.peak, Mapping):
             check_number(CALL, "peak", self.peak, 0.0, open_low=True)
             return
@@ -59,7 +68,10 @@ class Annealing:
             progress: share of the run that is over; taken as 0..1.
         """
         known = canonical_name(name)
-        peak = self.peak.get(known or "") if isinstance(self.peak, Mapping) else self.peak
+        if isinstance(self.peak, Mapping):
+            peak = self.peak.get(known or "")
+        else:
+            peak = self.opacity_peak if known == "opacities" else self.peak
         if known is None or peak is None:
             return 1.0
         t = min(max(progress, 0.0), 1.0)
