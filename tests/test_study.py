@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import inspect
 import json
+import math
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from splatting.arms import NOISE_LR
+from splatting.fit import FitOptions
 from splatting.scenes import load_scene
 from study import report
 from study.analysis import Study
 from study.arms import BASELINE, STUDY_ARMS, find_study_arm
 from study.decisions import COMPARISONS, decide
+from study.fitting import OPACITY_DECAY, SCALE_DECAY, StudyFit
 from study.plan import plan
 from study.records import COLUMNS, Record, Setting, gather, merge, read, write
 from study.run import main as run_study
 from study.training import Spec, train
+from torch import Tensor
 
-from opt3dgs_optim import Annealing, PhaseScheduler
+from opt3dgs_optim import Annealing, EnergyHistogram, PhaseScheduler
 
 RECORDS = report.FOLDER / "records.json"
 
@@ -45,15 +52,19 @@ def test_the_defaults_are_what_the_page_concludes() -> None:
     committed = json.loads((report.FOLDER / "decisions.json").read_text(encoding="utf-8"))
     assert committed == decided
     parameters = inspect.signature(PhaseScheduler.__init__).parameters
-    assert set(decided) <= set(parameters)
-    for part, on in decided.items():
+    whole = {part: on for part, on in decided.items() if "." not in part}
+    assert set(whole) <= set(parameters)
+    for part, on in whole.items():
         assert bool(parameters[part].default) == on, part
+    annealing = Annealing()
+    assert (annealing.opacity_peak != annealing.peak) == decided["annealing.opacity_peak"]
 
 
 def test_the_default_annealing_is_the_measured_one() -> None:
-    arm = COMPARISONS["annealing"][0]
-    assert arm == f"annealed-{Annealing().peak:g}-{Annealing().final:g}+faded" == report.BEST
-    measured = find_study_arm(arm).arm(load_scene("embedded")).make
+    arm = COMPARISONS["annealing.opacity_peak"][0]
+    peak, opacities = Annealing().peak, Annealing().opacity_peak
+    assert arm == f"annealed-{peak:g}-opacities-{opacities:g}+faded" == report.BEST
+    measured = find_study_arm(arm).arm(_embedded()).make
     assert measured is not None
     phases, defaults = measured(300, 1.0, None), PhaseScheduler(300, noise_scale=NOISE_LR)
     for part in ("annealing", "fading", "multiplier", "squared_loss", "reset_moments", "curvature"):
@@ -158,10 +169,154 @@ def _iterations(made: dict[str, object]) -> list[int]:
     return [row["iteration"] for row in curve]
 
 
-@pytest.mark.parametrize("host", ["visible", "annealed+decoupled", "annealed+average"])
-def test_host_options_train(tmp_path: Path, host: str) -> None:
-    made = train(Spec("embedded", host, 0, 20, 80), tmp_path, None, None)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "visible",
+        "annealed+decoupled",
+        "annealed+average",
+        "annealed-4-0.4+faded+decoupled",
+        "annealed-4-0.4+faded+regularisers-0",
+        "annealed-4-0.4+faded+regularisers-0.1",
+        "annealed-4-0.4+faded-means-1",
+        "noise-visible",
+        "noise-hidden",
+        "awsgld-fixed-range",
+        "awsgld-fixed-temperature",
+        "matrix",
+    ],
+)
+def test_arms_train(tmp_path: Path, name: str) -> None:
+    made = train(Spec("embedded", name, 0, 60, 80), tmp_path, None, None)
     assert np.isfinite(_psnr(made)).all()
+
+
+_embedded = cache(lambda: load_scene("embedded"))  # seconds to make
+
+
+def _fit(arm: str, host: dict[str, object] | None = None) -> StudyFit:
+    found = find_study_arm(arm)
+    found = found if host is None else replace(found, host=host)
+    return StudyFit(_embedded(), found, FitOptions(3000, 120))
+
+
+def _gradients(fit: StudyFit) -> dict[str, Tensor]:
+    """Of the regularisers alone; zero where they do not reach."""
+    (fit._regularisers() + 0.0 * sum(p.sum() for p in fit.gaussians.values())).backward()
+    return {name: param.grad for name, param in fit.gaussians.items() if param.grad is not None}
+
+
+@pytest.mark.parametrize(
+    ("name", "factor"),
+    [
+        ("annealed-4-0.4+faded", 1.0),
+        ("annealed-4-0.4+faded+regularisers-0.1", 0.1),
+        ("annealed-4-0.4+faded+regularisers-0", 0.0),
+        ("annealed-4-0.4+faded+decoupled", 0.0),
+        ("annealed-4-0.4+faded-means-1", 1.0),
+    ],
+)
+def test_regularisers_in_the_loss(name: str, factor: float) -> None:
+    whole, own = _gradients(_fit("mcmc")), _gradients(_fit(name))
+    assert whole["scales"].abs().min() > 0
+    assert whole["opacities"].abs().min() > 0
+    for key, gradient in whole.items():
+        torch.testing.assert_close(own[key], factor * gradient)  # one rounding of the factor
+
+
+def test_a_decay_outside_adam_acts_where_the_regularisers_do_not() -> None:
+    with_decay, without = (
+        _fit("annealed-4-0.4+faded+decoupled"),
+        _fit("annealed-4-0.4+faded+regularisers-0"),
+    )
+    with_decay.step()
+    without.step()
+    smaller = {
+        name: (without.gaussians[name] - with_decay.gaussians[name]).detach()
+        for name in without.gaussians
+    }
+    opacity = torch.sigmoid(without.gaussians["opacities"].detach())
+    wanted = {
+        "opacities": OPACITY_DECAY * opacity * (1 - opacity),
+        "scales": torch.full_like(smaller["scales"], SCALE_DECAY),
+    }
+    for name, decay in wanted.items():
+        # float32 keeps 1e-6 of a logit or a log of a few units.
+        torch.testing.assert_close(smaller.pop(name), decay, rtol=0.0, atol=2e-6)
+    assert all(not difference.any() for difference in smaller.values())
+
+
+def test_positions_that_are_not_annealed_step_as_stock_ones() -> None:
+    stock, annealed, own = (
+        _fit("mcmc"),
+        _fit("annealed-4-0.4+faded"),
+        _fit("annealed-4-0.4+faded-means-1"),
+    )
+    start = {name: param.detach().clone() for name, param in stock.gaussians.items()}
+    for fit in (stock, annealed, own):
+        fit.step()
+    # The opacities of the start are far above the noise's gate, so a step is Adam's alone.
+    assert torch.equal(own.gaussians["means"], stock.gaussians["means"])
+    assert not torch.equal(own.gaussians["means"], annealed.gaussians["means"])
+    for name in start.keys() - {"means"}:
+        assert torch.equal(own.gaussians[name], annealed.gaussians[name]), name
+
+
+def test_noise_by_visibility() -> None:
+    means: dict[str, Tensor] = {}
+    seen = torch.zeros(())
+    for name in ("mcmc", "noise-visible", "noise-hidden", "quiet"):
+        fit = _fit("mcmc" if name == "quiet" else name)
+        with torch.no_grad():
+            fit.gaussians["opacities"].fill_(math.log(0.0055 / 0.9945))  # where the gate opens
+            fit.gaussians["means"][::3] += 1e3  # where no camera looks
+        if name == "quiet":
+            fit.noise = None
+        torch.manual_seed(5)
+        fit.step()
+        means[name] = fit.gaussians["means"].detach()
+        seen = seen if fit.seen is None else fit.seen
+    assert 20 < seen.sum() < 100
+    noisy = (means["mcmc"] != means["quiet"]).any(dim=1)
+    assert noisy[seen].all()
+    assert noisy[~seen].any()
+    rows = seen[:, None]
+    where = torch.where
+    assert torch.equal(means["noise-visible"], where(rows, means["mcmc"], means["quiet"]))
+    assert torch.equal(means["noise-hidden"], where(rows, means["quiet"], means["mcmc"]))
+
+
+@pytest.mark.parametrize(
+    ("name", "host", "message"),
+    [
+        ("mcmc", {"nonsense": 1}, "nonsense.*there are beta2"),
+        ("faded", {"regularisers": -0.1}, "regularisers=-0.1, but a number from 0 on"),
+        ("faded", {"regularisers": 1.0, "decoupled": True}, "decoupled=True takes them away"),
+        ("mcmc", {"noise": "seen"}, "noise='seen', but one of visible, hidden"),
+        ("faded", {"noise": "visible"}, "noise='visible', but its optimizers inject"),
+    ],
+)
+def test_bad_host_options_say_what_is_wrong(
+    name: str, host: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        _fit(name, host)
+
+
+def test_range_and_temperature_are_fixed_one_at_a_time() -> None:
+    kinds = {}
+    for name in ("awsgld", "awsgld-fixed-range", "awsgld-fixed-temperature", "awsgld-fixed"):
+        phases = _fit(name).phases
+        assert phases is not None
+        assert isinstance(phases.multiplier, EnergyHistogram)
+        kinds[name] = (phases.multiplier.energy_range, phases.multiplier.temperature)
+        assert phases.multiplier.warmup == 250
+    assert kinds == {
+        "awsgld": ("auto", "auto"),
+        "awsgld-fixed-range": ((0.0, 0.2), "auto"),
+        "awsgld-fixed-temperature": ("auto", 2e-3),
+        "awsgld-fixed": ((0.0, 0.2), 2e-3),
+    }
 
 
 def test_records_survive_writing(tmp_path: Path) -> None:

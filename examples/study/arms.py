@@ -2,55 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any
 
-from splatting.arms import ALL_OFF, PAPER_WARMUP, Arm, paper_scheduler
+from splatting.arms import PAPER_WARMUP
 from splatting.scenes import Scene
 
-from opt3dgs_optim import EnergyHistogram, PhaseScheduler
+from opt3dgs_optim import EnergyHistogram
 from opt3dgs_optim.annealing import Annealing
+from opt3dgs_optim.energy import PAPER_RANGE, PAPER_TEMPERATURE
 from opt3dgs_optim.fading import Fading
 from opt3dgs_optim.lqnadam import CurvatureOptions
 from opt3dgs_optim.multiplier import ConstantMultiplier
-
-BASELINE = "mcmc"
-# (scene, iterations, mean nu of the arm in `needs`) -> the options that differ from ALL_OFF
-Options = Callable[[Scene, int, float | None], dict[str, Any]]
-
-
-@dataclass(frozen=True)
-class StudyArm:
-    """One way of training, as options of `PhaseScheduler` and of the trainer around it."""
-
-    name: str
-    what: str
-    control: str  # the arm that a gain is measured against
-    options: Options | None = None  # None: torch's own Adam in the trainer
-    switch: float = 1.0  # where exploitation starts
-    trunk: str | None = None  # branch off this arm's run at the switch
-    needs: str | None = None  # the arm whose mean nu it takes
-    host: dict[str, Any] = field(default_factory=dict)  # what `StudyFit` does differently
-
-    def arm(self, scene: Scene) -> Arm:
-        """The arm as the examples' trainer takes it."""
-        if self.options is None:
-            return Arm(self.name, self.what)
-        options = self.options
-
-        # The switch is the arm's own, so that a trunk and its branches share their `FitOptions`.
-        def make(iterations: int, _switch: float, nu: float | None) -> PhaseScheduler:
-            if self.name == "paper":
-                return paper_scheduler(iterations, self.switch, nu)
-            changed = ALL_OFF | options(scene, iterations, nu)
-            return PhaseScheduler(iterations, self.switch, **changed)
-
-        return Arm(self.name, self.what, make=make, needs=self.needs)
-
-
-def _fixed(**options: Any) -> Options:
-    return lambda _scene, _iterations, _nu: options
+from study.lead_arms import leads
+from study.study_arm import BASELINE, DEFAULTS, Options, StudyArm, anneal_all, fixed
 
 
 def _histogram(**changes: Any) -> Options:
@@ -76,7 +40,7 @@ def _epoch_pairs(scene: Scene, _iterations: int, _nu: float | None) -> dict[str,
 def core() -> list[StudyArm]:
     """Whole trainings that only the trainer's learning rates, nu or the moments distinguish."""
     rates = [
-        StudyArm(f"rates-x{k:g}", f"all steps times {k:g}", BASELINE, _fixed(multiplier=float(k)))
+        StudyArm(f"rates-x{k:g}", f"all steps times {k:g}", BASELINE, fixed(multiplier=float(k)))
         for k in (1.5, 2, 3)
     ]
     annealed = [
@@ -84,11 +48,11 @@ def core() -> list[StudyArm]:
             f"annealed-{peak:g}-{final:g}",
             f"all steps times {peak:g} falling to {final:g}",
             BASELINE,
-            _fixed(annealing=Annealing(peak, final)),
+            fixed(annealing=anneal_all(peak, final)),
         )
         for peak, final in ((4, 0.4), (8, 0.4), (8, 0.1), (16, 0.4))
     ]
-    both = Annealing(4.0, 0.4)
+    both = anneal_all(4.0)
     return [
         StudyArm(BASELINE, "stock 3DGS-MCMC, torch's Adam", BASELINE),
         StudyArm("awsgld", "with the flat-histogram multiplier", BASELINE, _histogram()),
@@ -97,18 +61,24 @@ def core() -> list[StudyArm]:
         ),
         *rates,
         *annealed,
-        StudyArm("faded", "moments of random points faded", BASELINE, _fixed(fading=Fading())),
+        StudyArm("faded", "moments of random points faded", BASELINE, fixed(fading=Fading())),
         StudyArm(
             "annealed-4-0.4+faded",
-            "annealed from 4, and faded: the defaults",
+            "annealed from 4, and faded",
             "annealed-8-0.4",
-            _fixed(annealing=both, fading=Fading()),
+            fixed(annealing=both, fading=Fading()),
+        ),
+        StudyArm(
+            DEFAULTS,
+            "the same, but opacities annealed from 1: the defaults",
+            "annealed-4-0.4+faded",
+            fixed(annealing=Annealing(4.0, 0.4, opacity_peak=1.0), fading=Fading()),
         ),
         StudyArm(
             "annealed-8-0.4+awsgld",
             "annealed, with the flat-histogram multiplier",
             "annealed-8-0.4",
-            lambda *call: {**_histogram()(*call), "annealing": Annealing(8.0, 0.4)},
+            lambda *call: {**_histogram()(*call), "annealing": anneal_all(8.0)},
         ),
         StudyArm(
             "faded+awsgld",
@@ -116,7 +86,7 @@ def core() -> list[StudyArm]:
             "faded",
             lambda *call: {**_histogram()(*call), "fading": Fading()},
         ),
-        StudyArm("paper", "everything, the paper's settings", BASELINE, _fixed(), 29 / 30),
+        StudyArm("paper", "everything, the paper's settings", BASELINE, fixed(), 29 / 30),
     ]
 
 
@@ -131,6 +101,8 @@ def histograms() -> list[StudyArm]:
         "view-centred": {"energy": "view_centered"},
         "backward-slope": {"slope": "backward"},
         "fixed": {"paper": True},
+        "fixed-range": {"energy_range": PAPER_RANGE},
+        "fixed-temperature": {"temperature": PAPER_TEMPERATURE},
     }
     return [
         StudyArm(f"awsgld-{name}", f"the histogram with {options}", "awsgld", _histogram(**options))
@@ -141,26 +113,26 @@ def histograms() -> list[StudyArm]:
 def last_phases() -> list[StudyArm]:
     """What changes at the switch, branched off one and the same exploration."""
     kinds: dict[str, tuple[str, str | None, Options]] = {
-        "l1+reset": ("L1, moments reset", None, _fixed(reset_moments=True)),
-        "l2": ("L2, moments kept", None, _fixed(squared_loss=True)),
-        "l2+reset": ("L2, moments reset", None, _fixed(squared_loss=True, reset_moments=True)),
+        "l1+reset": ("L1, moments reset", None, fixed(reset_moments=True)),
+        "l2": ("L2, moments kept", None, fixed(squared_loss=True)),
+        "l2+reset": ("L2, moments reset", None, fixed(squared_loss=True, reset_moments=True)),
         "l2+reset+lqn": (
             "the same with L-BFGS directions, consecutive pairs",
             "l2+reset",
-            _fixed(squared_loss=True, reset_moments=True, curvature=CurvatureOptions()),
+            fixed(squared_loss=True, reset_moments=True, curvature=CurvatureOptions()),
         ),
         "l2+reset+lqn-powell": (
             "the same with Powell damping",
             "l2+reset",
-            _fixed(squared_loss=True, reset_moments=True, curvature=CurvatureOptions(powell=True)),
+            fixed(squared_loss=True, reset_moments=True, curvature=CurvatureOptions(powell=True)),
         ),
         "l2+reset+lqn-epoch": ("pairs between means over epochs", "l2+reset", _epoch_pairs),
         "l1+reset+lqn": (
             "L1, moments reset, L-BFGS directions",
             "l1+reset",
-            _fixed(reset_moments=True, curvature=CurvatureOptions()),
+            fixed(reset_moments=True, curvature=CurvatureOptions()),
         ),
-        "noise-off": ("no noise", None, _fixed(noise_in_exploitation=False)),
+        "noise-off": ("no noise", None, fixed(noise_in_exploitation=False)),
     }
     return [
         StudyArm(
@@ -179,7 +151,7 @@ def last_phases() -> list[StudyArm]:
 def on_top() -> list[StudyArm]:
     """The last phase on top of annealing: does curvature earn its place there?"""
     trunk = "annealed-8-0.4"
-    anneal = Annealing(8.0, 0.4)
+    anneal = anneal_all(8.0)
     kinds: dict[str, tuple[str | None, dict[str, Any]]] = {
         "l2": (None, {"squared_loss": True}),
         "l1+reset": (None, {"reset_moments": True}),
@@ -192,92 +164,11 @@ def on_top() -> list[StudyArm]:
             f"annealed+{name}@1/10",
             f"annealed, then {name} in the last tenth",
             f"annealed+{control}@1/10" if control else trunk,
-            _fixed(annealing=anneal, **options),
+            fixed(annealing=anneal, **options),
             0.9,
             trunk=trunk,
         )
         for name, (control, options) in kinds.items()
-    ]
-
-
-def leads() -> list[StudyArm]:
-    """What else an optimizer can do without touching the representation."""
-    fast = _fixed(annealing=Annealing(8.0, 0.4))
-    geometry = {"means": 8.0, "scales": 8.0, "quats": 8.0, "opacities": 8.0}
-    single = [
-        StudyArm(
-            f"annealed-{name}-only",
-            f"annealed: {name} alone",
-            BASELINE,
-            _fixed(annealing=Annealing({name: 8.0}, 0.4)),
-        )
-        for name in ("means", "scales", "quats", "opacities", "sh0")
-    ]
-    fading = [
-        StudyArm(f"faded-{key}", what, "faded", _fixed(fading=fading))
-        for key, what, fading in (
-            ("v-only", "exp_avg_sq faded, exp_avg kept", Fading(exp_avg=1.0)),
-            ("m-only", "exp_avg faded, exp_avg_sq kept", Fading(exp_avg_sq=1.0)),
-            ("all-points", "all points at once, a fifth as often", Fading(share=1.0, events=60)),
-            ("rarely", "a tenth of the events", Fading(events=30)),
-        )
-    ]
-    on_annealed = "annealed-8-0.4"
-    return [
-        *single,
-        *fading,
-        StudyArm(
-            "annealed-geometry",
-            "annealed: all but the colours",
-            on_annealed,
-            _fixed(annealing=Annealing({**geometry, "sh0": 2.0}, 0.4)),
-        ),
-        StudyArm(
-            "annealed+beta2-0.99", "annealed, beta2 = 0.99", on_annealed, fast, host={"beta2": 0.99}
-        ),
-        StudyArm("beta2-0.99", "beta2 = 0.99", BASELINE, _fixed(), host={"beta2": 0.99}),
-        StudyArm("visible", "visible rows only", BASELINE, _fixed(), host={"visible": True}),
-        StudyArm(
-            "annealed+visible",
-            "annealed, visible rows only",
-            on_annealed,
-            fast,
-            host={"visible": True},
-        ),
-        StudyArm(
-            "annealed+average",
-            "annealed, last tenth of the iterates averaged",
-            on_annealed,
-            fast,
-            host={"average": 0.9},
-        ),
-        StudyArm(
-            "average",
-            "last tenth of the iterates averaged",
-            BASELINE,
-            _fixed(),
-            host={"average": 0.9},
-        ),
-        StudyArm(
-            "annealed-no-noise",
-            "annealed, no position noise at all",
-            on_annealed,
-            _fixed(annealing=Annealing(8.0, 0.4), noise_scale=0.0),
-        ),
-        StudyArm(
-            "decoupled",
-            "opacity and scale decay outside Adam",
-            BASELINE,
-            _fixed(),
-            host={"decoupled": True},
-        ),
-        StudyArm(
-            "annealed+decoupled",
-            "annealed, opacity and scale decay outside Adam",
-            on_annealed,
-            fast,
-            host={"decoupled": True},
-        ),
     ]
 
 

@@ -5,16 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from study.analysis import Gain, Study
+from study.study_arm import DEFAULTS
 
-ITERATIONS = 3_000
-# part -> (the arm with it, the arm without it)
+SHORT, LONG = 3_000, 7_500
+# part, or an option of it -> (the arm with it, the arm without it, iterations)
 COMPARISONS = {
-    "annealing": ("annealed-4-0.4+faded", "faded"),
-    "fading": ("annealed-4-0.4+faded", "annealed-8-0.4"),
-    "multiplier": ("awsgld", "constant"),
-    "squared_loss": ("l2@1/30", "mcmc"),
-    "reset_moments": ("l1+reset@1/30", "mcmc"),
-    "curvature": ("l2+reset+lqn@1/30", "l2+reset@1/30"),
+    "annealing": ("annealed-4-0.4+faded", "faded", SHORT),
+    "annealing.opacity_peak": (DEFAULTS, "annealed-4-0.4+faded", LONG),
+    "fading": ("annealed-4-0.4+faded", "annealed-8-0.4", SHORT),
+    "multiplier": ("awsgld", "constant", SHORT),
+    "squared_loss": ("l2@1/30", "mcmc", SHORT),
+    "reset_moments": ("l1+reset@1/30", "mcmc", SHORT),
+    "curvature": ("l2+reset+lqn@1/30", "l2+reset@1/30", SHORT),
 }
 
 
@@ -24,6 +26,7 @@ class Decision:
 
     arm: str
     control: str
+    iterations: int
     gain: Gain | None  # None: not measured
 
     @property
@@ -37,10 +40,10 @@ def decide(study: Study) -> dict[str, Decision]:
 
     Annealing and fading are judged against each other alone, fading against the annealing that did
     best by itself, since both lengthen steps; the multiplier against a constant of its mean,
-    curvature against the same phase without it.
+    curvature against the same phase without it. A peak of the opacities' own is judged in longer
+    trainings, since what it prevents takes time: points that few views see are relocated.
     """
-    settings = study.settings(ITERATIONS)
     return {
-        part: Decision(arm, control, study.gain(settings, arm, control))
-        for part, (arm, control) in COMPARISONS.items()
+        part: Decision(arm, control, count, study.gain(study.settings(count), arm, control))
+        for part, (arm, control, count) in COMPARISONS.items()
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -9,11 +10,23 @@ from splatting.fit import Fit, FitOptions
 from splatting.scenes import Scene
 from torch import Tensor
 
-from study.arms import StudyArm
+from study.full_matrix import FullMatrixAdam
+from study.study_arm import StudyArm
+from study.view_pairs import SameViewAdam
 
 OPACITY_DECAY = 1e-3  # of the opacity in an iteration, as a step of its logit
 SCALE_DECAY = 1e-5  # of the log of the scales
-HOST_OPTIONS = ("beta2", "visible", "average", "decoupled")
+HOST_OPTIONS = (
+    "beta2",
+    "visible",
+    "average",
+    "decoupled",
+    "regularisers",
+    "noise",
+    "same_view",
+    "matrix",
+)
+NOISY_ROWS = ("visible", "hidden")
 
 
 class StudyFit(Fit):
@@ -21,35 +34,66 @@ class StudyFit(Fit):
 
     beta2: another beta2 in all optimizers. visible: step only rows that this view's loss reaches.
     average: from this share of the run on, evaluate the mean of the iterates. decoupled: opacity
-    and scale regularisation as a decay outside Adam (as AdamW does with weights).
+    and scale regularisation as a decay outside Adam (as AdamW does with weights). regularisers: a
+    factor on both of them inside the loss, 0 or more. noise: `"visible"` for position noise only
+    on the rows that this view's loss reaches, `"hidden"` for the others only; of an arm whose
+    noise is the trainer's. same_view: curvature pairs between two visits of one view; of an arm
+    with curvature. matrix: a matrix of second moments for the positions, with this eigenvalue
+    floor (see `FullMatrixAdam`); of an arm with torch's Adam.
+
+    Raises:
+        ValueError: a host option is unknown, or its value is outside what is allowed.
     """
 
     def __init__(
         self, scene: Scene, arm: StudyArm, options: FitOptions, mean_nu: float | None = None
     ) -> None:
-        unknown = set(arm.host) - set(HOST_OPTIONS)
-        if unknown:
-            raise ValueError(f"arm {arm.name}: unknown host options {sorted(unknown)}")
+        _check_host(arm)
         self.host = arm.host
         self.study_arm = arm
         self.mean: dict[str, Tensor] = {}
         self.num_averaged = 0
+        self.seen: Tensor | None = None  # [N] bool, rows that this view's loss reaches
         super().__init__(scene, arm.arm(scene), options, mean_nu)
         if "beta2" in self.host:
             for optimizer in self.optimizers.values():
                 optimizer.param_groups[0]["betas"] = (0.9, self.host["beta2"])
+        self._change_positions()
+
+    def _change_positions(self) -> None:
+        """Give the positions the optimizer that the arm asks for."""
+        means = self.optimizers["means"]
+        if self.host.get("same_view"):
+            if self.phases is None or not self.phases.curvature:
+                raise ValueError(
+                    f"StudyFit: arm {self.study_arm.name}: same_view=True, but it has no curvature"
+                )
+            self.optimizers["means"] = SameViewAdam.of(means, len(self.scene.train))
+        if "matrix" in self.host:
+            (old,) = means.param_groups
+            group = {key: old[key] for key in ("params", "lr", "betas", "eps", "name")}
+            self.optimizers["means"] = FullMatrixAdam([group], floor=self.host["matrix"])
+
+    def _next_view(self) -> int:
+        view = super()._next_view()
+        means = self.optimizers["means"]
+        if isinstance(means, SameViewAdam):
+            means.view = view
+        return view
 
     def _regularisers(self) -> Tensor:
-        return torch.zeros(()) if self.host.get("decoupled") else super()._regularisers()
+        factor = 0.0 if self.host.get("decoupled") else self.host.get("regularisers", 1.0)
+        return factor * super()._regularisers() if factor else torch.zeros(())
 
     def _step_optimizers(self) -> None:
-        if self.host.get("visible"):
+        if "visible" in self.host or "noise" in self.host:
             # The regularisers reach every row; the image reaches the positions of visible ones.
             means_grad = self.gaussians["means"].grad
             assert means_grad is not None
-            seen = (means_grad != 0).any(dim=1)
+            self.seen = (means_grad != 0).any(dim=1)
+        if self.host.get("visible"):
             for optimizer in self.optimizers.values():
-                optimizer.step(visible=seen)  # pyright: ignore[reportCallIssue]
+                optimizer.step(visible=self.seen)  # pyright: ignore[reportCallIssue]
                 optimizer.zero_grad(set_to_none=True)
         else:
             super()._step_optimizers()
@@ -61,6 +105,19 @@ class StudyFit(Fit):
         opacity = torch.sigmoid(self.gaussians["opacities"])
         self.gaussians["opacities"].sub_(OPACITY_DECAY * opacity * (1 - opacity))
         self.gaussians["scales"].sub_(SCALE_DECAY)
+
+    @torch.no_grad()
+    def _inject_noise(self) -> None:
+        rows = self.host.get("noise")
+        if rows is None:
+            super()._inject_noise()
+            return
+        assert self.seen is not None
+        # All rows draw, so that the random numbers are those of the arm without this option.
+        quiet = ~self.seen if rows == "visible" else self.seen
+        before = self.gaussians["means"][quiet]
+        super()._inject_noise()
+        self.gaussians["means"][quiet] = before
 
     def step(self) -> Tensor:
         """One iteration."""
@@ -98,3 +155,29 @@ class StudyFit(Fit):
             for value in state.values()
         ]
         return sum(t.numel() * t.element_size() for t in tensors if isinstance(t, Tensor))
+
+
+def _check_host(arm: StudyArm) -> None:
+    call, host = f"StudyFit: arm {arm.name}", arm.host
+    unknown = set(host) - set(HOST_OPTIONS)
+    if unknown:
+        raise ValueError(
+            f"{call}: unknown host options {sorted(unknown)}; there are {', '.join(HOST_OPTIONS)}"
+        )
+    factor = host.get("regularisers", 1.0)
+    if not 0.0 <= factor < math.inf:
+        raise ValueError(f"{call}: regularisers={factor!r}, but a number from 0 on is needed")
+    if "regularisers" in host and host.get("decoupled"):
+        raise ValueError(f"{call}: regularisers={factor!r}, but decoupled=True takes them away")
+    rows = host.get("noise")
+    if rows is not None and rows not in NOISY_ROWS:
+        raise ValueError(f"{call}: noise={rows!r}, but one of {', '.join(NOISY_ROWS)} is needed")
+    if rows is not None and arm.options is not None:
+        raise ValueError(
+            f"{call}: noise={rows!r}, but its optimizers inject the noise: the trainer must"
+        )
+    if "matrix" in host and arm.options is not None:
+        raise ValueError(
+            f"{call}: matrix={host['matrix']!r}, but its positions are stepped by the scheduler's "
+            "optimizer: torch's Adam must"
+        )

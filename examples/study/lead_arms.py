@@ -1,0 +1,181 @@
+"""Arms of the study beyond the paper: what else an optimizer can do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from opt3dgs_optim.annealing import Annealing
+from opt3dgs_optim.fading import Fading
+from opt3dgs_optim.lqnadam import CurvatureOptions
+from study.study_arm import BASELINE, StudyArm, anneal_all, fixed
+
+EIGENVALUE_FLOOR = 1e-3  # of a point's largest
+
+
+def leads() -> list[StudyArm]:
+    """What else an optimizer can do without touching the representation."""
+    fast = fixed(annealing=anneal_all(8.0))
+    geometry = {"means": 8.0, "scales": 8.0, "quats": 8.0, "opacities": 8.0}
+    single = [
+        StudyArm(
+            f"annealed-{name}-only",
+            f"annealed: {name} alone",
+            BASELINE,
+            fixed(annealing=Annealing({name: 8.0}, 0.4)),
+        )
+        for name in ("means", "scales", "quats", "opacities", "sh0")
+    ]
+    fading = [
+        StudyArm(f"faded-{key}", what, "faded", fixed(fading=fading))
+        for key, what, fading in (
+            ("v-only", "exp_avg_sq faded, exp_avg kept", Fading(exp_avg=1.0)),
+            ("m-only", "exp_avg faded, exp_avg_sq kept", Fading(exp_avg_sq=1.0)),
+            ("all-points", "all points at once, a fifth as often", Fading(share=1.0, events=60)),
+            ("rarely", "a tenth of the events", Fading(events=30)),
+        )
+    ]
+    on_annealed = "annealed-8-0.4"
+    return [
+        *single,
+        *fading,
+        StudyArm(
+            "annealed-geometry",
+            "annealed: all but the colours",
+            on_annealed,
+            fixed(annealing=Annealing({**geometry, "sh0": 2.0}, 0.4)),
+        ),
+        StudyArm(
+            "annealed+beta2-0.99", "annealed, beta2 = 0.99", on_annealed, fast, host={"beta2": 0.99}
+        ),
+        StudyArm("beta2-0.99", "beta2 = 0.99", BASELINE, fixed(), host={"beta2": 0.99}),
+        StudyArm("visible", "visible rows only", BASELINE, fixed(), host={"visible": True}),
+        StudyArm(
+            "annealed+visible",
+            "annealed, visible rows only",
+            on_annealed,
+            fast,
+            host={"visible": True},
+        ),
+        StudyArm(
+            "annealed+average",
+            "annealed, last tenth of the iterates averaged",
+            on_annealed,
+            fast,
+            host={"average": 0.9},
+        ),
+        StudyArm(
+            "average",
+            "last tenth of the iterates averaged",
+            BASELINE,
+            fixed(),
+            host={"average": 0.9},
+        ),
+        StudyArm(
+            "annealed-no-noise",
+            "annealed, no position noise at all",
+            on_annealed,
+            fixed(annealing=anneal_all(8.0), noise_scale=0.0),
+        ),
+        StudyArm(
+            "decoupled",
+            "opacity and scale decay outside Adam",
+            BASELINE,
+            fixed(),
+            host={"decoupled": True},
+        ),
+        StudyArm(
+            "annealed+decoupled",
+            "annealed, opacity and scale decay outside Adam",
+            on_annealed,
+            fast,
+            host={"decoupled": True},
+        ),
+        *_regularised(),
+        *_noisy(),
+        *_same_view(),
+        *_matrix(),
+    ]
+
+
+def _regularised() -> list[StudyArm]:
+    """Annealed and faded: weaker regularisers, or none in Adam's moments; positions unannealed."""
+    both = {"annealing": anneal_all(4.0), "fading": Fading()}
+    others: dict[str, float] = dict.fromkeys(("scales", "quats", "opacities", "sh0", "shN"), 4.0)
+    kinds: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
+        "+decoupled": ("opacity and scale decay outside Adam", both, {"decoupled": True}),
+        "+regularisers-0": ("no regularisers", both, {"regularisers": 0.0}),
+        "+regularisers-0.1": ("a tenth of the regularisers", both, {"regularisers": 0.1}),
+        "-means-1": (
+            "positions not annealed",
+            {**both, "annealing": Annealing(others, 0.4)},
+            {},
+        ),
+    }
+    return [
+        StudyArm(
+            f"annealed-4-0.4+faded{name}",
+            f"annealed from 4, faded, {what}",
+            "annealed-4-0.4+faded",
+            fixed(**options),
+            host=host,
+        )
+        for name, (what, options, host) in kinds.items()
+    ]
+
+
+def _noisy() -> list[StudyArm]:
+    """Stock, with the position noise on some rows only, or none."""
+    return [
+        StudyArm("no-noise", "no position noise", BASELINE, fixed(noise_scale=0.0)),
+        *_masked_noise(),
+    ]
+
+
+def _same_view() -> list[StudyArm]:
+    """L-BFGS directions whose pairs hold no difference between views."""
+    kinds = (("l1+reset", 10), ("l1+reset", 4), ("l2+reset", 4))
+    return [
+        StudyArm(
+            f"{loss}+lqn-view@1/{share}",
+            f"pairs between two visits of one view, in the last 1/{share}",
+            f"{loss}@1/{share}",
+            fixed(
+                squared_loss=loss.startswith("l2"),
+                reset_moments=True,
+                curvature=CurvatureOptions(),
+            ),
+            1 - 1 / share,
+            trunk=BASELINE,
+            host={"same_view": True},
+        )
+        for loss, share in kinds
+    ]
+
+
+def _matrix() -> list[StudyArm]:
+    """A 3x3 second moment for the positions, floored; in the last phase or all the time."""
+    host = {"matrix": EIGENVALUE_FLOOR}
+    what = "a 3x3 second moment per point for the positions"
+    return [
+        StudyArm(
+            "matrix@1/10",
+            f"{what}, in the last 1/10",
+            BASELINE,
+            switch=0.9,
+            trunk=BASELINE,
+            host=host,
+        ),
+        StudyArm("matrix", what, BASELINE, host=host),
+    ]
+
+
+def _masked_noise() -> list[StudyArm]:
+    return [
+        StudyArm(
+            f"noise-{rows}",
+            f"position noise only on rows that this view's loss {does}",
+            BASELINE,
+            host={"noise": rows},
+        )
+        for rows, does in (("visible", "reaches"), ("hidden", "does not reach"))
+    ]
