@@ -16,6 +16,7 @@ from typing import Any
 DOCS = Path(__file__).resolve().parent
 README = DOCS.parent / "README.md"
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.+?)\\[)\]]</\1>', re.S)
+PRINTED = '<div class="highlight"><span class="filename">prints</span>'
 PICTURE = re.compile(r'<img [^>]*\bsrc="([^":]+)"[^>]*>')
 FETCHES = (
     re.compile(r"<(?:script|img|iframe|source|video|embed)\b[^>]*\bsrc=[\"']?(?:https?:)?//", re.I),
@@ -34,9 +35,10 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Turn the formulas into MathML, and let a picture open by itself: phones show it small."""
+    """Turn the formulas into MathML, mark what is printed, let a picture open by itself."""
     html = FORMULA.sub(lambda m: mathml(m[2], block=m[1] == "div"), html)
-    return PICTURE.sub(r'<a href="\1">\g<0></a>', html)
+    html = html.replace(PRINTED, PRINTED.replace('"highlight"', '"highlight printed"'))
+    return PICTURE.sub(r'<a class="picture" href="\1">\g<0></a>', html)
 
 
 def on_post_build(config: Any, **_: Any) -> None:

@@ -12,7 +12,6 @@ import argparse
 import json
 import os
 import platform
-import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -24,6 +23,7 @@ from advising.pilots import PEAKS, Pilot, PilotOptions, finished
 from advising.verdicts import as_json, as_row, best_peak, caveats, compare, settings, table
 from advising.workers import train_all
 from splatting.scenes import load_scene
+from splatting.stopping import stop_at_once
 from train import recorded_command
 
 
@@ -57,8 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             args.scene, args.size, args.iterations, args.points, args.init, args.sh_degree
         )
         out = args.out or Path("runs") / f"advise-{scene.name}-{args.size}"
-        for kind in (signal.SIGINT, signal.SIGTERM):  # a shell's background job ignores the first
-            signal.signal(kind, signal.default_int_handler)
+        stop_at_once()
         advice = _advise(options, args.seeds, args.jobs, out)
     except (OSError, ValueError) as error:
         print(f"advise: {error}", file=sys.stderr)

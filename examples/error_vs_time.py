@@ -24,6 +24,7 @@ from pathlib import Path
 from splatting.arms import HISTOGRAM_ARM, Arm, in_order
 from splatting.gallery import draw_gallery
 from splatting.scenes import load_scene
+from splatting.stopping import stop_at_once
 from tqdm import tqdm
 from train import add_fit_options, recorded_command
 
@@ -98,8 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ]
         _refuse_other_options(trainings, args, scene.name)
         command = recorded_command("error_vs_time.py", parser, args)
-        for kind in (signal.SIGINT, signal.SIGTERM):  # a shell's background job ignores the first
-            signal.signal(kind, signal.default_int_handler)
+        stop_at_once()
         _train_all(trainings, args, command)
     except (OSError, ValueError) as error:
         print(f"error_vs_time: {error}", file=sys.stderr)

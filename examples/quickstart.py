@@ -1,4 +1,4 @@
-"""A first look, in seconds and without data: python examples/quickstart.py -o quickstart.png.
+"""A first look, in seconds and without data: python examples/quickstart.py.
 
 Fits flat Gaussians to a small drawn picture, once with torch's Adam and once with the same Adam
 upgraded by a `PhaseScheduler`, as in a real trainer, and draws both. It shows how the parts are
@@ -141,8 +141,15 @@ def draw(trainings: list[Training], path: Path) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """The command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("-o", "--out", type=Path, default=Path("quickstart.png"), metavar="PNG")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "-o",
+        "--out",
+        type=Path,
+        default=Path("runs/quickstart.png"),
+        metavar="PNG",
+        help="picture to write (default: runs/quickstart.png)",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the first Gaussians")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     trainings = [

@@ -25,6 +25,7 @@ import torch
 from opt3dgs_optim import report
 from opt3dgs_optim.follow import NO_MATPLOTLIB, NOTHING_YET, Follower, follow
 from opt3dgs_optim.follow_page import duration, page
+from opt3dgs_optim.follow_plot import legend_columns, log_scale
 from opt3dgs_optim.follow_state import Watched, stamp_of, watch
 from opt3dgs_optim.runlog import RunLog, read_run
 
@@ -234,6 +235,36 @@ def test_odd_values_are_drawn_or_left_out(tmp_path: Path, value: float) -> None:
     follower.draw()
     follower.write()
     assert picture((tmp_path / "live.png").read_bytes()).ndim == 3
+
+
+@needs_matplotlib
+@pytest.mark.parametrize("highest", [0.06, 0.4, 20.0, 5e4])
+def test_the_loss_has_plain_numbers_at_its_axis(highest: float) -> None:
+    """Powers of ten with a factor would push the panels' labels out of the picture."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure()
+    panel = figure.subplots()
+    panel.plot([0, 1], [0.05, highest])
+    log_scale(panel)
+    FigureCanvasAgg(figure).draw()
+    assert panel.get_yscale() == "log"
+    low, high = panel.get_ylim()
+    major = panel.yaxis.get_major_ticks()
+    shown = [tick.label1.get_text() for tick in major if low <= tick.get_loc() <= high]
+    assert len(shown) >= 2
+    assert all(re.fullmatch(r"[0-9.]+(e[-+]\d+)?", text) for text in shown)
+    assert {tick.label1.get_text() for tick in panel.yaxis.get_minor_ticks()} <= {""}
+
+
+def test_a_long_name_takes_columns_from_the_legend() -> None:
+    assert legend_columns(["mcmc"] * 8, 11, most=4) == 4
+    assert legend_columns(["mcmc", "x" * 32], 11, most=4) == 3
+    assert legend_columns(["mcmc"] * 8, 4.4, most=2) == 2
+    assert legend_columns(["mcmc", "x" * 32], 4.4, most=2) == 1
+    assert legend_columns(["x" * 200], 4.4, most=2) == 1
+    assert legend_columns([], 4.4, most=2) == 2
 
 
 def test_nothing_to_draw_is_no_error(tmp_path: Path) -> None:

@@ -149,6 +149,37 @@ def test_a_scheduler_with_everything_off_or_everything_on() -> None:
     assert only(repr(constant), "nu:") == "nu: 1.5, mean 1.5 since the warm-up"
 
 
+def test_what_an_adaptive_run_has_switched_off() -> None:
+    scheduler = PhaseScheduler(
+        2000, 2000, multiplier=EnergyHistogram(energy_range=(0.0, 1.0), warmup=4), adaptive=True
+    )
+    optimizers = upgraded(scheduler)
+    for said in (repr(scheduler), repr(optimizers["means"])):
+        assert only(said, "adaptive:") == "adaptive: nothing is switched off"
+    for _ in range(600):  # one energy again and again: nu is 1 all the time
+        scheduler.observe(0.5)
+    reason = scheduler.switched_off["multiplier"]
+    for said in (repr(scheduler), repr(optimizers["means"])):
+        assert "adaptive:" not in said
+        shown = only(said, "switched off:").removeprefix("switched off: multiplier: ")
+        assert reason.startswith(shown.removesuffix(" ..."))
+        assert len(shown) > 40
+        assert max(map(len, said.splitlines())) <= 100
+        assert only(said, "nu:") == "nu: off"
+    assert "switched off" not in repr(PhaseScheduler(2000))
+    assert "adaptive" not in repr(PhaseScheduler(2000))
+
+
+def test_a_part_that_is_switched_on_again_is_no_longer_listed() -> None:
+    energies = EnergyHistogram(energy="view_centered", warmup=4)
+    scheduler = PhaseScheduler(1000, multiplier=energies, adaptive=True)
+    for _ in range(200):
+        scheduler.observe(0.5, view=0)
+    assert only(repr(scheduler), "switched off:").startswith("switched off: view_centering: all of")
+    scheduler.observe(0.5, view=1)
+    assert only(repr(scheduler), "adaptive:") == "adaptive: nothing is switched off"
+
+
 @pytest.mark.parametrize("steps", [0, 3, 11])
 def test_copies_and_lines_stay_short(steps: int) -> None:
     scheduler = everything(12, 8)

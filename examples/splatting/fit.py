@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import os
-import signal
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from signal import SIGINT, SIGTERM
 from typing import Any, Literal
 
 import torch
@@ -29,6 +27,7 @@ from splatting.gaussians import (
 from splatting.metrics import photometric_loss, psnr, ssim
 from splatting.rasterizer import render
 from splatting.scenes import Scene, View
+from splatting.stopping import StopRequest
 
 LR_DECAY = 0.01  # of the positions' learning rate over the run
 TRAIN_VIEWS_EVALUATED = 8
@@ -271,7 +270,7 @@ def run(
         return fit.evaluate()
     fit.compile_kernels()
     every = max(total // fit.options.evaluations, 1)
-    with _open_log(fit, folder / "log.jsonl", metadata or {}) as log, _StopRequest() as stop:
+    with _open_log(fit, folder / "log.jsonl", metadata or {}) as log, StopRequest() as stop:
         metrics = _evaluate(fit, log)
         while fit.iteration < total:
             phase = fit.phase
@@ -289,25 +288,6 @@ def run(
                 raise KeyboardInterrupt
         log.event("finished", fit.iteration, mean_nu=fit.mean_nu)
     return metrics
-
-
-class _StopRequest:
-    """Ctrl-C or a termination signal asks for a stop after the iteration; a second one insists."""
-
-    requested = False
-
-    def __enter__(self) -> _StopRequest:
-        self._old = {kind: signal.signal(kind, self._ask) for kind in (SIGINT, SIGTERM)}
-        return self
-
-    def _ask(self, _kind: int, _frame: object) -> None:
-        if self.requested:
-            raise KeyboardInterrupt
-        self.requested = True
-
-    def __exit__(self, *_: object) -> None:
-        for kind, old in self._old.items():
-            signal.signal(kind, old)
 
 
 def _open_log(fit: Fit, path: Path, metadata: dict[str, Any]) -> RunLog:

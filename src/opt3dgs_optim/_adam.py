@@ -27,9 +27,15 @@ class HookedAdam(RowwiseAdam):
     `step`, so that learning-rate schedulers and step hooks wrap it once.
     """
 
-    def __init__(self, params: Any, lr: float | Tensor, *args: Any, **kwargs: Any) -> None:
-        skip = kwargs.pop("skip_nonfinite", True)
-        self.skip_nonfinite = check_flag(type(self).__name__, "skip_nonfinite", skip)
+    def __init__(
+        self,
+        params: Any,
+        lr: float | Tensor,
+        *args: Any,
+        skip_nonfinite: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        self.skip_nonfinite = check_flag(type(self).__name__, "skip_nonfinite", skip_nonfinite)
         self.skipped_rows: Tensor | int = 0  # so far, for a non-finite gradient; 0-d on a GPU
         super().__init__(params, lr, *args, **kwargs)
 
@@ -126,6 +132,12 @@ class HookedAdam(RowwiseAdam):
             num_points: number of rows, which must be the mask's.
             visible: [N] mask; anything but 0 is visible.
             visibility: another name of `visible`, gsplat's.
+
+        Returns:
+            The closure's value, or None.
+
+        Raises:
+            ValueError: several masks, or one that fits no parameter.
         """
         masks = [m for m in (visible, visibility) if m is not None]
         if isinstance(closure, Tensor):
@@ -232,7 +244,7 @@ class HookedAdam(RowwiseAdam):
         )
 
     def _scaled_lr(self, group: dict[str, Any], device: torch.device) -> float | Tensor:
-        """Lr times the factor, never written into the group: schedulers would compound it."""
+        """lr times the factor, never written into the group: schedulers would compound it."""
         factor = self._factor(group)
         if factor is None:
             return group["lr"]

@@ -17,17 +17,16 @@ from torch import Tensor
 
 from opt3dgs_optim._adaptive_state import NO_EVIDENCE
 from opt3dgs_optim._evidence import (
-    accurate,
-    empty,
     foresight,
+    forget_energies,
     largest_noise,
     noise_tensors,
     nu_numbers,
     use_energy,
+    widest_float,
 )
 from opt3dgs_optim.energy import EnergyHistogram
 from opt3dgs_optim.multiplier import ConstantMultiplier
-from opt3dgs_optim.noise import CovarianceNoise
 
 if TYPE_CHECKING:
     from opt3dgs_optim.phases import PhaseScheduler
@@ -86,8 +85,8 @@ class Adaptive:
         if self._scheduler.num_observed % self._interval() == 0:
             self._check(value.device)
         elif "noise" in self.reasons and self._edited():
-            noise = self._averaged(self._noise_number(value.device))
-            self._judge_noise(float(noise))
+            noise = self._noise_number(value.device)
+            self._judge_noise(float(self._scheduler.over_ranks(noise)))
 
     def _interval(self) -> int:
         """Iterations between checks: a tenth of a short exploitation."""
@@ -126,24 +125,19 @@ class Adaptive:
 
     def _move(self, device: torch.device) -> None:
         if self._pairs.device != device:
-            self._pairs = self._pairs.to(device, accurate(device))
+            self._pairs = self._pairs.to(device, widest_float(device))
 
     # -- a check: one synchronisation ----------------------------------------------------------
 
     def _check(self, device: torch.device) -> None:
         parts = [self._nu_numbers(device), self._pairs, self._noise_number(device).reshape(1)]
-        dtype = accurate(device)
-        numbers = self._averaged(torch.cat([part.to(device, dtype) for part in parts])).tolist()
+        dtype = widest_float(device)
+        packed = torch.cat([part.to(device, dtype) for part in parts])
+        numbers = self._scheduler.over_ranks(packed).tolist()
         self._judge_views()
         self._judge_multiplier(numbers[:4])
         self._judge_curvature(numbers[4:8])
         self._judge_noise(numbers[8])
-
-    def _averaged(self, numbers: Tensor) -> Tensor:
-        over_ranks = self._scheduler._over_ranks
-        if over_ranks is None:
-            return numbers
-        return torch.stack([over_ranks(number) for number in numbers.reshape(-1).unbind()])
 
     def _nu_numbers(self, device: torch.device) -> Tensor:
         """[energies since the warm-up, mean of nu, square sum, Theta above the range]."""
@@ -153,7 +147,7 @@ class Adaptive:
         return nu_numbers(multiplier)
 
     def _noise_number(self, device: torch.device) -> Tensor:
-        noise = self._given_noise()
+        noise = self._scheduler.given_noise
         if noise is None:
             return torch.zeros((), device=device)
         tensors = noise_tensors(noise)
@@ -163,19 +157,13 @@ class Adaptive:
 
     def _edited(self) -> bool:
         """Whether density control has put other opacities in place since the last look."""
-        noise = self._given_noise()
+        noise = self._scheduler.given_noise
         if noise is None:
             return False
         opacities = noise_tensors(noise)["opacities"]
         if self._opacities is None and not self._missed_edit:
             self._opacities = weakref.ref(opacities)  # resumed: the same rows in another object
         return self._opacities is None or opacities is not self._opacities()
-
-    def _given_noise(self) -> CovarianceNoise | None:
-        """The noise that the next step would add, were it not resting."""
-        scheduler = self._scheduler
-        off = scheduler.exploiting and not scheduler.noise_in_exploitation
-        return None if off else scheduler._noise
 
     # -- decisions -----------------------------------------------------------------------------
 
@@ -225,7 +213,7 @@ class Adaptive:
         self._switch_off("curvature", why)
 
     def _judge_noise(self, largest: float) -> None:
-        if self._given_noise() is None:
+        if self._scheduler.given_noise is None:
             return
         resting = "noise" in self.reasons
         if largest < NOISE_EFFECT and not resting:
@@ -270,7 +258,7 @@ class Adaptive:
     def _use_constant(self) -> None:
         """Put the constant in the histogram's place, and free the histogram's tensors."""
         if isinstance(self._asked_multiplier, EnergyHistogram):
-            empty(self._asked_multiplier)
+            forget_energies(self._asked_multiplier)
         self._windows = []
         assert self._constant is not None
         constant = ConstantMultiplier(self._constant)
@@ -288,9 +276,7 @@ class Adaptive:
         self._scheduler.curvature_options = options
 
     def _drop_pairs(self) -> None:
-        for optimizer in self._scheduler._upgraded:
-            optimizer.curvature_options = self._scheduler.curvature_options
-            optimizer.drop_pairs()
+        self._scheduler.drop_pairs()
         self._pairs.zero_()
         self._probes = 0
 

@@ -50,7 +50,7 @@ def foresight(
     gain = _cosine(foretold, s) - _cosine(y, s)
     known = visible & (head.counter > 1) & torch.isfinite(gain) & (s != 0).any(0) & (y != 0).any(0)
     summed = torch.stack([torch.where(known, gain, 0.0).sum(), known.sum().to(gain.dtype)])
-    return summed.to(accurate(summed.device))
+    return summed.to(widest_float(summed.device))
 
 
 def _cosine(a: Tensor, b: Tensor) -> Tensor:
@@ -86,7 +86,7 @@ def nu_numbers(histogram: EnergyHistogram) -> Tensor:
     return torch.stack([moments.weight, moments.mean, moments._square, histogram._weights[-1]])
 
 
-def empty(histogram: EnergyHistogram) -> None:
+def forget_energies(histogram: EnergyHistogram) -> None:
     """Free the histogram's tensors on the device: as if it had seen no energy."""
     histogram._allocate(torch.device("cpu"))
     histogram.num_observed = 0
@@ -101,6 +101,6 @@ def use_energy(histogram: EnergyHistogram, kind: Any) -> None:
     histogram._views = ViewMeans(histogram.ema_decay, weights.dtype, weights.device)
 
 
-def accurate(device: torch.device) -> torch.dtype:
+def widest_float(device: torch.device) -> torch.dtype:
     """float64, where the device has it."""
     return torch.float32 if device.type == "mps" else torch.float64

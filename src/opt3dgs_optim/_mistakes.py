@@ -7,13 +7,14 @@ import types
 import warnings
 import weakref
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 from torch import Tensor
 from torch.optim import Adam, Optimizer
 
 CALL = "PhaseScheduler"
 NOISE_STEPS = 5  # steps in a row with positions changed by somebody else before it is said
+STALE_STEPS = 200  # steps without a new energy before it is said
 FROZEN_STEPS = 20  # exploitation steps without a gradient of the positions before it is said
 
 
@@ -142,5 +143,38 @@ class NoiseTwiceWatch:
                 f"{CALL}: the positions were changed in place between {NOISE_STEPS} steps in a "
                 "row, while noise_scale > 0 adds position noise in every step; if the trainer "
                 "injects its own noise, set its noise_lr to 0, or leave noise_scale at 0",
+                stacklevel=5,
+            )
+
+
+class EnergySource(Protocol):
+    """What tells how many energies have been observed: a histogram or a scheduler."""
+
+    num_observed: int
+
+
+class EnergyWatch:
+    """Says once, clearly, that an optimizer is stepped without any energy."""
+
+    def __init__(self, call: str) -> None:
+        self._call = call
+        self._seen = -1
+        self._stale = 0
+        self._told = False
+
+    def check(self, source: EnergySource) -> None:
+        """Call in every step."""
+        if self._told:
+            return
+        self._stale = self._stale + 1 if source.num_observed == self._seen else 0
+        self._seen = source.num_observed
+        if source.num_observed == 0 or self._stale >= STALE_STEPS:
+            since = "yet" if source.num_observed == 0 else f"for {STALE_STEPS} steps"
+            self._told = True
+            warnings.warn(
+                f"{self._call}: step() was called but no energy has been observed {since}, so "
+                "the multiplier is not being adapted and this is plain Adam. Call observe(loss) "
+                "on the histogram or the scheduler once per iteration, before step(), or pass "
+                "step() a closure that returns the loss.",
                 stacklevel=5,
             )

@@ -59,18 +59,23 @@ def damped_pair(pair: Pair, gamma: Tensor) -> Pair:
 def two_loop(grad: Tensor, s: Tensor, y: Tensor, gamma_clamp: tuple[float, float] | None) -> Tensor:
     """The recursion of `curvature.two_loop`, [D, N], for gradients of moderate size.
 
+    Nocedal and Wright (2006), algorithm 7.4; its formulas are in `curvature.two_loop`.
+
     Args:
         grad: [D, N].
         s: [K, D, N], newest first, zero where there is no pair.
         y: [K, D, N], unit length where there is a pair.
         gamma_clamp: see `curvature.two_loop`.
+
+    Returns:
+        The pseudo-gradient H g, in the parameters' units; the gradient where there is no pair.
     """
     # One [N] tensor per coordinate: a compiler makes a single loop of it, and torch alone is no
     # slower than on [D, N].
     pairs = [(s_j.unbind(), y_j.unbind()) for s_j, y_j in zip(s, y, strict=True)]
     q = list(grad.unbind())
     alphas, inverses = [], []
-    for s_j, y_j in pairs:
+    for s_j, y_j in pairs:  # the first loop, newest to oldest
         # No pair: 1 / inf = 0.
         inverse = threshold(dot(s_j, y_j), 0.0, torch.inf).reciprocal()
         alpha = dot(s_j, q) * inverse
@@ -79,6 +84,7 @@ def two_loop(grad: Tensor, s: Tensor, y: Tensor, gamma_clamp: tuple[float, float
         inverses.append(inverse)
     gamma = _initial_scaling(*pairs[0], gamma_clamp)
     r = [a * gamma for a in q]
+    # The second loop, oldest to newest.
     for (s_j, y_j), alpha, inverse in zip(
         reversed(pairs), reversed(alphas), reversed(inverses), strict=True
     ):

@@ -13,7 +13,13 @@ from torch.optim import Adam, Optimizer
 from opt3dgs_optim._adam import STATE_KEY, HookedAdam, fused_on_cuda
 from opt3dgs_optim._checkpoint import check_keys
 from opt3dgs_optim._groups import canonical_name, is_positions
-from opt3dgs_optim._mistakes import FrozenWatch, NoiseTwiceWatch, Replaced, has_own_mask
+from opt3dgs_optim._mistakes import (
+    EnergyWatch,
+    FrozenWatch,
+    NoiseTwiceWatch,
+    Replaced,
+    has_own_mask,
+)
 from opt3dgs_optim._repr import (
     block,
     curvature_line,
@@ -21,8 +27,7 @@ from opt3dgs_optim._repr import (
     scheduler_lines,
     skipped_lines,
 )
-from opt3dgs_optim._visible import ROW_STEPS
-from opt3dgs_optim.awsgld import EnergyWatch
+from opt3dgs_optim._row_steps import ROW_STEPS
 from opt3dgs_optim.lqnadam import LQNAdam
 
 if TYPE_CHECKING:
@@ -117,8 +122,8 @@ class PhasedAdam(LQNAdam):
             self._noise_watch.check(positions[0])
 
     def _end_step(self) -> None:
-        if self.scheduler._adaptive is not None:
-            self.scheduler._adaptive.count_pairs(self._tally)
+        if self.scheduler.adaptive is not None:
+            self.scheduler.adaptive.count_pairs(self._tally)
         if self.scheduler.noise is None:
             return
         positions = self._positions()
@@ -130,9 +135,9 @@ class PhasedAdam(LQNAdam):
     def _foresee(
         self, history: Tensor, position: Tensor, gradient: Tensor, visible: Tensor | None = None
     ) -> None:
-        if self.scheduler._adaptive is not None:
+        if self.scheduler.adaptive is not None:
             size = self.curvature_options.history_size
-            self.scheduler._adaptive.foresee(history, size, position, gradient, visible)
+            self.scheduler.adaptive.foresee(history, size, position, gradient, visible)
 
     def _positions(self) -> list[Tensor]:
         return [p for g in self.param_groups if is_positions(g) for p in g["params"]]

@@ -1,4 +1,4 @@
-"""The mean of a number over the ranks of a torch.distributed process group."""
+"""Means over the ranks of a torch.distributed process group."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from torch import Tensor
 
 
 class RankMean:
-    """Averages 0-d energies over a process group, every rank weighing the same.
+    """Averages tensors over a process group, every rank weighing the same.
 
     Args:
+        call: whose option `process_group` is, for the messages.
         process_group: a `torch.distributed.ProcessGroup`, e.g. `torch.distributed.group.WORLD`.
 
     Raises:
@@ -34,12 +35,13 @@ class RankMean:
         self._reduce = distributed.all_reduce
         self._size = distributed.get_world_size(process_group)
 
-    def __call__(self, energy: Tensor) -> Tensor:
-        """The mean over the ranks, 0-d; not finite on any rank is not finite on all.
+    def __call__(self, values: Tensor) -> Tensor:
+        """The means over the ranks, of the shape of `values`.
 
-        Every rank must call as often. Nothing is read back to the host.
+        A value that is not finite on one rank is not finite on all. Every rank must call as often.
+        Nothing is read back to the host.
         """
-        total = energy.detach().clone().reshape(())
+        total = values.detach().clone()
         if total.dtype in (torch.float16, torch.bfloat16):
             total = total.float()
         self._reduce(total, group=self._group)

@@ -5,12 +5,14 @@ Numbers that live on a GPU are read, so that a `repr` waits for it.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from torch import Tensor
 
 MOST_GROUPS = 8
+WIDTH = 96  # of a line whose length is not known
 
 
 def block(name: str, lines: Iterable[str]) -> str:
@@ -84,7 +86,7 @@ def noise_line(noise: Any) -> str:
 
 
 def scheduler_lines(scheduler: Any) -> list[str]:
-    """Phase and multiplier of a `PhaseScheduler`, then its parts that are on."""
+    """Phase and multiplier of a `PhaseScheduler`, its parts that are on, what is switched off."""
     lines = [
         phase_line(
             scheduler.iteration,
@@ -97,4 +99,13 @@ def scheduler_lines(scheduler: Any) -> list[str]:
     if scheduler.noise is not None:
         lines.append(noise_line(scheduler.noise))
     parts = (getattr(scheduler, name, None) for name in ("annealing", "fading"))
-    return lines + [str(part) for part in parts if part is not None]
+    lines += [str(part) for part in parts if part is not None]
+    return lines + adaptive_lines(scheduler.switched_off) if scheduler.adaptive else lines
+
+
+def adaptive_lines(switched_off: Mapping[str, str]) -> list[str]:
+    """A line per part that `adaptive=True` has switched off, with its reason as far as it fits."""
+    if not switched_off:
+        return ["adaptive: nothing is switched off"]
+    texts = [f"switched off: {part}: {reason}" for part, reason in switched_off.items()]
+    return [textwrap.shorten(text, WIDTH, placeholder=" ...") for text in texts]

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 from torch.optim.adam import Adam
 
-from opt3dgs_optim._visible import ROW_STEPS, RowSteps, masked_adam, shaped
+from opt3dgs_optim._row_steps import ROW_STEPS, RowSteps
+from opt3dgs_optim._visible import masked_adam, shaped
 
 
 class RowwiseAdam(Adam):

@@ -51,8 +51,9 @@ class Upgrading:
             optimizers: a dict of `torch.optim.Adam`, one per parameter (gsplat, nerfstudio), or
                 one Adam with named groups (INRIA, 3dgs-mcmc). Those that hold no Gaussian
                 parameter (camera poses, exposures) come back as they are, or stay plain Adam.
-            gaussians: the trainer's dict of raw tensors (`scales, quats, opacities`), or a
-                function returning it; needed with `noise_scale > 0`.
+            gaussians: the trainer's dict of raw tensors, or a function returning it: `scales`
+                [N, 3] log, `quats` [N, 4] wxyz, `opacities` [N] or [N, 1] logits. Needed with
+                `noise_scale > 0`.
             strategy: what says the trainer's own noise_lr (gsplat's MCMCStrategy, 3dgs-mcmc's
                 arguments): noise twice is refused.
 
@@ -110,6 +111,12 @@ class Upgrading:
         for optimizer in self._upgraded:
             if moments or optimizer is self._positions:
                 optimizer.reset_points(rows, moments=moments)
+
+    def drop_pairs(self) -> None:
+        """Free all curvature pairs; new ones are taken by the present `curvature_options`."""
+        for optimizer in self._upgraded:
+            optimizer.curvature_options = self.curvature_options
+            optimizer.drop_pairs()
 
     def follow_scene(self, scene: Any) -> None:
         """Let a scene of gsplat 1.6 tell which rows its density control moved.

@@ -7,75 +7,10 @@ have no bias correction. Here a row counts its own steps: it goes where it would
 from __future__ import annotations
 
 import math
-import weakref
 from typing import Any
 
 import torch
 from torch import Tensor
-
-ROW_STEPS = "row_steps"  # [N] float32 per parameter, in the state beside torch's moments
-SETTLED = 1e6  # steps after which the bias correction is 1 to float32
-
-
-class RowSteps:
-    """Keeps the step counts of the rows in line with the rows, whatever a trainer edits.
-
-    Some trainers edit every tensor of the state by rows, others (INRIA, 3dgs-mcmc) the two moments
-    only: then the counts are of other rows, and are estimated anew.
-    """
-
-    def __init__(self) -> None:
-        # of every parameter: itself, its counts and its first moment at the last step
-        self._seen: list[tuple[weakref.ref[Tensor], ...]] = []
-
-    def of(self, param: Tensor, state: dict[str, Any]) -> Tensor:
-        """The counts [N] in `state`, made or repaired where they do not fit the moments."""
-        counts, moment = state.get(ROW_STEPS), state["exp_avg"]
-        if counts is None:
-            counts = _estimate(state)
-        elif not any(entry[0]() is param for entry in self._seen):
-            # The object of the moments is another one but that of the counts is not: the trainer
-            # has edited the first and left the second.
-            edited_without_ours = self._left_behind(counts, moment)
-            if edited_without_ours or counts.shape != moment.shape[:1]:
-                counts = _estimate(state)
-            else:
-                counts = torch.where(_empty_rows(moment), 0.0, counts)
-        state[ROW_STEPS] = counts
-        self._remember(param, counts, moment)
-        return counts
-
-    def _left_behind(self, counts: Tensor, moment: Tensor) -> bool:
-        return any(at() is counts and other() is not moment for _, at, other in self._seen)
-
-    def _remember(self, param: Tensor, counts: Tensor, moment: Tensor) -> None:
-        # One entry a tensor. A parameter that has been replaced may still be alive in the trainer;
-        # one that is gone has an entry as long as its counts are in the state, left behind.
-        self._seen = [
-            (of, at, moments)
-            for of, at, moments in self._seen
-            if of() is not param and at() is not None and at() is not counts
-        ]
-        self._seen.append((weakref.ref(param), weakref.ref(counts), weakref.ref(moment)))
-
-    def trust(self, param: Tensor, state: dict[str, Any]) -> None:
-        """Take the counts in `state` as those of the present rows (a loaded checkpoint)."""
-        counts, moment = state.get(ROW_STEPS), state.get("exp_avg")
-        if counts is not None and moment is not None and counts.shape == moment.shape[:1]:
-            self._remember(param, counts, moment)
-
-
-def _empty_rows(moment: Tensor) -> Tensor:
-    return (moment == 0).reshape(moment.shape[0], -1).all(dim=1)
-
-
-def _estimate(state: dict[str, Any]) -> Tensor:
-    """Counts from the steps of the whole parameter: 0 for rows without moments."""
-    moment = state["exp_avg_sq"]
-    steps = state["step"].to(device=moment.device, dtype=torch.float32)
-    # No shared steps but moments: the optimizer had no bias correction (gsplat's SelectiveAdam).
-    steps = torch.where(steps > 0, steps, SETTLED)
-    return torch.where(_empty_rows(moment), 0.0, steps)
 
 
 def check_visible(call: str, visible: Tensor, num_points: int | None) -> Tensor:

@@ -20,6 +20,11 @@ class BackendInfo:
     """What runs for tensors of one kind; `reason` says why it is not the other.
 
     The two give the same numbers, up to rounding.
+
+    Attributes:
+        device, dtype: of the tensors that it is about.
+        backend: what runs, "cuda" or "torch".
+        reason: why, in words.
     """
 
     device: str

@@ -48,8 +48,7 @@ class Cost:
 @dataclass(frozen=True)
 class _Subject:
     call: Callable[[], Any]
-    # After the warm-up: bytes kept or None, bytes moved.
-    count: Callable[[], tuple[int | None, int]]
+    count: Callable[[], tuple[int | None, int]]  # bytes kept (or None) and moved, once warmed up
 
 
 def measure(device: torch.device, points: int, show: Callable[[str], None]) -> list[Cost]:
@@ -121,14 +120,7 @@ def _step(points: int, device: torch.device, *, exploit: bool | None) -> _Subjec
     optimizers = _adams(splats, device)
     scheduler: PhaseScheduler | None = None
     if exploit is not None:
-        scheduler = PhaseScheduler(
-            1_000_000,
-            switch=0 if exploit else 1_000_000,
-            multiplier=EnergyHistogram(energy_range=(0.0, 1.0), temperature=0.1, warmup=0),
-            curvature=CurvatureOptions(),
-            squared_loss=True,
-            noise_scale=NOISE_SCALE,
-        )
+        scheduler = _paper_parts(exploit)
         optimizers = scheduler.upgrade(optimizers, splats)
     for param in splats.values():
         param.grad = 1e-4 * torch.randn_like(param)
@@ -147,13 +139,24 @@ def _step(points: int, device: torch.device, *, exploit: bool | None) -> _Subjec
             optimizer.step()
 
     def bytes_of() -> tuple[int, int]:
-        kept = _state_bytes(optimizers)
-        moved = 2 * _nbytes(splats.values()) + _nbytes(p.grad for p in splats.values()) + 2 * kept
-        if exploit is not None:
-            moved += _noise_bytes(splats)
-        return kept, moved
+        params, kept = splats.values(), _state_bytes(optimizers)
+        moved = 2 * _nbytes(params) + _nbytes(p.grad for p in params) + 2 * kept
+        return kept, moved + (0 if exploit is None else _noise_bytes(splats))
 
     return _Subject(call, bytes_of)
+
+
+def _paper_parts(exploit: bool) -> PhaseScheduler:
+    """All parts of the paper and the noise, in one of the two phases for good."""
+    steps = 1_000_000
+    return PhaseScheduler(
+        steps,
+        switch=0 if exploit else steps,
+        multiplier=EnergyHistogram(energy_range=(0.0, 1.0), temperature=0.1, warmup=0),
+        curvature=CurvatureOptions(),
+        squared_loss=True,
+        noise_scale=NOISE_SCALE,
+    )
 
 
 def _noise_bytes(splats: dict[str, torch.nn.Parameter]) -> int:

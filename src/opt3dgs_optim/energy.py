@@ -193,6 +193,9 @@ class EnergyHistogram:
 
         Returns:
             nu, 0-d, on the energy's device.
+
+        Raises:
+            ValueError: the energy has several elements, or its view is missing.
         """
         if self.energy == "view_centered" and not isinstance(view, (int, str)):
             raise ValueError(

@@ -24,7 +24,7 @@ class Fading:
     longer. So fading is a larger learning rate for single points, for a while.
 
     The same points are faded in all Gaussian parameters. Which ones depends on `seed`, the event
-    and the number of points alone: a resumed run repeats them.
+    and the number of points alone: a resumed run repeats them. It costs no memory.
 
     Args:
         share: of the points in each event, chance per point in (0, 1].
@@ -70,7 +70,12 @@ class Fading:
         )
 
     def fade(self, state: Mapping[Any, dict[str, Any]], events: range) -> None:
-        """Fade the moments of every parameter in an optimizer's `state`; dimension 0 is points."""
+        """Fade the moments of every parameter, in place.
+
+        Args:
+            state: an optimizer's, by parameter [N, ..]; what has no moments is left out.
+            events: numbers of the events to come, from 0.
+        """
         for param, moments in state.items():
             if "exp_avg" not in moments or param.dim() == 0:
                 continue

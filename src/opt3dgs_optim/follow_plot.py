@@ -8,7 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from opt3dgs_optim.report_style import FAINT, binned, draw_legend, label_of, look, plain_style
+from opt3dgs_optim.report_style import (
+    FAINT,
+    binned,
+    draw_legend,
+    label_of,
+    look,
+    panel_grid,
+    plain_style,
+)
 from opt3dgs_optim.runread import Run
 
 __all__ = ["draw_live"]
@@ -31,34 +39,24 @@ def draw_live(labels: Sequence[str], runs: Sequence[Run], metric: str, *, narrow
     Raises:
         ModuleNotFoundError: matplotlib is not installed.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     rows = _rows(runs, metric)
     if not rows:
         return b""
     axes = ("seconds",) if narrow else ("seconds", "iteration")
-    width, columns = (4.4, 2) if narrow else (11, 4)
+    width = 4.4 if narrow else 11.0
+    columns = legend_columns(labels, width, 2 if narrow else 4)
     heights = [_height(name, len(runs)) for name in rows]
-    legend = 0.24 * -(-len(runs) // columns) + 0.15
+    legend = 0.2 * -(-len(runs) // columns) + 0.2
     height = sum(heights) + 0.16 * (len(rows) - 1) + legend + 0.65
-    figure = Figure(figsize=(width, height), dpi=200 if narrow else 150, facecolor="white")
-    FigureCanvasAgg(figure)
-    grid = figure.subplots(
-        len(rows),
+    figure, grid = panel_grid(
+        heights,
         len(axes),
-        sharex="col",
-        sharey="row",
-        squeeze=False,
-        gridspec_kw={
-            "height_ratios": heights,
-            "left": 0.17 if narrow else 0.075,
-            "right": 0.97 if narrow else 0.985,
-            "top": 1 - legend / height,
-            "bottom": 0.55 / height,
-            "wspace": 0.06,
-            "hspace": 0.16 * len(rows) / sum(heights),
-        },
+        (width, height),
+        sides=(0.19, 0.97) if narrow else (0.075, 0.985),
+        above=legend,
+        below=0.55,
+        gap=0.16 * len(rows) / sum(heights),
+        dpi=200 if narrow else 150,
     )
     for column, axis in enumerate(axes):
         for row, name in enumerate(rows):
@@ -119,23 +117,31 @@ def _panel(panel: Any, name: str, runs: Sequence[Run], axis: str) -> None:
     elif name == "accepted":
         panel.set_ylim(-0.04, 1.04)
     elif name in ("loss", "energy"):
-        _log_scale(panel)
+        log_scale(panel)
     else:
         _zoom(panel, [run.series(name) for run in runs])
 
 
-def _log_scale(panel: Any) -> None:
-    values = [y for line in panel.get_lines() for y in line.get_ydata()]
-    if values and min(values) > 0:
-        from matplotlib.ticker import LogFormatter, MaxNLocator, ScalarFormatter
+def legend_columns(labels: Sequence[str], width: float, most: int) -> int:
+    """How many columns of the longest label fit into so many inches, 1 to `most`."""
+    longest = max(map(len, labels), default=0)
+    return max(1, min(most, int(width / (0.45 + 0.075 * longest))))
 
-        panel.set_yscale("log")
-        if max(values) < 10 * min(values):  # hardly a power of ten in it: plain numbers
-            panel.yaxis.set_major_locator(MaxNLocator(5))
-            panel.yaxis.set_major_formatter(ScalarFormatter())
-            panel.yaxis.set_minor_formatter("")
-        else:
-            panel.yaxis.set_major_formatter(LogFormatter())
+
+def log_scale(panel: Any) -> None:
+    """Logarithmic if all values allow it, with plain numbers: powers of ten are too wide."""
+    values = [y for line in panel.get_lines() for y in line.get_ydata()]
+    if not values or min(values) <= 0:
+        return
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
+
+    panel.set_yscale("log")
+    panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    panel.yaxis.set_minor_formatter("")
+    if max(values) < 10 * min(values):  # hardly a power of ten in it
+        panel.yaxis.set_major_locator(MaxNLocator(5))
+    elif max(values) < 1000 * min(values):
+        panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
 
 
 def _zoom(panel: Any, series: Sequence[tuple[np.ndarray, ...]]) -> None:

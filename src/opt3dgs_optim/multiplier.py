@@ -42,7 +42,15 @@ class ConstantMultiplier:
         return torch.tensor(self.value)
 
     def observe(self, energy: Tensor | float, *, view: Hashable | None = None) -> Tensor:
-        """Take an energy; only whether it is finite matters."""
+        """Take an energy; only whether it is finite matters.
+
+        Args:
+            energy: the training loss of this iteration, 0-d.
+            view: not used; as in `EnergyHistogram.observe`.
+
+        Returns:
+            The multiplier of the next step, 0-d.
+        """
         value = energy if isinstance(energy, Tensor) else torch.tensor(float(energy))
         self.last_finite = torch.isfinite(value.detach()).reshape(())
         self.num_observed += 1

@@ -31,9 +31,9 @@ class CovarianceNoise:
     """3DGS-MCMC's position noise: `scale * lr * covariance_noise(...)` (eq. 2).
 
     Args:
-        gaussians: the trainer's dict with `scales`, `quats`, `opacities`, or a function that
-            returns it. It is read anew in every step, because density control replaces the
-            tensors in it.
+        gaussians: the trainer's dict with `scales` [N, 3] log, `quats` [N, 4] wxyz and
+            `opacities` [N] or [N, 1] logits, or a function that returns it. It is read anew in
+            every step, because density control replaces the tensors in it.
         scale: noise_lr of 3DGS-MCMC.
         generator: random generator of the parameters' device, or None for torch's own.
         backend: `"auto"`, `"cuda"` or `"torch"`; see `backend_info`.
@@ -49,7 +49,11 @@ class CovarianceNoise:
         check_choice("CovarianceNoise", "backend", self.backend, BACKENDS)
 
     def add_to(self, means: Tensor, lr: float | Tensor) -> None:
-        """Add the noise to `means` [N, 3] in place; lr is their present learning rate."""
+        """Add the noise to `means` [N, 3] in place; lr is their present learning rate.
+
+        Raises:
+            ValueError: a tensor is missing among the Gaussians, or has another number of rows.
+        """
         source = self.gaussians() if callable(self.gaussians) else self.gaussians
         missing = [name for name in ("scales", "quats", "opacities") if name not in source]
         if missing:

@@ -14,6 +14,14 @@ from torch.optim import Optimizer
 from opt3dgs_optim._adaptive_state import check_loadable
 from opt3dgs_optim._checkpoint import check_keys, check_whole
 from opt3dgs_optim._checks import check_count, check_flag, check_number, check_part
+from opt3dgs_optim._phase_options import (
+    PAPER_STEPS,
+    PAPER_SWITCH,
+    PAPER_WARMUP,
+    as_multiplier,
+    resets_moments,
+    switch_iteration,
+)
 from opt3dgs_optim._ranks import RankMean
 from opt3dgs_optim._repr import block, curvature_line, scheduler_lines
 from opt3dgs_optim._upgrading import Upgrading
@@ -28,11 +36,9 @@ if TYPE_CHECKING:
     from opt3dgs_optim._adaptive import Adaptive
     from opt3dgs_optim.runlog import RunLog
 
+__all__ = ["PAPER_STEPS", "PAPER_SWITCH", "Phase", "PhaseScheduler"]
+
 CALL = "PhaseScheduler"
-PAPER_STEPS = 30_000
-PAPER_SWITCH = 29_000 / PAPER_STEPS
-PAPER_WARMUP = 2_500 / PAPER_STEPS
-SETTLING_STEPS = 100  # of Adam's second moment over views, after a restart
 OPTIMIZERS = TypeVar("OPTIMIZERS", bound="dict[str, Optimizer] | Optimizer")
 
 
@@ -82,6 +88,8 @@ class PhaseScheduler(Upgrading):
     optimizer. The state travels inside `param_groups[0]` of every upgraded optimizer's
     `state_dict()`, so that a trainer which saves its optimizers resumes bit for bit.
 
+    Memory: Adam's; with curvature `LQNAdam`'s, from the switch on.
+
     Examples:
         >>> import torch
         >>> from opt3dgs_optim import PhaseScheduler
@@ -129,13 +137,13 @@ class PhaseScheduler(Upgrading):
     ) -> None:
         super().__init__()
         self.total_steps = check_count(CALL, "total_steps", total_steps, 1)
-        self.switch_step = _switch_step(switch, self.total_steps)
-        self.multiplier = _as_multiplier(multiplier, self.total_steps)
+        self.switch_step = switch_iteration(switch, self.total_steps)
+        self.multiplier = as_multiplier(multiplier, self.total_steps)
         check_part(CALL, "curvature", curvature, "CurvatureOptions", "history_size")
         self.curvature = curvature is not None
         self.curvature_options = curvature or CurvatureOptions()
         self.squared_loss = check_flag(CALL, "squared_loss", squared_loss)
-        self.reset_moments = _resets(reset_moments, self.total_steps - self.switch_step)
+        self.reset_moments = resets_moments(reset_moments, self.total_steps - self.switch_step)
         self.noise_scale = check_number(CALL, "noise_scale", noise_scale, 0.0)
         self.noise_in_exploitation = check_flag(
             CALL, "noise_in_exploitation", noise_in_exploitation
@@ -148,11 +156,11 @@ class PhaseScheduler(Upgrading):
         self.num_observed = 0
         self.last_finite = torch.ones((), dtype=torch.bool)
         self._current = -1  # the iteration observed last, whose step comes next
-        self._adaptive: Adaptive | None = None
+        self.adaptive: Adaptive | None = None
         if check_flag(CALL, "adaptive", adaptive):
             from opt3dgs_optim._adaptive import Adaptive  # where it is off, it costs no import
 
-            self._adaptive = Adaptive(self)
+            self.adaptive = Adaptive(self)
 
     @classmethod
     def install(
@@ -173,6 +181,10 @@ class PhaseScheduler(Upgrading):
 
         Fixed energy range [0, 0.2] and temperature, warm-up 2,500 of 30,000, switch at 29,000,
         K = 5 consecutive pairs, L2, everything on.
+
+        Args:
+            total_steps: iterations of the training.
+            overrides: options of the class, instead of the paper's.
         """
         check_count(f"{CALL}.paper", "total_steps", total_steps, 1)
         settings: dict[str, Any] = {
@@ -211,10 +223,15 @@ class PhaseScheduler(Upgrading):
         return self.annealing.factor(name, max(self._current, 0) / self.total_steps)
 
     @property
-    def noise(self) -> CovarianceNoise | None:
-        """The position noise of the next step, or None."""
+    def given_noise(self) -> CovarianceNoise | None:
+        """The position noise that the options give the next step, or None."""
         off = self.exploiting and not self.noise_in_exploitation
-        return None if off or "noise" in self.switched_off else self._noise
+        return None if off else self._noise
+
+    @property
+    def noise(self) -> CovarianceNoise | None:
+        """The position noise of the next step, or None: `given_noise`, unless it is resting."""
+        return None if "noise" in self.switched_off else self.given_noise
 
     @property
     def switched_off(self) -> Mapping[str, str]:
@@ -223,7 +240,7 @@ class PhaseScheduler(Upgrading):
         `multiplier` and `curvature` for good; `noise` and `view_centering` until they are of use
         again; `epoch_pairs`: pairs are taken between consecutive steps instead.
         """
-        return {} if self._adaptive is None else self._adaptive.reasons
+        return {} if self.adaptive is None else self.adaptive.reasons
 
     @property
     def accepted_share(self) -> Tensor | None:
@@ -268,8 +285,7 @@ class PhaseScheduler(Upgrading):
             )
         value = loss if isinstance(loss, Tensor) else torch.tensor(float(loss))
         value = value.detach().reshape(())
-        if self._over_ranks is not None:
-            value = self._over_ranks(value)
+        value = self.over_ranks(value)
         finite = torch.isfinite(value)
         if self.last_finite.device == finite.device:
             self.last_finite.copy_(finite)  # in place: a CUDA graph of a step reads it
@@ -281,8 +297,12 @@ class PhaseScheduler(Upgrading):
         if self.log is not None:
             phase = self._phase_of(self._current).value
             self.log.step(self._current, phase=phase, energy=value, **self.log_values())
-        if self._adaptive is not None:
-            self._adaptive.observed(value, view)
+        if self.adaptive is not None:
+            self.adaptive.observed(value, view)
+
+    def over_ranks(self, values: Tensor) -> Tensor:
+        """Means of `values` over the process group, or `values` where there is none."""
+        return values if self._over_ranks is None else self._over_ranks(values)
 
     def log_values(self) -> dict[str, Tensor]:
         """What this step's line of a run log should hold, 0-d: nu and the accepted share.
@@ -304,6 +324,9 @@ class PhaseScheduler(Upgrading):
 
         Args:
             render, target: images of one shape, in 0..1.
+
+        Raises:
+            ValueError: their shapes differ.
         """
         if render.shape != target.shape:
             raise ValueError(
@@ -323,7 +346,7 @@ class PhaseScheduler(Upgrading):
             "iteration": self.iteration,
             "num_observed": self.num_observed,
             "multiplier": None if self.multiplier is None else self.multiplier.state_dict(),
-            **({} if self._adaptive is None else {"adaptive": self._adaptive.state_dict()}),
+            **({} if self.adaptive is None else {"adaptive": self.adaptive.state_dict()}),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -333,9 +356,9 @@ class PhaseScheduler(Upgrading):
         iteration = check_whole(call, "iteration", state["iteration"])
         num_observed = check_whole(call, "num_observed", state["num_observed"])
         saved = state["multiplier"]
-        check_loadable(call, state, self._adaptive is not None)
-        if self._adaptive is not None:
-            self._adaptive.load_state_dict(state.get("adaptive"))
+        check_loadable(call, state, self.adaptive is not None)
+        if self.adaptive is not None:
+            self.adaptive.load_state_dict(state.get("adaptive"))
         if self.multiplier is not None and saved is not None:
             self.multiplier.load_state_dict(saved)
         self._current = iteration - 1
@@ -349,32 +372,3 @@ class PhaseScheduler(Upgrading):
         else:
             lines.append("curvature=None")
         return block(CALL, lines)
-
-
-def _switch_step(switch: float | int, total_steps: int) -> int:
-    if isinstance(switch, int) and not isinstance(switch, bool):
-        return check_count(CALL, "switch", switch, 0, total_steps)
-    fraction = check_number(CALL, "switch", switch, 0.0, 1.0)
-    return round(fraction * total_steps)
-
-
-def _resets(value: bool | str, steps_left: int) -> bool:
-    if isinstance(value, bool):
-        return value
-    if value != "auto":
-        raise ValueError(f"{CALL}: reset_moments={value!r}, but True, False or 'auto' is needed")
-    return steps_left >= SETTLING_STEPS
-
-
-def _as_multiplier(value: Any, total_steps: int) -> EnergyHistogram | ConstantMultiplier | None:
-    if value is None or isinstance(value, (EnergyHistogram, ConstantMultiplier)):
-        return value
-    if value == "histogram":
-        # An automatic range needs a few energies even in the shortest run.
-        return EnergyHistogram(warmup=max(4, round(total_steps * PAPER_WARMUP)))
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        return ConstantMultiplier(check_number(CALL, "multiplier", value))
-    raise ValueError(
-        f"{CALL}: multiplier={value!r}, but 'histogram', an EnergyHistogram, a number or None is "
-        "needed"
-    )

@@ -1,8 +1,8 @@
-"""Compare runs from their logs: ``python -m opt3dgs_optim.report RUN... -o DIR``.
+"""Compare runs from their logs: `python -m opt3dgs_optim.report RUN... -o DIR`.
 
-Writes ``report.md``, ``report.csv``, ``report.json`` and, with matplotlib (the extra
-``opt3dgs_optim[report]``), ``report.png``, or ``report-SCENE.png`` for each of several scenes.
-With ``--follow`` it watches runs that are still training instead; see :mod:`opt3dgs_optim.follow`.
+Writes `report.md`, `report.csv`, `report.json` and, with matplotlib (the extra
+`opt3dgs_optim[report]`), `report.png`, or `report-SCENE.png` for each of several scenes.
+With `--follow` it watches runs that are still training instead; see `opt3dgs_optim.follow`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ NO_PICTURE = (
 
 
 def find_logs(paths: Sequence[str | Path]) -> list[Path]:
-    """The log files among ``paths``, and below those that are folders (``*.jsonl``), each once.
+    """The log files among `paths`, and below those that are folders (`*.jsonl`), each once.
 
     Raises:
         FileNotFoundError: a path that does not exist, or a folder without a log.
@@ -49,13 +49,19 @@ def find_logs(paths: Sequence[str | Path]) -> list[Path]:
 def write_report(
     runs: Sequence[Run], out: str | Path, *, metric: str = "psnr", baseline: str | None = None
 ) -> list[Path]:
-    """Write the report on ``runs`` into the folder ``out`` and return the files written.
+    """Write the report on `runs` into the folder `out` and return the files written.
 
     The picture is left out, and missing in the returned list, if matplotlib is not installed.
 
+    Args:
+        runs: of any number of scenes, arms and seeds.
+        out: folder, made if it is missing.
+        metric: to compare by, as the runs log it.
+        baseline: reference arm; None takes "mcmc" if there, else the first arm.
+
     Raises:
-        ValueError: no runs, or no run of the arm ``baseline``.
-        OSError: ``out`` cannot be written.
+        ValueError: no runs, or no run of the arm `baseline`.
+        OSError: `out` cannot be written.
     """
     if not runs:
         raise ValueError("write_report: no runs; pass at least one")

@@ -9,7 +9,16 @@ from typing import Any
 import numpy as np
 
 from opt3dgs_optim.report_stats import Arm, Comparison, higher_is_better
-from opt3dgs_optim.report_style import FAINT, INK, binned, draw_legend, label_of, look, plain_style
+from opt3dgs_optim.report_style import (
+    FAINT,
+    INK,
+    binned,
+    draw_legend,
+    label_of,
+    look,
+    panel_grid,
+    plain_style,
+)
 from opt3dgs_optim.runread import Run
 
 __all__ = ["draw"]
@@ -19,38 +28,25 @@ LEGEND_COLUMNS = 4
 
 
 def draw(comparison: Comparison, path: Path, footer: str) -> None:
-    """Draw ``comparison`` into the PNG file ``path``, with ``footer`` in small print.
+    """Draw `comparison` into the PNG file `path`, with `footer` in small print.
 
-    Lines are means over seeds, bands reach from the least to the greatest. Uses matplotlib's
-    Agg canvas alone: no backend is chosen and no global setting changed.
+    Lines are means over seeds, bands reach from the least to the greatest.
 
     Raises:
         ModuleNotFoundError: matplotlib is not installed.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     extras = [name for name in ("nu", "accepted") if _has_step(comparison, name)]
     heights = [3.4, *[1.15] * len(extras)]
     legend = 0.25 * -(-len(comparison.arms) // LEGEND_COLUMNS)  # inches
-    figure = Figure(figsize=(11, 1.85 + legend + sum(heights)), dpi=150, facecolor="white")
-    FigureCanvasAgg(figure)
-    height = figure.get_figheight()
-    grid = figure.subplots(
-        len(heights),
-        2,
-        sharex="col",
-        sharey="row",
-        squeeze=False,
-        gridspec_kw={
-            "height_ratios": heights,
-            "left": 0.075,
-            "right": 0.985,
-            "top": 1 - (0.8 + legend) / height,
-            "bottom": 1.0 / height,
-            "wspace": 0.06,
-            "hspace": 0.14,
-        },
+    figure, grid = panel_grid(
+        heights,
+        len(AXES),
+        (11, 1.85 + legend + sum(heights)),
+        sides=(0.075, 0.985),
+        above=0.8 + legend,
+        below=1.0,
+        gap=0.14,
+        dpi=150,
     )
     for column, axis in enumerate(AXES):
         _metric_panel(grid[0, column], comparison, axis)

@@ -17,7 +17,7 @@ LOWER_IS_BETTER = ("lpips", "loss", "error", "mse", "mae", "l1", "l2", "energy",
 
 @dataclass(frozen=True)
 class Stat:
-    """Mean and sample standard deviation (None for n = 1) over ``n`` runs."""
+    """Mean and sample standard deviation (None for n = 1) over `n` runs."""
 
     mean: float
     std: float | None
@@ -25,7 +25,7 @@ class Stat:
 
     @staticmethod
     def of(values: Sequence[float]) -> Stat | None:
-        """The statistic of ``values``, or None if there are none; a NaN among them shows."""
+        """The statistic of `values`, or None if there are none; a NaN among them shows."""
         if len(values) == 0:
             return None
         with np.errstate(invalid="ignore"):  # inf - inf
@@ -60,12 +60,12 @@ class Comparison:
 
 
 def compare(runs: Sequence[Run], metric: str, baseline: str | None) -> list[Comparison]:
-    """Group ``runs`` by the metadata ``scene`` and ``arm`` (else the file's name) and compare.
+    """Group `runs` by the metadata `scene` and `arm` (else the file's name) and compare.
 
-    ``baseline`` names the reference arm; None takes "mcmc" if there, else the first arm.
+    `baseline` names the reference arm; None takes "mcmc" if there, else the first arm.
 
     Raises:
-        ValueError: no run has the arm ``baseline``.
+        ValueError: no run has the arm `baseline`.
     """
     scenes: dict[str | None, dict[str, list[Run]]] = {}
     for run in runs:
@@ -159,7 +159,7 @@ def _curve(run: Run, metric: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _first_time(run: Run, metric: str, target: float) -> float | None:
-    """Seconds until the metric first reaches ``target``, linear between evaluations."""
+    """Seconds until the metric first reaches `target`, linear between evaluations."""
     seconds, values = _curve(run, metric)
     goal = target if higher_is_better(metric) else -target
     reached = np.flatnonzero(values >= goal)
@@ -173,7 +173,7 @@ def _first_time(run: Run, metric: str, target: float) -> float | None:
 
 
 def _at(run: Run, metric: str, time: float) -> float | None:
-    """The metric at ``time`` seconds, linear between evaluations; None before the first."""
+    """The metric at `time` seconds, linear between evaluations; None before the first."""
     seconds, values = _curve(run, metric)
     return float(np.interp(time, seconds, values)) if len(seconds) and time >= seconds[0] else None
 

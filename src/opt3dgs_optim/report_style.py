@@ -7,7 +7,16 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["FAINT", "INK", "binned", "draw_legend", "label_of", "look", "plain_style"]
+__all__ = [
+    "FAINT",
+    "INK",
+    "binned",
+    "draw_legend",
+    "label_of",
+    "look",
+    "panel_grid",
+    "plain_style",
+]
 
 # Okabe and Ito's colour-blind-safe palette, without the yellow that white swallows.
 COLOURS = ("#333333", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
@@ -39,6 +48,51 @@ def binned(x: np.ndarray, values: np.ndarray, bins: int = BINS) -> tuple[np.ndar
         np.array([x[part].mean() for part in parts]),
         np.array([values[part].mean() for part in parts]),
     )
+
+
+def panel_grid(
+    heights: Sequence[float],
+    columns: int,
+    size: tuple[float, float],
+    *,
+    sides: tuple[float, float],
+    above: float,
+    below: float,
+    gap: float,
+    dpi: int,
+) -> tuple[Any, Any]:
+    """A figure and its panels [rows, columns]: one x axis a column, one y axis a row.
+
+    Uses matplotlib's Agg canvas alone: no backend is chosen and no global setting changed.
+
+    Args:
+        heights: of the rows, one against the other.
+        columns: number of columns.
+        size: (width, height) of the figure in inches.
+        sides: where the panels begin and end, 0..1 of the width.
+        above, below: inches left free.
+        gap: between rows, in mean heights of a row.
+        dpi: dots per inch.
+
+    Raises:
+        ModuleNotFoundError: matplotlib is not installed.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, dpi=dpi, facecolor="white")
+    FigureCanvasAgg(figure)
+    spacing = {
+        "height_ratios": heights,
+        "left": sides[0],
+        "right": sides[1],
+        "top": 1 - above / size[1],
+        "bottom": below / size[1],
+        "wspace": 0.06,
+        "hspace": gap,
+    }
+    shared = {"sharex": "col", "sharey": "row", "squeeze": False}
+    return figure, figure.subplots(len(heights), columns, gridspec_kw=spacing, **shared)
 
 
 def plain_style(panel: Any) -> None:

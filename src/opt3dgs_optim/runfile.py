@@ -115,7 +115,7 @@ def _base_name(argument: str) -> str:
 
 
 def index(call: str, iteration: int) -> int:
-    """``iteration`` as an int >= 0; ValueError or TypeError otherwise."""
+    """`iteration` as an int >= 0; ValueError or TypeError otherwise."""
     try:
         value = operator.index(iteration)
     except TypeError:
@@ -141,7 +141,7 @@ def number(call: str, name: str, value: Any) -> float | int | str:
 
 
 def plain(call: str, value: Any) -> Any:
-    """``value`` (metadata, event details) as strict JSON holds it; TypeError if it cannot."""
+    """`value` (metadata, event details) as strict JSON holds it; TypeError if it cannot."""
     if value is None or isinstance(value, (bool, str)):
         return value
     if isinstance(value, os.PathLike):

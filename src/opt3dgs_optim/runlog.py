@@ -155,7 +155,7 @@ class RunLog:
         self._drain(wait=False)
 
     def evaluation(self, iteration: int, **metrics: float | int | Tensor) -> None:
-        """Log metrics (`psnr` in dB, `ssim`, `train_psnr`, `num_points`, ...).
+        """Log metrics (`psnr` in dB, `ssim`, `train_psnr`, `num_points`, ...), one number each.
 
         Adds `peak_cuda_bytes` (torch's peak of the current device) if CUDA is in use, else
         `peak_host_bytes` (peak resident set of the process). Errors as in `step`.

@@ -26,11 +26,11 @@ class Run:
     Attributes:
         name: the file's name without its ending.
         metadata: what the trainer passed; a later session's entries win.
-        origin: ``command``, ``time`` (ISO, UTC) and ``machine`` of the first session.
-        steps: columns of equal length over the step lines: ``iteration`` (int64), ``seconds``,
-            ``phase`` (str) and every logged value as float64, NaN where a line lacks it.
-        evaluations: the same over the evaluation lines, without ``phase``.
-        events: the event lines, as dictionaries with ``event``, ``iteration``, ``seconds``.
+        origin: `command`, `time` (ISO, UTC) and `machine` of the first session.
+        steps: columns of equal length over the step lines: `iteration` (int64), `seconds`,
+            `phase` (str) and every logged value as float64, NaN where a line lacks it.
+        evaluations: the same over the evaluation lines, without `phase`.
+        events: the event lines, as dictionaries with `event`, `iteration`, `seconds`.
         records: all lines kept, in order, as dictionaries; tells "logged as NaN" from "absent".
     """
 
@@ -43,7 +43,7 @@ class Run:
     records: list[dict[str, Any]]
 
     def series(self, name: str, kind: str = "evaluation") -> tuple[np.ndarray, ...]:
-        """(iteration, seconds, value) at the lines of ``kind`` that log the number ``name``."""
+        """(iteration, seconds, value) at the lines of `kind` that log the number `name`."""
         lines = [r for r in self.records if r["kind"] == kind and name in r]
         return tuple(
             np.array([r[key] for r in lines], dtype=dtype)
@@ -52,7 +52,7 @@ class Run:
 
 
 def read_run(path: str | os.PathLike[str]) -> Run:
-    """Read the run log ``path``.
+    """Read the run log `path`.
 
     A last line without its newline (a kill, or a writer at work) is left out, and so is such a
     line inside the file if a later session closed it off. The strings "nan", "inf" and "-inf"

@@ -42,15 +42,28 @@ def macros(
     return size + half + ([("IN_FLOAT64", "1")] if dtype == torch.float64 else [])
 
 
-def compile_cubin(name: str, dtype: torch.dtype, arch: str, **options: Any) -> Any:
+def compile_cubin(
+    name: str,
+    dtype: torch.dtype,
+    arch: str,
+    *,
+    history_size: int | None = None,
+    packed: bool = False,
+    cache: Any = None,
+    logs: Any = None,
+    ptxas_options: list[str] | None = None,
+) -> Any:
     """Compile a kernel file for an architecture such as "sm_90"; no GPU is needed.
 
     Args:
         name: a key of `KERNELS`.
         dtype: torch.float32 or torch.float64.
         arch: without one, cuda.core would ask the driver.
-        options: `history_size`; `packed`, for half-size pairs; `cache`, a cuda.core program
-            cache; `logs`, an object with `write`; `ptxas_options`.
+        history_size: K; of "lqn.cu" only.
+        packed: whether for half-size pairs; of "lqn.cu" only.
+        cache: a cuda.core program cache.
+        logs: an object with `write`, for what the compiler says.
+        ptxas_options: for the assembler, such as "-v".
 
     Returns:
         cuda.core's ObjectCode.
@@ -62,12 +75,11 @@ def compile_cubin(name: str, dtype: torch.dtype, arch: str, **options: Any) -> A
         core.ProgramOptions(
             arch=arch,
             std="c++17",
-            define_macro=macros(dtype, options.get("history_size"), options.get("packed", False))
-            or None,
-            ptxas_options=options.get("ptxas_options"),
+            define_macro=macros(dtype, history_size, packed) or None,
+            ptxas_options=ptxas_options,
         ),
     )
-    return program.compile("cubin", logs=options.get("logs"), cache=options.get("cache"))
+    return program.compile("cubin", logs=logs, cache=cache)
 
 
 @functools.cache
@@ -88,8 +100,14 @@ def _kernel(
 ) -> Any:
     major, minor = torch.cuda.get_device_capability(device)
     importlib.import_module("cuda.core").Device(device).set_current()
-    options = {"history_size": history_size, "packed": packed, "cache": _disk_cache()}
-    code = compile_cubin(name, dtype, f"sm_{major}{minor}", **options)
+    code = compile_cubin(
+        name,
+        dtype,
+        f"sm_{major}{minor}",
+        history_size=history_size,
+        packed=packed,
+        cache=_disk_cache(),
+    )
     return code.get_kernel(KERNELS[name])
 
 
