@@ -43,7 +43,9 @@ class FrozenRows:
             capacity = min(CAPACITY, grad.shape[0])
             rows = torch.nonzero_static(bad, size=capacity, fill_value=0).squeeze(1)
             frozen = cls(rows, bad[rows], kept)
-            frozen.overflow = (bad.sum() > capacity).to(torch.float32)
+            # Not the list's: its unused places name row 0, and that one may be bad.
+            frozen.count = bad.sum()
+            frozen.overflow = (frozen.count > capacity).to(torch.float32)
         grad[rows] = torch.where(frozen._like(grad), 0.0, grad[rows])
         return frozen
 
