@@ -1,11 +1,15 @@
 """Stiff problems with known minima: how far, how fast and up to which condition each method gets.
 
-    python examples/stability.py            # writes docs/results/stability/
+    python examples/stability.py            # writes docs/results/stability/ and docs/stability.md
+    python examples/stability.py --tables   # the same from the JSON of the last run
 
 torch's Adam and LBFGS, AWSGLD, LQNAdam, and the two-loop recursion of LQNAdam with a line search
 instead of Adam. Every problem is a batch of rows in axes of their own; torch's LBFGS, which knows
 one vector only, gets an optimizer per row. Adam, AWSGLD and LQNAdam get the best of three learning
 rates (1, 10 and 100 thousandths of the distance to the minimum), decayed to 1e-6 of it.
+
+The page also shows the long tests, the coverage and the mutants. `--slow` and `--coverage` take in
+what pytest has left (`--junitxml`, `--cov-report=json`); tests/mutants.py writes its own.
 """
 
 from __future__ import annotations
@@ -32,6 +36,7 @@ sys.path.insert(0, str(ROOT / "tests"))  # the problems are the tests' own
 
 from line_search import minimise  # noqa: E402
 from problems import (  # noqa: E402
+    MULTIMODAL,
     SMOOTH,
     Problem,
     gradient,
@@ -41,15 +46,23 @@ from problems import (  # noqa: E402
     rotations,
     to_world,
 )
+from stability_page import coverage_result, filled, slow_result, table  # noqa: E402
 
 Function = Callable[[Tensor], Tensor]
 Course = list[tuple[int, float, float]]  # iteration, seconds, error
 Step = Callable[[], Tensor]  # takes one iteration, returns the rows' points
 SHARES = (1e-3, 1e-2, 1e-1)
 ARMS = ("Adam", "AWSGLD", "LQNAdam", "LBFGS (torch)", "two-loop + line search")
-COLORS = dict(zip(ARMS, ("#4c72b0", "#8c8c8c", "#c44e52", "#dd8452", "#55a868"), strict=True))
+COLORS = dict(zip(ARMS, ("#4c72b0", "#222222", "#c44e52", "#dd8452", "#55a868"), strict=True))
+# AWSGLD is near Adam: seen on top of it.
+STYLES: dict[str, dict[str, Any]] = {
+    "Adam": {"lw": 5, "alpha": 0.5},
+    "AWSGLD": {"lw": 1.5, "ls": "--"},
+}
 CONDITIONS = (1.0, 1e1, 1e2, 1e3, 1e4, 1e6, 1e9, 1e12)
 LBFGS_ROWS = 4
+# Several valleys. The double well's start is a minimum.
+VALLEYS = tuple(problem for problem in MULTIMODAL if problem.start != problem.minimum)
 
 
 def adam_like(arm: str, value: Function, start: Tensor, lr: float, steps: int) -> Step:
@@ -144,7 +157,8 @@ def problem_courses(problem: Problem, rows: int, steps: int) -> dict[str, Course
     def error(x: Tensor) -> float:
         many = len(x)
         found = placed(problem, scale[:many], turn[:many])(x)
-        return max(float((found - problem.minimum_value).median()) / problem.start_value, 1e-40)
+        height = problem.start_value - problem.minimum_value
+        return max(float((found - problem.minimum_value).median()) / height, 1e-40)
 
     return compare(value, start, distance, error, steps)
 
@@ -191,12 +205,11 @@ def first_below(course: Course, bound: float, column: int) -> str:
     return "-" if not hits else (f"{hits[0]:.2f}" if column == 1 else str(hits[0]))
 
 
-def table(title: str, results: dict[str, dict[str, Course]], cell: Callable[[Course], str]) -> str:
-    lines = [f"### {title}", "", "| problem | " + " | ".join(ARMS) + " |"]
-    lines.append("|---" * (len(ARMS) + 1) + "|")
-    for name, courses in results.items():
-        lines.append(f"| {name} | " + " | ".join(cell(courses[arm]) for arm in ARMS) + " |")
-    return "\n".join(lines) + "\n"
+def comparison(
+    title: str, results: dict[str, dict[str, Course]], cell: Callable[[Course], str]
+) -> str:
+    rows = [(name, *(cell(courses[arm]) for arm in ARMS)) for name, courses in results.items()]
+    return f"### {title}\n\n" + table(("problem", *ARMS), rows)
 
 
 def survived(quadratics: dict[str, dict[str, Course]]) -> dict[str, float]:
@@ -212,18 +225,29 @@ def survived(quadratics: dict[str, dict[str, Course]]) -> dict[str, float]:
 def report(results: dict[str, Any]) -> str:
     about = results["about"]
     problems, quadratics = results["problems"], results["quadratics"]
+    found = results["survived"]
     parts = [
         f"Made by `{about['command']}` on {about['date']}: {about['machine']}, {about['rows']} "
         f"rows, {about['steps']} steps (line searches: up to 150).\n",
-        table(
-            "Digits of f lost (-log10 of f over its start)", problems, lambda c: digits(c[-1][2])
+        comparison(
+            "Digits reached (-log10 of f over its start)", problems, lambda c: digits(c[-1][2])
         ),
-        table("Iterations to 1e-6 of f", problems, lambda c: first_below(c, 1e-6, 0)),
-        table("Seconds to 1e-6 of f (LBFGS: 4 rows)", problems, lambda c: first_below(c, 1e-6, 1)),
-        table("Quadratics: digits of |x| lost", quadratics, lambda c: digits(c[-1][2])),
-        "### Worst condition at which the median row loses 3 digits of |x|\n",
-        "| " + " | ".join(ARMS) + " |\n" + "|---" * len(ARMS) + "|",
-        "| " + " | ".join(f"{v:.0e}" for v in results["survived"].values()) + " |\n",
+        comparison("Iterations to 1e-6 of f", problems, lambda c: first_below(c, 1e-6, 0)),
+        comparison(
+            "Seconds to 1e-6 of f (LBFGS: 4 rows)", problems, lambda c: first_below(c, 1e-6, 1)
+        ),
+        comparison(
+            "Several valleys: what is left of f above its lowest minimum, over that of the start",
+            results["valleys"],
+            lambda c: f"{c[-1][2]:.2f}",
+        ),
+        comparison(
+            "Quadratics: digits reached (-log10 of |x| over its start)",
+            quadratics,
+            lambda c: digits(c[-1][2]),
+        ),
+        "### Worst condition survived (the median row reaches 3 digits of |x|)\n",
+        table(found, [[f"{v:.0e}" for v in found.values()]]),
         "### Decades of gradient size (of 82, 1e-44 to 1e37; float32) with the same steps\n",
         *(f"- {arm}: {decades}" for arm, decades in results["decades"].items()),
     ]
@@ -239,7 +263,7 @@ def plot(results: dict[str, dict[str, Course]], column: int, label: str, path: P
     for axis, (name, courses) in zip(axes.flat, results.items(), strict=False):
         for arm in ARMS:
             at = [entry[column] for entry in courses[arm]]
-            style = {"lw": 4, "alpha": 0.5} if arm == "Adam" else {"lw": 1.5}  # AWSGLD is near it
+            style = STYLES.get(arm, {"lw": 1.5})
             errors = [entry[2] for entry in courses[arm]]
             axis.plot(at, errors, color=COLORS[arm], label=arm, **style)
         axis.set(title=name, xscale="log", yscale="log", xlabel=label)
@@ -256,16 +280,11 @@ def plot(results: dict[str, dict[str, Course]], column: int, label: str, path: P
     plt.close(figure)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs/results/stability")
-    parser.add_argument("--rows", type=int, default=50)
-    parser.add_argument("--steps", type=int, default=1000)
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    options.output.mkdir(parents=True, exist_ok=True)
-    sizes = (options.rows, options.steps)
+def measured(rows: int, steps: int, machine: str) -> dict[str, Any]:
+    """Every arm on every problem."""
+    sizes = (rows, steps)
     problems = {p.name: problem_courses(p, *sizes) for p in tqdm(SMOOTH, desc="problems")}
+    valleys = {p.name: problem_courses(p, *sizes) for p in tqdm(VALLEYS, desc="valleys")}
     quadratics = {
         f"condition {c:.0e}": condition_courses(c, *sizes)
         for c in tqdm(CONDITIONS, desc="quadratics")
@@ -273,18 +292,50 @@ def main() -> None:
     about = {
         "command": "python examples/stability.py",
         "date": date.today().isoformat(),
-        "machine": f"{platform.system()} {platform.machine()}, 1 thread, torch {torch.__version__}",
-        "rows": options.rows,
-        "steps": options.steps,
+        "machine": machine,
+        "rows": rows,
+        "steps": steps,
     }
-    results: dict[str, Any] = {"about": about, "problems": problems, "quadratics": quadratics}
-    results |= {"survived": survived(quadratics), "decades": range_survived()}
-    (options.output / "stability.json").write_text(json.dumps(results) + "\n")
-    (options.output / "stability.md").write_text(report(results))
-    plot(problems, 0, "iterations", options.output / "iterations.png")
-    plot(problems, 1, "seconds", options.output / "seconds.png")
-    plot(quadratics, 0, "iterations", options.output / "conditions.png")
-    print(f"wrote {options.output}")
+    results: dict[str, Any] = {"about": about, "problems": problems, "valleys": valleys}
+    results |= {"quadratics": quadratics}
+    return results | {"survived": survived(quadratics), "decades": range_survived()}
+
+
+def write_json(path: Path, results: dict[str, Any], indent: int | None = None) -> None:
+    path.write_text(json.dumps(results, indent=indent) + "\n")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs/results/stability")
+    parser.add_argument("--page", type=Path, default=ROOT / "docs/stability.md")
+    parser.add_argument("--rows", type=int, default=50)
+    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--tables", action="store_true", help="measure nothing")
+    parser.add_argument("--slow", type=Path, nargs="+", metavar="XML", help="of the long tests")
+    parser.add_argument("--coverage", type=Path, metavar="JSON", help="report of coverage.py")
+    parser.add_argument("--note", default="", help="what the coverage is of, if not of all tests")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    folder: Path = options.output
+    folder.mkdir(parents=True, exist_ok=True)
+    machine = f"{platform.system()} {platform.machine()}, torch {torch.__version__}"
+    if options.slow:
+        write_json(folder / "slow.json", slow_result(options.slow, machine), 1)
+    if options.coverage:
+        covered = coverage_result(options.coverage, machine, options.note)
+        write_json(folder / "coverage.json", covered, 1)
+    if not (options.tables or options.slow or options.coverage):
+        results = measured(options.rows, options.steps, f"{machine}, 1 thread")
+        write_json(folder / "stability.json", results)
+    results = json.loads((folder / "stability.json").read_text())
+    if not (options.slow or options.coverage):
+        plot(results["problems"], 0, "iterations", folder / "iterations.png")
+        plot(results["problems"], 1, "seconds", folder / "seconds.png")
+        plot(results["quadratics"], 0, "iterations", folder / "conditions.png")
+    (folder / "stability.md").write_text(report(results))
+    options.page.write_text(filled(options.page.read_text(), folder, report(results)))
+    print(f"wrote {folder} and {options.page}")
 
 
 if __name__ == "__main__":

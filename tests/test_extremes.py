@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from problems import SMOOTH, gradient, hessians, quadratic
+from problems import MULTIMODAL, SMOOTH, gradient, hessians, quadratic
 from torch import Tensor
 from trainers import (
     everything,
@@ -268,7 +268,7 @@ def test_one_view_only() -> None:
 # -- everything at once ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("problem", SMOOTH, ids=lambda p: p.name)
+@pytest.mark.parametrize("problem", [*SMOOTH, *MULTIMODAL], ids=lambda p: p.name)
 @pytest.mark.parametrize("cls", BOTH)
 def test_every_problem_in_float32_from_its_start(cls: Any, problem: Any) -> None:
     """Gradients of 1e12 and more beside others of 1e-6: finite, and lower than at the start."""

@@ -22,6 +22,7 @@ BAD = [math.nan, math.inf, -math.inf]
 BOTH = [AWSGLD, LQNAdam]
 ROWS = 20_000
 PATHS = [{}, {"foreach": True}, {"foreach": False}, {"fused": True}]
+MILLIONS = pytest.param({}, 2_000_000, marks=pytest.mark.slow, id="millions")
 
 
 def noise(rows: int, seed: int) -> Tensor:
@@ -35,20 +36,24 @@ def state_of(optimizer: Any, x: Tensor) -> dict[str, Tensor]:
 # -- gradients -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("path", PATHS, ids=str)
+@pytest.mark.parametrize(
+    ("path", "rows"), [*(pytest.param(path, ROWS, id=str(path)) for path in PATHS), MILLIONS]
+)
 @pytest.mark.parametrize("cls", BOTH)
-def test_broken_rows_stand_still_and_the_others_do_not_notice(cls: Any, path: dict) -> None:
-    """Among 20,000 rows, a few break in each of some steps; the rest is bit-identical."""
-    x, y = [torch.nn.Parameter(noise(ROWS, 0)) for _ in "ab"]
+def test_broken_rows_stand_still_and_the_others_do_not_notice(
+    cls: Any, path: dict, rows: int
+) -> None:
+    """Among 20,000 rows, or millions, a few break in some steps; the rest is bit-identical."""
+    x, y = [torch.nn.Parameter(noise(rows, 0)) for _ in "ab"]
     hostile, clean = cls([x], lr=0.01, **path), cls([y], lr=0.01, **path)
     generator = torch.Generator().manual_seed(1)
-    touched = torch.zeros(ROWS, dtype=torch.bool)
+    touched = torch.zeros(rows, dtype=torch.bool)
     count = 0
     broken, before = torch.zeros(0), (torch.zeros(0), {})
     for step in range(12):
-        x.grad, y.grad = [2 * p.detach() + noise(ROWS, step) * 0.1 for p in (x, y)]
+        x.grad, y.grad = [2 * p.detach() + noise(rows, step) * 0.1 for p in (x, y)]
         if step % 3 == 1:
-            broken = torch.randint(ROWS, (7,), generator=generator).unique()
+            broken = torch.randint(rows, (7,), generator=generator).unique()
             x.grad[broken, step % 3] = BAD[step % len(BAD)]
             touched[broken] = True
             count += len(broken)

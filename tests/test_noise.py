@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 import numpy as np
@@ -9,7 +10,13 @@ import pytest
 import torch
 from oracles import covariance
 
-from opt3dgs_optim.noise import CovarianceNoise, covariance_noise
+from opt3dgs_optim.noise import (
+    GATE_OPACITY,
+    GATE_SHARPNESS,
+    CovarianceNoise,
+    IsotropicNoise,
+    covariance_noise,
+)
 
 
 def gaussians(n: int, seed: int = 0) -> dict[str, torch.Tensor]:
@@ -98,3 +105,87 @@ def test_mistakes_are_named() -> None:
         CovarianceNoise({"scales": means}).add_to(means, 1.0)
     with pytest.raises(ValueError, match="5 scales for 4 means"):
         CovarianceNoise(gaussians(5)).add_to(means, 1.0)
+
+
+def test_the_constants_are_the_trainers() -> None:
+    """noise_lr, k and 1 - x0 of 3dgs-mcmc."""
+    assert CovarianceNoise({}).scale == 5e5
+    assert (GATE_SHARPNESS, GATE_OPACITY) == (100.0, 0.005)
+
+
+def test_quaternions_of_any_length_and_of_none() -> None:
+    """As torch.nn.functional.normalize: below 1e-12 there is no direction, and no NaN."""
+    g = gaussians(5)
+    eta = torch.ones(5, 3, dtype=torch.float64)
+    sizes = torch.tensor([1e-6, 0.1, 1.0, 1e6, 1.0], dtype=torch.float64)[:, None]
+    unit = torch.nn.functional.normalize(g["quats"])
+    found = covariance_noise(g["scales"], unit * sizes, g["opacities"], eta)
+    expected = covariance_noise(g["scales"], unit, g["opacities"], eta)
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)
+    none = covariance_noise(g["scales"], 0 * unit, g["opacities"], eta)
+    # R = 1 where there is no quaternion: the variances along the axes
+    upright = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(5, 4)
+    assert torch.equal(none, covariance_noise(g["scales"], upright, g["opacities"], eta))
+
+
+@pytest.mark.parametrize(
+    "lr", [0.05, torch.tensor(0.05, dtype=torch.float64)], ids=["float", "0-d"]
+)
+def test_added_noise_is_scale_times_learning_rate_times_the_draw(lr: float | torch.Tensor) -> None:
+    g = gaussians(7)
+    start = torch.randn(7, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    means = start.clone()
+    noise = CovarianceNoise(g, scale=0.25, generator=torch.Generator().manual_seed(5))
+    noise.add_to(means, lr)
+    eta = torch.randn(7, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    drawn = covariance_noise(g["scales"], g["quats"], g["opacities"], eta)
+    torch.testing.assert_close(means, start + 0.25 * 0.05 * drawn, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("options", "deviation"),
+    [
+        ({"temperature": 0.5}, math.sqrt(2 * 0.02 * 0.5)),
+        ({"std": 0.3}, 0.3),
+        ({"temperature": 0.0}, 0.0),
+        ({"std": 0.0}, 0.0),
+    ],
+    ids=str,
+)
+def test_isotropic_noise_is_the_deviation_times_the_draw(options: dict, deviation: float) -> None:
+    start = torch.randn(6, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    point = start.clone()
+    noise = IsotropicNoise(**options, generator=torch.Generator().manual_seed(5))
+    noise.add_to(point, 0.02)
+    eta = torch.randn(6, 2, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    torch.testing.assert_close(point, start + deviation * eta, rtol=1e-14, atol=0)
+
+
+def test_isotropic_noise_is_given_in_one_way() -> None:
+    options: dict
+    for options in ({}, {"temperature": 1.0, "std": 1.0}):
+        with pytest.raises(ValueError, match="exactly one of the two"):
+            IsotropicNoise(**options)
+    for name in ("temperature", "std"):
+        options = {name: -0.5}
+        with pytest.raises(ValueError, match=rf"IsotropicNoise: {name}=-0\.5"):
+            IsotropicNoise(**options)
+
+
+def test_a_scale_of_a_half_or_none() -> None:
+    for scale in (0.5, 0.0):
+        assert CovarianceNoise({}, scale=scale).scale == scale
+    with pytest.raises(ValueError, match=r"scale=-0\.5"):
+        CovarianceNoise({}, scale=-0.5)
+    with pytest.raises(ValueError, match="backend='fast'"):
+        CovarianceNoise({}, backend="fast")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("rows", [3, 5])
+def test_gaussians_of_another_scene(rows: int) -> None:
+    """Also where the number of points is that of the coordinates."""
+    means = torch.zeros(rows, 3, dtype=torch.float64)
+    with pytest.raises(ValueError, match=f"6 scales for {rows} means"):
+        CovarianceNoise(gaussians(6)).add_to(means, 1.0)
+    CovarianceNoise(gaussians(rows)).add_to(means, 1.0)
+    assert bool(means.any())

@@ -10,6 +10,8 @@ import torch
 from line_search import minimise
 from oracles import dense_bfgs
 from problems import (
+    MUELLER_BROWN_OTHERS,
+    MULTIMODAL,
     SMOOTH,
     Problem,
     gradient,
@@ -219,6 +221,29 @@ def test_two_loop_with_a_line_search_reaches_the_minimum(problem: Problem, rows:
         error = (end - minimum).norm(dim=1) / minimum.norm(dim=1)
         # f is flat to its rounding: half of the digits, less those of the condition (2,500)
         assert float(error.max()) < 1e-7
+
+
+@pytest.mark.parametrize("problem", MULTIMODAL, ids=lambda p: p.name)
+def test_of_several_valleys_it_finds_the_bottom_of_one(problem: Problem) -> None:
+    """From around the customary start, in units of 1e-8 to 1e8: which one is the start's affair."""
+    rows = 30
+    scale, turn = log_uniform(rows, 1e-8, 1e8), rotations(rows, problem.dim)
+    value = placed(problem, scale, turn)
+    generator = torch.Generator().manual_seed(0)
+    start = problem.starts(rows)
+    start += 0.3 * torch.randn(start.shape, generator=generator, dtype=torch.float64)
+    end = minimise(value, to_world(start, scale, turn), 40)[-1]
+    there = torch.einsum("nij,ni->nj", turn, end / scale[:, None])
+    found = problem.value(there)
+    assert bool((found < problem.value(start)).all())
+    assert bool((found >= problem.minimum_value - 1e-8).all())
+    # the square root of float64's rounding of f, times curvatures of up to 1e3
+    assert float(problem.gradient(there).abs().max()) < 1e-5
+    if problem.name == "Mueller-Brown":
+        minima = torch.tensor([problem.minimum_value, *(m[2] for m in MUELLER_BROWN_OTHERS[:2])])
+        distance = (found[:, None] - minima.double()).abs()
+        assert float(distance.amin(1).max()) < 1e-4
+        assert float(distance.amin(0).max()) < 1e-4  # each of the three, from somewhere
 
 
 def decayed(
