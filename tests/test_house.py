@@ -147,12 +147,6 @@ def test_the_oracles_share_no_code_with_what_they_check() -> None:
 
 # -- names -----------------------------------------------------------------------------------------
 
-# The adaptive part looks into the histogram: for it alone, no public surface is made.
-FRIENDS = {
-    (f"{PACKAGE}._evidence", name)
-    for name in ("_allocate", "_nu_moments", "_square", "_views", "_weights")
-}
-
 
 def is_private(name: str) -> bool:
     return name.startswith("_") and not name.endswith("__")
@@ -190,7 +184,7 @@ def test_no_private_name_is_used_across_modules() -> None:
             elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith(PACKAGE):
                 names = [a.name for a in node.names if f"{node.module}.{a.name}" not in TREES]
                 used |= {(module, name) for name in names if is_private(name)}
-    assert used == FRIENDS
+    assert used == set()
 
 
 # Letters and synonyms, and the words that are used here instead.

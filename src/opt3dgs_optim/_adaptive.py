@@ -18,11 +18,9 @@ from torch import Tensor
 from opt3dgs_optim._adaptive_state import NO_EVIDENCE
 from opt3dgs_optim._evidence import (
     foresight,
-    forget_energies,
     largest_noise,
     noise_tensors,
     nu_numbers,
-    use_energy,
     widest_float,
 )
 from opt3dgs_optim.energy import EnergyHistogram
@@ -258,7 +256,7 @@ class Adaptive:
     def _use_constant(self) -> None:
         """Put the constant in the histogram's place, and free the histogram's tensors."""
         if isinstance(self._asked_multiplier, EnergyHistogram):
-            forget_energies(self._asked_multiplier)
+            self._asked_multiplier.forget()
         self._windows = []
         assert self._constant is not None
         constant = ConstantMultiplier(self._constant)
@@ -267,7 +265,7 @@ class Adaptive:
 
     def _use_energy(self, kind: Any) -> None:
         if isinstance(self._scheduler.multiplier, EnergyHistogram):
-            use_energy(self._scheduler.multiplier, kind)
+            self._scheduler.multiplier.use_energy(kind)
 
     def _use_options(self, consecutive: bool) -> None:
         options = self._asked_options

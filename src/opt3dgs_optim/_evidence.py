@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from opt3dgs_optim import _pairs, curvature
 from opt3dgs_optim._columns import columns
 from opt3dgs_optim._covariance import GATE_OPACITY, GATE_SHARPNESS
-from opt3dgs_optim._running import ViewMeans
 from opt3dgs_optim.energy import EnergyHistogram
 from opt3dgs_optim.noise import CovarianceNoise, GaussianTensors
 
@@ -82,23 +79,7 @@ def nu_numbers(histogram: EnergyHistogram) -> Tensor:
     """[4]: energies since the warm-up, nu's mean and sum of squared deviations over them, and
     Theta's share in the open partition above the range.
     """
-    moments = histogram._nu_moments
-    return torch.stack([moments.weight, moments.mean, moments._square, histogram._weights[-1]])
-
-
-def forget_energies(histogram: EnergyHistogram) -> None:
-    """Free the histogram's tensors on the device: as if it had seen no energy."""
-    histogram._allocate(torch.device("cpu"))
-    histogram.num_observed = 0
-
-
-def use_energy(histogram: EnergyHistogram, kind: Any) -> None:
-    """Go over to another kind of energy; the views' means are freed, and begin anew."""
-    if histogram.energy == kind:
-        return
-    histogram.energy = kind
-    weights = histogram._weights
-    histogram._views = ViewMeans(histogram.ema_decay, weights.dtype, weights.device)
+    return torch.cat([histogram.multiplier_moments, histogram.weights[-1:]])
 
 
 def widest_float(device: torch.device) -> torch.dtype:

@@ -13,12 +13,15 @@ from torch import Tensor
 
 
 class RunningMoments:
-    """Mean, variance and minimum of a stream of scalars; decay 1 weighs all of them alike."""
+    """Mean, variance and minimum of a stream of scalars; decay 1 weighs all of them alike.
+
+    `squares` is the sum of squared deviations from the mean.
+    """
 
     def __init__(self, decay: float, dtype: torch.dtype, device: torch.device) -> None:
         self.decay = decay
         start = torch.tensor([0.0, 0.0, 0.0, torch.inf], dtype=dtype, device=device)
-        self.weight, self.mean, self._square, self.low = start.unbind()
+        self.weight, self.mean, self.squares, self.low = start.unbind()
 
     def update(self, value: Tensor, valid: Tensor) -> None:
         """Take `value` (0-d) if `valid` (0-d bool)."""
@@ -26,25 +29,25 @@ class RunningMoments:
         # West's update: numerically safe for a large mean with a small variance.
         change = value - self.mean
         mean = self.mean + change / weight
-        square = self.decay * self._square + change * (value - mean)
+        square = self.decay * self.squares + change * (value - mean)
         self.weight.copy_(torch.where(valid, weight, self.weight))
         self.mean.copy_(torch.where(valid, mean, self.mean))
-        self._square.copy_(torch.where(valid, square, self._square))
+        self.squares.copy_(torch.where(valid, square, self.squares))
         self.low.copy_(torch.where(valid, torch.minimum(self.low, value), self.low))
 
     @property
     def variance(self) -> Tensor:
         """Population variance, 0-d; 0 before the first value."""
-        return (self._square / self.weight.clamp(min=1)).clamp(min=0)
+        return (self.squares / self.weight.clamp(min=1)).clamp(min=0)
 
     def state(self) -> list[float]:
         """Plain floats (synchronises)."""
-        return torch.stack([self.weight, self.mean, self._square, self.low]).tolist()
+        return torch.stack([self.weight, self.mean, self.squares, self.low]).tolist()
 
     def load(self, state: list[float]) -> None:
         """Restore `state()`."""
         loaded = torch.tensor(state, dtype=self.mean.dtype, device=self.mean.device)
-        self.weight, self.mean, self._square, self.low = loaded.unbind()
+        self.weight, self.mean, self.squares, self.low = loaded.unbind()
 
 
 class ViewMeans:

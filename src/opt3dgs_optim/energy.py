@@ -139,6 +139,17 @@ class EnergyHistogram:
         self._views = ViewMeans(self.ema_decay, dtype, device)
         self._last_finite = torch.ones((), dtype=torch.bool, device=device)
 
+    def forget(self) -> None:
+        """Free what is held on a device: as if no energy had been seen."""
+        self._allocate(torch.device("cpu"))
+        self.num_observed = 0
+
+    def use_energy(self, energy: Literal["raw", "ema", "view_centered"]) -> None:
+        """Go over to another kind of energy; the views' means are freed, and begin anew."""
+        if energy != self.energy:
+            self.energy = energy
+            self._views = ViewMeans(self.ema_decay, self._weights.dtype, self._weights.device)
+
     # -- reading -----------------------------------------------------------------------------
 
     @property
@@ -168,6 +179,12 @@ class EnergyHistogram:
     def multiplier_std(self) -> Tensor:
         """Standard deviation of nu over all energies after the warm-up, 0-d."""
         return self._nu_moments.variance.sqrt()
+
+    @property
+    def multiplier_moments(self) -> Tensor:
+        """[3]: energies after the warm-up, nu's mean and sum of squared deviations over them."""
+        moments = self._nu_moments
+        return torch.stack([moments.weight, moments.mean, moments.squares])
 
     @property
     def calibrated_range(self) -> tuple[float, float]:
