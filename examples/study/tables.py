@@ -20,7 +20,7 @@ def gains_table(gains: Sequence[Gain]) -> str:
     for g in gains:
         lines.append(
             f"| `{g.arm}` | {STUDY_ARMS[g.arm].what} | `{g.control}` | {len(g.scenes)}, {g.seeds} "
-            f"| {g.equal_iterations:+.2f} | {g.equal_seconds:+.2f} ± {g.spread:.2f} "
+            f"| {g.equal_iterations:+.2f} | {_gain_and_spread(g)} "
             f"| {g.train:+.2f} | x{g.seconds:.2f} | {g.verdict} |"
         )
     return "\n".join(lines)
@@ -65,7 +65,7 @@ def goals_table(study: Study, kinds: dict[str, list[Setting]], arm: str, control
         lines.append(
             f"| {name} | {', '.join(gain.scenes)}; {gain.seeds} "
             f"| {gain.psnr - gain.equal_iterations:.2f} | {gain.equal_iterations:+.2f} "
-            f"| {gain.equal_seconds:+.2f} ± {gain.spread:.2f} | {reach} |"
+            f"| {_gain_and_spread(gain)} | {reach} |"
         )
     return "\n".join(lines)
 
@@ -85,6 +85,12 @@ def nu_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) -> 
         if any(cell != "-" for cell in cells):
             lines.append(f"| `{arm}` | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def _gain_and_spread(gain: Gain) -> str:
+    """At equal seconds; one seed has no spread."""
+    spread = f" ± {gain.spread:.2f}" if gain.seeds > 1 else ""
+    return f"{gain.equal_seconds:+.2f}{spread}"
 
 
 def _mean_and_spread(values: Sequence[float]) -> str:
