@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from splatting.arms import PAPER_WARMUP
+from splatting.arms import PAPER_WARMUP, paper_scheduler
 from splatting.scenes import Scene
 
 from opt3dgs_optim import EnergyHistogram
@@ -14,7 +14,7 @@ from opt3dgs_optim.fading import Fading
 from opt3dgs_optim.lqnadam import CurvatureOptions
 from opt3dgs_optim.multiplier import ConstantMultiplier
 from study.lead_arms import leads
-from study.study_arm import BASELINE, DEFAULTS, Options, StudyArm, anneal_all, fixed
+from study.study_arm import ALL_ANNEALED, BASELINE, DEFAULTS, Options, StudyArm, anneal_all, fixed
 
 
 def _histogram(**changes: Any) -> Options:
@@ -63,7 +63,7 @@ def core() -> list[StudyArm]:
         *annealed,
         StudyArm("faded", "moments of random points faded", BASELINE, fixed(fading=Fading())),
         StudyArm(
-            "annealed-4-0.4+faded",
+            ALL_ANNEALED,
             "annealed from 4, and faded",
             "annealed-8-0.4",
             fixed(annealing=both, fading=Fading()),
@@ -71,7 +71,7 @@ def core() -> list[StudyArm]:
         StudyArm(
             DEFAULTS,
             "the same, but opacities annealed from 1: the defaults",
-            "annealed-4-0.4+faded",
+            ALL_ANNEALED,
             fixed(annealing=Annealing(4.0, 0.4, opacity_peak=1.0), fading=Fading()),
         ),
         StudyArm(
@@ -86,7 +86,14 @@ def core() -> list[StudyArm]:
             "faded",
             lambda *call: {**_histogram()(*call), "fading": Fading()},
         ),
-        StudyArm("paper", "everything, the paper's settings", BASELINE, fixed(), 29 / 30),
+        StudyArm(
+            "paper",
+            "everything, the paper's settings",
+            BASELINE,
+            fixed(),
+            29 / 30,
+            preset=paper_scheduler,
+        ),
     ]
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from opt3dgs_optim.annealing import Annealing
 from opt3dgs_optim.fading import Fading
 from opt3dgs_optim.lqnadam import CurvatureOptions
-from study.study_arm import BASELINE, StudyArm, anneal_all, fixed
+from study.study_arm import ALL_ANNEALED, BASELINE, StudyArm, anneal_all, fixed
 
 EIGENVALUE_FLOOR = 1e-3  # of a point's largest
 
@@ -113,9 +113,9 @@ def _regularised() -> list[StudyArm]:
     }
     return [
         StudyArm(
-            f"annealed-4-0.4+faded{name}",
+            f"{ALL_ANNEALED}{name}",
             f"annealed from 4, faded, {what}",
-            "annealed-4-0.4+faded",
+            ALL_ANNEALED,
             fixed(**options),
             host=host,
         )
@@ -127,7 +127,15 @@ def _noisy() -> list[StudyArm]:
     """Stock, with the position noise on some rows only, or none."""
     return [
         StudyArm("no-noise", "no position noise", BASELINE, fixed(noise_scale=0.0)),
-        *_masked_noise(),
+        *(
+            StudyArm(
+                f"noise-{rows}",
+                f"position noise only on rows that this view's loss {does}",
+                BASELINE,
+                host={"noise": rows},
+            )
+            for rows, does in (("visible", "reaches"), ("hidden", "does not reach"))
+        ),
     ]
 
 
@@ -166,16 +174,4 @@ def _matrix() -> list[StudyArm]:
             host=host,
         ),
         StudyArm("matrix", what, BASELINE, host=host),
-    ]
-
-
-def _masked_noise() -> list[StudyArm]:
-    return [
-        StudyArm(
-            f"noise-{rows}",
-            f"position noise only on rows that this view's loss {does}",
-            BASELINE,
-            host={"noise": rows},
-        )
-        for rows, does in (("visible", "reaches"), ("hidden", "does not reach"))
     ]

@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from study.arms import STUDY_ARMS, core, histograms, last_phases, leads, on_top
-from study.study_arm import DEFAULTS
+from study.study_arm import ALL_ANNEALED, DEFAULTS
 from study.training import Spec
 
 SCENES = ("plush", "banana", "lund_door", "brighton_beach", "embedded")
 QUICK_SCENES = ("banana", "embedded")  # for the options of a part
+FEW_VIEWS_SCENES = ("brighton_beach", "plush")  # fewest views to speak of over-fitting, and most
+OVERFITTING = tuple(f"{ALL_ANNEALED}{x}" for x in ("-means-1", "+decoupled", "+regularisers-0"))
 POINTS = 4_000
 EMBEDDED_POINTS = 2_000
 FIRST_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "annealed-8-0.4", "faded")
@@ -52,15 +54,13 @@ def stages(seeds: int = 3) -> dict[str, list[tuple[str, str, int, int, int, str]
         ]
 
     two = ["mcmc", DEFAULTS]
-    last = "annealed-4-0.4+faded"
-    overfitting = [f"{last}{change}" for change in ("+decoupled", "+regularisers-0", "-means-1")]
     longer = ["annealed-8-0.4", "annealed-4-0.4", "faded"]
     return {
         "core": cross(SCENES, FIRST_ARMS, seeds, 3_000),
         "tails": cross(SCENES, tails, seeds, 3_000),
-        "long": cross(SCENES, [*two, last], seeds, 7_500),
-        "few-views": cross(("brighton_beach", "plush"), overfitting, 1, 7_500),
-        "defaults": cross(SCENES, [last, DEFAULTS], seeds, 3_000),
+        "long": cross(SCENES, [*two, ALL_ANNEALED], seeds, 7_500),
+        "few-views": cross(FEW_VIEWS_SCENES, OVERFITTING, 1, 7_500),
+        "defaults": cross(SCENES, [ALL_ANNEALED, DEFAULTS], seeds, 3_000),
         "long-parts": cross(SCENES, longer, 1, 7_500),
         "full": cross(SCENES, two, 1, 30_000),
         "rest": cross(QUICK_SCENES, later, seeds, 3_000),

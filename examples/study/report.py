@@ -19,9 +19,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from study import arms as groups
 from study.analysis import Gain, Study, baseline_of
 from study.decisions import decide
+from study.plan import FEW_VIEWS_SCENES, OVERFITTING
 from study.plots import plot_curves, plot_gains
-from study.records import Setting, gather, merge, read, write
-from study.study_arm import DEFAULTS
+from study.records import gather, merge, read, write
+from study.study_arm import ALL_ANNEALED, DEFAULTS
 from study.tables import gains_table, goals_table, nu_table, scenes_table
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -29,17 +30,9 @@ FOLDER = REPOSITORY / "docs" / "results" / "study"
 PAGE = REPOSITORY / "docs" / "evidence.md"
 PAGES = (PAGE, REPOSITORY / "README.md")  # that have tables
 SHORT = 3_000
-LONG_ARMS = ("mcmc", "faded", "annealed-4-0.4", "annealed-8-0.4", "annealed-4-0.4+faded", DEFAULTS)
+LONG_ARMS = ("mcmc", "faded", "annealed-4-0.4", "annealed-8-0.4", ALL_ANNEALED, DEFAULTS)
 BEST = DEFAULTS
-ALL_ANNEALED = "annealed-4-0.4+faded"
-FEW_VIEWS_ARMS = (
-    "mcmc",
-    ALL_ANNEALED,
-    f"{ALL_ANNEALED}-means-1",
-    f"{ALL_ANNEALED}+decoupled",
-    f"{ALL_ANNEALED}+regularisers-0",
-    BEST,
-)
+FEW_VIEWS_ARMS = ("mcmc", ALL_ANNEALED, *OVERFITTING, BEST)
 CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4", BEST)
 MARKER = re.compile(r"(<!-- study:([a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -53,6 +46,7 @@ def tables(study: Study) -> dict[str, str]:
         "7,500 iterations": study.settings(7_500),
         "30,000 iterations": study.settings(30_000),
     }
+    few = [s for s in long["7,500 iterations"] if s.scene in FEW_VIEWS_SCENES]
     made = {
         "core": gains_table(gains["core"]),
         "scenes": scenes_table(study, short, names["core"]),
@@ -63,7 +57,7 @@ def tables(study: Study) -> dict[str, str]:
         "leads": gains_table(gains["leads"]) if gains["leads"] else _missing("leads"),
         "long": goals_table(study, {"3,000 iterations": short, **long}, BEST, groups.BASELINE),
         "long-scenes": scenes_table(study, long["7,500 iterations"], LONG_ARMS),
-        "few-views": scenes_table(study, _few_views(long["7,500 iterations"]), FEW_VIEWS_ARMS),
+        "few-views": scenes_table(study, few, FEW_VIEWS_ARMS),
         "full-scenes": scenes_table(study, long["30,000 iterations"], LONG_ARMS),
         "decisions": _decisions_table(study),
     }
@@ -75,11 +69,6 @@ def tables(study: Study) -> dict[str, str]:
         kinds = {"3,000 iterations": settings}
         made[stage] = goals_table(study, kinds, BEST, groups.BASELINE) if found else _missing(stage)
     return made
-
-
-def _few_views(settings: list[Setting]) -> list[Setting]:
-    """The scene with the fewest views to speak of over-fitting, and one with many."""
-    return [setting for setting in settings if setting.scene in ("brighton_beach", "plush")]
 
 
 def _missing(stage: str) -> str:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -20,6 +19,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from splatting.stopping import stop_at_once
 from tqdm import tqdm
 
 from study.arms import STUDY_ARMS
@@ -48,8 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         stages = args.stages.split(",") if args.stages else None
         trainings = plan(args.scenes, args.out, stages, args.seeds)
-        for kind in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(kind, signal.default_int_handler)
+        stop_at_once()
         failed = _train_all(trainings, args.jobs)
     except (OSError, ValueError) as error:
         print(f"study: {error}", file=sys.stderr)

@@ -6,12 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from splatting.arms import ALL_OFF, Arm, paper_scheduler
+from splatting.arms import ALL_OFF, Arm, MakeScheduler
 from splatting.scenes import Scene
 
 from opt3dgs_optim import Annealing, PhaseScheduler
 
 BASELINE = "mcmc"
+ALL_ANNEALED = "annealed-4-0.4+faded"
 DEFAULTS = "annealed-4-opacities-1+faded"  # what `PhaseScheduler(total_steps)` is
 # (scene, iterations, mean nu of the arm in `needs`) -> the options that differ from ALL_OFF
 Options = Callable[[Scene, int, float | None], dict[str, Any]]
@@ -29,6 +30,7 @@ class StudyArm:
     trunk: str | None = None  # branch off this arm's run at the switch
     needs: str | None = None  # the arm whose mean nu it takes
     host: dict[str, Any] = field(default_factory=dict)  # what `StudyFit` does differently
+    preset: MakeScheduler | None = None  # makes the scheduler, where no options say it
 
     def arm(self, scene: Scene) -> Arm:
         """The arm as the examples' trainer takes it."""
@@ -38,8 +40,8 @@ class StudyArm:
 
         # The switch is the arm's own, so that a trunk and its branches share their `FitOptions`.
         def make(iterations: int, _switch: float, nu: float | None) -> PhaseScheduler:
-            if self.name == "paper":
-                return paper_scheduler(iterations, self.switch, nu)
+            if self.preset is not None:
+                return self.preset(iterations, self.switch, nu)
             changed = ALL_OFF | options(scene, iterations, nu)
             return PhaseScheduler(iterations, self.switch, **changed)
 
