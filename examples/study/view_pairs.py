@@ -46,28 +46,28 @@ class SameViewAdam(PhasedAdam):
         optimizer.num_views, optimizer.view = num_views, 0
         return optimizer
 
-    def _pseudo_gradient(self, param: Tensor, grad: Tensor, epoch_ends: bool) -> Tensor:
-        options, position = self.curvature_options, param.detach()
+    def _has_operator(self, position: Tensor) -> bool:
+        return False  # it takes consecutive pairs
+
+    def _history(self, param: Tensor, position: Tensor) -> Tensor:
         if not self._is_known(param):
             self.state[param].pop(VISITS, None)
-        history = self._history(param, position)
-        accepted, candidates = record_visit(
+        return super()._history(param, position)
+
+    def _take_pairs(
+        self, param: Tensor, history: Tensor, position: Tensor, gradient: Tensor, epoch_ends: bool
+    ) -> None:
+        options = self.curvature_options
+        taken = record_visit(
             history,
             options.history_size,
             self._visits(param)[:, self.view],
             position,
-            grad,
+            gradient,
             min_cosine=options.min_cosine,
             powell=options.powell,
         )
-        self._tally.append(torch.stack([accepted.sum(), candidates.sum()]))
-        return curvature.direction(
-            grad,
-            history,
-            options.history_size,
-            graft=options.graft,
-            gamma_clamp=options.gamma_clamp,
-        )
+        self._count(*taken)
 
     def _visits(self, param: Tensor) -> Tensor:
         state, (rows, dim) = self.state[param], param.shape

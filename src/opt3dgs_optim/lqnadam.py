@@ -310,28 +310,14 @@ class LQNAdam(HookedAdam):
                 gamma_clamp=options.gamma_clamp,
                 backend=options.backend,
             )
-            self._tally.append(torch.stack([accepted.sum(), candidates.sum()]))
+            self._count(accepted, candidates)
             return fed.reshape(grad.shape)
         if options.backend == "cuda":
             raise RuntimeError(
                 f"LQNAdam: backend='cuda' with pairs={options.pairs!r} and points of shape "
                 f"{tuple(position.shape)}, but the kernel is for consecutive pairs and [N, 3]"
             )
-        visible = (gradient != 0).any(dim=1) & torch.isfinite(gradient).all(dim=1)
-        if options.pairs == "epoch":
-            recorded = self._average_epoch(param, position, gradient, visible, epoch_ends)
-        else:
-            recorded = (position, gradient, visible)
-        if recorded is not None:
-            self._foresee(history, *recorded)
-            accepted, candidates = curvature.record(
-                history,
-                options.history_size,
-                *recorded,
-                min_cosine=options.min_cosine,
-                powell=options.powell,
-            )
-            self._tally.append(torch.stack([accepted.sum(), candidates.sum()]))
+        self._take_pairs(param, history, position, gradient, epoch_ends)
         return curvature.direction(
             gradient,
             history,
@@ -339,6 +325,31 @@ class LQNAdam(HookedAdam):
             graft=options.graft,
             gamma_clamp=options.gamma_clamp,
         ).reshape(grad.shape)
+
+    def _take_pairs(
+        self, param: Tensor, history: Tensor, position: Tensor, gradient: Tensor, epoch_ends: bool
+    ) -> None:
+        """Store the pairs that this step completes; position and gradient are [N, D]."""
+        options = self.curvature_options
+        visible = (gradient != 0).any(dim=1) & torch.isfinite(gradient).all(dim=1)
+        recorded = (position, gradient, visible)
+        if options.pairs == "epoch":
+            recorded = self._average_epoch(param, *recorded, epoch_ends)
+        if recorded is None:
+            return
+        self._foresee(history, *recorded)
+        taken = curvature.record(
+            history,
+            options.history_size,
+            *recorded,
+            min_cosine=options.min_cosine,
+            powell=options.powell,
+        )
+        self._count(*taken)
+
+    def _count(self, accepted: Tensor, candidates: Tensor) -> None:
+        """Remember a step's pairs for `accepted_share`; [N] bool each."""
+        self._tally.append(torch.stack([accepted.sum(), candidates.sum()]))
 
     def _foresee(
         self, history: Tensor, position: Tensor, gradient: Tensor, visible: Tensor | None = None
