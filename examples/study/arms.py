@@ -106,7 +106,7 @@ def histograms() -> list[StudyArm]:
         "clamp-0.25-4": {"clamp": (0.25, 4.0)},
         "ema": {"energy": "ema"},
         "view-centred": {"energy": "view_centered"},
-        "backward-slope": {"slope": "backward"},
+        "least-squares-slope": {"slope": "least_squares"},
         "fixed": {"paper": True},
         "fixed-range": {"energy_range": PAPER_RANGE},
         "fixed-temperature": {"temperature": PAPER_TEMPERATURE},
