@@ -114,7 +114,7 @@ def _advise(options: PilotOptions, seeds: int, jobs: int, out: Path) -> dict[str
         for peak in PEAKS
     }
     best = best_peak(scan)
-    kinds = ("fading", "multiplier", "no noise", "reset", "squared loss", "curvature")
+    kinds = ("fading", "pooling", "multiplier", "no noise", "reset", "squared loss", "curvature")
     train([(kind, best) for kind in kinds], "2 of 3, the other parts")
     nus = [result["mean_nu"] for result in of("multiplier", best)]
     train([("constant", best)], "3 of 3, nu's control", nu=True)
@@ -123,6 +123,7 @@ def _advise(options: PilotOptions, seeds: int, jobs: int, out: Path) -> dict[str
     rows = [
         *scan.values(),
         compare("fading", "none", of("fading", best), base),
+        compare("pooling", "none", of("pooling", best), base),
         compare("multiplier", "a constant, its mean", of("multiplier", best), of("constant", best)),
         compare("noise", "none", base, of("no noise", best)),
         compare("reset", "moments kept", reset, base, **last),

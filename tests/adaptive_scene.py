@@ -67,6 +67,7 @@ class Training:
             curvature=scene.pairs,
             noise_scale=scene.noise_scale,
             annealing=None,
+            pooling=None,
             adaptive=options.pop("adaptive", True),
             **options,
         )

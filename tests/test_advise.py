@@ -92,7 +92,8 @@ def test_the_best_peak_must_pay() -> None:
 
 @pytest.mark.parametrize("peak", [0.0, 4.0])
 @pytest.mark.parametrize(
-    "paying", [(), ("fading",), ("multiplier", "reset"), ("curvature",), ("squared loss",)]
+    "paying",
+    [(), ("fading",), ("pooling",), ("multiplier", "reset"), ("curvature",), ("squared loss",)],
 )
 def test_the_settings_can_be_pasted(paying: tuple[str, ...], peak: float) -> None:
     rows = [row(part, PAYS) for part in paying] + [row("noise", DOES_NOT)]
@@ -101,6 +102,7 @@ def test_the_settings_can_be_pasted(paying: tuple[str, ...], peak: float) -> Non
     phases: PhaseScheduler = scope["phases"]
     assert (phases.annealing is not None) == (peak > 0)
     assert (phases.fading is not None) == ("fading" in paying)
+    assert (phases.pooling is not None) == ("pooling" in paying)
     assert (phases.multiplier is not None) == ("multiplier" in paying)
     assert phases.curvature == ("curvature" in paying)
     assert phases.squared_loss == ("squared loss" in paying)
@@ -184,10 +186,11 @@ def test_it_prints_table_settings_and_caveats(out: Path) -> None:
     advice = json.loads((out / "advice.json").read_text())
     assert advise.page(advice) == text
     parts = [each["part"] for each in advice["rows"]]
-    assert parts[4:] == ["fading", "multiplier", "noise", "reset", "squared loss", "curvature"]
+    others = ["fading", "pooling", "multiplier", "noise", "reset", "squared loss", "curvature"]
+    assert parts[4:] == others
     assert [part.split()[-1] for part in parts[:4]] == ["2", "4", "8", "16"]
     assert "PhaseScheduler(" in text
-    assert text.count("\n| ") == 11
+    assert text.count("\n| ") == 12
     assert str(out.parent) not in text + json.dumps(advice)
 
 

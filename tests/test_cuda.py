@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from kernel_host import OPTIONS, Problem, free_run, noise_case, relative_differe
 from torch import Tensor
 from trainers import everything
 
-from opt3dgs_optim import AWSGLD, LQNAdam, backend_info, curvature, ops
+from opt3dgs_optim import AWSGLD, Annealing, Fading, LQNAdam, Pooling, backend_info, curvature, ops
 from opt3dgs_optim.lqnadam import CurvatureOptions
 from opt3dgs_optim.noise import CovarianceNoise
 
@@ -215,7 +216,13 @@ def test_phase_scheduler_steps_without_synchronisation() -> None:
         name: torch.optim.Adam([{"params": [p], "lr": 1e-3, "name": name}], fused=True)
         for name, p in splats.items()
     }
-    phases = everything(40, switch=20, noise_scale=1.0, curvature=CurvatureOptions(backend="cuda"))
+    ours: dict[str, Any] = {
+        "annealing": Annealing(),
+        "fading": Fading(events=10),
+        "pooling": Pooling(),
+        "curvature": CurvatureOptions(backend="cuda"),
+    }
+    phases = everything(40, switch=20, noise_scale=1.0, **ours)
     optimizers = phases.upgrade(adams, splats)
     loss = torch.tensor(0.1, device="cuda")
     for step in range(40):

@@ -21,6 +21,7 @@ from opt3dgs_optim import (
     Fading,
     LQNAdam,
     PhaseScheduler,
+    Pooling,
     backend_info,
     two_loop,
 )
@@ -127,6 +128,7 @@ TABLE: dict[str, tuple[Callable[..., Any], type, dict[str, Any]]] = {
             "noise_in_exploitation": FLAGS,
             "annealing": [2.0, True, "annealing", {"peak": 2.0}],
             "fading": [0.2, True, {"share": 0.2}],
+            "pooling": [True, "means", ("means",)],
             "adaptive": FLAGS,
             "log": ["run.jsonl", 1],
             "process_group": ["world", 3],
@@ -140,6 +142,11 @@ TABLE: dict[str, tuple[Callable[..., Any], type, dict[str, Any]]] = {
             "opacity_peak": [*NOT_NUMBERS, 0.0, -1.0],
             "final": [*NOT_NUMBERS, 0.0, -1.0],
         },
+    ),
+    "Pooling": (
+        Pooling,
+        Pooling,
+        {"names": ["means", 3, (), ("means", "camera"), (3,), ([],)]},
     ),
     "Fading": (
         Fading,

@@ -60,15 +60,17 @@ def test_the_defaults_are_what_the_page_concludes() -> None:
     assert (annealing.opacity_peak != annealing.peak) == decided["annealing.opacity_peak"]
 
 
-def test_the_default_annealing_is_the_measured_one() -> None:
-    arm = COMPARISONS["annealing.opacity_peak"][0]
-    peak, opacities = Annealing().peak, Annealing().opacity_peak
-    assert arm == f"annealed-{peak:g}-opacities-{opacities:g}+faded" == report.BEST
-    measured = find_study_arm(arm).arm(_embedded()).make
+def test_the_defaults_are_the_measured_arm() -> None:
+    measured = find_study_arm(report.BEST).arm(_embedded()).make
     assert measured is not None
     phases, defaults = measured(300, 1.0, None), PhaseScheduler(300, noise_scale=NOISE_LR)
-    for part in ("annealing", "fading", "multiplier", "squared_loss", "reset_moments", "curvature"):
+    parts = ("annealing", "fading", "pooling", "multiplier", "curvature")
+    for part in (*parts, "squared_loss", "reset_moments"):
         assert getattr(phases, part) == getattr(defaults, part), part
+    peak, opacities = Annealing().peak, Annealing().opacity_peak
+    unpooled = f"annealed-{peak:g}-opacities-{opacities:g}+faded"
+    assert COMPARISONS["annealing.opacity_peak"][0] == unpooled
+    assert COMPARISONS["pooling"][1] == report.BEST
 
 
 def test_gain_at_equal_seconds_and_its_spread() -> None:
@@ -179,6 +181,9 @@ def _iterations(made: dict[str, object]) -> list[int]:
         "annealed-4-0.4+faded+regularisers-0",
         "annealed-4-0.4+faded+regularisers-0.1",
         "annealed-4-0.4+faded-means-1",
+        "annealed-4-opacities-1+faded+eps-all-0.1",
+        "annealed-4-opacities-1+faded+pooled-all",
+        "adamw-gs",
         "noise-visible",
         "noise-hidden",
         "awsgld-fixed-range",
@@ -244,6 +249,31 @@ def test_a_decay_outside_adam_acts_where_the_regularisers_do_not() -> None:
         # float32 keeps 1e-6 of a logit or a log of a few units.
         torch.testing.assert_close(smaller.pop(name), decay, rtol=0.0, atol=2e-6)
     assert all(not difference.any() for difference in smaller.values())
+
+
+def test_a_scheduled_decay_acts_in_its_part_of_the_run() -> None:
+    fit = _fit("adamw-gs")
+    decayed: dict[float, set[str]] = {}
+    for share in (0.0, 0.04, 0.2, 0.49, 0.5, 0.9):
+        fit.iteration = round(share * fit.options.iterations)
+        before = {name: param.detach().clone() for name, param in fit.gaussians.items()}
+        fit._decay()
+        decayed[share] = {n for n, p in fit.gaussians.items() if not torch.equal(p, before[n])}
+    both = {"opacities", "scales"}
+    assert decayed == {0.0: set(), 0.04: {"scales"}, 0.2: both, 0.49: both, 0.5: set(), 0.9: set()}
+
+
+def test_a_relative_eps_shortens_the_steps_of_small_gradients() -> None:
+    fit = _fit("annealed-4-opacities-1+faded+eps-opacities-0.1")
+    for _ in range(3):
+        fit.step()
+    (group,) = fit.optimizers["opacities"].param_groups
+    moments = fit.optimizers["opacities"].state[fit.gaussians["opacities"]]["exp_avg_sq"].clone()
+    typical = (moments.mean() / (1 - 0.999**3)).sqrt()
+    fit.step()
+    assert group["eps"] == pytest.approx(0.1 * float(typical), rel=1e-4)
+    others = [o.param_groups[0]["eps"] for n, o in fit.optimizers.items() if n != "opacities"]
+    assert set(others) == {1e-15}
 
 
 def test_positions_that_are_not_annealed_step_as_stock_ones() -> None:

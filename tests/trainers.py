@@ -45,6 +45,7 @@ EVERYTHING: dict[str, Any] = {
     "reset_moments": "auto",
     "annealing": None,
     "fading": None,
+    "pooling": None,
 }
 NOTHING: dict[str, Any] = {
     "multiplier": None,
@@ -53,6 +54,7 @@ NOTHING: dict[str, Any] = {
     "reset_moments": False,
     "annealing": None,
     "fading": None,
+    "pooling": None,
 }
 
 

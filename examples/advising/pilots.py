@@ -20,6 +20,7 @@ from opt3dgs_optim.annealing import Annealing
 from opt3dgs_optim.fading import Fading
 from opt3dgs_optim.lqnadam import CurvatureOptions
 from opt3dgs_optim.multiplier import ConstantMultiplier
+from opt3dgs_optim.pooling import Pooling
 
 SWITCH = 0.75  # of a pilot: where the trainings of the last phase branch off
 PEAKS = (2.0, 4.0, 8.0, 16.0)
@@ -30,7 +31,7 @@ COUNT_EVERY = 10
 class Pilot:
     """One training. `peak` is that of the annealing under it, 0 for none."""
 
-    kind: str  # "base", "fading", "multiplier", "constant", "no noise", or a kind of last phase
+    kind: str  # "base", a part, "constant", "no noise", or a kind of last phase
     peak: float
     seed: int
 
@@ -76,6 +77,8 @@ def _arm(pilot: Pilot) -> Arm:
             options["annealing"] = Annealing(pilot.peak)
         if pilot.kind == "fading":
             options["fading"] = Fading()
+        elif pilot.kind == "pooling":
+            options["pooling"] = Pooling()
         elif pilot.kind == "multiplier":
             options["multiplier"] = EnergyHistogram(warmup=warmup)
         elif pilot.kind == "constant":

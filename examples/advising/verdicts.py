@@ -95,6 +95,7 @@ def settings(peak: float, rows: Sequence[Row], total_steps: int = 30_000) -> str
     else:
         lines.append("annealing=None,")
     lines.append("fading=Fading()," if "fading" in on else "fading=None,")
+    lines.append("pooling=Pooling()," if "pooling" in on else "pooling=None,")
     if {"multiplier", "curvature"} & on:
         lines.append("adaptive=True,")
     imports = ["from opt3dgs_optim import PhaseScheduler"]
@@ -102,6 +103,7 @@ def settings(peak: float, rows: Sequence[Row], total_steps: int = 30_000) -> str
         ("Annealing", "annealing"),
         ("Fading", "fading"),
         ("CurvatureOptions", "lqnadam"),
+        ("Pooling", "pooling"),
     ):
         if any(f"{name}(" in line for line in lines):
             imports.append(f"from opt3dgs_optim.{module} import {name}")

@@ -37,6 +37,7 @@ ALL_OFF: dict[str, Any] = {
     "reset_moments": False,
     "annealing": None,
     "fading": None,
+    "pooling": None,
     "noise_scale": NOISE_LR,
 }
 

@@ -13,8 +13,30 @@ from opt3dgs_optim.energy import PAPER_RANGE, PAPER_TEMPERATURE
 from opt3dgs_optim.fading import Fading
 from opt3dgs_optim.lqnadam import CurvatureOptions
 from opt3dgs_optim.multiplier import ConstantMultiplier
+from opt3dgs_optim.pooling import Pooling
 from study.lead_arms import leads
-from study.study_arm import ALL_ANNEALED, BASELINE, DEFAULTS, Options, StudyArm, anneal_all, fixed
+from study.study_arm import (
+    ALL_ANNEALED,
+    BASELINE,
+    DEFAULTS,
+    POOLED,
+    Options,
+    StudyArm,
+    anneal_all,
+    fixed,
+)
+
+_defaults = {"annealing": Annealing(4.0, 0.4, opacity_peak=1.0), "fading": Fading()}
+# What the arms beyond the paper are made of, by the arm's name, and how a table says it.
+PARTS: dict[str, dict[str, Any]] = {
+    "annealed-8-0.4": {"annealing": anneal_all(8.0)},
+    "faded": {"fading": Fading()},
+    DEFAULTS: _defaults,
+    POOLED: {**_defaults, "pooling": Pooling()},
+}
+WORDS = {"annealed-8-0.4": "annealed", "faded": "faded", DEFAULTS: "the defaults", POOLED: "pooled"}
+
+LABELS = {"annealed": "annealed-8-0.4", "defaults": DEFAULTS, "pooled": POOLED}
 
 
 def _histogram(**changes: Any) -> Options:
@@ -30,6 +52,14 @@ def _histogram(**changes: Any) -> Options:
 def _constant(_scene: Scene, iterations: int, nu: float | None) -> dict[str, Any]:
     assert nu is not None
     return {"multiplier": ConstantMultiplier(nu, warmup=round(iterations * PAPER_WARMUP))}
+
+
+def _histogram_and(parts: dict[str, Any]) -> Options:
+    return lambda *call: {**_histogram()(*call), **parts}
+
+
+def _constant_and(parts: dict[str, Any]) -> Options:
+    return lambda *call: {**_constant(*call), **parts}
 
 
 def _epoch_pairs(scene: Scene, _iterations: int, _nu: float | None) -> dict[str, Any]:
@@ -61,7 +91,7 @@ def core() -> list[StudyArm]:
         ),
         *rates,
         *annealed,
-        StudyArm("faded", "moments of random points faded", BASELINE, fixed(fading=Fading())),
+        StudyArm("faded", "moments of random points faded", BASELINE, fixed(**PARTS["faded"])),
         StudyArm(
             ALL_ANNEALED,
             "annealed from 4, and faded",
@@ -72,19 +102,13 @@ def core() -> list[StudyArm]:
             DEFAULTS,
             "the same, but opacities annealed from 1: the defaults",
             ALL_ANNEALED,
-            fixed(annealing=Annealing(4.0, 0.4, opacity_peak=1.0), fading=Fading()),
+            fixed(**PARTS[DEFAULTS]),
         ),
         StudyArm(
-            "annealed-8-0.4+awsgld",
-            "annealed, with the flat-histogram multiplier",
-            "annealed-8-0.4",
-            lambda *call: {**_histogram()(*call), "annealing": anneal_all(8.0)},
-        ),
-        StudyArm(
-            "faded+awsgld",
-            "faded, with the flat-histogram multiplier",
-            "faded",
-            lambda *call: {**_histogram()(*call), "fading": Fading()},
+            POOLED,
+            "the defaults, second moments pooled",
+            DEFAULTS,
+            fixed(**PARTS[POOLED]),
         ),
         StudyArm(
             "paper",
@@ -94,6 +118,30 @@ def core() -> list[StudyArm]:
             29 / 30,
             preset=paper_scheduler,
         ),
+    ]
+
+
+def with_nu() -> list[StudyArm]:
+    """The multiplier on top of annealing and fading, beside a constant of its mean."""
+    return [
+        arm
+        for trunk, parts in PARTS.items()
+        if trunk != POOLED
+        for arm in (
+            StudyArm(
+                f"{trunk}+constant",
+                f"{WORDS[trunk]}, with a constant multiplier: the next arm's mean nu",
+                trunk,
+                _constant_and(parts),
+                needs=f"{trunk}+awsgld",
+            ),
+            StudyArm(
+                f"{trunk}+awsgld",
+                f"{WORDS[trunk]}, with the flat-histogram multiplier",
+                f"{trunk}+constant",
+                _histogram_and(parts),
+            ),
+        )
     ]
 
 
@@ -156,9 +204,7 @@ def last_phases() -> list[StudyArm]:
 
 
 def on_top() -> list[StudyArm]:
-    """The last phase on top of annealing: does curvature earn its place there?"""
-    trunk = "annealed-8-0.4"
-    anneal = anneal_all(8.0)
+    """The last phase on top of annealing and fading: does curvature earn its place there?"""
     kinds: dict[str, tuple[str | None, dict[str, Any]]] = {
         "l2": (None, {"squared_loss": True}),
         "l1+reset": (None, {"reset_moments": True}),
@@ -168,20 +214,21 @@ def on_top() -> list[StudyArm]:
     }
     return [
         StudyArm(
-            f"annealed+{name}@1/10",
-            f"annealed, then {name} in the last tenth",
-            f"annealed+{control}@1/10" if control else trunk,
-            fixed(annealing=anneal, **options),
+            f"{label}+{name}@1/10",
+            f"{WORDS[trunk]}, then {name} in the last tenth",
+            f"{label}+{control}@1/10" if control else trunk,
+            fixed(**PARTS[trunk], **options),
             0.9,
             trunk=trunk,
         )
+        for label, trunk in LABELS.items()
         for name, (control, options) in kinds.items()
     ]
 
 
 STUDY_ARMS = {
     arm.name: arm
-    for arms in (core(), histograms(), last_phases(), on_top(), leads())
+    for arms in (core(), with_nu(), histograms(), last_phases(), on_top(), leads())
     for arm in arms
 }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from study.analysis import Gain, Study
-from study.study_arm import ALL_ANNEALED, DEFAULTS
+from study.study_arm import ALL_ANNEALED, DEFAULTS, POOLED
 
 SHORT, LONG = 3_000, 7_500
 # part, or an option of it -> (the arm with it, the arm without it, iterations)
@@ -13,6 +13,7 @@ COMPARISONS = {
     "annealing": (ALL_ANNEALED, "faded", SHORT),
     "annealing.opacity_peak": (DEFAULTS, ALL_ANNEALED, LONG),
     "fading": (ALL_ANNEALED, "annealed-8-0.4", SHORT),
+    "pooling": (POOLED, DEFAULTS, LONG),
     "multiplier": ("awsgld", "constant", SHORT),
     "squared_loss": ("l2@1/30", "mcmc", SHORT),
     "reset_moments": ("l1+reset@1/30", "mcmc", SHORT),

@@ -16,6 +16,9 @@ from study.view_pairs import SameViewAdam
 
 OPACITY_DECAY = 1e-3  # of the opacity in an iteration, as a step of its logit
 SCALE_DECAY = 1e-5  # of the log of the scales
+# AdamW-GS's schedule of the two, as shares of the run: 3,000, 1,000 and 15,000 of 30,000
+DECAY_STARTS = {"opacities": 0.1, "scales": 1 / 30}
+DECAY_STOP = 0.5
 HOST_OPTIONS = (
     "beta2",
     "visible",
@@ -25,8 +28,11 @@ HOST_OPTIONS = (
     "noise",
     "same_view",
     "matrix",
+    "relative_eps",
+    "relative_eps_of",
 )
 NOISY_ROWS = ("visible", "hidden")
+EPS = 1e-15  # the trainer's
 
 
 class StudyFit(Fit):
@@ -34,12 +40,14 @@ class StudyFit(Fit):
 
     beta2: another beta2 in all optimizers. visible: step only rows that this view's loss reaches.
     average: from this share of the run on, evaluate the mean of the iterates. decoupled: opacity
-    and scale regularisation as a decay outside Adam (as AdamW does with weights). regularisers: a
+    and scale regularisation as a decay outside Adam (as AdamW does with weights), `"scheduled"`
+    for AdamW-GS's part of the run instead of all of it. regularisers: a
     factor on both of them inside the loss, 0 or more. noise: `"visible"` for position noise only
     on the rows that this view's loss reaches, `"hidden"` for the others only; of an arm whose
     noise is the trainer's. same_view: curvature pairs between two visits of one view; of an arm
     with curvature. matrix: a matrix of second moments for the positions, with this eigenvalue
-    floor (see `FullMatrixAdam`); of an arm with torch's Adam.
+    floor (see `FullMatrixAdam`); of an arm with torch's Adam. relative_eps: Adam's eps as a share
+    of the root mean square gradient, of the parameters in `relative_eps_of`.
 
     Raises:
         ValueError: a host option is unknown, or its value is outside what is allowed.
@@ -91,6 +99,8 @@ class StudyFit(Fit):
             means_grad = self.gaussians["means"].grad
             assert means_grad is not None
             self.seen = (means_grad != 0).any(dim=1)
+        if "relative_eps" in self.host:
+            self._set_eps()
         if self.host.get("visible"):
             for optimizer in self.optimizers.values():
                 optimizer.step(visible=self.seen)  # pyright: ignore[reportCallIssue]
@@ -100,11 +110,28 @@ class StudyFit(Fit):
         if self.host.get("decoupled"):
             self._decay()
 
+    def _set_eps(self) -> None:
+        for name in self.host["relative_eps_of"]:
+            (group,) = self.optimizers[name].param_groups
+            state = self.optimizers[name].state.get(self.gaussians[name])
+            if not state:
+                continue
+            correction = 1 - group["betas"][1] ** float(state["step"])
+            typical = float((state["exp_avg_sq"].mean() / correction).sqrt())
+            group["eps"] = max(self.host["relative_eps"] * typical, EPS)
+
     @torch.no_grad()
     def _decay(self) -> None:
-        opacity = torch.sigmoid(self.gaussians["opacities"])
-        self.gaussians["opacities"].sub_(OPACITY_DECAY * opacity * (1 - opacity))
-        self.gaussians["scales"].sub_(SCALE_DECAY)
+        if self._decays("opacities"):
+            opacity = torch.sigmoid(self.gaussians["opacities"])
+            self.gaussians["opacities"].sub_(OPACITY_DECAY * opacity * (1 - opacity))
+        if self._decays("scales"):
+            self.gaussians["scales"].sub_(SCALE_DECAY)
+
+    def _decays(self, name: str) -> bool:
+        progress = self.iteration / self.options.iterations
+        scheduled = DECAY_STARTS[name] <= progress < DECAY_STOP
+        return scheduled or self.host["decoupled"] != "scheduled"
 
     @torch.no_grad()
     def _inject_noise(self) -> None:

@@ -7,7 +7,16 @@ from typing import Any
 from opt3dgs_optim.annealing import Annealing
 from opt3dgs_optim.fading import Fading
 from opt3dgs_optim.lqnadam import CurvatureOptions
-from study.study_arm import ALL_ANNEALED, BASELINE, StudyArm, anneal_all, fixed
+from opt3dgs_optim.pooling import Pooling
+from study.study_arm import (
+    ALL_ANNEALED,
+    BASELINE,
+    DEFAULTS,
+    POOLED,
+    StudyArm,
+    anneal_all,
+    fixed,
+)
 
 EIGENVALUE_FLOOR = 1e-3  # of a point's largest
 
@@ -90,10 +99,73 @@ def leads() -> list[StudyArm]:
             fast,
             host={"decoupled": True},
         ),
+        *_pooled(),
+        *_small_gradients(),
+        StudyArm(
+            "adamw-gs",
+            "AdamW-GS's parts together: visible rows only, faded, scheduled decay outside Adam",
+            BASELINE,
+            fixed(fading=Fading(events=140, start=1 / 30)),
+            host={"visible": True, "decoupled": "scheduled"},
+        ),
         *_regularised(),
         *_noisy(),
+        *_tolerant(),
         *_same_view(),
         *_matrix(),
+    ]
+
+
+def _pooled() -> list[StudyArm]:
+    """One second moment per point: for stock, and of other parameters than the defaults'."""
+    parts = {"annealing": Annealing(4.0, 0.4, opacity_peak=1.0), "fading": Fading()}
+    kinds: dict[str, tuple[str, ...]] = {
+        "means": ("means",),
+        "scales": ("scales",),
+        "scales-quats": ("scales", "quats"),
+        "all": ("means", "scales", "quats", "sh0", "shN"),
+    }
+    no_regularisers: dict[str, Any] = {"host": {"regularisers": 0.0}}
+    alone, pooled = f"{DEFAULTS}+regularisers-0", f"{POOLED}+regularisers-0"
+    return [
+        StudyArm("pooled", "second moments pooled", BASELINE, fixed(pooling=Pooling())),
+        StudyArm(
+            alone, "the defaults, no regularisers", DEFAULTS, fixed(**parts), **no_regularisers
+        ),
+        StudyArm(
+            pooled,
+            "the defaults, pooled, no regularisers",
+            alone,
+            fixed(**parts, pooling=Pooling()),
+            **no_regularisers,
+        ),
+        *(
+            StudyArm(
+                f"{POOLED}-{key}",
+                f"the defaults, pooled: {', '.join(names)}",
+                DEFAULTS,
+                fixed(**parts, pooling=Pooling(names)),
+            )
+            for key, names in kinds.items()
+        ),
+    ]
+
+
+def _small_gradients() -> list[StudyArm]:
+    """Annealed and faded, with an eps that shortens the steps of points with small gradients."""
+    parts = {"annealing": Annealing(4.0, 0.4, opacity_peak=1.0), "fading": Fading()}
+    return [
+        StudyArm(
+            f"{DEFAULTS}+eps-{key}-{share:g}",
+            f"{DEFAULTS}, eps {share:g} of the typical gradient, {key}",
+            DEFAULTS,
+            fixed(**parts),
+            host={"relative_eps": share, "relative_eps_of": names},
+        )
+        for key, names, share in (
+            ("all", ("means", "scales", "quats", "opacities", "sh0"), 0.1),
+            ("opacities", ("opacities",), 0.1),
+        )
     ]
 
 
@@ -157,6 +229,25 @@ def _same_view() -> list[StudyArm]:
             host={"same_view": True},
         )
         for loss, share in kinds
+    ]
+
+
+def _tolerant() -> list[StudyArm]:
+    """L-BFGS directions from such pairs only whose curvature stands out of the noise."""
+    return [
+        StudyArm(
+            f"l2+reset+lqn-cosine-{cosine:g}@1/10",
+            f"only pairs with cos(s, y) above {cosine:g}, in the last 1/10",
+            "l2+reset@1/10",
+            fixed(
+                squared_loss=True,
+                reset_moments=True,
+                curvature=CurvatureOptions(min_cosine=cosine),
+            ),
+            0.9,
+            trunk=BASELINE,
+        )
+        for cosine in (0.3, 0.7)
     ]
 
 

@@ -6,14 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from study.arms import STUDY_ARMS, core, histograms, last_phases, leads, on_top
-from study.study_arm import ALL_ANNEALED, DEFAULTS
+from study.arms import STUDY_ARMS, core, histograms, last_phases, leads, on_top, with_nu
+from study.study_arm import ALL_ANNEALED, DEFAULTS, POOLED
 from study.training import Spec
 
 SCENES = ("plush", "banana", "lund_door", "brighton_beach", "embedded")
 QUICK_SCENES = ("banana", "embedded")  # for the options of a part
 FEW_VIEWS_SCENES = ("brighton_beach", "plush")  # fewest views to speak of over-fitting, and most
-OVERFITTING = tuple(f"{ALL_ANNEALED}{x}" for x in ("-means-1", "+decoupled", "+regularisers-0"))
+OVERFITTING = (
+    *(f"{ALL_ANNEALED}{x}" for x in ("-means-1", "+decoupled", "+regularisers-0")),
+    *(f"{DEFAULTS}+eps-{x}-0.1" for x in ("opacities", "all")),
+    *(f"{arm}+regularisers-0" for arm in (DEFAULTS, POOLED)),
+)
 POINTS = 4_000
 EMBEDDED_POINTS = 2_000
 FIRST_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "annealed-8-0.4", "faded")
@@ -36,6 +40,9 @@ def stages(seeds: int = 3) -> dict[str, list[tuple[str, str, int, int, int, str]
     later = [name for name in parts if name not in FIRST_ARMS]
     tails = [arm.name for arm in (*last_phases(), *on_top())]
     options = [arm.name for arm in histograms()]
+    multiplied = [arm.name for arm in with_nu()]
+    on_defaults = [name for name in multiplied if name.startswith(DEFAULTS)]
+    later += [name for name in multiplied if name not in on_defaults]
     beyond = [arm.name for arm in leads()]
 
     def cross(
@@ -58,11 +65,12 @@ def stages(seeds: int = 3) -> dict[str, list[tuple[str, str, int, int, int, str]
     return {
         "core": cross(SCENES, FIRST_ARMS, seeds, 3_000),
         "tails": cross(SCENES, tails, seeds, 3_000),
-        "long": cross(SCENES, [*two, ALL_ANNEALED], seeds, 7_500),
+        "long": cross(SCENES, [*two, ALL_ANNEALED, POOLED], seeds, 7_500),
         "few-views": cross(FEW_VIEWS_SCENES, OVERFITTING, 1, 7_500),
-        "defaults": cross(SCENES, [ALL_ANNEALED, DEFAULTS], seeds, 3_000),
+        "defaults": cross(SCENES, [ALL_ANNEALED, DEFAULTS, POOLED], seeds, 3_000),
         "long-parts": cross(SCENES, longer, 1, 7_500),
         "full": cross(SCENES, two, 1, 30_000),
+        "with-nu": cross(SCENES, on_defaults, seeds, 3_000),
         "rest": cross(QUICK_SCENES, later, seeds, 3_000),
         "leads": cross(QUICK_SCENES, beyond, seeds, 3_000),
         "options": cross(QUICK_SCENES, options, seeds, 3_000),

@@ -22,7 +22,7 @@ from study.decisions import decide
 from study.plan import FEW_VIEWS_SCENES, OVERFITTING
 from study.plots import plot_curves, plot_gains
 from study.records import gather, merge, read, write
-from study.study_arm import ALL_ANNEALED, DEFAULTS
+from study.study_arm import ALL_ANNEALED, DEFAULTS, POOLED
 from study.tables import gains_table, goals_table, nu_table, scenes_table
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -30,9 +30,10 @@ FOLDER = REPOSITORY / "docs" / "results" / "study"
 PAGE = REPOSITORY / "docs" / "evidence.md"
 PAGES = (PAGE, REPOSITORY / "README.md")  # that have tables
 SHORT = 3_000
-LONG_ARMS = ("mcmc", "faded", "annealed-4-0.4", "annealed-8-0.4", ALL_ANNEALED, DEFAULTS)
+ALONE = ("mcmc", "faded", "annealed-4-0.4", "annealed-8-0.4")
+LONG_ARMS = (*ALONE, ALL_ANNEALED, DEFAULTS, POOLED)
 BEST = DEFAULTS
-FEW_VIEWS_ARMS = ("mcmc", ALL_ANNEALED, *OVERFITTING, BEST)
+FEW_VIEWS_ARMS = ("mcmc", ALL_ANNEALED, *OVERFITTING, BEST, POOLED)
 CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4", BEST)
 MARKER = re.compile(r"(<!-- study:([a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -49,8 +50,9 @@ def tables(study: Study) -> dict[str, str]:
     few = [s for s in long["7,500 iterations"] if s.scene in FEW_VIEWS_SCENES]
     made = {
         "core": gains_table(gains["core"]),
-        "scenes": scenes_table(study, short, names["core"]),
-        "nu": nu_table(study, short, [*names["core"], *names["options"]]),
+        "with-nu": gains_table(gains["with-nu"]),
+        "scenes": scenes_table(study, short, [*names["core"], *names["with-nu"]]),
+        "nu": nu_table(study, short, [*names["core"], *names["with-nu"], *names["options"]]),
         "tails": gains_table(gains["tails"]),
         "on-top": gains_table(gains["on-top"]),
         "options": gains_table(gains["options"]) if gains["options"] else _missing("options"),
@@ -78,6 +80,7 @@ def _missing(stage: str) -> str:
 
 _KINDS: dict[str, Callable[[], list[groups.StudyArm]]] = {
     "core": groups.core,
+    "with-nu": groups.with_nu,
     "tails": groups.last_phases,
     "on-top": groups.on_top,
     "options": groups.histograms,

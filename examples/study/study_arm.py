@@ -14,6 +14,7 @@ from opt3dgs_optim import Annealing, PhaseScheduler
 BASELINE = "mcmc"
 ALL_ANNEALED = "annealed-4-0.4+faded"
 DEFAULTS = "annealed-4-opacities-1+faded"  # what `PhaseScheduler(total_steps)` is
+POOLED = f"{DEFAULTS}+pooled"
 # (scene, iterations, mean nu of the arm in `needs`) -> the options that differ from ALL_OFF
 Options = Callable[[Scene, int, float | None], dict[str, Any]]
 

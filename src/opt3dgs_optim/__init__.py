@@ -13,6 +13,7 @@ from opt3dgs_optim.energy import EnergyHistogram
 from opt3dgs_optim.fading import Fading
 from opt3dgs_optim.lqnadam import LQNAdam
 from opt3dgs_optim.phases import Phase, PhaseScheduler
+from opt3dgs_optim.pooling import Pooling
 
 __all__ = [
     "AWSGLD",
@@ -23,6 +24,7 @@ __all__ = [
     "LQNAdam",
     "Phase",
     "PhaseScheduler",
+    "Pooling",
     "__version__",
     "backend_info",
     "two_loop",

@@ -183,6 +183,10 @@ class PhasedAdam(LQNAdam):
         return scheduler.exploiting and scheduler.curvature and is_positions(group)
 
     def _after_group(self, group: dict[str, Any], params: list[Tensor]) -> None:
+        pooling = self.scheduler.pooling
+        if pooling is not None and pooling.covers(group.get("name")):
+            for param, rows in zip(params, self._moving or [None] * len(params), strict=True):
+                pooling.pool(self.state[param], rows)
         noise = self.scheduler.noise
         if noise is not None and is_positions(group):
             self._add_noise(noise, group, params)

@@ -98,7 +98,7 @@ def scheduler_lines(scheduler: Any) -> list[str]:
     ]
     if scheduler.noise is not None:
         lines.append(noise_line(scheduler.noise))
-    parts = (getattr(scheduler, name, None) for name in ("annealing", "fading"))
+    parts = (getattr(scheduler, name, None) for name in ("annealing", "fading", "pooling"))
     lines += [str(part) for part in parts if part is not None]
     return lines + adaptive_lines(scheduler.switched_off) if scheduler.adaptive else lines
 

@@ -31,6 +31,7 @@ from opt3dgs_optim.fading import Fading
 from opt3dgs_optim.lqnadam import CurvatureOptions
 from opt3dgs_optim.multiplier import ConstantMultiplier
 from opt3dgs_optim.noise import CovarianceNoise
+from opt3dgs_optim.pooling import Pooling
 
 if TYPE_CHECKING:
     from opt3dgs_optim._adaptive import Adaptive
@@ -77,6 +78,7 @@ class PhaseScheduler(Upgrading):
         annealing: `Annealing(...)` for steps that start longer and end shorter than the trainer's
             learning rates alone would have them, in all phases; or None, for off.
         fading: `Fading(...)` for shrinking Adam's moments of random points, or None, for off.
+        pooling: `Pooling(...)` for one second moment per point and parameter, or None, for off.
         adaptive: whether parts that this training shows to do nothing for it are switched off, see
             `switched_off`. Every 100 iterations that is one synchronisation with the GPU.
         log: a `RunLog` that gets one line per `observe`.
@@ -131,6 +133,7 @@ class PhaseScheduler(Upgrading):
         noise_in_exploitation: bool = True,
         annealing: Annealing | None = Annealing(),  # noqa: B008 (immutable)
         fading: Fading | None = Fading(),  # noqa: B008 (immutable)
+        pooling: Pooling | None = None,
         adaptive: bool = False,
         log: RunLog | None = None,
         process_group: Any = None,
@@ -150,6 +153,7 @@ class PhaseScheduler(Upgrading):
         )
         self.annealing = check_part(CALL, "annealing", annealing, "Annealing(...)", "factor")
         self.fading = check_part(CALL, "fading", fading, "Fading(...)", "fade")
+        self.pooling = check_part(CALL, "pooling", pooling, "Pooling(...)", "pool")
         self.log = check_part(CALL, "log", log, "a RunLog", "step")
         self._over_ranks = None if process_group is None else RankMean(CALL, process_group)
         self._overrun = False
