@@ -350,18 +350,25 @@ def test_range_and_temperature_are_fixed_one_at_a_time() -> None:
 
 
 def test_records_survive_writing(tmp_path: Path) -> None:
-    train(Spec("embedded", "faded", 1, 20, 80), tmp_path, None, None)
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    train(Spec("embedded", "faded", 1, 20, 80), tmp_path / "a", None, None)
+    train(Spec("embedded", "faded", 1, 20, 80, sh_degree=1), tmp_path / "b", None, None)
     path = tmp_path / "records.json"
-    write(gather(tmp_path), path)
-    (one,) = read(path)
+    write(merge(gather(tmp_path / "a"), gather(tmp_path / "b")), path)
+    one, other = read(path)
     assert (one.arm, one.seed, one.setting.iterations) == ("faded", 1, 20)
     assert one.seconds > 0
+    assert other.state_bytes > one.state_bytes
+    assert other.setting == replace(one.setting, sh_degree=1)
+    assert Study([one, other]).settings(20) == [one.setting]
+    assert Study([one, other]).settings(20, sh_degree=1) == [other.setting]
 
 
 def test_new_records_take_the_place_of_old_ones() -> None:
     def one(seed: int, seconds: float) -> dict[str, object]:
         key = {"scene": "a", "points": 1, "iterations": 2, "init": "sfm", "arm": "mcmc"}
-        return {**key, "seed": seed, "seconds": seconds}
+        return {**key, "sh_degree": 0, "seed": seed, "seconds": seconds}
 
     merged = merge([one(0, 1.0), one(1, 1.0)], [one(2, 2.0), one(1, 2.0)])
     assert merged == [one(0, 1.0), one(1, 2.0), one(2, 2.0)]

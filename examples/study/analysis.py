@@ -52,7 +52,9 @@ class Study:
         for record in records:
             self._of[record.setting, record.arm][record.seed] = record
 
-    def settings(self, iterations: int, init: str = "sfm", share: float = 1.0) -> list[Setting]:
+    def settings(
+        self, iterations: int, init: str = "sfm", share: float = 1.0, sh_degree: int = 0
+    ) -> list[Setting]:
         """The settings of one kind, one per scene.
 
         Args:
@@ -67,6 +69,7 @@ class Study:
                 for setting, _ in self._of
                 if setting.iterations == iterations
                 and setting.init == init
+                and setting.sh_degree == sh_degree
                 and setting.points == round(budget[setting.scene] * share)
             },
             key=lambda setting: setting.scene,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from study.arms import STUDY_ARMS, core, histograms, last_phases, leads, on_top, with_nu
@@ -34,8 +34,8 @@ class Training:
     nu_from: Path | None = None
 
 
-def stages(seeds: int = 3) -> dict[str, list[tuple[str, str, int, int, int, str]]]:
-    """(scene, arm, seed, iterations, points, init) of every stage."""
+def stages(seeds: int = 3) -> dict[str, list[Spec]]:
+    """The trainings of every stage; their scenes are names, not yet folders."""
     parts = [arm.name for arm in core()]
     later = [name for name in parts if name not in FIRST_ARMS]
     tails = [arm.name for arm in (*last_phases(), *on_top())]
@@ -52,9 +52,10 @@ def stages(seeds: int = 3) -> dict[str, list[tuple[str, str, int, int, int, str]
         iterations: int,
         share: float = 1.0,
         init: str = "sfm",
-    ) -> list[tuple[str, str, int, int, int, str]]:
+        sh_degree: int = 0,
+    ) -> list[Spec]:
         return [
-            (scene, arm, seed, iterations, round(points_of(scene) * share), init)
+            Spec(scene, arm, seed, iterations, round(points_of(scene) * share), init, sh_degree)
             for seed in range(count)
             for scene in scenes
             for arm in arms
@@ -76,6 +77,7 @@ def stages(seeds: int = 3) -> dict[str, list[tuple[str, str, int, int, int, str]
         "options": cross(QUICK_SCENES, options, seeds, 3_000),
         "random": cross(SCENES, two, seeds, 3_000, init="random"),
         "small": cross(SCENES, two, seeds, 3_000, share=0.25),
+        "harmonics": cross(SCENES, two, 1, 3_000, sh_degree=3),
         "rest-all": cross(SCENES, later, seeds, 3_000),
         "long-all": cross(SCENES, longer, seeds, 7_500),
     }
@@ -99,10 +101,9 @@ def plan(root: Path, out: Path, only: list[str] | None = None, seeds: int = 3) -
         raise ValueError(f"--stages {sorted(unknown)}: unknown; there are {', '.join(chosen)}")
     trainings: dict[Path, Training] = {}
     for stage in only or list(chosen):
-        for scene, arm, seed, iterations, points, init in chosen[stage]:
-            source = scene if scene == "embedded" else str(root / scene)
-            spec = Spec(source, arm, seed, iterations, points, init)
-            for training in _with_needs(spec, out):
+        for spec in chosen[stage]:
+            source = spec.scene if spec.scene == "embedded" else str(root / spec.scene)
+            for training in _with_needs(replace(spec, scene=source), out):
                 trainings.setdefault(training.folder, training)
     return list(trainings.values())
 
@@ -113,7 +114,7 @@ def _with_needs(spec: Spec, out: Path) -> list[Training]:
     folders: dict[str, Path | None] = {"trunk": None, "nu": None}
     for key, name in (("trunk", arm.trunk), ("nu", arm.needs)):
         if name is not None:
-            other = Spec(**{**vars(spec), "arm": name})
+            other = replace(spec, arm=name)
             needed += _with_needs(other, out)
             folders[key] = folder_of(other, out)
     first = tuple(folder for folder in folders.values() if folder is not None)
@@ -124,5 +125,7 @@ def _with_needs(spec: Spec, out: Path) -> list[Training]:
 def folder_of(spec: Spec, out: Path) -> Path:
     """Where a training lives."""
     kind = f"{spec.points}-{spec.iterations}-{spec.init}"
+    if spec.sh_degree:
+        kind += f"-sh{spec.sh_degree}"
     arm = spec.arm.replace("/", "_")
     return out / Path(spec.scene).name / kind / arm / f"seed-{spec.seed}"

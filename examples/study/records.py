@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ class Setting:
     points: int
     iterations: int
     init: str
+    sh_degree: int = 0
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def gather(folder: Path) -> list[dict[str, Any]]:
 
 def merge(old: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """All of both; a training that both have is the new one."""
-    keys = ("scene", "points", "iterations", "init", "arm", "seed")
+    keys = (*(field.name for field in fields(Setting)), "arm", "seed")
     kept = {tuple(record[key] for key in keys): record for record in (*old, *new)}
     return [kept[key] for key in sorted(kept)]
 
@@ -103,7 +104,7 @@ def read(path: Path) -> list[Record]:
 def _record(entry: dict[str, Any]) -> Record:
     table = np.array(entry["curve"], dtype=float)
     return Record(
-        Setting(entry["scene"], entry["points"], entry["iterations"], entry["init"]),
+        Setting(*(entry[field.name] for field in fields(Setting))),
         entry["arm"],
         entry["seed"],
         {name: table[:, i] for i, name in enumerate(COLUMNS)},

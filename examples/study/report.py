@@ -66,6 +66,7 @@ def tables(study: Study) -> dict[str, str]:
     for stage, settings in (
         ("random", study.settings(SHORT, "random")),
         ("small", study.settings(SHORT, share=0.25)),
+        ("harmonics", study.settings(SHORT, sh_degree=3)),
     ):
         found = study.gain(settings, BEST, groups.BASELINE)
         kinds = {"3,000 iterations": settings}

@@ -74,7 +74,8 @@ class Pooling:
             moment = moments.get(key)
             if moment is None or moment.dim() < 2 or moment.shape[0] == 0:
                 continue
-            pooled = moment.mean(tuple(range(1, moment.dim())), keepdim=True).expand_as(moment)
+            coordinates = tuple(range(1, moment.dim()))
+            pooled = moment.mean(coordinates, keepdim=True).expand_as(moment)
             if rows is not None:
                 pooled = torch.where(shaped(rows, moment), pooled, moment)
             moment.copy_(pooled)
