@@ -14,6 +14,7 @@ import matplotlib.pyplot as plt
 
 from study.analysis import Gain, Study
 from study.records import Record, Setting
+from study.study_arm import DEFAULTS
 
 # Okabe and Ito's colours: told apart with any kind of colour vision.
 COLOURS = ("#000000", "#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -81,7 +82,8 @@ def plot_gains(gains: Sequence[Gain], path: Path, title: str) -> None:
             capsize=3,
         )
     axis.axvline(0.0, color="black", linewidth=0.8)
-    axis.set_yticks(places, [f"{g.arm}  (vs {g.control})" for g in gains], fontsize=8)
+    labels = [f"{g.arm}  (vs {g.control})".replace(DEFAULTS, "defaults") for g in gains]
+    axis.set_yticks(places, labels, fontsize=8)
     axis.set_ylim(-0.7, len(gains) - 0.3)
     axis.set_xlabel("gain at equal seconds (dB), ± 2 deviations over seeds")
     axis.grid(axis="x", alpha=0.3)

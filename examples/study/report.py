@@ -22,7 +22,7 @@ from study.decisions import decide
 from study.plan import FEW_VIEWS_SCENES, OVERFITTING
 from study.plots import plot_curves, plot_gains
 from study.records import gather, merge, read, write
-from study.study_arm import ALL_ANNEALED, DEFAULTS, POOLED
+from study.study_arm import ALL_ANNEALED, BASELINE, DEFAULTS, POOLED
 from study.tables import gains_table, goals_table, nu_table, scenes_table
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -57,7 +57,7 @@ def tables(study: Study) -> dict[str, str]:
         "on-top": gains_table(gains["on-top"]),
         "options": gains_table(gains["options"]) if gains["options"] else _missing("options"),
         "leads": gains_table(gains["leads"]) if gains["leads"] else _missing("leads"),
-        "long": goals_table(study, {"3,000 iterations": short, **long}, BEST, groups.BASELINE),
+        "long": goals_table(study, {"3,000 iterations": short, **long}, BEST, BASELINE),
         "long-scenes": scenes_table(study, long["7,500 iterations"], LONG_ARMS),
         "few-views": scenes_table(study, few, FEW_VIEWS_ARMS),
         "full-scenes": scenes_table(study, long["30,000 iterations"], LONG_ARMS),
@@ -68,9 +68,9 @@ def tables(study: Study) -> dict[str, str]:
         ("small", study.settings(SHORT, share=0.25)),
         ("harmonics", study.settings(SHORT, sh_degree=3)),
     ):
-        found = study.gain(settings, BEST, groups.BASELINE)
+        found = study.gain(settings, BEST, BASELINE)
         kinds = {"3,000 iterations": settings}
-        made[stage] = goals_table(study, kinds, BEST, groups.BASELINE) if found else _missing(stage)
+        made[stage] = goals_table(study, kinds, BEST, BASELINE) if found else _missing(stage)
     return made
 
 
@@ -119,15 +119,25 @@ def plots(study: Study, folder: Path) -> list[Path]:
         if settings:
             plot_curves(study, settings, arms, folder / name)
             drawn.append(folder / name)
-    title = f"scenes together, {SHORT:,} iterations; baseline {baseline_of(study, short):.2f} dB"
-    for name, kinds in (("gains.png", ("core", "leads")), ("gains_tails.png", ("tails", "on-top"))):
+    for name, kinds in (
+        ("gains.png", ("core", "with-nu")),
+        ("gains_tails.png", ("tails", "on-top")),
+        ("gains_leads.png", ("leads",)),
+    ):
         gains: list[Gain] = []
         for kind in kinds:
             gains += study.gains(short, [arm.name for arm in _KINDS[kind]()])
         if gains:
-            plot_gains(gains, folder / name, title)
+            plot_gains(gains, folder / name, _title(study, gains))
             drawn.append(folder / name)
     return drawn
+
+
+def _title(study: Study, gains: Sequence[Gain]) -> str:
+    scenes = {scene for gain in gains for scene in gain.scenes}
+    settings = [s for s in study.settings(SHORT) if s.scene in scenes]
+    baseline = f"{BASELINE} {baseline_of(study, settings):.2f} dB"
+    return f"{', '.join(sorted(scenes))}; {SHORT:,} iterations; {baseline}"
 
 
 def fill(page: str, made: dict[str, str]) -> str:
