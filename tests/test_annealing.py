@@ -7,7 +7,15 @@ from typing import Any
 
 import pytest
 import torch
-from trainers import NOTHING, edit_rows, gsplat_optimizers, inria_optimizer, make_splats, train
+from trainers import (
+    NOTHING,
+    check_resume,
+    edit_rows,
+    gsplat_optimizers,
+    inria_optimizer,
+    make_splats,
+    train,
+)
 
 from opt3dgs_optim import Annealing, Fading, PhaseScheduler
 
@@ -73,22 +81,8 @@ def test_annealing_multiplies_nu_and_goes_on_after_the_switch() -> None:
 
 @pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
 def test_resume_is_bit_exact(make: Any) -> None:
-    options = {"annealing": Annealing(), "fading": Fading(share=0.5, events=20)}
-    ours, theirs = make_splats(), make_splats()
-    a, b = phases_with(**options), phases_with(**options)
-    whole, first = a.upgrade(make(ours)), b.upgrade(make(theirs))
-    train(ours, whole, a, 0, TOTAL)
-    train(theirs, first, b, 0, 23)
-    c = phases_with(**options)
-    second: Any = c.upgrade(make(theirs))
-    if isinstance(first, dict):
-        for name, optimizer in first.items():
-            second[name].load_state_dict(optimizer.state_dict())
-    else:
-        second.load_state_dict(first.state_dict())
-    train(theirs, second, c, 23, TOTAL)
-    for name in ours:
-        assert torch.equal(ours[name], theirs[name]), name
+    options: dict[str, Any] = {"annealing": Annealing(), "fading": Fading(share=0.5, events=20)}
+    check_resume(make, lambda: phases_with(**options), TOTAL, 23)
 
 
 # -- fading ----------------------------------------------------------------------------------------

@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from trainers import NOTHING, edit_rows, gsplat_optimizers, inria_optimizer, make_splats, train
+from trainers import (
+    NOTHING,
+    check_resume,
+    edit_rows,
+    gsplat_optimizers,
+    inria_optimizer,
+    make_splats,
+    train,
+)
 
 from opt3dgs_optim import Fading, PhaseScheduler, Pooling
 
@@ -132,22 +140,8 @@ def test_every_trainers_names_are_pooled(make: Any) -> None:
 
 @pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
 def test_resume_is_bit_exact(make: Any) -> None:
-    options = {"pooling": Pooling(), "fading": Fading(share=0.5, events=20)}
-    ours, theirs = make_splats(), make_splats()
-    a, b = phases_with(**options), phases_with(**options)
-    whole, first = a.upgrade(make(ours)), b.upgrade(make(theirs))
-    train(ours, whole, a, 0, TOTAL)
-    train(theirs, first, b, 0, 23)
-    c = phases_with(**options)
-    second: Any = c.upgrade(make(theirs))
-    if isinstance(first, dict):
-        for name, optimizer in first.items():
-            second[name].load_state_dict(optimizer.state_dict())
-    else:
-        second.load_state_dict(first.state_dict())
-    train(theirs, second, c, 23, TOTAL)
-    for name in ours:
-        assert torch.equal(ours[name], theirs[name]), name
+    options: dict[str, Any] = {"pooling": Pooling(), "fading": Fading(share=0.5, events=20)}
+    check_resume(make, lambda: phases_with(**options), TOTAL, 23)
 
 
 def test_a_training_that_began_without_it_is_pooled_from_the_next_step() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -128,6 +129,29 @@ def train(
         for optimizer in every:
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
+
+
+def check_resume(make: Any, phases: Callable[[], PhaseScheduler], total: int, at: int) -> None:
+    """A run that is saved after `at` iterations and goes on ends with the bits of a whole one.
+
+    Args:
+        make: `gsplat_optimizers` or `inria_optimizer`.
+        phases: a new scheduler with each call.
+    """
+    ours, theirs = make_splats(), make_splats()
+    a, b, c = phases(), phases(), phases()
+    whole, first = a.upgrade(make(ours)), b.upgrade(make(theirs))
+    train(ours, whole, a, 0, total)
+    train(theirs, first, b, 0, at)
+    second: Any = c.upgrade(make(theirs))
+    if isinstance(first, dict):
+        for name, optimizer in first.items():
+            second[name].load_state_dict(optimizer.state_dict())
+    else:
+        second.load_state_dict(first.state_dict())
+    train(theirs, second, c, at, total)
+    for name in ours:
+        assert torch.equal(ours[name], theirs[name]), name
 
 
 def edit_rows(
