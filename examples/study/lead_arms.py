@@ -43,10 +43,17 @@ def leads() -> list[StudyArm]:
             ("rarely", "a tenth of the events", Fading(events=30)),
         )
     ]
+    v_only = StudyArm(
+        f"{DEFAULTS}-v-only",
+        "the defaults, exp_avg_sq faded, exp_avg kept",
+        DEFAULTS,
+        fixed(annealing=Annealing(4.0, 0.4, opacity_peak=1.0), fading=Fading(exp_avg=1.0)),
+    )
     on_annealed = "annealed-8-0.4"
     return [
         *single,
         *fading,
+        v_only,
         StudyArm(
             "annealed-geometry",
             "annealed: all but the colours",

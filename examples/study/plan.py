@@ -20,6 +20,7 @@ OVERFITTING = (
 )
 POINTS = 4_000
 EMBEDDED_POINTS = 2_000
+CONFIRMED = ("faded-v-only", f"{DEFAULTS}-v-only")  # what gained most among the other leads
 FIRST_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "annealed-8-0.4", "faded")
 
 
@@ -74,6 +75,7 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         "with-nu": cross(SCENES, on_defaults, seeds, 3_000),
         "rest": cross(QUICK_SCENES, later, seeds, 3_000),
         "leads": cross(QUICK_SCENES, beyond, seeds, 3_000),
+        "confirmed": cross(SCENES, CONFIRMED, seeds, 3_000),
         "options": cross(QUICK_SCENES, options, seeds, 3_000),
         "random": cross(SCENES, two, seeds, 3_000, init="random"),
         "small": cross(SCENES, two, seeds, 3_000, share=0.25),

@@ -137,7 +137,7 @@ def _title(study: Study, gains: Sequence[Gain]) -> str:
     scenes = {scene for gain in gains for scene in gain.scenes}
     settings = [s for s in study.settings(SHORT) if s.scene in scenes]
     baseline = f"{BASELINE} {baseline_of(study, settings):.2f} dB"
-    return f"{', '.join(sorted(scenes))}; {SHORT:,} iterations; {baseline}"
+    return f"{', '.join(sorted(scenes))}\n{SHORT:,} iterations; {baseline}"
 
 
 def fill(page: str, made: dict[str, str]) -> str:
