@@ -58,6 +58,7 @@ def tables(study: Study) -> dict[str, str]:
         "options": gains_table(gains["options"]) if gains["options"] else _missing("options"),
         "leads": gains_table(gains["leads"]) if gains["leads"] else _missing("leads"),
         "long": goals_table(study, {"3,000 iterations": short, **long}, BEST, BASELINE),
+        "pooled": goals_table(study, {"3,000 iterations": short, **long}, POOLED, BASELINE),
         "long-scenes": scenes_table(study, long["7,500 iterations"], LONG_ARMS),
         "few-views": scenes_table(study, few, FEW_VIEWS_ARMS),
         "full-scenes": scenes_table(study, long["30,000 iterations"], LONG_ARMS),
