@@ -100,7 +100,7 @@ def core() -> list[StudyArm]:
         ),
         StudyArm(
             DEFAULTS,
-            "the same, but opacities annealed from 1: the defaults",
+            "the same, but opacities annealed from 1",
             ALL_ANNEALED,
             fixed(**PARTS[DEFAULTS]),
         ),

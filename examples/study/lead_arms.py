@@ -164,7 +164,7 @@ def _small_gradients() -> list[StudyArm]:
     return [
         StudyArm(
             f"{DEFAULTS}+eps-{key}-{share:g}",
-            f"{DEFAULTS}, eps {share:g} of the typical gradient, {key}",
+            f"the defaults, eps {share:g} of the typical gradient, {key}",
             DEFAULTS,
             fixed(**parts),
             host={"relative_eps": share, "relative_eps_of": names},

@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 
 from study.analysis import Gain, Study
 from study.records import Record, Setting
-from study.study_arm import DEFAULTS
+from study.study_arm import label
 
 # Okabe and Ito's colours: told apart with any kind of colour vision.
 COLOURS = ("#000000", "#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -39,7 +39,7 @@ def plot_curves(study: Study, settings: Sequence[Setting], arms: Sequence[str], 
             seconds, table = _curves(records)
             (line,) = axis.plot(seconds, table.mean(0), color=colour, linewidth=1.6)
             axis.fill_between(seconds, table.min(0), table.max(0), color=colour, alpha=0.15, lw=0)
-            handles.setdefault(arm, line)
+            handles.setdefault(label(arm), line)
             lows.append(float(np.interp(0.1 * seconds[-1], seconds, table.mean(0))))
         axis.set_title(f"{setting.scene}, {setting.points:,} points", fontsize=10)
         axis.set_ylim(bottom=min(lows, default=None))
@@ -82,7 +82,7 @@ def plot_gains(gains: Sequence[Gain], path: Path, title: str) -> None:
             capsize=3,
         )
     axis.axvline(0.0, color="black", linewidth=0.8)
-    labels = [f"{g.arm}  (vs {g.control})".replace(DEFAULTS, "defaults") for g in gains]
+    labels = [f"{label(g.arm)}  (vs {label(g.control)})" for g in gains]
     axis.set_yticks(places, labels, fontsize=8)
     axis.set_ylim(-0.7, len(gains) - 0.3)
     axis.set_xlabel("gain at equal seconds (dB), ± 2 deviations over seeds")

@@ -22,7 +22,7 @@ from study.decisions import decide
 from study.plan import FEW_VIEWS_SCENES, OVERFITTING
 from study.plots import plot_curves, plot_gains
 from study.records import gather, merge, read, write
-from study.study_arm import ALL_ANNEALED, BASELINE, DEFAULTS, POOLED
+from study.study_arm import ALL_ANNEALED, BASELINE, DEFAULTS, POOLED, label
 from study.tables import gains_table, goals_table, nu_table, scenes_table
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -103,7 +103,7 @@ def _decisions_table(study: Study) -> str:
             count = f"{len(gain.scenes)}, {gain.seeds}"
         on = "on" if decision.on else "off"
         lines.append(
-            f"| {part} | `{decision.arm}` against `{decision.control}` "
+            f"| {part} | `{label(decision.arm)}` against `{label(decision.control)}` "
             f"| {decision.iterations:,} | {shown} | {count} | {on} |"
         )
     return "\n".join(lines)

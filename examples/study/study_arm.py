@@ -49,6 +49,11 @@ class StudyArm:
         return Arm(self.name, self.what, make=make, needs=self.needs)
 
 
+def label(arm: str) -> str:
+    """An arm's name in tables and plots, where the defaults' is long."""
+    return arm.replace(DEFAULTS, "defaults")
+
+
 def fixed(**options: Any) -> Options:
     """These options, whatever the scene."""
     return lambda _scene, _iterations, _nu: options

@@ -8,6 +8,7 @@ from statistics import fmean, stdev
 from study.analysis import Gain, Study
 from study.arms import STUDY_ARMS
 from study.records import Record, Setting
+from study.study_arm import label
 
 
 def gains_table(gains: Sequence[Gain]) -> str:
@@ -19,8 +20,8 @@ def gains_table(gains: Sequence[Gain]) -> str:
     ]
     for g in gains:
         lines.append(
-            f"| `{g.arm}` | {STUDY_ARMS[g.arm].what} | `{g.control}` | {len(g.scenes)}, {g.seeds} "
-            f"| {g.equal_iterations:+.2f} | {_gain_and_spread(g)} "
+            f"| `{label(g.arm)}` | {STUDY_ARMS[g.arm].what} | `{label(g.control)}` "
+            f"| {len(g.scenes)}, {g.seeds} | {g.equal_iterations:+.2f} | {_gain_and_spread(g)} "
             f"| {g.train:+.2f} | x{g.seconds:.2f} | {g.verdict} |"
         )
     return "\n".join(lines)
@@ -45,7 +46,7 @@ def scenes_table(study: Study, settings: Sequence[Setting], arms: Sequence[str])
         shown = f"{fmean(lpips):.4f}" if complete and len(lpips) == len(every) else "-"
         state = fmean(r.state_bytes / r.curve["num_points"][-1] for r in every)
         peak = f"{fmean(r.peak_rss_bytes for r in every) / 1e6:.0f}"
-        row = [f"`{arm}`", *cells, ssim, shown, f"{state:.0f}", peak]
+        row = [f"`{label(arm)}`", *cells, ssim, shown, f"{state:.0f}", peak]
         lines.append(f"| {' | '.join(row)} |")
     return "\n".join(lines)
 
@@ -83,7 +84,7 @@ def nu_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) -> 
             values = [r.mean_nu for r in records if r.mean_nu is not None]
             cells.append(_mean_and_spread(values))
         if any(cell != "-" for cell in cells):
-            lines.append(f"| `{arm}` | {' | '.join(cells)} |")
+            lines.append(f"| `{label(arm)}` | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
