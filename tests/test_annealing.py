@@ -14,16 +14,13 @@ from trainers import (
     gsplat_optimizers,
     inria_optimizer,
     make_splats,
+    only,
     train,
 )
 
 from opt3dgs_optim import Annealing, Fading, PhaseScheduler
 
 TOTAL = 60
-
-
-def phases_with(**options: Any) -> PhaseScheduler:
-    return PhaseScheduler(TOTAL, **NOTHING | options)
 
 
 @pytest.mark.parametrize(
@@ -54,7 +51,7 @@ def test_every_step_is_adams_times_the_factor() -> None:
     """The same gradients with learning rates set by hand give the same bits."""
     annealing = Annealing(8.0, 0.4)
     ours, theirs = make_splats(), make_splats()
-    phases = phases_with(annealing=annealing)
+    phases = only(TOTAL, annealing=annealing)
     optimizers, plain = phases.upgrade(gsplat_optimizers(ours)), gsplat_optimizers(theirs)
     rates = {name: opt.param_groups[0]["lr"] for name, opt in plain.items()}
     for i in range(TOTAL):
@@ -82,7 +79,7 @@ def test_annealing_multiplies_nu_and_goes_on_after_the_switch() -> None:
 @pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
 def test_resume_is_bit_exact(make: Any) -> None:
     options: dict[str, Any] = {"annealing": Annealing(), "fading": Fading(share=0.5, events=20)}
-    check_resume(make, lambda: phases_with(**options), TOTAL, 23)
+    check_resume(make, lambda: only(TOTAL, **options), TOTAL, 23)
 
 
 # -- fading ----------------------------------------------------------------------------------------
@@ -100,7 +97,7 @@ def test_events_are_spread_evenly_and_each_happens_once() -> None:
 
 def test_the_same_points_fade_in_all_parameters_and_the_share_is_right() -> None:
     splats = make_splats(400)
-    phases = phases_with(fading=Fading(share=0.25, events=1, start=0.0, stop=0.5))
+    phases = only(TOTAL, fading=Fading(share=0.25, events=1, start=0.0, stop=0.5))
     optimizers = phases.upgrade(gsplat_optimizers(splats))
     train(splats, optimizers, phases, 0, 29)
     before = {
@@ -143,7 +140,7 @@ def test_a_step_after_fading_is_no_longer_than_before() -> None:
 
 def test_fading_survives_density_control() -> None:
     splats = make_splats()
-    phases = phases_with(fading=Fading(share=1.0, events=60, start=0.0, stop=1.0))
+    phases = only(TOTAL, fading=Fading(share=1.0, events=60, start=0.0, stop=1.0))
     optimizers = phases.upgrade(gsplat_optimizers(splats))
     for i in range(0, TOTAL, 10):
         train(splats, optimizers, phases, i, i + 10)

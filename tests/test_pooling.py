@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import itertools
 from typing import Any
 
 import numpy as np
@@ -11,12 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 from trainers import (
-    NOTHING,
     check_resume,
     edit_rows,
     gsplat_optimizers,
     inria_optimizer,
     make_splats,
+    only,
     train,
 )
 
@@ -25,10 +24,6 @@ from opt3dgs_optim import Fading, PhaseScheduler, Pooling
 TOTAL = 60
 GEOMETRY = ("means", "scales", "quats")
 BETAS, EPS = (0.9, 0.999), 1e-15
-
-
-def phases_with(**options: Any) -> PhaseScheduler:
-    return PhaseScheduler(TOTAL, **NOTHING | options)
 
 
 def _reference(start: Tensor, gradients: list[Tensor], lr: float) -> tuple[np.ndarray, np.ndarray]:
@@ -49,7 +44,7 @@ def _reference(start: Tensor, gradients: list[Tensor], lr: float) -> tuple[np.nd
 def test_it_is_adam_with_the_mean_of_the_second_moments(fused: bool | None) -> None:
     splats = make_splats(9)
     start = {name: param.detach().clone() for name, param in splats.items()}
-    phases = phases_with(pooling=Pooling())
+    phases = only(TOTAL, pooling=Pooling())
     optimizers = phases.upgrade(gsplat_optimizers(splats, fused=fused))
     plain = {name: torch.nn.Parameter(value.clone()) for name, value in start.items()}
     adam = gsplat_optimizers(plain, fused=fused)
@@ -85,7 +80,7 @@ def test_a_step_has_the_direction_of_the_mean_gradient() -> None:
     cosines: dict[str, float] = {}
     for kind, pooling in (("adam", None), ("pooled", Pooling())):
         param = torch.nn.Parameter(torch.zeros(50, 3, dtype=torch.float64))
-        phases = phases_with(pooling=pooling)
+        phases = only(TOTAL, pooling=pooling)
         (optimizer,) = phases.upgrade(
             {"means": torch.optim.Adam([{"params": param, "lr": 1e-3, "name": "means"}], eps=EPS)}
         ).values()
@@ -108,7 +103,7 @@ def test_an_axis_without_evidence_does_not_make_full_steps() -> None:
     moved: dict[str, Tensor] = {}
     for kind, pooling in (("adam", None), ("pooled", Pooling())):
         param = torch.nn.Parameter(torch.zeros(20, 3))
-        phases = phases_with(pooling=pooling)
+        phases = only(TOTAL, pooling=pooling)
         (optimizer,) = phases.upgrade(
             {"means": torch.optim.Adam([{"params": param, "lr": 1e-3, "name": "means"}], eps=EPS)}
         ).values()
@@ -126,7 +121,7 @@ def test_an_axis_without_evidence_does_not_make_full_steps() -> None:
 @pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
 def test_every_trainers_names_are_pooled(make: Any) -> None:
     splats = make_splats()
-    phases = phases_with(pooling=Pooling(("xyz", "scales")))
+    phases = only(TOTAL, pooling=Pooling(("xyz", "scales")))
     assert phases.pooling is not None
     assert phases.pooling.names == ("means", "scales")
     optimizers = phases.upgrade(make(splats))
@@ -141,7 +136,7 @@ def test_every_trainers_names_are_pooled(make: Any) -> None:
 @pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
 def test_resume_is_bit_exact(make: Any) -> None:
     options: dict[str, Any] = {"pooling": Pooling(), "fading": Fading(share=0.5, events=20)}
-    check_resume(make, lambda: phases_with(**options), TOTAL, 23)
+    check_resume(make, lambda: only(TOTAL, **options), TOTAL, 23)
 
 
 def test_a_training_that_began_without_it_is_pooled_from_the_next_step() -> None:
@@ -149,7 +144,7 @@ def test_a_training_that_began_without_it_is_pooled_from_the_next_step() -> None
     stock = gsplat_optimizers(splats)
     train(splats, stock, None, 0, 10)
     mean = stock["scales"].state[splats["scales"]]["exp_avg_sq"].mean(1)
-    phases = phases_with(pooling=Pooling())
+    phases = only(TOTAL, pooling=Pooling())
     optimizers = phases.upgrade(stock)
     train(splats, optimizers, phases, 10, 11)
     pooled = optimizers["scales"].state[splats["scales"]]["exp_avg_sq"]
@@ -159,7 +154,7 @@ def test_a_training_that_began_without_it_is_pooled_from_the_next_step() -> None
 
 def test_density_control_may_edit_the_rows() -> None:
     splats = make_splats(12)
-    phases = phases_with(pooling=Pooling())
+    phases = only(TOTAL, pooling=Pooling())
     optimizers = phases.upgrade(gsplat_optimizers(splats))
     train(splats, optimizers, phases, 0, 10)
     kept = torch.tensor([0, 3, 5, 11])
@@ -179,7 +174,7 @@ def test_rows_that_do_not_step_keep_their_moments() -> None:
     stock = gsplat_optimizers(splats)
     train(splats, stock, None, 0, 5)
     state = copy.deepcopy(stock["means"].state[splats["means"]])
-    phases = phases_with(pooling=Pooling())
+    phases = only(TOTAL, pooling=Pooling())
     optimizer: Any = phases.upgrade(stock)["means"]
     mask = torch.tensor([True, False, True, True, False, True])
     phases.observe(0.1)
@@ -203,7 +198,7 @@ def test_rows_that_do_not_step_keep_their_moments() -> None:
 
 def test_a_step_that_is_dropped_leaves_everything() -> None:
     splats = make_splats()
-    phases = phases_with(pooling=Pooling())
+    phases = only(TOTAL, pooling=Pooling())
     optimizers = phases.upgrade(gsplat_optimizers(splats))
     train(splats, optimizers, phases, 0, 5)
     before = [
@@ -219,7 +214,7 @@ def test_a_step_that_is_dropped_leaves_everything() -> None:
 
 def test_amsgrads_maxima_are_pooled_too() -> None:
     splats = make_splats()
-    phases = phases_with(pooling=Pooling())
+    phases = only(TOTAL, pooling=Pooling())
     optimizers = phases.upgrade(gsplat_optimizers(splats, amsgrad=True))
     train(splats, optimizers, phases, 0, 5)
     state = optimizers["quats"].state[splats["quats"]]
@@ -230,7 +225,7 @@ def test_amsgrads_maxima_are_pooled_too() -> None:
 def test_without_it_nothing_is_pooled_and_the_paper_has_none() -> None:
     assert PhaseScheduler.paper(100).pooling is None
     splats, plain = make_splats(), make_splats()
-    phases = phases_with()
+    phases = only(TOTAL)
     optimizers, adam = phases.upgrade(gsplat_optimizers(splats)), gsplat_optimizers(plain)
     train(splats, optimizers, phases, 0, 20)
     train(plain, adam, None, 0, 20)
@@ -252,11 +247,11 @@ def test_empty_and_odd_shapes() -> None:
     Pooling().pool({})
 
 
-@pytest.mark.parametrize("names", list(itertools.chain(["means", (), ("means", "camera")], [(3,)])))
+@pytest.mark.parametrize("names", ["means", (), ("means", "camera"), (3,)])
 def test_bad_names_say_what_is_allowed(names: Any) -> None:
     with pytest.raises(ValueError, match=r"^Pooling: names="):
         Pooling(names)
 
 
 def test_repr_says_what_is_pooled() -> None:
-    assert "Pooling(names=('means',))" in repr(phases_with(pooling=Pooling(("means",))))
+    assert "Pooling(names=('means',))" in repr(only(TOTAL, pooling=Pooling(("means",))))

@@ -66,6 +66,11 @@ def everything(
     return PhaseScheduler(total_steps, switch, **{**EVERYTHING, **options})
 
 
+def only(total_steps: int, **options: Any) -> PhaseScheduler:
+    """These options on, and nothing else."""
+    return PhaseScheduler(total_steps, **NOTHING | options)
+
+
 def make_splats(n: int = 12, seed: int = 0) -> dict[str, Parameter]:
     """Random Gaussians under gsplat's names."""
     generator = torch.Generator().manual_seed(seed)

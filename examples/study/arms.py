@@ -8,7 +8,6 @@ from splatting.arms import PAPER_WARMUP, paper_scheduler
 from splatting.scenes import Scene
 
 from opt3dgs_optim import EnergyHistogram
-from opt3dgs_optim.annealing import Annealing
 from opt3dgs_optim.energy import PAPER_RANGE, PAPER_TEMPERATURE
 from opt3dgs_optim.fading import Fading
 from opt3dgs_optim.lqnadam import CurvatureOptions
@@ -18,6 +17,7 @@ from study.lead_arms import leads
 from study.study_arm import (
     ALL_ANNEALED,
     BASELINE,
+    DEFAULT_PARTS,
     DEFAULTS,
     POOLED,
     Options,
@@ -26,13 +26,12 @@ from study.study_arm import (
     fixed,
 )
 
-_defaults = {"annealing": Annealing(4.0, 0.4, opacity_peak=1.0), "fading": Fading()}
 # What the arms beyond the paper are made of, by the arm's name, and how a table says it.
 PARTS: dict[str, dict[str, Any]] = {
     "annealed-8-0.4": {"annealing": anneal_all(8.0)},
     "faded": {"fading": Fading()},
-    DEFAULTS: _defaults,
-    POOLED: {**_defaults, "pooling": Pooling()},
+    DEFAULTS: DEFAULT_PARTS,
+    POOLED: {**DEFAULT_PARTS, "pooling": Pooling()},
 }
 WORDS = {"annealed-8-0.4": "annealed", "faded": "faded", DEFAULTS: "the defaults", POOLED: "pooled"}
 
@@ -54,12 +53,8 @@ def _constant(_scene: Scene, iterations: int, nu: float | None) -> dict[str, Any
     return {"multiplier": ConstantMultiplier(nu, warmup=round(iterations * PAPER_WARMUP))}
 
 
-def _histogram_and(parts: dict[str, Any]) -> Options:
-    return lambda *call: {**_histogram()(*call), **parts}
-
-
-def _constant_and(parts: dict[str, Any]) -> Options:
-    return lambda *call: {**_constant(*call), **parts}
+def _with(options: Options, parts: dict[str, Any]) -> Options:
+    return lambda *call: {**options(*call), **parts}
 
 
 def _epoch_pairs(scene: Scene, _iterations: int, _nu: float | None) -> dict[str, Any]:
@@ -132,14 +127,14 @@ def with_nu() -> list[StudyArm]:
                 f"{trunk}+constant",
                 f"{WORDS[trunk]}, with a constant multiplier: the next arm's mean nu",
                 trunk,
-                _constant_and(parts),
+                _with(_constant, parts),
                 needs=f"{trunk}+awsgld",
             ),
             StudyArm(
                 f"{trunk}+awsgld",
                 f"{WORDS[trunk]}, with the flat-histogram multiplier",
                 f"{trunk}+constant",
-                _histogram_and(parts),
+                _with(_histogram(), parts),
             ),
         )
     ]

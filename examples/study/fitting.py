@@ -29,7 +29,6 @@ HOST_OPTIONS = (
     "same_view",
     "matrix",
     "relative_eps",
-    "relative_eps_of",
 )
 NOISY_ROWS = ("visible", "hidden")
 EPS = 1e-15  # the trainer's
@@ -46,8 +45,8 @@ class StudyFit(Fit):
     on the rows that this view's loss reaches, `"hidden"` for the others only; of an arm whose
     noise is the trainer's. same_view: curvature pairs between two visits of one view; of an arm
     with curvature. matrix: a matrix of second moments for the positions, with this eigenvalue
-    floor (see `FullMatrixAdam`); of an arm with torch's Adam. relative_eps: Adam's eps as a share
-    of the root mean square gradient, of the parameters in `relative_eps_of`.
+    floor (see `FullMatrixAdam`); of an arm with torch's Adam. relative_eps: Adam's eps of some
+    parameters, by name, as a share of their root mean square gradient.
 
     Raises:
         ValueError: a host option is unknown, or its value is outside what is allowed.
@@ -111,14 +110,14 @@ class StudyFit(Fit):
             self._decay()
 
     def _set_eps(self) -> None:
-        for name in self.host["relative_eps_of"]:
+        for name, share in self.host["relative_eps"].items():
             (group,) = self.optimizers[name].param_groups
             state = self.optimizers[name].state.get(self.gaussians[name])
             if not state:
                 continue
             correction = 1 - group["betas"][1] ** float(state["step"])
             typical = float((state["exp_avg_sq"].mean() / correction).sqrt())
-            group["eps"] = max(self.host["relative_eps"] * typical, EPS)
+            group["eps"] = max(share * typical, EPS)
 
     @torch.no_grad()
     def _decay(self) -> None:

@@ -11,6 +11,8 @@ from opt3dgs_optim.pooling import Pooling
 from study.study_arm import (
     ALL_ANNEALED,
     BASELINE,
+    DEFAULT_ANNEALING,
+    DEFAULT_PARTS,
     DEFAULTS,
     POOLED,
     StudyArm,
@@ -47,7 +49,7 @@ def leads() -> list[StudyArm]:
         f"{DEFAULTS}-v-only",
         "the defaults, exp_avg_sq faded, exp_avg kept",
         DEFAULTS,
-        fixed(annealing=Annealing(4.0, 0.4, opacity_peak=1.0), fading=Fading(exp_avg=1.0)),
+        fixed(annealing=DEFAULT_ANNEALING, fading=Fading(exp_avg=1.0)),
     )
     on_annealed = "annealed-8-0.4"
     return [
@@ -125,7 +127,6 @@ def leads() -> list[StudyArm]:
 
 def _pooled() -> list[StudyArm]:
     """One second moment per point: for stock, and of other parameters than the defaults'."""
-    parts = {"annealing": Annealing(4.0, 0.4, opacity_peak=1.0), "fading": Fading()}
     kinds: dict[str, tuple[str, ...]] = {
         "means": ("means",),
         "scales": ("scales",),
@@ -137,13 +138,17 @@ def _pooled() -> list[StudyArm]:
     return [
         StudyArm("pooled", "second moments pooled", BASELINE, fixed(pooling=Pooling())),
         StudyArm(
-            alone, "the defaults, no regularisers", DEFAULTS, fixed(**parts), **no_regularisers
+            alone,
+            "the defaults, no regularisers",
+            DEFAULTS,
+            fixed(**DEFAULT_PARTS),
+            **no_regularisers,
         ),
         StudyArm(
             pooled,
             "the defaults, pooled, no regularisers",
             alone,
-            fixed(**parts, pooling=Pooling()),
+            fixed(**DEFAULT_PARTS, pooling=Pooling()),
             **no_regularisers,
         ),
         *(
@@ -151,7 +156,7 @@ def _pooled() -> list[StudyArm]:
                 f"{POOLED}-{key}",
                 f"the defaults, pooled: {', '.join(names)}",
                 DEFAULTS,
-                fixed(**parts, pooling=Pooling(names)),
+                fixed(**DEFAULT_PARTS, pooling=Pooling(names)),
             )
             for key, names in kinds.items()
         ),
@@ -160,14 +165,13 @@ def _pooled() -> list[StudyArm]:
 
 def _small_gradients() -> list[StudyArm]:
     """Annealed and faded, with an eps that shortens the steps of points with small gradients."""
-    parts = {"annealing": Annealing(4.0, 0.4, opacity_peak=1.0), "fading": Fading()}
     return [
         StudyArm(
             f"{DEFAULTS}+eps-{key}-{share:g}",
             f"the defaults, eps {share:g} of the typical gradient, {key}",
             DEFAULTS,
-            fixed(**parts),
-            host={"relative_eps": share, "relative_eps_of": names},
+            fixed(**DEFAULT_PARTS),
+            host={"relative_eps": dict.fromkeys(names, share)},
         )
         for key, names, share in (
             ("all", ("means", "scales", "quats", "opacities", "sh0"), 0.1),

@@ -9,12 +9,15 @@ from typing import Any
 from splatting.arms import ALL_OFF, Arm, MakeScheduler
 from splatting.scenes import Scene
 
-from opt3dgs_optim import Annealing, PhaseScheduler
+from opt3dgs_optim import Annealing, Fading, PhaseScheduler
 
 BASELINE = "mcmc"
 ALL_ANNEALED = "annealed-4-0.4+faded"
 DEFAULTS = "annealed-4-opacities-1+faded"  # what `PhaseScheduler(total_steps)` is
 POOLED = f"{DEFAULTS}+pooled"
+# As measured, so that a change of the package's defaults does not change what an arm was.
+DEFAULT_ANNEALING = Annealing(4.0, 0.4, opacity_peak=1.0)
+DEFAULT_PARTS: dict[str, Any] = {"annealing": DEFAULT_ANNEALING, "fading": Fading()}
 # (scene, iterations, mean nu of the arm in `needs`) -> the options that differ from ALL_OFF
 Options = Callable[[Scene, int, float | None], dict[str, Any]]
 
