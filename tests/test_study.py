@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import math
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -23,7 +24,8 @@ from study.fitting import OPACITY_DECAY, SCALE_DECAY, StudyFit
 from study.plan import plan
 from study.records import COLUMNS, Record, Setting, gather, merge, read, write
 from study.run import main as run_study
-from study.training import Spec, train
+from study.tables import machines_line
+from study.training import Spec, machine, train
 from torch import Tensor
 
 from opt3dgs_optim import Annealing, EnergyHistogram, PhaseScheduler
@@ -36,7 +38,8 @@ def record(arm: str, scene: str, seed: int, psnr: float, seconds: float = 10.0) 
     curve = {name: np.array([0.0, 1.0]) for name in COLUMNS}
     curve["seconds"] = np.array([0.0, seconds])
     curve["psnr"] = np.array([10.0, psnr])
-    return Record(Setting(scene, 100, 3000, "sfm"), arm, seed, curve, None, 1, 1, None)
+    setting = Setting(scene, 100, 3000, "sfm")
+    return Record(setting, arm, seed, curve, None, 1, 1, None, "a machine", f"2026-01-0{seed + 1}")
 
 
 def test_the_pages_are_made_from_the_records() -> None:
@@ -361,8 +364,20 @@ def test_records_survive_writing(tmp_path: Path) -> None:
     assert one.seconds > 0
     assert other.state_bytes > one.state_bytes
     assert other.setting == replace(one.setting, sh_degree=1)
+    assert one.machine == machine()
+    assert torch.__version__ in one.machine
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", one.date)
     assert Study([one, other]).settings(20) == [one.setting]
     assert Study([one, other]).settings(20, sh_degree=1) == [other.setting]
+
+
+def test_machines_and_days_are_said() -> None:
+    records = [record("mcmc", "a", seed, 20.0) for seed in (2, 0, 1)]
+    other = replace(records[0], machine="another", date="2026-02-01")
+    assert machines_line([*records, other]) == (
+        "3 trainings, 2026-01-01 to 2026-01-03: a machine, one thread each.\n"
+        "1 training, 2026-02-01: another, one thread each."
+    )
 
 
 def test_new_records_take_the_place_of_old_ones() -> None:

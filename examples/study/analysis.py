@@ -52,6 +52,10 @@ class Study:
         for record in records:
             self._of[record.setting, record.arm][record.seed] = record
 
+    def records(self) -> list[Record]:
+        """All of them."""
+        return [record for runs in self._of.values() for record in runs.values()]
+
     def settings(
         self, iterations: int, init: str = "sfm", share: float = 1.0, sh_degree: int = 0
     ) -> list[Setting]:

@@ -35,6 +35,8 @@ class Record:
     state_bytes: int
     peak_rss_bytes: int
     lpips: float | None
+    machine: str
+    date: str  # the training's last day, YYYY-MM-DD, UTC
 
     @property
     def seconds(self) -> float:
@@ -112,4 +114,6 @@ def _record(entry: dict[str, Any]) -> Record:
         entry["state_bytes"],
         entry["peak_rss_bytes"],
         entry.get("lpips"),
+        entry["machine"],
+        entry["date"],
     )

@@ -23,7 +23,7 @@ from study.plan import FEW_VIEWS_SCENES, OVERFITTING
 from study.plots import plot_curves, plot_gains
 from study.records import gather, merge, read, write
 from study.study_arm import ALL_ANNEALED, BASELINE, DEFAULTS, POOLED, label
-from study.tables import gains_table, goals_table, nu_table, scenes_table
+from study.tables import gains_table, goals_table, machines_line, nu_table, scenes_table
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FOLDER = REPOSITORY / "docs" / "results" / "study"
@@ -49,6 +49,7 @@ def tables(study: Study) -> dict[str, str]:
     }
     few = [s for s in long["7,500 iterations"] if s.scene in FEW_VIEWS_SCENES]
     made = {
+        "machines": machines_line(study.records()),
         "core": gains_table(gains["core"]),
         "with-nu": gains_table(gains["with-nu"]),
         "scenes": scenes_table(study, short, [*names["core"], *names["with-nu"]]),

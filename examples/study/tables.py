@@ -11,6 +11,20 @@ from study.records import Record, Setting
 from study.study_arm import label
 
 
+def machines_line(records: Sequence[Record]) -> str:
+    """How many trainings ran on which machine, and when."""
+    days: dict[str, list[str]] = {}
+    for record in records:
+        days.setdefault(record.machine, []).append(record.date)
+    said = []
+    for machine, dates in days.items():
+        first, last = min(dates), max(dates)
+        when = first if first == last else f"{first} to {last}"
+        count = "1 training" if len(dates) == 1 else f"{len(dates):,} trainings"
+        said.append(f"{count}, {when}: {machine}, one thread each.")
+    return "\n".join(said)
+
+
 def gains_table(gains: Sequence[Gain]) -> str:
     """One line per arm: what it gains over its control, and the rule's verdict."""
     lines = [

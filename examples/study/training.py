@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import resource
 import sys
 import time
@@ -91,11 +92,19 @@ def train(spec: Spec, folder: Path, trunk: Path | None, mean_nu: float | None) -
     record["mean_nu"] = fit.mean_nu
     record["state_bytes"] = fit.state_bytes()
     record["peak_rss_bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    record["machine"] = machine()
+    record["date"] = time.strftime("%Y-%m-%d", time.gmtime())
     record["finished"] = True
     images = [(255 * fit.image(view)).round().to(torch.uint8).numpy() for view in scene.test]
     np.savez_compressed(folder / "renders.npz", *images)
     _write(path, record)
     return record
+
+
+def machine() -> str:
+    """What the training runs on, as the page says it."""
+    system = f"{platform.system()} {platform.machine()}"
+    return f"{system}, {os.cpu_count()} cores, torch {torch.__version__}"
 
 
 @cache
