@@ -21,6 +21,7 @@ from study.analysis import Study
 from study.arms import BASELINE, STUDY_ARMS, find_study_arm
 from study.decisions import COMPARISONS, decide
 from study.fitting import OPACITY_DECAY, SCALE_DECAY, StudyFit
+from study.own_statistics import chosen_rows
 from study.plan import plan
 from study.records import COLUMNS, Record, Setting, gather, merge, read, write
 from study.run import main as run_study
@@ -202,10 +203,10 @@ def test_arms_train(tmp_path: Path, name: str) -> None:
 _embedded = cache(lambda: load_scene("embedded"))  # seconds to make
 
 
-def _fit(arm: str, host: dict[str, object] | None = None) -> StudyFit:
+def _fit(arm: str, host: dict[str, object] | None = None, iterations: int = 3000) -> StudyFit:
     found = find_study_arm(arm)
     found = found if host is None else replace(found, host=host)
-    return StudyFit(_embedded(), found, FitOptions(3000, 120))
+    return StudyFit(_embedded(), found, FitOptions(iterations, 120))
 
 
 def _gradients(fit: StudyFit) -> dict[str, Tensor]:
@@ -398,3 +399,48 @@ def test_bad_calls_say_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixtu
         find_study_arm("nonsense")
     with pytest.raises(ValueError, match="marker study:nonsense"):
         report.fill("<!-- study:nonsense -->\n<!-- end -->", {})
+
+
+def test_stale_and_fresh_rows_are_found() -> None:
+    first = torch.tensor([[0.1, 0.0], [1.0, 1.0], [0.5, 0.0], [0.0, 0.0], [0.01, 0.01]])
+    moments = {"exp_avg": first, "exp_avg_sq": torch.tensor([[1.0, 1.0]] * 3 + [[0, 0], [1, 1]])}
+    # ratios: 0.005, 1, 0.125, never a gradient, 0.0001
+    assert chosen_rows(moments, 0.4, stale=True).tolist() == [4, 0]
+    assert chosen_rows(moments, 0.4, stale=False).tolist() == [1, 2]
+    assert sorted(chosen_rows(moments, 1.0, stale=True).tolist()) == [0, 1, 2, 4]
+
+
+@pytest.mark.parametrize("name", ["faded-scales-only", "faded-stale", "faded-fresh"])
+def test_fading_of_one_parameter_or_of_chosen_points(name: str) -> None:
+    fit = _fit(name, iterations=60)
+    changed: dict[str, float] = {}
+    for _ in range(6):
+        before = {n: _second_moment(fit, n) for n in fit.gaussians}
+        fit.step()
+        for n, old in before.items():
+            # Without an event exp_avg_sq falls by a thousandth at most.
+            fallen = (_second_moment(fit, n) < 0.9 * old).reshape(len(old), -1).all(1)
+            changed[n] = max(changed.get(n, 0.0), fallen.float().mean().item())
+    if name == "faded-scales-only":
+        assert changed.pop("scales") > 0.1
+        assert set(changed.values()) == {0.0}
+    else:
+        assert min(changed.values()) > 0.0, changed
+
+
+def _second_moment(fit: StudyFit, name: str) -> Tensor:
+    state = fit.optimizers[name].state.get(fit.gaussians[name], {})
+    return state.get("exp_avg_sq", torch.zeros_like(fit.gaussians[name])).clone()
+
+
+def test_own_steps_have_the_wanted_size() -> None:
+    fit = _fit("own-step", iterations=200)
+    for _ in range(30):
+        fit.step()
+    for name in ("scales", "sh0"):
+        before = fit.gaussians[name].detach().clone()
+        (group,) = fit.optimizers[name].param_groups
+        wanted = 0.1 ** (fit.iteration / 200) * group["lr"]
+        fit.step()
+        size = (fit.gaussians[name] - before).square().mean().sqrt().item()
+        assert size == pytest.approx(wanted, rel=0.25), name

@@ -8,6 +8,7 @@ from opt3dgs_optim.annealing import Annealing
 from opt3dgs_optim.fading import Fading
 from opt3dgs_optim.lqnadam import CurvatureOptions
 from opt3dgs_optim.pooling import Pooling
+from study.own_statistics import ChosenFading, OwnStep
 from study.study_arm import (
     ALL_ANNEALED,
     BASELINE,
@@ -55,6 +56,7 @@ def leads() -> list[StudyArm]:
     return [
         *single,
         *fading,
+        *_chosen(),
         v_only,
         StudyArm(
             "annealed-geometry",
@@ -122,6 +124,40 @@ def leads() -> list[StudyArm]:
         *_tolerant(),
         *_same_view(),
         *_matrix(),
+    ]
+
+
+def _chosen() -> list[StudyArm]:
+    """Fading of one parameter, of points that the moments choose; steps of a chosen size."""
+    single = [
+        StudyArm(
+            f"faded-{name}-only",
+            f"faded: {name} alone",
+            BASELINE,
+            lambda *_, name=name: {"fading": ChosenFading(names=(name,))},
+        )
+        for name in ("means", "scales", "quats", "opacities", "sh0")
+    ]
+    return [
+        *single,
+        StudyArm(
+            "faded-stale",
+            "the points whose exp_avg^2 / exp_avg_sq is smallest",
+            "faded",
+            lambda *_: {"fading": ChosenFading("stale")},
+        ),
+        StudyArm(
+            "faded-fresh",
+            "the points whose exp_avg^2 / exp_avg_sq is largest",
+            "faded",
+            lambda *_: {"fading": ChosenFading("fresh")},
+        ),
+        StudyArm(
+            "own-step",
+            "root mean square of every parameter's steps falling from lr to lr / 10",
+            "annealed-4-0.4",
+            lambda *_: {"annealing": OwnStep()},
+        ),
     ]
 
 
