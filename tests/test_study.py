@@ -434,13 +434,13 @@ def _second_moment(fit: StudyFit, name: str) -> Tensor:
 
 
 def test_own_steps_have_the_wanted_size() -> None:
-    fit = _fit("own-step", iterations=200)
+    fit = _fit("own-step-2", iterations=200)
     for _ in range(30):
         fit.step()
     for name in ("scales", "sh0"):
         before = fit.gaussians[name].detach().clone()
         (group,) = fit.optimizers[name].param_groups
-        wanted = 0.1 ** (fit.iteration / 200) * group["lr"]
+        wanted = 2.0 * 0.05 ** (fit.iteration / 200) * group["lr"]
         fit.step()
         size = (fit.gaussians[name] - before).square().mean().sqrt().item()
         assert size == pytest.approx(wanted, rel=0.25), name

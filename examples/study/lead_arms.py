@@ -152,11 +152,20 @@ def _chosen() -> list[StudyArm]:
             "faded",
             lambda *_: {"fading": ChosenFading("fresh")},
         ),
+        *(
+            StudyArm(
+                f"own-step-{first:g}",
+                f"root mean square of every parameter's steps falling from {size} to lr / 10",
+                "annealed-4-0.4",
+                lambda *_, first=first: {"annealing": OwnStep(first)},
+            )
+            for first, size in ((1.0, "lr"), (2.0, "2 lr"))
+        ),
         StudyArm(
-            "own-step",
-            "root mean square of every parameter's steps falling from lr to lr / 10",
-            "annealed-4-0.4",
-            lambda *_: {"annealing": OwnStep()},
+            "own-step-1+faded",
+            "the same from lr, and faded",
+            "own-step-1",
+            lambda *_: {"annealing": OwnStep(), "fading": Fading()},
         ),
     ]
 

@@ -71,13 +71,14 @@ def chosen_rows(moments: dict[str, Tensor], share: float, stale: bool) -> Tensor
 
 
 class OwnStep:
-    """Annealing of the step itself: its root mean square falls from lr to lr * `final`.
+    """Annealing of the step itself: its root mean square falls from lr * `first` to lr * `final`.
 
     The factor on a parameter's step is what that takes: the wanted size over the root mean square
     of exp_avg / sqrt(exp_avg_sq), looked at every few iterations, and at most `LARGEST_FACTOR`.
     """
 
-    def __init__(self, final: float = 0.1) -> None:
+    def __init__(self, first: float = 1.0, final: float = 0.1) -> None:
+        self.first = first
         self.final = final
         self._fit: StudyFit | None = None
         self._sizes: dict[str, tuple[int, float]] = {}  # name -> iteration // STRIDE, size
@@ -94,7 +95,8 @@ class OwnStep:
         now = fit.iteration // STRIDE
         if self._sizes.get(name, (-1, 1.0))[0] != now:
             self._sizes[name] = (now, self._size(name))
-        return min(self.final**progress / self._sizes[name][1], LARGEST_FACTOR)
+        wanted = self.first ** (1 - progress) * self.final**progress
+        return min(wanted / self._sizes[name][1], LARGEST_FACTOR)
 
     def _size(self, name: str) -> float:
         """Root mean square of the step over the learning rate; 1 before the first one."""
