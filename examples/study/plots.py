@@ -14,10 +14,20 @@ import matplotlib.pyplot as plt
 
 from study.analysis import Gain, Study
 from study.records import Record, Setting
-from study.study_arm import label
+from study.study_arm import BASELINE, DEFAULTS, POOLED, label
 
 # Okabe and Ito's colours: told apart with any kind of colour vision.
-COLOURS = ("#000000", "#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+COLOURS = {
+    BASELINE: "#000000",
+    "awsgld": "#d55e00",
+    "constant": "#e69f00",
+    "rates-x2": "#f0e442",
+    "faded": "#cc79a7",
+    "annealed-8-0.4": "#56b4e9",
+    DEFAULTS: "#0072b2",
+    POOLED: "#009e73",
+}
+SHOWN_FROM = 0.25  # of an arm's seconds: what it does before may be out of the picture
 VERDICT_COLOURS = {"pays": "#009e73", "does not pay": "#999999", "undecided": "#e69f00"}
 DPI = 150
 
@@ -31,18 +41,21 @@ def plot_curves(study: Study, settings: Sequence[Setting], arms: Sequence[str], 
     )
     handles: dict[str, object] = {}
     for axis, setting in zip(axes.flat, settings, strict=False):
-        lows = []
-        for colour, arm in zip(COLOURS, arms, strict=False):
+        shown: list[float] = []
+        for arm in arms:
             records = list(study.runs(setting, arm).values())
             if not records:
                 continue
             seconds, table = _curves(records)
+            low, high, colour = table.min(0), table.max(0), COLOURS[arm]
             (line,) = axis.plot(seconds, table.mean(0), color=colour, linewidth=1.6)
-            axis.fill_between(seconds, table.min(0), table.max(0), color=colour, alpha=0.15, lw=0)
+            axis.fill_between(seconds, low, high, color=colour, alpha=0.15, lw=0)
             handles.setdefault(label(arm), line)
-            lows.append(float(np.interp(0.1 * seconds[-1], seconds, table.mean(0))))
+            late = seconds >= SHOWN_FROM * seconds[-1]
+            shown += [*low[late], *high[late]]
         axis.set_title(f"{setting.scene}, {setting.points:,} points", fontsize=10)
-        axis.set_ylim(bottom=min(lows, default=None))
+        margin = 0.05 * (max(shown) - min(shown))
+        axis.set_ylim(min(shown) - margin, max(shown) + margin)
         axis.grid(alpha=0.3)
     for axis in axes.flat[len(settings) :]:
         axis.axis("off")

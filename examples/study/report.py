@@ -115,8 +115,12 @@ def plots(study: Study, folder: Path) -> list[Path]:
     short, drawn = study.settings(SHORT), []
     for name, settings, arms in (
         ("curves.png", short, CURVE_ARMS),
-        ("curves_long.png", study.settings(7_500), ("mcmc", "faded", "annealed-8-0.4", BEST)),
-        ("curves_full.png", study.settings(30_000), ("mcmc", "annealed-8-0.4", BEST)),
+        (
+            "curves_long.png",
+            study.settings(7_500),
+            ("mcmc", "faded", "annealed-8-0.4", BEST, POOLED),
+        ),
+        ("curves_full.png", study.settings(30_000), ("mcmc", BEST, POOLED)),
     ):
         if settings:
             plot_curves(study, settings, arms, folder / name)
