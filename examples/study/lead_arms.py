@@ -156,10 +156,13 @@ def _chosen() -> list[StudyArm]:
             StudyArm(
                 f"own-step-{first:g}",
                 f"root mean square of every parameter's steps falling from {size} to lr / 10",
-                "annealed-4-0.4",
+                control,
                 lambda *_, first=first: {"annealing": OwnStep(first)},
             )
-            for first, size in ((1.0, "lr"), (2.0, "2 lr"))
+            for first, size, control in (
+                (1.0, "lr", "annealed-4-0.4"),
+                (2.0, "2 lr", "annealed-8-0.4"),
+            )
         ),
         StudyArm(
             "own-step-1+faded",
