@@ -124,6 +124,27 @@ def _ratio(after: dict[str, Any], before: dict[str, Any], key: str) -> torch.Ten
     return (after[key].reshape(old.shape) * old).sum(1) / (old * old).sum(1)
 
 
+@pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
+def test_only_the_named_parameters_fade(make: Any) -> None:
+    after: list[dict[str, torch.Tensor]] = []
+    for names in ((), ("opacities", "scaling"), None):  # INRIA's name of the scales
+        splats = make_splats(40)
+        fading = None if names == () else Fading(1.0, events=1, start=0.0, names=names)
+        phases = only(TOTAL, fading=fading)
+        optimizers = phases.upgrade(make(splats))
+        train(splats, optimizers, phases, 0, 31)
+        states = [
+            o.state for o in (optimizers.values() if isinstance(optimizers, dict) else [optimizers])
+        ]
+        moments = {p: s["exp_avg_sq"] for state in states for p, s in state.items()}
+        after.append({name: moments[param].clone() for name, param in splats.items()})
+    plain, some, every = after
+    for name in plain:
+        assert not torch.equal(plain[name], every[name]), name
+        named = name in ("opacities", "scales")
+        assert torch.equal(some[name], every[name] if named else plain[name]), name
+
+
 def test_a_step_after_fading_is_no_longer_than_before() -> None:
     """0.2 / sqrt(0.04) = 1: what the defaults are chosen for."""
     param = torch.nn.Parameter(torch.zeros(500, 3))
@@ -162,6 +183,8 @@ def test_fading_survives_density_control() -> None:
         (lambda: Fading(events=0), r"Fading: events=0"),
         (lambda: Fading(start=0.6, stop=0.5), r"Fading: stop=0.5.*\(0.6, 1.0\]"),
         (lambda: Fading(seed=-1), r"Fading: seed=-1"),
+        (lambda: Fading(names=("pose",)), r"Fading: names=\('pose',\).*means, scales"),
+        (lambda: Fading(names=()), r"Fading: names=\(\)"),
         (lambda: PhaseScheduler(10, annealing=2.0), r"annealing=2.0, but Annealing"),  # pyright: ignore
         (lambda: PhaseScheduler(10, fading=True), r"fading=True, but Fading"),  # pyright: ignore
     ],

@@ -11,7 +11,7 @@ from splatting.scenes import Scene
 from torch import Tensor
 
 from study.full_matrix import FullMatrixAdam
-from study.own_statistics import ChosenFading, OwnStep
+from study.own_statistics import OwnStep
 from study.study_arm import StudyArm
 from study.view_pairs import SameViewAdam
 
@@ -67,10 +67,8 @@ class StudyFit(Fit):
             for optimizer in self.optimizers.values():
                 optimizer.param_groups[0]["betas"] = (0.9, self.host["beta2"])
         self._change_positions()
-        if self.phases is not None:
-            for part in (self.phases.annealing, self.phases.fading):
-                if isinstance(part, (ChosenFading, OwnStep)):
-                    part.watch(self)
+        if self.phases is not None and isinstance(self.phases.annealing, OwnStep):
+            self.phases.annealing.watch(self)
 
     def _change_positions(self) -> None:
         """Give the positions the optimizer that the arm asks for."""

@@ -16,6 +16,7 @@ from study.study_arm import (
     DEFAULT_PARTS,
     DEFAULTS,
     POOLED,
+    UNFADED_OPACITIES,
     StudyArm,
     anneal_all,
     fixed,
@@ -58,6 +59,15 @@ def leads() -> list[StudyArm]:
         *fading,
         *_chosen(),
         v_only,
+        StudyArm(
+            UNFADED_OPACITIES,
+            "the defaults, opacities not faded",
+            DEFAULTS,
+            fixed(
+                annealing=DEFAULT_ANNEALING,
+                fading=Fading(names=("means", "scales", "quats", "sh0", "shN")),
+            ),
+        ),
         StudyArm(
             "annealed-geometry",
             "annealed: all but the colours",
@@ -134,7 +144,7 @@ def _chosen() -> list[StudyArm]:
             f"faded-{name}-only",
             f"faded: {name} alone",
             BASELINE,
-            lambda *_, name=name: {"fading": ChosenFading(names=(name,))},
+            fixed(fading=Fading(names=(name,))),
         )
         for name in ("means", "scales", "quats", "opacities", "sh0")
     ]
@@ -144,13 +154,13 @@ def _chosen() -> list[StudyArm]:
             "faded-stale",
             "the points whose exp_avg^2 / exp_avg_sq is smallest",
             "faded",
-            lambda *_: {"fading": ChosenFading("stale")},
+            fixed(fading=ChosenFading("stale")),
         ),
         StudyArm(
             "faded-fresh",
             "the points whose exp_avg^2 / exp_avg_sq is largest",
             "faded",
-            lambda *_: {"fading": ChosenFading("fresh")},
+            fixed(fading=ChosenFading("fresh")),
         ),
         *(
             StudyArm(

@@ -1,4 +1,4 @@
-"""Fading and annealing that the optimizers' own moments steer, and fading of one parameter."""
+"""Fading and annealing that the optimizers' own moments steer."""
 
 from __future__ import annotations
 
@@ -13,42 +13,32 @@ from opt3dgs_optim.fading import Fading
 if TYPE_CHECKING:
     from study.fitting import StudyFit
 
-Choice = Literal["random", "stale", "fresh"]
 STRIDE = 10  # iterations between two looks at the steps' size
 LARGEST_FACTOR = 16.0
 
 
 class ChosenFading:
-    """`Fading` whose points the moments choose, or of some parameters only.
+    """`Fading` whose points the moments choose, parameter by parameter.
 
     A point is stale where its gradients have shrunk: exp_avg^2 is then small beside exp_avg_sq,
     both summed over its coordinates. `"stale"` fades the share of the points in which it is
-    smallest, `"fresh"` that in which it is largest, parameter by parameter.
+    smallest, `"fresh"` that in which it is largest.
     """
 
-    def __init__(self, choice: Choice = "random", names: tuple[str, ...] | None = None) -> None:
+    def __init__(self, choice: Literal["stale", "fresh"]) -> None:
         self.choice = choice
-        self.names = names
-        self.random = Fading()
-        self._fit: StudyFit | None = None
-
-    def watch(self, fit: StudyFit) -> None:
-        """Whose parameters' names are meant."""
-        self._fit = fit
+        self.random = Fading()  # whose numbers these are
 
     def events_before(self, iteration: int, total_steps: int) -> int:
         """As `Fading`."""
         return self.random.events_before(iteration, total_steps)
 
+    def covers(self, name: str | None) -> bool:
+        """As `Fading`."""
+        return self.random.covers(name)
+
     def fade(self, state: Mapping[Any, dict[str, Any]], events: range) -> None:
-        """As `Fading`, of the chosen points and parameters."""
-        assert self._fit is not None
-        if self.names is not None:
-            faded = [self._fit.gaussians[name] for name in self.names]
-            state = {p: s for p, s in state.items() if any(p is other for other in faded)}
-        if self.choice == "random":
-            self.random.fade(state, events)
-            return
+        """As `Fading`, of the chosen points."""
         for moments in state.values():
             for _ in events:
                 rows = chosen_rows(moments, self.random.share, stale=self.choice == "stale")

@@ -7,12 +7,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from study.arms import STUDY_ARMS, core, histograms, last_phases, leads, on_top, with_nu
-from study.study_arm import ALL_ANNEALED, DEFAULTS, POOLED
+from study.study_arm import ALL_ANNEALED, DEFAULTS, POOLED, UNFADED_OPACITIES
 from study.training import Spec
 
 SCENES = ("plush", "banana", "lund_door", "brighton_beach", "embedded")
 QUICK_SCENES = ("banana", "embedded")  # for the options of a part
 FEW_VIEWS_SCENES = ("brighton_beach", "plush")  # fewest views to speak of over-fitting, and most
+FULL_PARTS_SCENES = ("brighton_beach", "lund_door")  # where the defaults lose
 OVERFITTING = (
     *(f"{ALL_ANNEALED}{x}" for x in ("-means-1", "+decoupled", "+regularisers-0")),
     *(f"{DEFAULTS}+eps-{x}-0.1" for x in ("opacities", "all")),
@@ -70,8 +71,9 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         "long": cross(SCENES, [*two, ALL_ANNEALED, POOLED], seeds, 7_500),
         "few-views": cross(FEW_VIEWS_SCENES, OVERFITTING, 1, 7_500),
         "defaults": cross(SCENES, [ALL_ANNEALED, DEFAULTS, POOLED], seeds, 3_000),
-        "long-parts": cross(SCENES, longer, 1, 7_500),
+        "long-parts": cross(SCENES, [*longer, UNFADED_OPACITIES], 1, 7_500),
         "full": cross(SCENES, [*two, POOLED], 1, 30_000),
+        "full-parts": cross(FULL_PARTS_SCENES, [UNFADED_OPACITIES], 1, 30_000),
         "with-nu": cross(SCENES, on_defaults, seeds, 3_000),
         "rest": cross(QUICK_SCENES, later, seeds, 3_000),
         "leads": cross(QUICK_SCENES, beyond, seeds, 3_000),

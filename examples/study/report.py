@@ -22,7 +22,7 @@ from study.decisions import decide
 from study.plan import FEW_VIEWS_SCENES, OVERFITTING
 from study.plots import plot_curves, plot_gains
 from study.records import gather, merge, read, write
-from study.study_arm import ALL_ANNEALED, BASELINE, DEFAULTS, POOLED, label
+from study.study_arm import ALL_ANNEALED, BASELINE, DEFAULTS, POOLED, UNFADED_OPACITIES, label
 from study.tables import gains_table, goals_table, machines_line, nu_table, scenes_table
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -31,9 +31,9 @@ PAGE = REPOSITORY / "docs" / "evidence.md"
 PAGES = (PAGE, REPOSITORY / "README.md")  # that have tables
 SHORT = 3_000
 ALONE = ("mcmc", "faded", "annealed-4-0.4", "annealed-8-0.4")
-LONG_ARMS = (*ALONE, ALL_ANNEALED, DEFAULTS, POOLED)
+LONG_ARMS = (*ALONE, ALL_ANNEALED, DEFAULTS, UNFADED_OPACITIES, POOLED)
 BEST = DEFAULTS
-FEW_VIEWS_ARMS = ("mcmc", ALL_ANNEALED, *OVERFITTING, BEST, POOLED)
+FEW_VIEWS_ARMS = ("mcmc", ALL_ANNEALED, *OVERFITTING, UNFADED_OPACITIES, BEST, POOLED)
 CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4", BEST)
 MARKER = re.compile(r"(<!-- study:([a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 

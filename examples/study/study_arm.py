@@ -15,6 +15,7 @@ BASELINE = "mcmc"
 ALL_ANNEALED = "annealed-4-0.4+faded"
 DEFAULTS = "annealed-4-opacities-1+faded"  # what `PhaseScheduler(total_steps)` is
 POOLED = f"{DEFAULTS}+pooled"
+UNFADED_OPACITIES = f"{DEFAULTS}-opacities-unfaded"
 # As measured, so that a change of the package's defaults does not change what an arm was.
 DEFAULT_ANNEALING = Annealing(4.0, 0.4, opacity_peak=1.0)
 DEFAULT_PARTS: dict[str, Any] = {"annealing": DEFAULT_ANNEALING, "fading": Fading()}

@@ -22,6 +22,20 @@ def canonical_name(name: str | None) -> str | None:
     return _CANONICAL.get(name) if name is not None else None
 
 
+def check_names(call: str, names: Any) -> tuple[str, ...]:
+    """Gsplat's names of these Gaussian parameters; ValueError for another name, or none at all."""
+    known: tuple[str | None, ...] = ()
+    if isinstance(names, (tuple, list)):
+        known = tuple(canonical_name(n) if isinstance(n, str) else None for n in names)
+    found = tuple(name for name in known if name is not None)
+    if not found or len(found) < len(known):
+        raise ValueError(
+            f"{call}: names={names!r}, but a tuple of Gaussian parameters' names is needed: "
+            f"{', '.join(GAUSSIAN_NAMES)}"
+        )
+    return found
+
+
 def is_positions(group: Mapping[str, Any]) -> bool:
     """Whether a parameter group holds the Gaussians' positions."""
     return canonical_name(group.get("name")) == "means"

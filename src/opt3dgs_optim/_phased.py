@@ -151,14 +151,14 @@ class PhasedAdam(LQNAdam):
                     state[key].zero_()
 
     def _fade(self) -> None:
-        """The fading events since the last iteration, in the Gaussian parameters only."""
+        """The fading events since the last iteration, in the parameters that it covers."""
         fading, scheduler = self.scheduler.fading, self.scheduler
         if fading is None or scheduler.num_observed == 0:
             return
         now, total = scheduler.iteration, scheduler.total_steps
         events = range(fading.events_before(now - 1, total), fading.events_before(now, total))
         if events:
-            groups = [g for g in self.param_groups if self._is_points(g)]
+            groups = [g for g in self.param_groups if fading.covers(g.get("name"))]
             fading.fade(
                 {p: self.state[p] for g in groups for p in g["params"] if p in self.state}, events
             )

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim._checks import check_count, check_number
+from opt3dgs_optim._groups import canonical_name, check_names
 
 CALL = "Fading"
 
@@ -23,7 +24,7 @@ class Fading:
     while exp_avg_sq needs a thousand to recover: until then the point's steps are up to five times
     longer. So fading is a larger learning rate for single points, for a while.
 
-    The same points are faded in all Gaussian parameters. Which ones depends on `seed`, the event
+    The same points are faded in all these parameters. Which ones depends on `seed`, the event
     and the number of points alone: a resumed run repeats them. It costs no memory.
 
     Args:
@@ -33,9 +34,10 @@ class Fading:
         events: how many over the run.
         start, stop: where the first and the last event are, as shares of the run.
         seed: of the choice of points.
+        names: the Gaussian parameters, under gsplat's or INRIA's names; None: all of them.
 
     Raises:
-        ValueError: an option is outside what is allowed.
+        ValueError: an option is outside what is allowed, or a name is no Gaussian parameter's.
     """
 
     share: float = 0.2
@@ -45,6 +47,7 @@ class Fading:
     start: float = 0.03
     stop: float = 0.5
     seed: int = 0
+    names: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         check_number(CALL, "share", self.share, 0.0, 1.0, open_low=True)
@@ -54,6 +57,17 @@ class Fading:
         check_number(CALL, "start", self.start, 0.0, 1.0)
         check_number(CALL, "stop", self.stop, self.start, 1.0, open_low=True)
         check_count(CALL, "seed", self.seed, 0)
+        if self.names is not None:
+            object.__setattr__(self, "names", check_names(CALL, self.names))
+
+    def covers(self, name: str | None) -> bool:
+        """Whether a parameter is faded.
+
+        Args:
+            name: its name, gsplat's or INRIA's; None is no Gaussian parameter.
+        """
+        known = canonical_name(name)
+        return known is not None and (self.names is None or known in self.names)
 
     def events_before(self, iteration: int, total_steps: int) -> int:
         """Number of events before the step of this iteration (from 0)."""

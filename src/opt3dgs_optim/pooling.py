@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from opt3dgs_optim._groups import GAUSSIAN_NAMES, canonical_name
+from opt3dgs_optim._groups import canonical_name, check_names
 from opt3dgs_optim._visible import shaped
 
 CALL = "Pooling"
@@ -43,16 +43,7 @@ class Pooling:
     names: tuple[str, ...] = ("means", "scales", "quats")
 
     def __post_init__(self) -> None:
-        names: Any = self.names
-        known: tuple[str | None, ...] = ()
-        if isinstance(names, (tuple, list)):
-            known = tuple(canonical_name(n) if isinstance(n, str) else None for n in names)
-        if not known or None in known:
-            raise ValueError(
-                f"{CALL}: names={names!r}, but a tuple of Gaussian parameters' names is needed: "
-                f"{', '.join(GAUSSIAN_NAMES)}"
-            )
-        object.__setattr__(self, "names", known)
+        object.__setattr__(self, "names", check_names(CALL, self.names))
 
     def covers(self, name: str | None) -> bool:
         """Whether a parameter is pooled.
