@@ -86,7 +86,7 @@ class OwnStep:
         if self._sizes.get(name, (-1, 1.0))[0] != now:
             self._sizes[name] = (now, self._size(name))
         wanted = self.first ** (1 - progress) * self.final**progress
-        return min(wanted / self._sizes[name][1], LARGEST_FACTOR)
+        return wanted / max(self._sizes[name][1], wanted / LARGEST_FACTOR)
 
     def _size(self, name: str) -> float:
         """Root mean square of the step over the learning rate; 1 before the first one."""
