@@ -36,6 +36,7 @@ FREE = "any value is meaningful, or torch raises where it is used"
 NOT_NUMBERS = [math.nan, math.inf, "0.5", None, True, [0.5]]
 FLAGS = [1, 0, "yes", None, 0.0]
 COUNTS = [-1, 2.0, "3", None, True, math.nan]
+NOT_NAMES = ["means", 3, (), ("means", "camera"), (3,), ([],)]
 CHOICES = ["no such choice", 1, None, True, ["raw"]]
 INTERVALS = [(1.0, 0.0), (0.0, 0.0), (0.0,), (0.0, math.inf), (math.nan, 1.0), 0.5, "wide"]
 
@@ -146,7 +147,7 @@ TABLE: dict[str, tuple[Callable[..., Any], type, dict[str, Any]]] = {
     "Pooling": (
         Pooling,
         Pooling,
-        {"names": ["means", 3, (), ("means", "camera"), (3,), ([],)]},
+        {"names": NOT_NAMES},
     ),
     "Fading": (
         Fading,
@@ -159,6 +160,7 @@ TABLE: dict[str, tuple[Callable[..., Any], type, dict[str, Any]]] = {
             "start": [*NOT_NUMBERS, -0.1, 1.1],
             "stop": [*NOT_NUMBERS, 0.03, 1.1],
             "seed": COUNTS,
+            "names": NOT_NAMES,
         },
     ),
     "ConstantMultiplier": (

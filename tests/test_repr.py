@@ -12,7 +12,7 @@ import torch
 from torch.optim import Optimizer
 from trainers import everything
 
-from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam, PhaseScheduler
+from opt3dgs_optim import AWSGLD, EnergyHistogram, Fading, LQNAdam, PhaseScheduler
 from opt3dgs_optim.noise import CovarianceNoise, IsotropicNoise
 
 
@@ -168,6 +168,13 @@ def test_what_an_adaptive_run_has_switched_off() -> None:
         assert only(said, "nu:") == "nu: off"
     assert "switched off" not in repr(PhaseScheduler(2000))
     assert "adaptive" not in repr(PhaseScheduler(2000))
+
+
+def test_a_part_with_many_options_takes_two_lines() -> None:
+    names = ("means", "scales", "quats", "sh0", "shN")
+    said = repr(PhaseScheduler(2000, fading=Fading(names=names)))
+    assert max(map(len, said.splitlines())) <= 100
+    assert f"names={names}" in " ".join(said.split())
 
 
 def test_a_part_that_is_switched_on_again_is_no_longer_listed() -> None:

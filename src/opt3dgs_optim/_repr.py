@@ -99,7 +99,9 @@ def scheduler_lines(scheduler: Any) -> list[str]:
     if scheduler.noise is not None:
         lines.append(noise_line(scheduler.noise))
     parts = (getattr(scheduler, name, None) for name in ("annealing", "fading", "pooling"))
-    lines += [str(part) for part in parts if part is not None]
+    for part in parts:
+        if part is not None:
+            lines += textwrap.wrap(str(part), WIDTH, subsequent_indent="  ")
     return lines + adaptive_lines(scheduler.switched_off) if scheduler.adaptive else lines
 
 
