@@ -27,7 +27,7 @@ COLOURS = {
     DEFAULTS: "#0072b2",
     POOLED: "#009e73",
 }
-SHOWN_FROM = 0.25  # of an arm's seconds: what it does before may be out of the picture
+SHOWN_FROM = 0.25  # of an arm's seconds: what it falls to before may be out of the picture
 VERDICT_COLOURS = {"pays": "#009e73", "does not pay": "#999999", "undecided": "#e69f00"}
 DPI = 150
 
@@ -52,7 +52,7 @@ def plot_curves(study: Study, settings: Sequence[Setting], arms: Sequence[str], 
             axis.fill_between(seconds, low, high, color=colour, alpha=0.15, lw=0)
             handles.setdefault(label(arm), line)
             late = seconds >= SHOWN_FROM * seconds[-1]
-            shown += [*low[late], *high[late]]
+            shown += [*low[late], high.max()]
         axis.set_title(f"{setting.scene}, {setting.points:,} points", fontsize=10)
         margin = 0.05 * (max(shown) - min(shown))
         axis.set_ylim(min(shown) - margin, max(shown) + margin)
