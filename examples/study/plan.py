@@ -46,6 +46,7 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
     on_defaults = [name for name in multiplied if name.startswith(DEFAULTS)]
     later += [name for name in multiplied if name not in on_defaults]
     beyond = [arm.name for arm in leads()]
+    same_view = [arm.name for arm in leads() if arm.host.get("same_view")]
 
     def cross(
         scenes: Sequence[str],
@@ -78,6 +79,7 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         "rest": cross(QUICK_SCENES, later, seeds, 3_000),
         "leads": cross(QUICK_SCENES, beyond, seeds, 3_000),
         "confirmed": cross(SCENES, CONFIRMED, seeds, 3_000),
+        "same-view": cross(SCENES, same_view, seeds, 3_000),
         "options": cross(SCENES, options, seeds, 3_000),
         "random": cross(SCENES, two, seeds, 3_000, init="random"),
         "small": cross(SCENES, two, seeds, 3_000, share=0.25),
