@@ -6,6 +6,7 @@ import inspect
 import json
 import math
 import re
+import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -16,7 +17,7 @@ import torch
 from splatting.arms import NOISE_LR
 from splatting.fit import FitOptions
 from splatting.scenes import load_scene
-from study import report
+from study import report, steps
 from study.analysis import Study
 from study.arms import BASELINE, STUDY_ARMS, find_study_arm
 from study.decisions import COMPARISONS, decide
@@ -370,6 +371,16 @@ def test_records_survive_writing(tmp_path: Path) -> None:
     assert re.fullmatch(r"\d{4}-\d\d-\d\d", one.date)
     assert Study([one, other]).settings(20) == [one.setting]
     assert Study([one, other]).settings(20, sh_degree=1) == [other.setting]
+
+
+def test_the_picture_of_the_steps_is_drawn_from_its_file(tmp_path: Path) -> None:
+    committed = report.FOLDER / "steps.json"
+    data = json.loads(committed.read_text(encoding="utf-8"))
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", data["date"])
+    assert "torch" in data["machine"]
+    shutil.copy(committed, tmp_path)
+    assert steps.main(["--redraw", "-o", str(tmp_path)]) == 0
+    assert (tmp_path / "steps.png").stat().st_size > 10_000
 
 
 def test_machines_and_days_are_said() -> None:

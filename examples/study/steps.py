@@ -12,6 +12,7 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from tqdm import tqdm
 from study.arms import find_study_arm
 from study.fitting import StudyFit
 from study.plots import COLOURS, DPI
+from study.training import machine
 
 mpl.use("Agg")
 
@@ -74,8 +76,8 @@ def draw(data: dict[str, Any], path: Path) -> None:
         1, len(names), figsize=(3.0 * len(names), 3.0), sharey=True, layout="constrained"
     )
     for axis, name in zip(axes, names, strict=True):
-        for colour, (arm, run) in zip(COLOURS, data["arms"].items(), strict=False):
-            axis.plot(run["rows"]["iteration"], run["rows"][name], color=colour, label=arm)
+        for arm, run in data["arms"].items():
+            axis.plot(run["rows"]["iteration"], run["rows"][name], color=COLOURS[arm], label=arm)
         axis.set_title(name, fontsize=10)
         axis.set_yscale("log")
         axis.set_xlabel("iteration")
@@ -103,7 +105,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             torch.set_num_threads(1)
             scene = load_scene(args.scene)
             runs = {arm: step_lengths(scene, arm, args.iterations, args.points) for arm in ARMS}
-            about = {"scene": scene.name, "iterations": args.iterations, "points": args.points}
+            about = {
+                "machine": machine(),
+                "date": date.today().isoformat(),
+                "scene": scene.name,
+                "iterations": args.iterations,
+                "points": args.points,
+            }
             args.out.mkdir(parents=True, exist_ok=True)
             path.write_text(json.dumps({**about, "arms": runs}) + "\n", encoding="utf-8")
         draw(json.loads(path.read_text(encoding="utf-8")), args.out / "steps.png")
