@@ -22,6 +22,7 @@ from study.study_arm import (
     fixed,
 )
 
+PARAMETERS = ("means", "scales", "quats", "opacities", "sh0")  # of the study's scenes
 EIGENVALUE_FLOOR = 1e-3  # of a point's largest
 
 
@@ -36,7 +37,7 @@ def leads() -> list[StudyArm]:
             BASELINE,
             fixed(annealing=Annealing({name: 8.0}, 0.4)),
         )
-        for name in ("means", "scales", "quats", "opacities", "sh0")
+        for name in PARAMETERS
     ]
     fading = [
         StudyArm(f"faded-{key}", what, "faded", fixed(fading=fading))
@@ -146,7 +147,7 @@ def _chosen() -> list[StudyArm]:
             BASELINE,
             fixed(fading=Fading(names=(name,))),
         )
-        for name in ("means", "scales", "quats", "opacities", "sh0")
+        for name in PARAMETERS
     ]
     return [
         *single,
@@ -232,7 +233,7 @@ def _small_gradients() -> list[StudyArm]:
             host={"relative_eps": dict.fromkeys(names, share)},
         )
         for key, names, share in (
-            ("all", ("means", "scales", "quats", "opacities", "sh0"), 0.1),
+            ("all", PARAMETERS, 0.1),
             ("opacities", ("opacities",), 0.1),
         )
     ]
