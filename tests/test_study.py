@@ -28,6 +28,7 @@ from study.records import COLUMNS, Record, Setting, gather, merge, read, write
 from study.run import main as run_study
 from study.tables import machines_line
 from study.training import Spec, machine, train
+from study.view_angles import nearest_angles
 from torch import Tensor
 
 from opt3dgs_optim import Annealing, EnergyHistogram, PhaseScheduler
@@ -381,6 +382,20 @@ def test_the_picture_of_the_steps_is_drawn_from_its_file(tmp_path: Path) -> None
     shutil.copy(committed, tmp_path)
     assert steps.main(["--redraw", "-o", str(tmp_path)]) == 0
     assert (tmp_path / "steps.png").stat().st_size > 10_000
+
+
+def test_angles_between_views() -> None:
+    scene = _embedded()
+    first, second = scene.train[:2]
+    directions = [
+        np.asarray(v.camera.position - scene.points.median(0).values) for v in (first, second)
+    ]
+    lengths = [np.linalg.norm(d) for d in directions]
+    between = math.degrees(math.acos(directions[0] @ directions[1] / math.prod(lengths)))
+    assert nearest_angles(replace(scene, train=[first], test=[second])) == pytest.approx(
+        [between], rel=1e-3
+    )
+    assert nearest_angles(replace(scene, test=[first])) == pytest.approx([0.0], abs=0.1)
 
 
 def test_machines_and_days_are_said() -> None:
