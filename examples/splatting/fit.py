@@ -25,7 +25,7 @@ from splatting.gaussians import (
     stock_learning_rates,
 )
 from splatting.metrics import photometric_loss, psnr, ssim
-from splatting.rasterizer import render
+from splatting.rasterizer import Rendering, render
 from splatting.scenes import Scene, View
 from splatting.stopping import StopRequest
 
@@ -124,7 +124,7 @@ class Fit:
         """One iteration; returns the detached loss."""
         index = self._next_view()
         view = self.scene.train[index]
-        image = render(self.gaussians, view.camera, sh_degree=self.options.sh_degree).image
+        image = self._render(view).image
         pixel_loss = None if self.phases is None else self.phases.pixel_loss
         loss = photometric_loss(image, view.image, pixel_loss)
         if self.arm.mcmc:
@@ -177,9 +177,11 @@ class Fit:
     @torch.no_grad()
     def image(self, view: View) -> Tensor:
         """The render of a view, [H, W, 3] in 0..1."""
-        return render(self.gaussians, view.camera, sh_degree=self.options.sh_degree).image.clamp(
-            0, 1
-        )
+        return self._render(view).image.clamp(0, 1)
+
+    def _render(self, view: View) -> Rendering:
+        degree, background = self.options.sh_degree, self.scene.background
+        return render(self.gaussians, view.camera, sh_degree=degree, background=background)
 
     def compile_kernels(self) -> None:
         """Have the rasterizer compiled, or loaded from its cache, before the run's clock starts."""

@@ -113,6 +113,13 @@ def core() -> list[StudyArm]:
             29 / 30,
             preset=paper_scheduler,
         ),
+        StudyArm(
+            "paper-constant",
+            "a constant multiplier, the paper's mean nu",
+            BASELINE,
+            _constant,
+            needs="paper",
+        ),
     ]
 
 

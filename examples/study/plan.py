@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from study.arms import STUDY_ARMS, core, histograms, last_phases, leads, on_top, with_nu
 from study.study_arm import ALL_ANNEALED, DEFAULTS, POOLED, UNFADED_OPACITIES
@@ -13,6 +14,9 @@ from study.training import Spec
 SCENES = ("plush", "banana", "lund_door", "brighton_beach", "embedded")
 QUICK_SCENES = ("banana", "embedded")  # for the options of a part
 FEW_VIEWS_SCENES = ("brighton_beach", "plush")  # fewest views to speak of over-fitting, and most
+MANY_VIEWS_SCENES = ("bonsai", "lego", "plush")
+ROTATED_SCENES = (*MANY_VIEWS_SCENES, "embedded", "banana", "lund_door", "brighton_beach")
+ROTATED_ARMS = ("mcmc", DEFAULTS, "paper", "paper-constant", "faded", "rates-x2", POOLED)
 FULL_PARTS_SCENES = ("brighton_beach", "lund_door")  # where the defaults lose
 OVERFITTING = (
     *(f"{ALL_ANNEALED}{x}" for x in ("-means-1", "+decoupled", "+regularisers-0")),
@@ -20,7 +24,7 @@ OVERFITTING = (
     *(f"{arm}+regularisers-0" for arm in (DEFAULTS, POOLED)),
 )
 POINTS = 4_000
-EMBEDDED_POINTS = 2_000
+NUM_POINTS = {"embedded": 2_000, "bonsai": 10_000, "lego": 10_000}
 CONFIRMED = ("faded-v-only", f"{DEFAULTS}-v-only")  # what gained most among the other leads
 FIRST_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "annealed-8-0.4", "faded")
 
@@ -54,11 +58,10 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         count: int,
         iterations: int,
         share: float = 1.0,
-        init: str = "sfm",
-        sh_degree: int = 0,
+        **others: Any,
     ) -> list[Spec]:
         return [
-            Spec(scene, arm, seed, iterations, round(points_of(scene) * share), init, sh_degree)
+            Spec(scene, arm, seed, iterations, round(points_of(scene) * share), **others)
             for seed in range(count)
             for scene in scenes
             for arm in arms
@@ -74,6 +77,15 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         "defaults": cross(SCENES, [ALL_ANNEALED, DEFAULTS, POOLED], seeds, 3_000),
         "long-parts": cross(SCENES, [*longer, UNFADED_OPACITIES], 1, 7_500),
         "full": cross(SCENES, [*two, POOLED], 1, 30_000),
+        "rotated-first": cross(MANY_VIEWS_SCENES, two, 1, 30_000, rotated=True),
+        "rotated": [
+            spec
+            for seed in range(seeds)
+            for scenes in (MANY_VIEWS_SCENES, ROTATED_SCENES[len(MANY_VIEWS_SCENES) :])
+            for arm in ROTATED_ARMS
+            for spec in cross(scenes, [arm], seeds, 30_000, rotated=True)
+            if spec.seed == seed
+        ],
         "full-parts": cross(FULL_PARTS_SCENES, [UNFADED_OPACITIES], 1, 30_000),
         "with-nu": cross(SCENES, on_defaults, seeds, 3_000),
         "rest": cross(QUICK_SCENES, later, seeds, 3_000),
@@ -91,7 +103,7 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
 
 def points_of(scene: str) -> int:
     """The most Gaussians of a scene."""
-    return EMBEDDED_POINTS if scene == "embedded" else POINTS
+    return NUM_POINTS.get(scene, POINTS)
 
 
 def plan(root: Path, out: Path, only: list[str] | None = None, seeds: int = 3) -> list[Training]:
@@ -133,5 +145,6 @@ def folder_of(spec: Spec, out: Path) -> Path:
     kind = f"{spec.points}-{spec.iterations}-{spec.init}"
     if spec.sh_degree:
         kind += f"-sh{spec.sh_degree}"
+    kind += "-rotated" * spec.rotated
     arm = spec.arm.replace("/", "_")
     return out / Path(spec.scene).name / kind / arm / f"seed-{spec.seed}"

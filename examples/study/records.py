@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-COLUMNS = ("iteration", "seconds", "psnr", "ssim", "train_psnr", "num_points")
+COLUMNS = ("iteration", "seconds", "psnr", "ssim", "train_psnr", "num_points", "lpips")
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,8 @@ class Setting:
     iterations: int
     init: str
     sh_degree: int = 0
+    rotated: bool = False  # the seed says which views are held out
+    size: str = "small"
 
 
 @dataclass(frozen=True)
@@ -76,15 +78,16 @@ def gather(folder: Path) -> list[dict[str, Any]]:
         record = json.loads(path.read_text(encoding="utf-8"))
         if record.get("finished"):
             del record["finished"]
-            record["curve"] = [[row[name] for name in COLUMNS] for row in record["curve"]]
+            record["curve"] = [[row.get(name) for name in COLUMNS] for row in record["curve"]]
             found.append(record)
     return found
 
 
 def merge(old: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """All of both; a training that both have is the new one."""
-    keys = (*(field.name for field in fields(Setting)), "arm", "seed")
-    kept = {tuple(record[key] for key in keys): record for record in (*old, *new)}
+    optional = {field.name: field.default for field in fields(Setting)}
+    keys = (*optional, "arm", "seed")
+    kept = {tuple(r.get(k, optional.get(k)) for k in keys): r for r in (*old, *new)}
     return [kept[key] for key in sorted(kept)]
 
 
@@ -98,18 +101,19 @@ def write(records: list[dict[str, Any]], path: Path) -> None:
 def read(path: Path) -> list[Record]:
     """The records of a committed file."""
     data = json.loads(path.read_text(encoding="utf-8"))
-    if data.get("columns") != list(COLUMNS):
-        raise ValueError(f"{path}: columns {data.get('columns')}, but {list(COLUMNS)} are needed")
-    return [_record(entry) for entry in data["records"]]
+    columns = data.get("columns", [])
+    if not set(COLUMNS) - {"lpips"} <= set(columns):
+        raise ValueError(f"{path}: columns {columns}, but {list(COLUMNS)} are needed")
+    return [_record(entry, columns) for entry in data["records"]]
 
 
-def _record(entry: dict[str, Any]) -> Record:
+def _record(entry: dict[str, Any], columns: list[str]) -> Record:
     table = np.array(entry["curve"], dtype=float)
     return Record(
-        Setting(*(entry[field.name] for field in fields(Setting))),
+        Setting(**{f.name: entry[f.name] for f in fields(Setting) if f.name in entry}),
         entry["arm"],
         entry["seed"],
-        {name: table[:, i] for i, name in enumerate(COLUMNS)},
+        {name: table[:, i] for i, name in enumerate(columns)},
         entry["mean_nu"],
         entry["state_bytes"],
         entry["peak_rss_bytes"],

@@ -43,13 +43,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--stages", help="comma-separated; all where not given")
     add("--seeds", type=int, default=3)
     add("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="trainings at a time")
+    add("--lpips", nargs=2, metavar=("FILE.py", "WEIGHTS"), help="see perceptual.py")
     add("-o", "--out", type=Path, default=Path("runs/study"), metavar="DIR")
     args = parser.parse_args(arguments)
     try:
         stages = args.stages.split(",") if args.stages else None
         trainings = plan(args.scenes, args.out, stages, args.seeds)
         stop_at_once()
-        failed = _train_all(trainings, args.jobs)
+        failed = _train_all(trainings, args.jobs, args.lpips)
     except (OSError, ValueError) as error:
         print(f"study: {error}", file=sys.stderr)
         return 2
@@ -61,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if failed else 0
 
 
-def _train_all(trainings: list[Training], jobs: int) -> list[Path]:
+def _train_all(trainings: list[Training], jobs: int, lpips: list[str] | None = None) -> list[Path]:
     done = {t.folder for t in trainings if finished(t.folder)}
     waiting = _batches([t for t in trainings if t.folder not in done])
     running: dict[Path, tuple[list[Training], subprocess.Popen[bytes]]] = {}
@@ -74,7 +75,7 @@ def _train_all(trainings: list[Training], jobs: int) -> list[Path]:
             ready = [b for b in waiting if all(n in done for t in b for n in t.needs)]
             for batch in ready[: max(jobs - len(running), 0)]:
                 waiting.remove(batch)
-                running[batch[0].folder] = (batch, _start(batch))
+                running[batch[0].folder] = (batch, _start(batch, lpips))
             if not running:  # what the others need has failed
                 failed += [t.folder for batch in waiting for t in batch]
                 break
@@ -115,15 +116,15 @@ def _batches(trainings: list[Training]) -> list[list[Training]]:
     return apart
 
 
-def _start(batch: list[Training]) -> subprocess.Popen[bytes]:
-    calls = [str(_write_call(training)) for training in batch]
+def _start(batch: list[Training], lpips: list[str] | None) -> subprocess.Popen[bytes]:
+    calls = [str(_write_call(training, lpips)) for training in batch]
     words = [sys.executable, str(Path(__file__).with_name("training.py")), *calls]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     with (batch[0].folder / "error.txt").open("wb") as errors:
         return subprocess.Popen(words, env=environment, stderr=errors, start_new_session=True)
 
 
-def _write_call(training: Training) -> Path:
+def _write_call(training: Training, lpips: list[str] | None) -> Path:
     training.folder.mkdir(parents=True, exist_ok=True)
     nu = None
     if training.nu_from is not None:
@@ -135,6 +136,7 @@ def _write_call(training: Training) -> Path:
         "folder": str(training.folder),
         "trunk": None if training.trunk is None else str(training.trunk),
         "mean_nu": nu,
+        "lpips": lpips,
     }
     path = training.folder / "call.json"
     path.write_text(json.dumps(call), encoding="utf-8")

@@ -12,8 +12,9 @@ import platform
 import resource
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +23,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 import torch
 from splatting.fit import FitOptions
-from splatting.scenes import Scene, load_scene
+from splatting.scenes import Background, Scene, Size, load_scene
 
 from study.arms import find_study_arm
 from study.fitting import StudyFit
+from study.perceptual import NET, load_tool, mean_lpips
 
+BACKGROUNDS: dict[str, Background] = {"lego": "white"}
 BRANCH_SHARES = (0.75, 0.9, 29 / 30)  # where the arms of the last phase branch off
 
 
@@ -41,6 +44,8 @@ class Spec:
     points: int
     init: str = "sfm"
     sh_degree: int = 0
+    size: Size = "small"
+    rotated: bool = False  # the seed says which views are held out: index = seed modulo 8
 
     def options(self) -> FitOptions:
         """For `Fit`; a trunk and its branches share them."""
@@ -48,10 +53,23 @@ class Spec:
         return FitOptions(self.iterations, self.points, self.seed, init, self.sh_degree, 1.0)
 
 
-def train(spec: Spec, folder: Path, trunk: Path | None, mean_nu: float | None) -> dict[str, Any]:
+def train(
+    spec: Spec,
+    folder: Path,
+    trunk: Path | None,
+    mean_nu: float | None,
+    lpips: Callable[[Scene, list[np.ndarray]], float] | None = None,
+) -> dict[str, Any]:
     """Train to the end; return the record that is also in `folder/record.json`."""
+
+    def evaluate() -> dict[str, float]:
+        metrics = fit.evaluate()
+        if lpips is not None:
+            metrics["lpips"] = lpips(scene, renders(fit))
+        return {name: round(value, 4) for name, value in metrics.items()}
+
     torch.set_num_threads(1)
-    scene, arm = _scene(spec.scene), find_study_arm(spec.arm)
+    scene, arm = scene_of(spec), find_study_arm(spec.arm)
     fit = StudyFit(scene, arm, spec.options(), mean_nu)
     checkpoint, path = folder / "checkpoint.pt", folder / "record.json"
     total, marks = spec.iterations, _marks(spec.iterations)
@@ -74,7 +92,7 @@ def train(spec: Spec, folder: Path, trunk: Path | None, mean_nu: float | None) -
         record["seconds"] = record["curve"][-1]["seconds"]
     fit.compile_kernels()
     if not record["curve"]:
-        record["curve"].append({"iteration": 0, "seconds": 0.0, **_rounded(fit.evaluate())})
+        record["curve"].append({"iteration": 0, "seconds": 0.0, **evaluate()})
     while fit.iteration < total:
         start = time.process_time()
         while True:
@@ -82,9 +100,8 @@ def train(spec: Spec, folder: Path, trunk: Path | None, mean_nu: float | None) -
             if fit.iteration in marks:
                 break
         record["seconds"] = round(record["seconds"] + time.process_time() - start, 3)
-        metrics = _rounded(fit.evaluate())
-        now = {"iteration": fit.iteration, "seconds": record["seconds"], **metrics}
-        record["curve"].append(now)
+        now = {"iteration": fit.iteration, "seconds": record["seconds"]}
+        record["curve"].append({**now, **evaluate()})
         if fit.iteration in (round(share * total) for share in BRANCH_SHARES):
             fit.save(folder / f"at-{fit.iteration}.pt")
         _write(path, record)
@@ -95,10 +112,14 @@ def train(spec: Spec, folder: Path, trunk: Path | None, mean_nu: float | None) -
     record["machine"] = machine()
     record["date"] = time.strftime("%Y-%m-%d", time.gmtime())
     record["finished"] = True
-    images = [(255 * fit.image(view)).round().to(torch.uint8).numpy() for view in scene.test]
-    np.savez_compressed(folder / "renders.npz", *images)
+    np.savez_compressed(folder / "renders.npz", *renders(fit))
     _write(path, record)
     return record
+
+
+def renders(fit: StudyFit) -> list[np.ndarray]:
+    """The test views as they are now, [H, W, 3] uint8 each."""
+    return [(255 * fit.image(view)).round().to(torch.uint8).numpy() for view in fit.scene.test]
 
 
 def machine() -> str:
@@ -107,19 +128,28 @@ def machine() -> str:
     return f"{system}, {os.cpu_count()} cores, torch {torch.__version__}"
 
 
+def scene_of(spec: Spec) -> Scene:
+    """The scene with the views that this training holds out."""
+    return _scene(spec.scene, spec.size, spec.seed % 8 if spec.rotated else None)
+
+
 @cache
-def _scene(source: str) -> Scene:
-    return load_scene(source)
+def perceptual(tool: Path, weights: Path) -> Callable[[Scene, list[np.ndarray]], float]:
+    """LPIPS of renders of a scene's test views; see `perceptual.py` for the tool."""
+    module = load_tool(tool)
+    return partial(mean_lpips, module, module.load(weights, NET))
+
+
+@cache
+def _scene(source: str, size: Size, held_out: int | None) -> Scene:
+    background = BACKGROUNDS.get(Path(source).name, "black")
+    return load_scene(source, size, background=background, held_out=held_out)
 
 
 def _marks(total: int) -> set[int]:
     """Iterations to evaluate at: every twentieth, and where arms branch off."""
     every = max(total // 20, 1)
     return {*range(every, total, every), *(round(s * total) for s in BRANCH_SHARES), total}
-
-
-def _rounded(metrics: dict[str, float]) -> dict[str, float]:
-    return {name: round(value, 4) for name, value in metrics.items()}
 
 
 def _write(path: Path, record: dict[str, Any]) -> None:
@@ -133,7 +163,8 @@ def main() -> int:
     for path in sys.argv[1:]:
         call = json.loads(Path(path).read_text(encoding="utf-8"))
         trunk = Path(call["trunk"]) if call["trunk"] else None
-        train(Spec(**call["spec"]), Path(call["folder"]), trunk, call["mean_nu"])
+        lpips = call.get("lpips") and perceptual(*map(Path, call["lpips"]))
+        train(Spec(**call["spec"]), Path(call["folder"]), trunk, call["mean_nu"], lpips)
     return 0
 
 
