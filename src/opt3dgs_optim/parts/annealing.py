@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
-from opt3dgs_optim._checks import check_number
-from opt3dgs_optim._groups import GAUSSIAN_NAMES, canonical_name
+from opt3dgs_optim.checks import check_number
+from opt3dgs_optim.course import Course
+from opt3dgs_optim.names import GAUSSIAN_NAMES, canonical_name, slot
+from opt3dgs_optim.part import Group, Part
 
 CALL = "Annealing"
 
 
 @dataclass(frozen=True)
-class Annealing:
+class Annealing(Part):
     """Multiply the step of every Gaussian parameter by a factor that falls geometrically.
 
         factor(t) = peak^(1 - t) * final^t,    t = iteration / total_steps in 0..1
@@ -58,9 +59,10 @@ class Annealing:
                     f"are {', '.join(GAUSSIAN_NAMES)}"
                 )
             peaks[known] = check_number(CALL, f"peak[{name!r}]", value, 0.0, open_low=True)
-        object.__setattr__(self, "peak", MappingProxyType(peaks))
+        object.__setattr__(self, "peak", peaks)
+        object.__setattr__(self, "names", tuple(peaks))
 
-    def factor(self, name: str | None, progress: float) -> float:
+    def at(self, name: str | None, progress: float) -> float:
         """The factor on a parameter's step.
 
         Args:
@@ -76,3 +78,12 @@ class Annealing:
             return 1.0
         t = min(max(progress, 0.0), 1.0)
         return peak ** (1.0 - t) * self.final**t
+
+    def factor(self, group: Group, course: Course) -> float:
+        """The factor on the group's next step."""
+        return self.at(slot(group), course.progress)
+
+    def numbers(self, course: Course) -> dict[str, float]:
+        """`annealing`: the factor on the steps of the positions, or of the first parameter."""
+        first = next(iter(self.peak)) if isinstance(self.peak, Mapping) else "means"
+        return {"annealing": self.at(first, course.progress)}

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import os
+import sys
+import warnings
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+import torch
 
 
 def check_number(
@@ -56,13 +61,6 @@ def check_flag(call: str, name: str, value: Any) -> bool:
     return value
 
 
-def check_part(call: str, name: str, value: Any, kind: str, *methods: str) -> Any:
-    """Return `value`, or raise ValueError unless it is None or has the attributes of a `kind`."""
-    if value is not None and not all(hasattr(value, method) for method in methods):
-        raise ValueError(f"{call}: {name}={value!r}, but {kind} or None is needed")
-    return value
-
-
 def check_interval(call: str, name: str, value: Any) -> tuple[float, float]:
     """Return `value` as (low, high) floats, or raise ValueError unless low < high, finite."""
     pair = isinstance(value, (tuple, list)) and len(value) == 2
@@ -73,3 +71,21 @@ def check_interval(call: str, name: str, value: Any) -> tuple[float, float]:
     if low >= high:
         raise ValueError(f"{call}: {name}={value!r}, but low < high is needed")
     return low, high
+
+
+def warn_user(message: str) -> None:
+    """Warn at the line outside of this package and torch from which the call came."""
+    inside = (os.path.dirname(__file__), os.path.dirname(torch.__file__))
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(inside):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level - 1)
+
+
+def check_keys(call: str, state: Any, needed: tuple[str, ...]) -> None:
+    """ValueError unless `state` is a mapping with at least the keys `needed`."""
+    if not isinstance(state, Mapping):
+        raise ValueError(f"{call}: {state!r}, but a dict is needed")
+    missing = sorted(set(needed) - set(state))
+    if missing:
+        raise ValueError(f"{call}: keys {missing} are missing")

@@ -5,18 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from opt3dgs_optim._groups import canonical_name, check_names
-from opt3dgs_optim._visible import shaped
-
-CALL = "Pooling"
-MOMENTS = ("exp_avg_sq", "max_exp_avg_sq")
+from opt3dgs_optim.course import Course
+from opt3dgs_optim.names import check_names
+from opt3dgs_optim.part import Group, Part
 
 
 @dataclass(frozen=True)
-class Pooling:
+class Pooling(Part):
     """Replace Adam's second moments of a point's coordinates by their mean (after VectorAdam).
 
         v_ij <- mean_j v_ij,    point i, coordinate j of one parameter
@@ -43,30 +40,12 @@ class Pooling:
     names: tuple[str, ...] = ("means", "scales", "quats")
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "names", check_names(CALL, self.names))
+        object.__setattr__(self, "names", check_names("Pooling", self.names))
 
-    def covers(self, name: str | None) -> bool:
-        """Whether a parameter is pooled.
-
-        Args:
-            name: its name, gsplat's or INRIA's; None is no Gaussian parameter.
-        """
-        return canonical_name(name) in self.names
-
-    @torch.no_grad()
-    def pool(self, moments: dict[str, Any], rows: Tensor | None = None) -> None:
-        """Pool the second moments of a parameter [N, ..], in place.
-
-        Args:
-            moments: its state in an optimizer; what has no second moments is left alone.
-            rows: [N] bool, the points to pool; all where it is None.
-        """
-        for key in MOMENTS:
-            moment = moments.get(key)
-            if moment is None or moment.dim() < 2 or moment.shape[0] == 0:
-                continue
-            coordinates = tuple(range(1, moment.dim()))
-            pooled = moment.mean(coordinates, keepdim=True).expand_as(moment)
-            if rows is not None:
-                pooled = torch.where(shaped(rows, moment), pooled, moment)
-            moment.copy_(pooled)
+    def after(self, group: Group, param: Tensor, state: dict[str, Any], course: Course) -> None:
+        """Pool the second moments of a parameter [N, ..], in place."""
+        for key in ("exp_avg_sq", "max_exp_avg_sq"):
+            moment = state.get(key)
+            if moment is not None and moment.dim() > 1 and moment.numel() > 0:
+                coordinates = tuple(range(1, moment.dim()))
+                moment.copy_(moment.mean(coordinates, keepdim=True).expand_as(moment))

@@ -14,19 +14,26 @@ GAUSSIAN_NAMES: Mapping[str, tuple[str, ...]] = {
     "sh0": ("sh0", "f_dc", "features_dc", "colors"),
     "shN": ("shN", "f_rest", "features_rest", "features"),
 }
+GAUSSIAN = tuple(GAUSSIAN_NAMES)
+SLOT = "gaussian"  # of a parameter group: gsplat's name of what it holds, written by `upgrade`
 _CANONICAL = {alias: name for name, aliases in GAUSSIAN_NAMES.items() for alias in aliases}
 
 
-def canonical_name(name: str | None) -> str | None:
-    """Gsplat's name of a Gaussian parameter group, or None for any other group."""
-    return _CANONICAL.get(name) if name is not None else None
+def canonical_name(name: Any) -> str | None:
+    """gsplat's name of a Gaussian parameter group, or None for any other group."""
+    return _CANONICAL.get(name) if isinstance(name, str) else None
+
+
+def slot(group: Mapping[str, Any]) -> str | None:
+    """gsplat's name of the Gaussian parameter in a group, or None: what `upgrade` said, else its own."""
+    return group[SLOT] if SLOT in group else canonical_name(group.get("name"))
 
 
 def check_names(call: str, names: Any) -> tuple[str, ...]:
-    """Gsplat's names of these Gaussian parameters; ValueError for another name, or none at all."""
+    """gsplat's names of these Gaussian parameters; ValueError for another name, or none at all."""
     known: tuple[str | None, ...] = ()
     if isinstance(names, (tuple, list)):
-        known = tuple(canonical_name(n) if isinstance(n, str) else None for n in names)
+        known = tuple(canonical_name(name) for name in names)
     found = tuple(name for name in known if name is not None)
     if not found or len(found) < len(known):
         raise ValueError(
@@ -34,8 +41,3 @@ def check_names(call: str, names: Any) -> tuple[str, ...]:
             f"{', '.join(GAUSSIAN_NAMES)}"
         )
     return found
-
-
-def is_positions(group: Mapping[str, Any]) -> bool:
-    """Whether a parameter group holds the Gaussians' positions."""
-    return canonical_name(group.get("name")) == "means"
