@@ -211,7 +211,10 @@ def _standalone(
 
 
 def _noise_of(case: str, params: dict[str, Any]) -> Any:
-    from opt3dgs_optim.noise import CovarianceNoise, IsotropicNoise
+    if IS_NEW:
+        CovarianceNoise, IsotropicNoise = package.PositionNoise, package.IsotropicNoise
+    else:
+        from opt3dgs_optim.noise import CovarianceNoise, IsotropicNoise
 
     if case == "awsgld covariance":
         return CovarianceNoise(params, NOISE_SCALE)
