@@ -79,6 +79,11 @@ class Course:
         return self.current + 1
 
     @property
+    def keeps_state(self) -> bool:
+        """Whether a checkpoint must hold anything of it."""
+        return self._has_phases or bool(self.parts)
+
+    @property
     def progress(self) -> float:
         """Share of the run before the iteration observed last, from 0."""
         return max(self.current, 0) / self.total_steps

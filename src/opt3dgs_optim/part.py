@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from torch import Tensor
@@ -54,6 +55,12 @@ class Part:
     during: ClassVar[Phase | None] = None
     keys: ClassVar[tuple[str, ...]] = ()
     names: tuple[str, ...] | None = GAUSSIAN
+
+    def __repr__(self) -> str:
+        """The options, without those of all Gaussian parameters."""
+        options = [f.name for f in fields(self)] if is_dataclass(self) else []
+        shown = [name for name in options if name != "names" or self.names != GAUSSIAN]
+        return f"{type(self).__name__}({', '.join(f'{n}={getattr(self, n)!r}' for n in shown)})"
 
     # -- once per iteration; nothing here may read a GPU's number back --------------------------
 

@@ -72,7 +72,8 @@ class Frozen:
         tensors = {key: value for key, value in state.items() if isinstance(value, Tensor)}
         if moving.dim() > 0:
             tensors.pop("step", None)
-        kept = [param.detach(), *tensors.values()]
+        # .data: putting back is no write that a part should notice by the version counter.
+        kept = [param.data, *tensors.values()]
         self._kept = [(each, each.clone(), shaped(moving, each)) for each in kept]
 
     @torch.no_grad()

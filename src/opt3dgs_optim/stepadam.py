@@ -344,7 +344,7 @@ class StepAdam(Adam):
         """torch's, with the course's inside `param_groups[0]`, and nothing of strangers' rows."""
         for param, state in self.state.items():
             self._ledger.drop_strangers(param, state, self.course.keys)
-        if not self.course.parts:
+        if not self.course.keeps_state:
             return super().state_dict()
         group = self.param_groups[0]
         group[STATE_KEY] = self.course.state_dict()

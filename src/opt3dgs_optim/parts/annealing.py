@@ -13,7 +13,7 @@ from opt3dgs_optim.part import Group, Part
 CALL = "Annealing"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Annealing(Part):
     """Multiply the step of every Gaussian parameter by a factor that falls geometrically.
 

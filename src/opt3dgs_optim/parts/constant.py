@@ -9,7 +9,7 @@ from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Group, Part, Phase
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ConstantMultiplier(Part):
     """nu = `value`, whatever the energy: a plain change of all learning rates while exploring.
 

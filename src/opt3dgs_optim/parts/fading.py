@@ -15,10 +15,10 @@ from opt3dgs_optim.part import Group, Part
 
 CALL = "Fading"
 DONE = "faded"  # of a group: events that its parameter has had
-MOST = 10  # events made up for at once, where a trainer's iteration count jumps
+MOST = 32  # events made up for at once, where a trainer's iteration count jumps
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Fading(Part):
     """Shrink Adam's state of a random share of the points, again and again (after AdamW-GS).
 

@@ -26,11 +26,8 @@ class SquaredLoss(Part):
         """Mean squared error, 0-d."""
         return error.square().mean()
 
-    def __repr__(self) -> str:
-        return "SquaredLoss()"
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FreshMoments(Part):
     """Adam's moments of the Gaussian parameters start anew at the switch.
 

@@ -12,7 +12,7 @@ from opt3dgs_optim.names import check_names
 from opt3dgs_optim.part import Group, Part
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Pooling(Part):
     """Replace Adam's second moments of a point's coordinates by their mean (after VectorAdam).
 
