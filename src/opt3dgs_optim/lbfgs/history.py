@@ -102,9 +102,9 @@ def push(history: Tensor, history_size: int, pair: Pair, accept: Tensor) -> None
     halves = history[:, :history_size].permute(1, 2, 0).unflatten(1, (2, dim + 1))
     slots = halves[:, :, :dim].unbind()  # s and y of each pair, [2, D, N]
     for slot in range(history_size - 1, 0, -1):
-        slots[slot].copy_(torch.where(accept, slots[slot - 1], slots[slot]))
-    for old, new in zip(slots[0].unbind(), (pair.s, pair.y), strict=True):
-        old.copy_(torch.where(accept, new, old))
+        torch.where(accept, slots[slot - 1], slots[slot], out=slots[slot])
+    for new, old in zip((pair.s, pair.y), slots[0].unbind(), strict=True):
+        torch.where(accept, new, old, out=old)
 
 
 def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:

@@ -143,8 +143,8 @@ def take_pairs(
     candidates = visible & (counter > 0)
     accepted = candidates & (pair.cosine > min_cosine)  # false where the pair is not finite
     push(history, history_size, pair, accepted)
-    last_position.copy_(torch.where(visible, position, last_position))
-    last_gradient.copy_(torch.where(visible, gradient, last_gradient))
+    torch.where(visible, position, last_position, out=last_position)
+    torch.where(visible, gradient, last_gradient, out=last_gradient)
     count = counter.maximum(visible.to(history.dtype)) + accepted
     counter.copy_(count.clamp(max=history_size + 1))
     return accepted, candidates

@@ -70,15 +70,15 @@ def recursion(grad: Tensor, s: Tensor, y: Tensor) -> Tensor:
     sy = dot(s, y)
     inverses = torch.threshold(sy, 0.0, torch.inf).reciprocal()  # no pair: 1 / inf = 0
     pairs = list(zip(s.unbind(), y.unbind(), inverses.unbind(), strict=True))
-    q, alphas = grad, []
+    q, alphas = grad.clone(), []
     for s_j, y_j, inverse in pairs:  # the first loop, newest to oldest
         alpha = dot(s_j, q) * inverse
-        q = torch.addcmul(q, alpha, y_j, value=-1)
+        q.addcmul_(alpha, y_j, value=-1)
         alphas.append(alpha)
     # |y| = 1, hence gamma = s.y / y.y = s.y. No pair: gamma = 1, and r stays the gradient.
-    r = q * torch.threshold(sy[0], 0.0, 1.0)
+    r = q.mul_(torch.threshold(sy[0], 0.0, 1.0))
     # The second loop, oldest to newest.
     for (s_j, y_j, inverse), alpha in zip(reversed(pairs), reversed(alphas), strict=True):
-        change = alpha - dot(y_j, r) * inverse
-        r = torch.addcmul(r, change, s_j)
+        beta = dot(y_j, r).mul_(inverse)
+        r.addcmul_(alpha.sub_(beta), s_j)
     return r
