@@ -18,66 +18,37 @@ to gather by row, which costs torch more than all the arithmetic; and the header
 memory sectors anyway. In memory, a history that torch computes on is transposed (strides of a
 [slots, lanes, N] tensor), one that the CUDA kernel computes on is contiguous; every function here
 takes both.
-
-A history of half-size pairs has two dimensions instead of three: see `_packed`.
 """
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from opt3dgs_optim import _packed, _pairs
-from opt3dgs_optim._pairs import Pair
+from opt3dgs_optim.lbfgs.columns import columns
+from opt3dgs_optim.lbfgs.pairs import Pair, normalised_pair
 
 MAX_HISTORY = 16
 
-PairDtype = Literal["float32", "bfloat16"]
-PAIR_DTYPES: tuple[PairDtype, ...] = ("float32", "bfloat16")
 
-
-def num_slots(history_size: int, dim: int) -> int:
-    """Slots of a history tensor for `history_size` pairs of points with `dim` coordinates."""
-    return history_size if history_size > dim else history_size + 1
-
-
-def history_shape(
-    points: Tensor, history_size: int, pair_dtype: PairDtype = "float32"
-) -> tuple[int, ...]:
-    """Shape of the history of `points` [N, D]."""
+def history_shape(points: Tensor, history_size: int) -> tuple[int, int, int]:
+    """Shape of the history of `points` [N, D] for `history_size` pairs of each."""
     rows, dim = points.shape
-    if pair_dtype == "bfloat16":
-        return rows, _packed.num_lanes(history_size, dim)
-    return rows, num_slots(history_size, dim), 2 * (dim + 1)
+    return rows, history_size + (history_size <= dim), 2 * (dim + 1)
 
 
-def new_history(
-    points: Tensor,
-    history_size: int,
-    *,
-    contiguous: bool = False,
-    pair_dtype: PairDtype = "float32",
-) -> Tensor:
+def new_history(points: Tensor, history_size: int, *, contiguous: bool = False) -> Tensor:
     """An empty history for `points` [N, D]; float32, or float64 for float64 points.
 
     `contiguous` is for the CUDA kernel; otherwise the memory is laid out for torch.
-
-    Raises:
-        ValueError: half-size pairs for float64 points.
     """
     dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
-    if pair_dtype == "bfloat16" and dtype == torch.float64:
-        raise ValueError(
-            "LQNAdam: pair_dtype='bfloat16' for a parameter of torch.float64, but one of "
-            "torch.float32 or fewer bits is needed"
-        )
-    shape = history_shape(points, history_size, pair_dtype)
+    rows, *cells = history_shape(points, history_size)
     if contiguous:
-        return torch.zeros(shape, dtype=dtype, device=points.device)
-    cells = torch.zeros((*shape[1:], shape[0]), dtype=dtype, device=points.device)
-    return cells.movedim(-1, 0)
+        return torch.zeros(rows, *cells, dtype=dtype, device=points.device)
+    return torch.zeros(*cells, rows, dtype=dtype, device=points.device).movedim(-1, 0)
 
 
 def laid_out(history: Tensor, *, contiguous: bool) -> Tensor:
@@ -96,45 +67,28 @@ class Header(NamedTuple):
     counter: Tensor  # [N] 0: never visible; c: holds c - 1 pairs
 
 
-def is_packed(history: Tensor) -> bool:
-    """Whether these are half-size pairs."""
-    return history.dim() == 2
-
-
 def header(history: Tensor, history_size: int) -> Header:
-    """The header's views into `history` [N, slots, 2 (D + 1)], or [N, lanes]."""
-    if is_packed(history):
-        return _whole_header(history, _packed.num_coordinates(history.shape[1], history_size))
+    """The header's views into `history` [N, slots, 2 (D + 1)]."""
     dim = history.shape[2] // 2 - 1
     if history_size > dim:
         position, gradient = history[:, :dim, dim], history[:, :dim, 2 * dim + 1]
         return Header(position, gradient, history[:, dim, dim])
-    return _whole_header(history[:, history_size], dim)
-
-
-def _whole_header(lanes: Tensor, dim: int) -> Header:
+    lanes = history[:, history_size]
     return Header(lanes[:, :dim], lanes[:, dim + 1 : 2 * dim + 1], lanes[:, dim])
 
 
 def check_history(call: str, grad: Tensor, history: Tensor, history_size: int) -> None:
     """ValueError unless `history` has the shape that `grad` [N, D] and `history_size` need."""
-    packed = is_packed(history)
-    needed = history_shape(grad, history_size, "bfloat16" if packed else "float32")
-    if tuple(history.shape) != needed:
+    needed = history_shape(grad, history_size)
+    if history.shape != needed:
         raise ValueError(
             f"{call}: history has shape {tuple(history.shape)}, but {list(needed)} is needed for a "
             f"gradient of shape {tuple(grad.shape)} and history_size={history_size}"
-        )
-    if packed and history.dtype != torch.float32:
-        raise ValueError(
-            f"{call}: a history of half-size pairs is {history.dtype}, but torch.float32 is needed"
         )
 
 
 def stored_pairs(history: Tensor, history_size: int) -> tuple[Tensor, Tensor]:
     """s and y of the stored pairs, [K, D, N] each, newest first."""
-    if is_packed(history):
-        return _packed.unpacked(history, history_size, history_size)
     dim = history.shape[2] // 2 - 1
     cells = history[:, :history_size].permute(1, 2, 0)
     if cells.stride(2) != 1:
@@ -142,29 +96,32 @@ def stored_pairs(history: Tensor, history_size: int) -> tuple[Tensor, Tensor]:
     return cells[:, :dim], cells[:, dim + 1 : 2 * dim + 1]
 
 
-def newest_gamma(history: Tensor, history_size: int) -> Tensor:
-    """Gamma of the newest pair, [N]; 0 where there is none."""
-    if is_packed(history):
-        s, y = _packed.unpacked(history, history_size, 1)
-    else:
-        s, y = stored_pairs(history[:, :1], 1)
-    return _pairs.dot(s[0], y[0])
-
-
-def as_stored(history: Tensor, pair: Pair) -> Pair:
-    """The pair with the rounding that storing it will cost."""
-    return _packed.as_stored(pair) if is_packed(history) else pair
-
-
 def push(history: Tensor, history_size: int, pair: Pair, accept: Tensor) -> None:
     """Put a pair in front of the others, in the rows of `accept` [N] (bool), in place."""
-    if is_packed(history):
-        _packed.push(history, history_size, pair, accept)
-        return
     dim = pair.s.shape[0]
-    cells = history.permute(1, 2, 0)
-    for first, new in ((0, pair.s), (dim + 1, pair.y)):
-        lanes = cells[:, first : first + dim]
-        for slot in range(history_size - 1, 0, -1):
-            lanes[slot].copy_(torch.where(accept, lanes[slot - 1], lanes[slot]))
-        lanes[0].copy_(torch.where(accept, new, lanes[0]))
+    halves = history[:, :history_size].permute(1, 2, 0).unflatten(1, (2, dim + 1))
+    slots = halves[:, :, :dim].unbind()  # s and y of each pair, [2, D, N]
+    for slot in range(history_size - 1, 0, -1):
+        torch.where(accept, slots[slot - 1], slots[slot], out=slots[slot])
+    for new, old in zip((pair.s, pair.y), slots[0].unbind(), strict=True):
+        torch.where(accept, new, old, out=old)
+
+
+def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:
+    """A history tensor of K given pairs per point, oldest first.
+
+    Args:
+        s: [K, N, D] parameter differences.
+        y: [K, N, D] gradient differences, with s.y > 0.
+
+    Returns:
+        A history for `two_loop(grad, history, history_size=K)`.
+    """
+    size = s.shape[0]
+    history = new_history(s[0], size)
+    everywhere = torch.ones(s.shape[1], dtype=torch.bool, device=s.device)
+    for k in range(size):
+        pair = normalised_pair(columns(s[k], history.dtype), columns(y[k], history.dtype))
+        push(history, size, pair, everywhere)
+    header(history, size).counter.fill_(size + 1)
+    return history
