@@ -14,7 +14,8 @@ from opt3dgs_optim.parts.histogram import EnergyHistogram
 from opt3dgs_optim.parts.last_phase import FreshMoments, SquaredLoss
 from opt3dgs_optim.parts.noise import IsotropicNoise, PositionNoise
 from opt3dgs_optim.parts.pooling import Pooling
-from opt3dgs_optim.phases import DEFAULTS, PhaseScheduler, paper_parts
+from opt3dgs_optim.phases import PhaseScheduler
+from opt3dgs_optim.presets import DEFAULTS, paper_parts
 from opt3dgs_optim.stepadam import StepAdam, reset_points
 from opt3dgs_optim.version import __version__
 

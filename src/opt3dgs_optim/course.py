@@ -147,7 +147,7 @@ class Course:
         return True
 
     def expect(self, steps: int) -> None:
-        """Called where Adam's moments come without a course's state: they have made so many steps."""
+        """Called where Adam's moments come without our state: they have made so many steps."""
 
     def numbers(self) -> dict[str, float | Tensor]:
         """What the parts that act say of themselves: columns of the run log."""

@@ -25,7 +25,7 @@ def canonical_name(name: Any) -> str | None:
 
 
 def slot(group: Mapping[str, Any]) -> str | None:
-    """gsplat's name of the Gaussian parameter in a group, or None: what `upgrade` said, else its own."""
+    """gsplat's name of the Gaussian parameter in a group: what `upgrade` said, or its own; None."""
     return group[SLOT] if SLOT in group else canonical_name(group.get("name"))
 
 

@@ -54,7 +54,7 @@ class Part:
 
     during: ClassVar[Phase | None] = None
     keys: ClassVar[tuple[str, ...]] = ()
-    names: tuple[str, ...] | None = GAUSSIAN
+    names: Any = GAUSSIAN  # tuple[str, ...] | None
 
     def __repr__(self) -> str:
         """The options, without those of all Gaussian parameters."""
@@ -97,7 +97,7 @@ class Part:
 
     # -- what it says and keeps ---------------------------------------------------------------
 
-    def numbers(self, course: Course) -> dict[str, float | Tensor]:
+    def numbers(self, course: Course) -> Mapping[str, float | Tensor]:
         """Columns of the run log for the iteration observed last: numbers or 0-d tensors."""
         return {}
 

@@ -2,50 +2,30 @@
 
 from __future__ import annotations
 
-import inspect
-import logging
-import sys
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor
-from torch.optim import Adam, Optimizer
+from torch.optim import Optimizer
 
 from opt3dgs_optim.checks import check_count, check_flag, check_number, warn_user
 from opt3dgs_optim.course import CHECK_STEPS, Course
 from opt3dgs_optim.describe import block, group_name
-from opt3dgs_optim.names import GAUSSIAN_NAMES, SLOT, canonical_name, slot
+from opt3dgs_optim.names import GAUSSIAN_NAMES, canonical_name, slot
 from opt3dgs_optim.part import Part, Phase
-from opt3dgs_optim.parts.annealing import Annealing
-from opt3dgs_optim.parts.curvature import Curvature
-from opt3dgs_optim.parts.fading import Fading
-from opt3dgs_optim.parts.histogram import EnergyHistogram
-from opt3dgs_optim.parts.last_phase import FreshMoments, SquaredLoss
+from opt3dgs_optim.presets import DEFAULTS, PAPER_STEPS, PAPER_SWITCH, paper_parts
 from opt3dgs_optim.ranks import RankMean
-from opt3dgs_optim.stepadam import STATE_KEY, StepAdam
+from opt3dgs_optim.upgrading import say, take
 from opt3dgs_optim.version import __version__
 
 if TYPE_CHECKING:
     from opt3dgs_optim.runs import RunLog
 
-__all__ = ["DEFAULTS", "PAPER_STEPS", "PAPER_SWITCH", "PhaseScheduler", "paper_parts"]
-
 CALL = "PhaseScheduler"
-PAPER_STEPS = 30_000
-PAPER_SWITCH = 29_000 / PAPER_STEPS
-PAPER_WARMUP = 2_500 / PAPER_STEPS
-DEFAULTS: tuple[Part, ...] = (Annealing(), Fading())  # what paid: docs/evidence.md
 SILENCE = 20  # iterations without a step, or steps without an energy, before it is said
 PAUSE = 200  # iterations without a step that some trainers have by design
-LOGGER = logging.getLogger("opt3dgs_optim")
 Optimizers = TypeVar("Optimizers", bound="Optimizer | Mapping[str, Optimizer]")
-
-
-def paper_parts(total_steps: int = PAPER_STEPS) -> list[Part]:
-    """The parts of Opt3DGS with the paper's settings, its warm-up scaled to `total_steps`."""
-    warmup = round(total_steps * PAPER_WARMUP)
-    return [EnergyHistogram.paper(warmup=warmup), FreshMoments(), SquaredLoss(), Curvature()]
 
 
 class PhaseScheduler(Course):
@@ -179,70 +159,40 @@ class PhaseScheduler(Course):
             TypeError: an optimizer of Gaussian parameters is no Adam, or has another owner.
             ValueError: nothing holds a Gaussian parameter, or a name occurs twice.
         """
-        taken: list[str] = []
-        left: list[str] = []
         if isinstance(optimizers, Optimizer):
-            self._take(optimizers, "the optimizer", None, taken, left)
+            found = [(None, optimizers, "the optimizer")]
         elif isinstance(optimizers, Mapping):
-            for key, optimizer in optimizers.items():
-                if canonical_name(key) is None:
-                    left.append(str(key))
-                else:
-                    self._take(optimizer, f"optimizers[{key!r}]", key, taken, left)
+            found = [(key, each, f"optimizers[{key!r}]") for key, each in optimizers.items()]
         else:
             raise TypeError(
                 f"{CALL}.upgrade: optimizers is a {type(optimizers).__name__}, but a dict of "
                 "optimizers, or one optimizer with named groups, is needed"
             )
+        taken: list[str] = []
+        left: list[str] = []
+        for key, optimizer, shown in found:
+            if key is not None and canonical_name(key) is None:
+                left.append(str(key))
+                continue
+            names, is_new = take(optimizer, self, shown, key)
+            taken += names
+            groups = enumerate(optimizer.param_groups)
+            left += [group_name(i, group) for i, group in groups if slot(group) is None]
+            self._num_optimizers += is_new
         if not taken:
             names = sorted(alias for aliases in GAUSSIAN_NAMES.values() for alias in aliases)
             raise ValueError(
                 f"{CALL}.upgrade: none of the names {left} is a Gaussian parameter's; allowed are "
                 f"{', '.join(names)}"
             )
-        _say(self._sign_of_life(taken, left))
-        return optimizers
-
-    def _take(
-        self, optimizer: Any, shown: str, key: str | None, taken: list[str], left: list[str]
-    ) -> None:
-        if isinstance(optimizer, StepAdam):
-            if optimizer.course is not self:
-                raise TypeError(
-                    f"{CALL}.upgrade: {shown} is a {type(optimizer).__name__} with parts of its own"
-                )
-            taken += [group_name(i, g) for i, g in enumerate(optimizer.param_groups)]
-            return
-        base = _check_upgradable(optimizer, shown)
-        # A dict's key says what its optimizer holds, whatever the group is called.
-        slots = [canonical_name(key or g.get("name")) for g in optimizer.param_groups]
-        known = [name for name in slots if name is not None]
-        if len(set(known)) < len(known):
-            twice = sorted({name for name in known if known.count(name) > 1})
-            raise ValueError(f"{CALL}.upgrade: two groups of {shown} hold {twice[0]!r}")
-        for i, (group, name) in enumerate(zip(optimizer.param_groups, slots, strict=True)):
-            (left if name is None else taken).append(key or group_name(i, group))
-        if not known:
-            return
-        for group, name in zip(optimizer.param_groups, slots, strict=True):
-            group[SLOT] = name
-        if "step" in vars(optimizer):  # a learning-rate scheduler's wrapper of the old class's
-            del optimizer.step
-        carries_state = STATE_KEY in optimizer.param_groups[0] or bool(optimizer.state)
-        optimizer.__class__ = StepAdam
-        optimizer.follow(self, base)
-        if carries_state:
-            optimizer._load_course()  # of a checkpoint that was loaded before the upgrade
-        self._num_optimizers += 1
-
-    def _sign_of_life(self, taken: list[str], left: list[str]) -> str:
         parts = ", ".join(str(part) for part in self.parts) or "none"
         others = f"; left alone: {', '.join(left)}" if left else ""
-        again = f", from iteration {self.iteration}" if self.iteration else ""
-        return (
-            f"opt3dgs_optim {__version__}: total_steps={self.total_steps}{again}, parts: {parts}; "
+        again = f" from iteration {self.iteration}" if self.iteration else ""
+        say(
+            f"opt3dgs_optim {__version__}: total_steps={self.total_steps}{again}, parts {parts}, "
             f"in the steps of {', '.join(taken)}{others}"
         )
+        return optimizers
 
     def observe(self, loss: Tensor | float, *, iteration: int | None = None) -> None:
         """Take the loss of this iteration: once, after backward, before the optimizers step.
@@ -315,8 +265,8 @@ class PhaseScheduler(Course):
         if self._silence > patience and not self._told:
             self._told = True
             warn_user(
-                f"{CALL}: {patience} losses were observed and no upgraded optimizer has stepped, so "
-                f"that {self._parts_in_words()} do nothing; call upgrade(...) again where the "
+                f"{CALL}: {patience} losses were observed and no upgraded optimizer has stepped: "
+                f"{self._parts_in_words()} do nothing; call upgrade(...) again where the "
                 "trainer makes its optimizers anew"
             )
         self._stepped, self._unheard = False, 0
@@ -356,33 +306,3 @@ class PhaseScheduler(Course):
             off = self.switched_off.get(name)
             lines.append(str(part) + ("" if off is None else f": switched off, {off}"))
         return block(CALL, lines)
-
-
-def _check_upgradable(optimizer: Any, shown: str) -> type[Adam]:
-    """The class whose step the parts surround; TypeError where it is no Adam that they know."""
-    kind = f"{type(optimizer).__module__}.{type(optimizer).__qualname__}"
-    if not isinstance(optimizer, Adam):
-        raise TypeError(
-            f"{CALL}.upgrade: {shown} is a {kind}, but torch.optim.Adam (or a subclass) is needed"
-        )
-    own = vars(optimizer).get("step")
-    if own is not None and not getattr(own, "_wrapped_by_lr_sched", False):
-        raise TypeError(f"{CALL}.upgrade: somebody has replaced the step of {shown}, a {kind}")
-    step = inspect.unwrap(type(optimizer).step)
-    if step is inspect.unwrap(Adam.step):
-        return Adam
-    if list(inspect.signature(step).parameters)[1:2] == ["visibility"]:
-        return type(optimizer)  # gsplat's SelectiveAdam, INRIA's SparseGaussianAdam
-    raise TypeError(
-        f"{CALL}.upgrade: {shown} is a {kind} with a step of its own, but Adam's, or one that "
-        "takes a visibility mask, is needed"
-    )
-
-
-def _say(message: str) -> None:
-    """A log line (INFO); on stderr where nobody has set logging up, as in most trainers."""
-    if LOGGER.hasHandlers():
-        LOGGER.info(message)
-    else:
-        record = LOGGER.makeRecord(LOGGER.name, logging.INFO, __file__, 0, message, (), None)
-        logging.StreamHandler(sys.stderr).handle(record)

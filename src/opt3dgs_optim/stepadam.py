@@ -15,6 +15,7 @@ from torch.optim import Adam
 
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.describe import block, group_lines
+from opt3dgs_optim.lending import Lent
 from opt3dgs_optim.names import SLOT, slot
 from opt3dgs_optim.part import Group, Part
 from opt3dgs_optim.rows import Frozen, Ledger, check_mask, check_rows, shaped
@@ -136,7 +137,7 @@ class StepAdam(Adam):
     step._wrapped_by_lr_sched = True  # pyright: ignore[reportFunctionMemberAccess]
 
     def _step_parts(self, mask: Tensor | None) -> None:
-        course, lent, frozen, moved = self.course, _Lent(), [], []
+        course, lent, frozen, moved = self.course, Lent(), [], []
         if mask is not None:
             self._check_mask(mask)
         befores, factors = course.hooks("before"), course.hooks("factor")
@@ -152,9 +153,9 @@ class StepAdam(Adam):
                     if self.acts_on(part, group):
                         factor = _times(factor, part.factor(group, course))
                 if factor is not None:
-                    self._lend_rate(group, factor, lent)
+                    lent.rate(group, factor, course.valid)
             if isinstance(course.valid, Tensor) and self._drops_on_device():
-                self._lend_flag(course.valid, lent)
+                lent.flag(self, course.valid)
             self._step_base(mask)
         finally:
             lent.take_back()
@@ -182,12 +183,13 @@ class StepAdam(Adam):
         param: Tensor,
         mask: Tensor | None,
         parts: list[Part],
-        lent: _Lent,
+        lent: Lent,
         frozen: list[Frozen],
     ) -> None:
         """Put what Adam is to be fed into `param.grad`."""
-        grad = fed = param.grad
+        grad = param.grad
         assert grad is not None
+        fed = grad
         self._guard(grad)
         moving = self._moving(group, param, mask)
         if moving is None and not parts:
@@ -201,9 +203,8 @@ class StepAdam(Adam):
         if parts:
             self._ledger.drop_strangers(param, state, self.course.keys)
             # Parts get the gradient of what is minimised, in unscaled units.
-            unit = -1.0 if group["maximize"] else 1.0
             scale = getattr(self, "grad_scale", None)
-            unit = unit if scale is None else unit * scale
+            unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
             plain = scale is None and unit == 1.0
             fed = fed if plain else fed / unit
             for part in parts:
@@ -239,31 +240,6 @@ class StepAdam(Adam):
     def _drops_on_device(self) -> bool:
         """Whether torch's own step can be told on the device not to be made."""
         return self._base is Adam and all(group["fused"] for group in self.param_groups)
-
-    def _lend_rate(self, group: Group, factor: float | Tensor, lent: _Lent) -> None:
-        """lr times the factor, never left in the group: schedulers would compound it."""
-        rate, device = group["lr"], group["params"][0].device
-        if isinstance(factor, Tensor):
-            if factor.device.type == "cpu":
-                factor = factor.item()
-            else:  # fused Adam reads a float32 learning rate from the device
-                factor = factor.to(device=device, dtype=torch.float32, non_blocking=True)
-        if group.get("decoupled_weight_decay") and group["weight_decay"]:
-            # The factor is on Adam's step; decay by it would grow weights where it is negative.
-            kept = 1 - rate * group["weight_decay"]
-            for param in group["params"]:
-                if param.grad is not None:
-                    valid = self.course.valid
-                    param.mul_(torch.where(valid, kept, 1.0) if isinstance(valid, Tensor) else kept)
-            lent.item(group, "weight_decay", 0.0)
-        lent.item(group, "lr", rate * factor)
-
-    def _lend_flag(self, valid: Tensor, lent: _Lent) -> None:
-        """Merge "the loss is not finite" with the GradScaler's flag."""
-        flag, theirs = (~valid).to(torch.float32), getattr(self, "found_inf", None)
-        if theirs is not None:
-            flag = torch.maximum(flag, theirs.reshape(()).to(flag.device))
-        lent.attribute(self, "found_inf", flag)
 
     def _finish(self, group: Group, param: Tensor) -> None:
         """After the parameter has moved and the group's rate is its own again."""
@@ -366,7 +342,7 @@ class StepAdam(Adam):
         try:
             params = [p for group in self.param_groups for p in group["params"]]
             check_rows(call, params, self.course.keys, self.state)
-            self._load_course()
+            self.take_loaded()
         except ValueError:
             self.state, self.param_groups = before
             raise
@@ -377,8 +353,8 @@ class StepAdam(Adam):
             self._use_fused()
         self._trust_rows()
 
-    def _load_course(self) -> None:
-        """Take the course's state out of the groups, where a checkpoint had put it."""
+    def take_loaded(self) -> None:
+        """Take the course's state out of the groups, where a checkpoint has put it."""
         shared = self.param_groups[0].pop(STATE_KEY, None)
         if shared is not None:
             self.course.load_state_dict(shared)
@@ -389,28 +365,6 @@ class StepAdam(Adam):
     def __repr__(self) -> str:
         lines = [str(part) for part in self.course.parts] + group_lines(self.param_groups)
         return block(type(self).__name__, lines)
-
-
-class _Lent:
-    """What a step has put in place of a group's numbers and a parameter's gradient."""
-
-    def __init__(self) -> None:
-        self._items: list[tuple[dict[str, Any], str, Any]] = []
-        self._attributes: list[tuple[Any, str, Any]] = []
-
-    def item(self, owner: dict[str, Any], key: str, value: Any) -> None:
-        self._items.append((owner, key, owner[key]))
-        owner[key] = value
-
-    def attribute(self, owner: Any, name: str, value: Any) -> None:
-        self._attributes.append((owner, name, getattr(owner, name, None)))
-        setattr(owner, name, value)
-
-    def take_back(self) -> None:
-        for owner, key, value in self._items:
-            owner[key] = value
-        for owner, name, value in self._attributes:
-            setattr(owner, name, value)
 
 
 def _times(factor: float | Tensor | None, other: float | Tensor | None) -> float | Tensor | None:

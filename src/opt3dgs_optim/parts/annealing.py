@@ -83,7 +83,7 @@ class Annealing(Part):
         """The factor on the group's next step."""
         return self.at(slot(group), course.progress)
 
-    def numbers(self, course: Course) -> dict[str, float]:
+    def numbers(self, course: Course) -> Mapping[str, float]:
         """`annealing`: the factor on the steps of the positions, or of the first parameter."""
         first = next(iter(self.peak)) if isinstance(self.peak, Mapping) else "means"
         return {"annealing": self.at(first, course.progress)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from opt3dgs_optim.checks import check_count, check_number
@@ -38,6 +39,6 @@ class ConstantMultiplier(Part):
         """The multiplier of the next step."""
         return 1.0 if course.num_observed <= self.warmup else self.value
 
-    def numbers(self, course: Course) -> dict[str, float]:
+    def numbers(self, course: Course) -> Mapping[str, float]:
         """`nu`, after the warm-up."""
         return {"nu": self.value} if course.num_observed > self.warmup else {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -140,7 +141,7 @@ class Curvature(Part):
         self._seen[2:] += foretold
         self._probes += 1
 
-    def numbers(self, course: Course) -> dict[str, float | Tensor]:
+    def numbers(self, course: Course) -> Mapping[str, float | Tensor]:
         """`accepted`: the share of the candidate pairs that the last step accepted."""
         share = self.accepted_share
         return {} if share is None else {"accepted": share}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -102,7 +103,7 @@ class Fading(Part):
                 if key in state:
                     state[key].mul_(second)
 
-    def numbers(self, course: Course) -> dict[str, float]:
+    def numbers(self, course: Course) -> Mapping[str, float]:
         """`faded`: the share of the points that the present iteration's events fade."""
         now, total = course.iteration, course.total_steps
         events = self.events_before(now, total) - self.events_before(now - 1, total)

@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim._checkpoint import check_histogram_state
-from opt3dgs_optim.checks import check_choice, check_count, check_interval, check_number
-from opt3dgs_optim.ranks import RankMean
-from opt3dgs_optim.part import Group, Part, Phase
 from opt3dgs_optim._running import RunningMoments, ViewMeans
+from opt3dgs_optim.checks import check_choice, check_count, check_interval, check_number
+from opt3dgs_optim.part import Group, Part, Phase
+from opt3dgs_optim.ranks import RankMean
 
 PAPER_TEMPERATURE = 2e-3  # not given in the paper; zeta * tau / du = 1.5 at its zeta and du
 PAPER_RANGE = (0.0, 0.2)
@@ -203,13 +203,20 @@ class EnergyHistogram(Part):
     def factor(self, group: Group, course: Any) -> Tensor | None:
         return self._nu if self.num_observed else None
 
-    def numbers(self, course: Any) -> dict[str, Any]:
+    def numbers(self, course: Any) -> Mapping[str, Any]:
         return {"nu": self._nu} if self.num_observed > self.warmup else {}
 
     # -- one energy --------------------------------------------------------------------------
 
     @torch.no_grad()
-    def observe(self, energy: Tensor | float, valid_: Any = None, course: Any = None, *, view: Hashable | None = None) -> Tensor:
+    def observe(
+        self,
+        energy: Tensor | float,
+        valid_: Any = None,
+        course: Any = None,
+        *,
+        view: Hashable | None = None,
+    ) -> Tensor:
         """Take one energy: compute nu from the present weights, then update the weights.
 
         Args:
