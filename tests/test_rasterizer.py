@@ -12,13 +12,13 @@ import torch
 from bench_raster import synthetic_scene
 from splatting.camera import Camera
 from splatting.compositing import composite
-from splatting.numba_kernel import kernel
+from splatting.fast.kernel import kernel
 from splatting.projection import project, rotation_matrices
 from splatting.rasterizer import Backend, render
 from splatting.spherical_harmonics import SH_0, sh_basis
 from torch import Tensor
 
-BACKENDS: tuple[Backend, ...] = ("reference", "numba")
+BACKENDS: tuple[Backend, ...] = ("reference", "fast")
 
 
 def look_at_origin(width: int = 24, height: int = 17, dtype: torch.dtype = torch.float64) -> Camera:
@@ -331,7 +331,7 @@ SCENES = {
 def test_numba_agrees_with_reference(name: str):
     gaussians, camera = SCENES[name](), look_at_origin()
     expected = image_and_gradients(gaussians, camera, "reference", torch.float64)
-    actual = image_and_gradients(gaussians, camera, "numba", torch.float64)
+    actual = image_and_gradients(gaussians, camera, "fast", torch.float64)
     # Rounding: the runs' geometric recurrence and another order of the sums; where scales are
     # extreme, the reference's inverse covariance too (1e-11; otherwise about 1e-14).
     assert_close(actual, expected, 1e-10 if name == "extreme scales" else 1e-12)
@@ -342,7 +342,7 @@ def test_numba_agrees_with_reference_in_float32(name: str):
     gaussians = {k: v.float().double() for k, v in SCENES[name]().items()}
     camera = look_at_origin().to(torch.float32)
     exact = image_and_gradients(gaussians, camera.to(torch.float64), "reference", torch.float64)
-    actual = image_and_gradients(gaussians, camera, "numba", torch.float32)
+    actual = image_and_gradients(gaussians, camera, "fast", torch.float32)
     # The kernels compute in float64: only background, incoming gradient and result are rounded.
     assert_close(actual, exact, 1e-6)
     # Here the reference's rounding adds up (about 3e-6); a pixel at a threshold would exceed this.
@@ -353,7 +353,7 @@ def test_numba_agrees_with_reference_in_float32(name: str):
 def test_numba_agrees_at_odd_image_sizes(size: tuple[int, int]):
     gaussians, camera = scene(40, 1), look_at_origin(*size)
     expected = image_and_gradients(gaussians, camera, "reference", torch.float64)
-    assert_close(image_and_gradients(gaussians, camera, "numba", torch.float64), expected, 1e-12)
+    assert_close(image_and_gradients(gaussians, camera, "fast", torch.float64), expected, 1e-12)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

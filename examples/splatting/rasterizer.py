@@ -14,7 +14,7 @@ from splatting.compositing import composite
 from splatting.projection import project, visible_points
 from splatting.spherical_harmonics import MAX_DEGREE, sh_colors
 
-Backend = Literal["reference", "numba"]
+Backend = Literal["reference", "fast"]
 TRAILING_SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3)}
 
 
@@ -33,7 +33,7 @@ def render(
     *,
     sh_degree: int | None = None,
     background: Tensor | None = None,
-    backend: Backend = "numba",
+    backend: Backend = "fast",
 ) -> Rendering:
     """Render Gaussians as gsplat 1.5.3 does with its defaults ("classic" mode, no antialiasing).
 
@@ -45,7 +45,7 @@ def render(
         camera: The pinhole camera.
         sh_degree: The highest degree of spherical harmonics to use; by default all there are.
         background: The colour [3] behind everything; by default black.
-        backend: "numba", compiled, on the CPU, with constant cameras; or "reference", plain
+        backend: "fast", compiled, on the CPU, with constant cameras; or "reference", plain
             torch on any device, whose memory grows as pixels times points, differentiable in the
             camera's pose too. Both compute the same numbers up to rounding; in float32 the
             reference loses Gaussians so large that their variance squared overflows.
@@ -66,9 +66,9 @@ def render(
     background = background.to(means)
     if backend == "reference":
         return _render_reference(values, camera.to(means.dtype), degree, background)
-    from splatting.rasterizer_numba import RasterizeNumba  # numba stays optional
+    from splatting.fast.rasterizer import Rasterize  # numba stays optional
 
-    return Rendering(*RasterizeNumba.apply(*values.values(), background, camera, degree))
+    return Rendering(*Rasterize.apply(*values.values(), background, camera, degree))
 
 
 def _render_reference(
@@ -151,9 +151,9 @@ def _check_backend(means: Tensor, camera: Camera, backend: str) -> None:
         raise ValueError(
             f"render: camera is {camera.width} x {camera.height} pixels, must be at least 1 x 1"
         )
-    if backend == "numba" and (means.device.type != "cpu" or camera.viewmat.requires_grad):
+    if backend == "fast" and (means.device.type != "cpu" or camera.viewmat.requires_grad):
         raise ValueError(
-            f'render: backend "numba" with means on {means.device} and camera.viewmat.'
+            f'render: backend "fast" with means on {means.device} and camera.viewmat.'
             f"requires_grad {camera.viewmat.requires_grad}, must be on the CPU and False; "
             'the backend "reference" has neither limit'
         )
