@@ -16,8 +16,8 @@ from numba.extending import intrinsic, models, overload, register_model
 WIDTH = 8
 _FLOAT = ir.FloatType()
 _LANES = ir.VectorType(_FLOAT, WIDTH)
-_MASK = ir.VectorType(ir.IntType(1), WIDTH)
 _BITS = ir.VectorType(ir.IntType(32), WIDTH)
+_TRUTHS = ir.VectorType(ir.IntType(1), WIDTH)
 
 
 class LanesType(types.Type):
@@ -28,7 +28,7 @@ class LanesType(types.Type):
 
 
 class MaskType(types.Type):
-    """Eight booleans."""
+    """Eight truths, each 32 bits of ones or zeros, as a vector register compares."""
 
     def __init__(self) -> None:
         super().__init__(name="Mask")
@@ -46,7 +46,7 @@ class _LanesModel(models.PrimitiveModel):
 @register_model(MaskType)
 class _MaskModel(models.PrimitiveModel):
     def __init__(self, dmm, fe_type):
-        super().__init__(dmm, fe_type, _MASK)
+        super().__init__(dmm, fe_type, _BITS)
 
 
 def _splat(builder, scalar, vector):
@@ -102,6 +102,14 @@ def _maximum(builder, a, b):
     return builder.select(builder.fcmp_ordered(">", a, b), a, b)
 
 
+def _compare(sign):
+    return lambda builder, a, b: builder.sext(builder.fcmp_ordered(sign, a, b), _BITS)
+
+
+def _is_true(builder, mask):
+    return builder.icmp_signed("<", mask, ir.Constant(_BITS, [0] * WIDTH))
+
+
 def _power_of_two(builder, whole):
     """2 to whole numbers above -127, written into the exponent's bits."""
     bits = builder.fptosi(whole, _BITS)
@@ -113,10 +121,10 @@ _add = _intrinsic_of_lanes(2, lambda builder, a, b: builder.fadd(a, b))
 _sub = _intrinsic_of_lanes(2, lambda builder, a, b: builder.fsub(a, b))
 _mul = _intrinsic_of_lanes(2, lambda builder, a, b: builder.fmul(a, b))
 _div = _intrinsic_of_lanes(2, lambda builder, a, b: builder.fdiv(a, b))
-_less = _intrinsic_of_lanes(2, lambda builder, a, b: builder.fcmp_ordered("<", a, b), mask_type)
-_at_most = _intrinsic_of_lanes(2, lambda b, x, y: b.fcmp_ordered("<=", x, y), mask_type)
-_greater = _intrinsic_of_lanes(2, lambda b, x, y: b.fcmp_ordered(">", x, y), mask_type)
-_at_least = _intrinsic_of_lanes(2, lambda b, x, y: b.fcmp_ordered(">=", x, y), mask_type)
+_less = _intrinsic_of_lanes(2, _compare("<"), mask_type)
+_at_most = _intrinsic_of_lanes(2, _compare("<="), mask_type)
+_greater = _intrinsic_of_lanes(2, _compare(">"), mask_type)
+_at_least = _intrinsic_of_lanes(2, _compare(">="), mask_type)
 
 multiply_add = _intrinsic_of_lanes(3, _call("llvm.fmuladd", 3))  # a b + c, with one rounding where that is fast
 minimum = _intrinsic_of_lanes(2, _minimum)
@@ -174,7 +182,7 @@ def choose(typing_context, mask, a, b):
     def codegen(context, builder, signature, values):
         kinds = signature.args
         return builder.select(
-            values[0],
+            _is_true(builder, values[0]),
             _as_lanes(context, builder, values[1], kinds[1]),
             _as_lanes(context, builder, values[2], kinds[2]),
         )
@@ -187,7 +195,7 @@ def truths(typing_context, mask):
     """The mask as the bits of an integer, lane 0 lowest."""
 
     def codegen(context, builder, signature, values):
-        byte = builder.bitcast(values[0], ir.IntType(WIDTH))
+        byte = builder.bitcast(_is_true(builder, values[0]), ir.IntType(WIDTH))
         return builder.zext(byte, ir.IntType(64))
 
     return types.int64(mask), codegen
@@ -261,6 +269,7 @@ def from_bits(typing_context, bits):
     """The mask whose lane i is bit i of an integer."""
 
     def codegen(context, builder, signature, values):
-        return builder.bitcast(builder.trunc(values[0], ir.IntType(WIDTH)), _MASK)
+        truth = builder.bitcast(builder.trunc(values[0], ir.IntType(WIDTH)), _TRUTHS)
+        return builder.sext(truth, _BITS)
 
     return mask_type(bits), codegen

@@ -134,29 +134,32 @@ def _columns(splats, geometry, point, tile_row, width):
 def list_points(order, splats, geometry, width, height):
     """The points of each tile, front to back: tile t has entries [starts[t], starts[t + 1])."""
     across, down = -(-width // WIDTH), -(-height // HEIGHT)
-    starts = np.zeros(across * down + 1, np.int64)
-    for point in range(order.shape[0]):
+    bands = 0
+    for point in order:
         first, end = int(splats[point, FIRST_ROW]), int(splats[point, END_ROW])
-        if first >= end:
-            continue
-        for tile_row in range(first // HEIGHT, (end - 1) // HEIGHT + 1):
-            left, right = _columns(splats, geometry, point, tile_row, width)
-            for column in range(left, right):
-                starts[tile_row * across + column + 1] += 1
-    for tile in range(across * down):
-        starts[tile + 1] += starts[tile]
-    filled = starts.copy()
-    entries = np.empty(starts[-1], np.int32)
+        bands += max((end - 1) // HEIGHT + 1 - first // HEIGHT, 0)
+    ranges = np.empty((bands, 3), np.int32)  # first tile, end, point
+    starts = np.zeros(across * down + 1, np.int64)
+    used = 0
     for point in order:
         first, end = int(splats[point, FIRST_ROW]), int(splats[point, END_ROW])
         if first >= end:
             continue
         for tile_row in range(first // HEIGHT, (end - 1) // HEIGHT + 1):
             left, right = _columns(splats, geometry, point, tile_row, width)
-            for column in range(left, right):
-                tile = tile_row * across + column
-                entries[filled[tile]] = point
-                filled[tile] += 1
+            ranges[used, 0], ranges[used, 1] = tile_row * across + left, tile_row * across + right
+            ranges[used, 2] = point
+            used += 1
+            for tile in range(tile_row * across + left, tile_row * across + right):
+                starts[tile + 1] += 1
+    for tile in range(across * down):
+        starts[tile + 1] += starts[tile]
+    filled = starts.copy()
+    entries = np.empty(starts[-1], np.int32)
+    for band in range(used):
+        for tile in range(ranges[band, 0], ranges[band, 1]):
+            entries[filled[tile]] = ranges[band, 2]
+            filled[tile] += 1
     return starts, entries
 
 
@@ -220,10 +223,12 @@ def composite_forward(starts, entries, splats, background, width, height):
             slope, shear, fall = splats[point, SLOPE], splats[point, SHEAR], splats[point, FALL]
             log_opacity = splats[point, LOG_OPACITY]
             slopes = repeat(slope)
-            along = slope * (x - splats[point, MEAN_X])
+            along, y = slope * (x - splats[point, MEAN_X]), splats[point, MEAN_Y]
+            red, green = repeat(splats[point, RED]), repeat(splats[point, GREEN])
+            blue = repeat(splats[point, BLUE])
             first = max(int(splats[point, FIRST_ROW]) - top, 0)
             for row in range(first, min(int(splats[point, END_ROW]) - top, HEIGHT)):
-                dy = top + row + 0.5 - splats[point, MEAN_Y]
+                dy = top + row + 0.5 - y
                 at_centre, level = along - shear * dy, log_opacity - fall * dy * dy
                 v = multiply_add(slopes, places, at_centre)
                 power = level - v * v
@@ -240,23 +245,22 @@ def composite_forward(starts, entries, splats, background, width, height):
                 blended = but_not(reached, full)
                 weight = choose(blended, alpha * before, 0.0)
                 at = row * WIDTH
-                red = multiply_add(weight, splats[point, RED], load(colour, at))
-                green = multiply_add(weight, splats[point, GREEN], load(colour, AREA + at))
-                blue = multiply_add(weight, splats[point, BLUE], load(colour, 2 * AREA + at))
-                store(colour, at, red)
-                store(colour, AREA + at, green)
-                store(colour, 2 * AREA + at, blue)
+                store(colour, at, multiply_add(weight, red, load(colour, at)))
+                at += AREA
+                store(colour, at, multiply_add(weight, green, load(colour, at)))
+                at += AREA
+                store(colour, at, multiply_add(weight, blue, load(colour, at)))
+                at = planes + row * WIDTH
                 after = choose(blended, after, before)
                 if truths(full):
                     after = choose(full, 0.0 - before, after)
-                    at += planes
                     filled = load(finished, at)
                     store(finished, at, choose(full, float(entry - starts[tile]), filled))
                     bits = truths(full)
                     while bits:
                         bits &= bits - 1
                         open_pixels -= 1
-                store(transmittance, planes + row * WIDTH, after)
+                store(transmittance, at, after)
             if open_pixels == 0:
                 stops[tile] = entry + 1
                 break
@@ -314,8 +318,9 @@ def composite_backward(
             slope, shear, fall = splats[point, SLOPE], splats[point, SHEAR], splats[point, FALL]
             log_opacity = splats[point, LOG_OPACITY]
             slopes = repeat(slope)
-            along = slope * (x - splats[point, MEAN_X])
-            red, green, blue = splats[point, RED], splats[point, GREEN], splats[point, BLUE]
+            along, y = slope * (x - splats[point, MEAN_X]), splats[point, MEAN_Y]
+            red, green = repeat(splats[point, RED]), repeat(splats[point, GREEN])
+            blue = repeat(splats[point, BLUE])
             number = repeat(float(entry - starts[tile]))
             sum_0, sum_v, sum_vv = repeat(0.0), repeat(0.0), repeat(0.0)
             sum_y, sum_vy, sum_yy = repeat(0.0), repeat(0.0), repeat(0.0)
@@ -323,7 +328,7 @@ def composite_backward(
             touched = False
             first = max(int(splats[point, FIRST_ROW]) - top, 0)
             for row in range(first, min(int(splats[point, END_ROW]) - top, HEIGHT)):
-                dy = top + row + 0.5 - splats[point, MEAN_Y]
+                dy = top + row + 0.5 - y
                 at_centre, level = along - shear * dy, log_opacity - fall * dy * dy
                 v = multiply_add(slopes, places, at_centre)
                 power = level - v * v
