@@ -19,6 +19,8 @@ from splatting.spherical_harmonics import SH_0, sh_basis
 from torch import Tensor
 
 BACKENDS: tuple[Backend, ...] = ("reference", "fast")
+# The fast twin is float32; what it gives is compared within its rounding.
+DTYPES = {"reference": torch.float64, "fast": torch.float32}
 
 
 def look_at_origin(width: int = 24, height: int = 17, dtype: torch.dtype = torch.float64) -> Camera:

@@ -273,3 +273,52 @@ def from_bits(typing_context, bits):
         return builder.sext(truth, _BITS)
 
     return mask_type(bits), codegen
+
+
+def _add_neighbours(builder, a, b):
+    """Sums of neighbouring lanes: of a and b in turns, within each half of the register."""
+    even, odd = [0, 2, 8, 10, 4, 6, 12, 14], [1, 3, 9, 11, 5, 7, 13, 15]
+    return builder.fadd(_shuffle(builder, a, b, even), _shuffle(builder, a, b, odd))
+
+
+def _shuffle(builder, a, b, order):
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), order))
+
+
+@intrinsic
+def totals(typing_context, a, b, c, d, e, f, g, h):
+    """The sums of eight lanes each, as eight lanes."""
+
+    def codegen(context, builder, signature, values):
+        pairs = [_add_neighbours(builder, *values[i : i + 2]) for i in (0, 2, 4, 6)]
+        first, second = _add_neighbours(builder, *pairs[:2]), _add_neighbours(builder, *pairs[2:])
+        low, high = [0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15]
+        return builder.fadd(
+            _shuffle(builder, first, second, low), _shuffle(builder, first, second, high)
+        )
+
+    return lanes_type(a, b, c, d, e, f, g, h), codegen
+
+
+@intrinsic
+def prefetch(typing_context, array, row):
+    """Ask for two cache lines of a row of a contiguous two-dimensional array, for later."""
+
+    def codegen(context, builder, signature, values):
+        array_type = signature.args[0]
+        structure = context.make_array(array_type)(context, builder, values[0])
+        strides = builder.extract_value(structure.strides, 0)
+        address = builder.add(
+            builder.ptrtoint(structure.data, strides.type), builder.mul(strides, values[1])
+        )
+        byte, whole = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, whole, whole, whole])
+        name = "llvm.prefetch.p0"
+        function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
+        for offset in (0, 64):
+            place = builder.add(address, ir.Constant(strides.type, offset))
+            arguments = [whole(0), whole(3), whole(1)]  # to read, keep close, data
+            builder.call(function, [builder.inttoptr(place, byte), *arguments])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), codegen

@@ -97,7 +97,7 @@ class Rasterize(torch.autograd.Function):
             by_means2d, by_covariances, means, quats, scales, viewmat, lens
         )
         by_sh0, by_shN, by_means_color = colors_backward(
-            sums[:, 6:], colors, means, viewpoint, shN, degree
+            sums[:, 6:9], colors, means, viewpoint, shN, degree
         )
         grads = (by_means + by_means_color, by_quats, by_scales, by_logits, by_sh0, by_shN)
 

@@ -33,20 +33,25 @@ from splatting.fast.lanes import (
     minimum,
     multiply_add,
     power_of_two,
+    prefetch,
     repeat,
     store,
     total,
+    totals,
     truths,
 )
 from splatting.projection import ALPHA_MIN
 
 HEIGHT = 8  # rows of a tile
 AREA = HEIGHT * WIDTH
+SUMS = 16  # columns of the backward pass's sums, of which 9 are used: a cache line a point
 SLACK = 1e-3  # pixels; a list may hold a point that reaches no pixel, the passes test each
 NEVER = np.float32(2.0**24)  # the entry that finishes a pixel which none finishes
 LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 MARGIN = 1e-5  # of log2 alpha: this near to the threshold, float64 decides
 HALF_LOG2_E = 0.5 / math.log(2)
+LEAST = -30.0  # of log2 alpha where a point does not reach: a normal number, selected away
+AHEAD = 6  # entries whose points are fetched into the cache before they are used
 CENTRE = (WIDTH - 1) / 2  # lanes are counted from the middle, where rounding is least
 
 # Columns of `splats` [V, 12], float64, one row a visible point.
@@ -219,6 +224,7 @@ def composite_forward(starts, entries, splats, background, width, height):
         open_pixels = rows * columns
         x = left + 0.5 + CENTRE
         for entry in range(starts[tile], starts[tile + 1]):
+            prefetch(splats, entries[min(entry + AHEAD, starts[tile + 1] - 1)])
             point = entries[entry]
             slope, shear, fall = splats[point, SLOPE], splats[point, SHEAR], splats[point, FALL]
             log_opacity = splats[point, LOG_OPACITY]
@@ -239,7 +245,7 @@ def composite_forward(starts, entries, splats, background, width, height):
                 reached = both(reached, before > 0.0)
                 if truths(reached) == 0:
                     continue
-                alpha = minimum(_power(maximum(power, -100.0)), ALPHA_MAX)
+                alpha = minimum(_power(maximum(power, LEAST)), ALPHA_MAX)
                 after = before * (1.0 - alpha)
                 full = both(reached, after <= TRANSMITTANCE_MIN)
                 blended = but_not(reached, full)
@@ -283,12 +289,13 @@ def composite_backward(
     """Gradients of the entries, summed per point.
 
     With g the gradient by the exponent, v as above and dy the offset from the mean, the columns
-    of the returned sums [V, 9] are those of g, g v, g dy, g v^2, g v dy, g dy^2, and of the
-    gradients by the colour. Returns the background's gradient [3] too.
+    of the returned sums [V, 16] are those of g, g v, g dy, g v^2, g v dy, g dy^2, and of the
+    gradients by the colour; the rest is unused. Returns the background's gradient [3] too.
     """
     height, width = grad_alpha.shape
     across = -(-width // WIDTH)
-    sums = np.zeros((splats.shape[0], 9))
+    sums = np.zeros((splats.shape[0], SUMS), np.float32)
+    flat_sums = sums.reshape(-1)
     grad_background = np.zeros(3)
     grads = np.empty(3 * AREA, np.float32)
     in_front, behind = np.empty(AREA, np.float32), np.empty(AREA, np.float32)
@@ -314,6 +321,9 @@ def composite_backward(
                 behind[i] = in_front[i] * by_left_over
         x = left + 0.5 + CENTRE
         for entry in range(stops[tile] - 1, starts[tile] - 1, -1):
+            coming = entries[max(entry - AHEAD, starts[tile])]
+            prefetch(splats, coming)
+            prefetch(sums, coming)
             point = entries[entry]
             slope, shear, fall = splats[point, SLOPE], splats[point, SHEAR], splats[point, FALL]
             log_opacity = splats[point, LOG_OPACITY]
@@ -340,7 +350,7 @@ def composite_backward(
                 if truths(reached) == 0:
                     continue
                 touched = True
-                unclamped = _power(maximum(power, -100.0))
+                unclamped = _power(maximum(power, LEAST))
                 alpha = minimum(unclamped, ALPHA_MAX)
                 inverse = 1.0 / (1.0 - alpha)
                 before = load(in_front, at)
@@ -368,14 +378,9 @@ def composite_backward(
                 sum_vy = multiply_add(gv, dy, sum_vy)
                 sum_yy = multiply_add(gy, dy, sum_yy)
             if touched:
-                sums[point, 0] += total(sum_0)
-                sums[point, 1] += total(sum_v)
-                sums[point, 2] += total(sum_y)
-                sums[point, 3] += total(sum_vv)
-                sums[point, 4] += total(sum_vy)
-                sums[point, 5] += total(sum_yy)
-                sums[point, 6] += total(sum_red)
-                sums[point, 7] += total(sum_green)
+                at = point * SUMS
+                more = totals(sum_0, sum_v, sum_y, sum_vv, sum_vy, sum_yy, sum_red, sum_green)
+                store(flat_sums, at, load(flat_sums, at) + more)
                 sums[point, 8] += total(sum_blue)
     return sums, grad_background
 
@@ -391,12 +396,14 @@ def splats_backward(sums, splats, geometry):
     for point in range(n):
         xy, yy = geometry[point, 3], geometry[point, 4]
         k = xy / yy
+        by_e, by_v, by_y = sums[point, 0], sums[point, 1], sums[point, 2]
+        by_vv, by_vy, by_yy = sums[point, 3], sums[point, 4], sums[point, 5]
         # q = Sigma^-1 d: its x is a = precision (dx - k dy) = scale v, its y is dy / yy - k a.
         scale = splats[point, SLOPE] / HALF_LOG2_E
-        a, b = scale * sums[point, 1], sums[point, 2] / yy
-        aa = scale * scale * sums[point, 3]
-        ab = scale / yy * sums[point, 4]
-        bb = sums[point, 5] / yy / yy
+        a, b = scale * by_v, by_y / yy
+        aa = scale * scale * by_vv
+        ab = scale / yy * by_vy
+        bb = by_yy / yy / yy
         grad_means[point, 0] = -a
         grad_means[point, 1] = k * a - b
         # d(exponent) = -q^T d(Sigma) q / 2
@@ -404,5 +411,5 @@ def splats_backward(sums, splats, geometry):
         grad_covariances[point, 1] = -0.5 * (ab - k * aa)
         grad_covariances[point, 2] = -0.5 * (k * k * aa - 2 * k * ab + bb)
         # alpha = opacity exp(-e): opacity d/d(opacity) = -d/de; the sigmoid adds 1 - opacity.
-        grad_logits[point] = -sums[point, 0] * (1 - geometry[point, 7])
+        grad_logits[point] = -by_e * (1 - geometry[point, 7])
     return grad_means, grad_covariances, grad_logits
