@@ -110,7 +110,7 @@ def test_bad_images_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"photo_03.png: missing"):
         load_scene(folder)
     shutil.rmtree(folder / "images_4")
-    with pytest.raises(FileNotFoundError, match=r"images_4: missing.*size='small'"):
+    with pytest.raises(FileNotFoundError, match=r"images_4: missing.*size='images_4'"):
         load_scene(folder)
 
 

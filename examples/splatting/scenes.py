@@ -54,9 +54,9 @@ def load_scene(
 ) -> Scene:
     """Load a scene from a folder, or make the embedded one.
 
-    A folder holds `images/`, its halves `images_2/` and quarters `images_4/`, and either a COLMAP model in `sparse/0/` (or
-    `sparse/`), or `transforms.json` with its .ply. Test views are those of `split.json` where
-    there is one, and otherwise every 8th of the sorted names.
+    A folder holds `images/`, its halves `images_2/` and quarters `images_4/`, and either a COLMAP
+    model in `sparse/0/` (or `sparse/`), or `transforms.json` with its .ply. Test views are those
+    of `split.json` where there is one, and otherwise every 8th of the sorted names.
 
     Args:
         source: "embedded" (procedural, nothing to download; see `embedded.py`) or a folder.

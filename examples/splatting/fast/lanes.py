@@ -77,9 +77,9 @@ def _intrinsic_of_lanes(arity, emit, result=lanes_type):
 
         return result(*arguments), codegen
 
-    one = lambda typing_context, a: make(typing_context, a)  # noqa: E731
-    two = lambda typing_context, a, b: make(typing_context, a, b)  # noqa: E731
-    three = lambda typing_context, a, b, c: make(typing_context, a, b, c)  # noqa: E731
+    one = lambda typing_context, a: make(typing_context, a)  # noqa: E731, PLW0108
+    two = lambda typing_context, a, b: make(typing_context, a, b)  # noqa: E731, PLW0108
+    three = lambda typing_context, a, b, c: make(typing_context, a, b, c)  # noqa: E731, PLW0108
     return intrinsic((one, two, three)[arity - 1])
 
 
@@ -126,7 +126,8 @@ _at_most = _intrinsic_of_lanes(2, _compare("<="), mask_type)
 _greater = _intrinsic_of_lanes(2, _compare(">"), mask_type)
 _at_least = _intrinsic_of_lanes(2, _compare(">="), mask_type)
 
-multiply_add = _intrinsic_of_lanes(3, _call("llvm.fmuladd", 3))  # a b + c, with one rounding where that is fast
+# a b + c, with one rounding where that is fast
+multiply_add = _intrinsic_of_lanes(3, _call("llvm.fmuladd", 3))
 minimum = _intrinsic_of_lanes(2, _minimum)
 maximum = _intrinsic_of_lanes(2, _maximum)
 floor = _intrinsic_of_lanes(1, _call("llvm.floor", 1))
@@ -138,7 +139,7 @@ def _overload_operator(operation, function):
     @overload(operation, inline="never")
     def of_lanes(a, b):
         if _is_lanes(a, b):
-            return lambda a, b: function(a, b)
+            return lambda a, b: function(a, b)  # noqa: PLW0108  numba compiles it
         return None
 
 

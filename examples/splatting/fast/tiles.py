@@ -195,7 +195,7 @@ def _exact_mask(slope, at_centre, level):
 
 
 @kernel
-def composite_forward(starts, entries, splats, background, width, height):
+def composite_forward(starts, entries, splats, background, width, height):  # noqa: PLR0915
     """Blend the points of each tile.
 
     Returns image [H, W, 3], alpha [H, W], and for the backward pass, tile after tile,
@@ -283,7 +283,7 @@ def composite_forward(starts, entries, splats, background, width, height):
 
 
 @kernel
-def composite_backward(
+def composite_backward(  # noqa: PLR0915
     grad_image, grad_alpha, background, transmittance, finished, starts, stops, entries, splats
 ):
     """Gradients of the entries, summed per point.
