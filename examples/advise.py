@@ -17,12 +17,12 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from advising.pilots import PEAKS, Pilot, PilotOptions, finished
 from advising.verdicts import as_json, as_row, best_peak, caveats, compare, settings, table
 from advising.workers import train_all
-from splatting.scenes import load_scene
+from splatting.scenes import Size, load_scene
 from splatting.stopping import stop_at_once
 from train import recorded_command
 
@@ -32,7 +32,7 @@ def _parser() -> argparse.ArgumentParser:
     defaults = PilotOptions("embedded")
     add = parser.add_argument
     add("--scene", default=defaults.scene, metavar="DIR", help="scene folder, or 'embedded'")
-    add("--size", default=defaults.size, choices=("small", "large"), help="image size")
+    add("--size", default=defaults.size, choices=get_args(Size), help="folder of the photos")
     add("--points", type=int, default=defaults.points, help="the most Gaussians")
     add("--iterations", type=int, default=defaults.iterations, help="of each pilot")
     add("--seeds", type=int, default=3)

@@ -12,6 +12,7 @@ import time
 
 import torch
 from splatting.camera import Camera
+from splatting.metrics import photometric_loss
 from splatting.rasterizer import render
 from torch import Tensor
 
@@ -41,31 +42,12 @@ def synthetic_camera(width: int, height: int) -> Camera:
     return Camera(viewmat, 1.2 * width, 1.2 * width, width / 2, height / 2, width, height)
 
 
-def blur_matrix(size: int, sigma: float = 1.5, radius: int = 5) -> Tensor:
-    """The banded matrix [size, size] of a Gaussian filter: on small images faster than conv2d."""
-    offsets = torch.arange(size)[:, None] - torch.arange(size)
-    weights = torch.exp(-0.5 * (offsets / sigma) ** 2) * (offsets.abs() <= radius)
-    kernel = torch.exp(-0.5 * (torch.arange(-radius, radius + 1) / sigma) ** 2)
-    return weights / kernel.sum()
-
-
-def ssim(a: Tensor, b: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-    """The mean structural similarity of two images [H, W, 3] (Wang et al. 2004)."""
-    a, b = a.permute(2, 0, 1), b.permute(2, 0, 1)
-    stack = torch.cat([a, b, a * a, b * b, a * b])
-    mean_a, mean_b, aa, bb, ab = (rows @ stack @ columns).split(3)
-    product, squares = mean_a * mean_b, mean_a * mean_a + mean_b * mean_b
-    numerator = (2 * product + 0.01**2) * (2 * (ab - product) + 0.03**2)
-    return (numerator / ((squares + 0.01**2) * (aa + bb - squares + 0.03**2))).mean()
-
-
 def measure(arguments: argparse.Namespace) -> dict[str, list[float]]:
     """Milliseconds of each part in each repetition."""
     camera = synthetic_camera(arguments.width, arguments.height)
     gaussians = synthetic_scene(arguments.points, arguments.degree)
     with torch.no_grad():
         target = render(synthetic_scene(arguments.points, arguments.degree, 1), camera).image
-    rows, columns = blur_matrix(camera.height), blur_matrix(camera.width)
     for tensor in gaussians.values():
         tensor.requires_grad_()
     optimizers = [torch.optim.Adam([t], lr=1e-3, eps=1e-15) for t in gaussians.values()]
@@ -79,7 +61,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, list[float]]:
         rendered = render(gaussians, camera).image
         mark("render, forward")
         image = rendered.detach().requires_grad_()
-        loss = 0.8 * (image - target).abs().mean() + 0.2 * (1 - ssim(image, target, rows, columns))
+        loss = photometric_loss(image, target)
         mark("loss, forward")
         (gradient,) = torch.autograd.grad(loss, image)
         mark("loss, backward")

@@ -51,7 +51,7 @@ class PilotOptions:
     """What all pilots of one advice share."""
 
     scene: str
-    size: Any = "small"
+    size: Any = "images_4"
     iterations: int = 400
     points: int = 2000
     init: Any = "sfm"

@@ -45,9 +45,10 @@ class FitOptions:
     sh_degree: int = 0
     switch: float = 29 / 30
     evaluations: int = 20
+    sh_degree_interval: int = 1000  # iterations until one degree more is used, as trainers do
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "points", "evaluations"):
+        for name in ("iterations", "points", "evaluations", "sh_degree_interval"):
             if getattr(self, name) < 1:
                 raise ValueError(f"FitOptions: {name}={getattr(self, name)}, must be at least 1")
         if self.init not in ("sfm", "random"):
@@ -180,8 +181,13 @@ class Fit:
         return self._render(view).image.clamp(0, 1)
 
     def _render(self, view: View) -> Rendering:
-        degree, background = self.options.sh_degree, self.scene.background
+        degree, background = self.active_sh_degree, self.scene.background
         return render(self.gaussians, view.camera, sh_degree=degree, background=background)
+
+    @property
+    def active_sh_degree(self) -> int:
+        """The degree of spherical harmonics in use: one more each `sh_degree_interval`."""
+        return min(self.iteration // self.options.sh_degree_interval, self.options.sh_degree)
 
     def compile_kernels(self) -> None:
         """Have the rasterizer compiled, or loaded from its cache, before the run's clock starts."""
@@ -235,7 +241,8 @@ class Fit:
         state = torch.load(path, weights_only=True)
         arm = trunk or self.arm.name
         mine = (self.scene.name, arm, asdict(self.options), CHECKPOINT_FORMAT)
-        its = (state["scene"], state["arm"], state["options"], state["format"])
+        options = asdict(FitOptions()) | state["options"]  # older files lack newer options
+        its = (state["scene"], state["arm"], options, state["format"])
         if mine != its:
             raise ValueError(
                 f"{path}: a checkpoint of {its}, but this run is {mine}; choose another folder"

@@ -15,11 +15,10 @@ from splatting.camera import Camera
 from splatting.colmap import PosedImage, SparseModel, read_colmap
 from splatting.transforms import read_json_object, read_transforms
 
-Size = Literal["small", "large"]
+Size = Literal["images", "images_2", "images_4"]  # the folder of the photos
 Layout = Literal["auto", "colmap", "transforms"]
 Background = Literal["black", "white"]
 
-_IMAGE_FOLDERS = {"small": "images_4", "large": "images"}
 _TEST_EVERY = 8  # the convention of Mip-NeRF 360 and of every 3DGS paper since
 
 
@@ -47,7 +46,7 @@ class Scene:
 
 def load_scene(
     source: str | Path,
-    size: Size = "small",
+    size: Size = "images_4",
     layout: Layout = "auto",
     *,
     background: Background = "black",
@@ -55,13 +54,13 @@ def load_scene(
 ) -> Scene:
     """Load a scene from a folder, or make the embedded one.
 
-    A folder holds `images/` and `images_4/` and either a COLMAP model in `sparse/0/` (or
-    `sparse/`), or `transforms.json` with its .ply. Test views are those of `split.json` where
-    there is one, and otherwise every 8th of the sorted names.
+    A folder holds `images/`, its halves `images_2/` and quarters `images_4/`, and either a COLMAP
+    model in `sparse/0/` (or `sparse/`), or `transforms.json` with its .ply. Test views are those
+    of `split.json` where there is one, and otherwise every 8th of the sorted names.
 
     Args:
         source: "embedded" (procedural, nothing to download; see `embedded.py`) or a folder.
-        size: "small" reads `images_4`, "large" `images`; intrinsics follow the actual image size.
+        size: the folder of the photos; intrinsics follow the actual image size.
         layout: "auto" prefers COLMAP where both layouts are present.
         background: what is behind the Gaussians; "white" for NeRF-synthetic scenes.
         held_out: the test views are those whose index among the sorted names is this modulo 8
@@ -92,7 +91,7 @@ def load_scene(
         raise ValueError(f"{folder}: expected finite sparse points, got {len(model.points)} points")
     names = sorted(image.name for image in model.images)
     train_names, test_names = _split(folder, names, held_out)
-    images = folder / _IMAGE_FOLDERS[size]
+    images = folder / size
     if not images.is_dir():
         raise FileNotFoundError(f"{images}: missing, expected the photos of size={size!r}")
     views = {posed.name: _load_view(images, posed) for posed in model.images}

@@ -145,6 +145,8 @@ def folder_of(spec: Spec, out: Path) -> Path:
     kind = f"{spec.points}-{spec.iterations}-{spec.init}"
     if spec.sh_degree:
         kind += f"-sh{spec.sh_degree}"
+    if spec.size != "images_4":
+        kind += f"-{spec.size}"
     kind += "-rotated" * spec.rotated
     arm = spec.arm.replace("/", "_")
     return out / Path(spec.scene).name / kind / arm / f"seed-{spec.seed}"

@@ -22,7 +22,7 @@ class Setting:
     init: str
     sh_degree: int = 0
     rotated: bool = False  # the seed says which views are held out
-    size: str = "small"
+    size: str = "images_4"
 
 
 @dataclass(frozen=True)
@@ -78,6 +78,8 @@ def gather(folder: Path) -> list[dict[str, Any]]:
         record = json.loads(path.read_text(encoding="utf-8"))
         if record.get("finished"):
             del record["finished"]
+            if record.get("size") == "small":  # its name in the first trainings at 30,000
+                record["size"] = "images_4"
             record["curve"] = [[row.get(name) for name in COLUMNS] for row in record["curve"]]
             found.append(record)
     return found

@@ -44,7 +44,7 @@ class Spec:
     points: int
     init: str = "sfm"
     sh_degree: int = 0
-    size: Size = "small"
+    size: Size = "images_4"
     rotated: bool = False  # the seed says which views are held out: index = seed modulo 8
 
     def options(self) -> FitOptions:

@@ -1,4 +1,8 @@
-"""The projection of `projection.py` and its gradient, compiled, in float64."""
+"""The projection of `projection.py` and its gradient, compiled, for the visible points alone.
+
+Parameters are read as float32 or float64, and computed with in float64: points are few beside
+pixels.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +10,16 @@ import math
 
 import numpy as np
 
-from splatting.numba_kernel import kernel
+from splatting.fast.kernel import kernel
 from splatting.projection import ALPHA_MIN, BLUR, FAR_PLANE, NEAR_PLANE
+
+MAX_EXTENT = math.sqrt(2 * math.log(1 / ALPHA_MIN))  # sigmas, at opacity 1
 
 
 @kernel
 def _unit_quaternion(quats, point):
-    w, x, y, z = quats[point, 0], quats[point, 1], quats[point, 2], quats[point, 3]
+    w, x = np.float64(quats[point, 0]), np.float64(quats[point, 1])
+    y, z = np.float64(quats[point, 2]), np.float64(quats[point, 3])
     norm = max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)  # as torch's normalize
     return w / norm, x / norm, y / norm, z / norm, norm
 
@@ -74,7 +81,7 @@ def _factors(x, y, z, viewmat, lens, rotation, log_scales, to_image, oriented, f
             for k in range(3):
                 value += to_image[row, k] * rotation[k, column]
             oriented[row, column] = value
-            factors[row, column] = value * math.exp(log_scales[column])
+            factors[row, column] = value * math.exp(np.float64(log_scales[column]))
 
 
 @kernel
@@ -85,21 +92,42 @@ def _reach(mean, variance, extent, size):
 
 
 @kernel
-def project_forward(means, quats, scales, opacities, viewmat, lens, width, height):
-    """Project all points; see `projection.project` and `projection.visible_points`.
+def _may_reach(mean, position, z, lens, largest, size):
+    """False only if a Gaussian no wider than `largest` cannot reach (0, size), cheaply."""
+    slope = min(max(position / z, lens[2]), lens[3])
+    focal = lens[0] / z * largest
+    radius = 1 + MAX_EXTENT * math.sqrt(focal * focal * (1 + slope * slope) + BLUR)
+    return not (mean + radius < 0 or mean - radius > size)
+
+
+@kernel
+def project_points(means, quats, scales, logits, viewmat, lens, width, height):
+    """Project the visible points; see `projection.project` and `projection.visible_points`.
 
     `lens` [2, 4] holds, for x and y, focal length, centre and the limits of the slope.
-    Returns means [N, 2], covariances [N, 3], determinants [N], depths [N], visible [N].
+    Returns visible [N], the V visible points' index, and their geometry [V, 8]: mean x, y,
+    covariance xx, xy, yy, its determinant, depth, opacity.
     """
     n = means.shape[0]
-    means2d, covariances = np.zeros((n, 2)), np.zeros((n, 3))
-    determinants, depths, visible = np.zeros(n), np.zeros(n), np.zeros(n, np.bool_)
+    visible, index = np.zeros(n, np.bool_), np.empty(n, np.int64)
+    geometry = np.empty((n, 8))
     rotation = np.empty((3, 3))
     to_image, oriented, f = np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
+    used = 0
     for point in range(n):
         x, y, z = _camera_space(means, point, viewmat)
-        depths[point] = z
-        if not (NEAR_PLANE < z < FAR_PLANE and opacities[point] > ALPHA_MIN):
+        if not NEAR_PLANE < z < FAR_PLANE:
+            continue
+        mean_x, mean_y = lens[0, 0] * x / z + lens[0, 1], lens[1, 0] * y / z + lens[1, 1]
+        largest = max(scales[point, 0], scales[point, 1], scales[point, 2])
+        largest = math.exp(np.float64(largest))
+        if not (
+            _may_reach(mean_x, x, z, lens[0], largest, width)
+            and _may_reach(mean_y, y, z, lens[1], largest, height)
+        ):
+            continue
+        opacity = 1 / (1 + math.exp(-np.float64(logits[point])))
+        if not opacity > ALPHA_MIN:
             continue
         qw, qx, qy, qz, _ = _unit_quaternion(quats, point)
         _rotation(qw, qx, qy, qz, rotation)
@@ -113,17 +141,18 @@ def project_forward(means, quats, scales, opacities, viewmat, lens, width, heigh
         determinant = area + BLUR * (xx + yy) + BLUR * BLUR
         if not math.isfinite(determinant):
             continue
-        means2d[point, 0] = lens[0, 0] * x / z + lens[0, 1]
-        means2d[point, 1] = lens[1, 0] * y / z + lens[1, 1]
-        covariances[point, 0] = xx + BLUR
-        covariances[point, 1] = f[0, 0] * f[1, 0] + f[0, 1] * f[1, 1] + f[0, 2] * f[1, 2]
-        covariances[point, 2] = yy + BLUR
-        determinants[point] = determinant
-        extent = math.sqrt(2 * math.log(opacities[point] / ALPHA_MIN))
-        visible[point] = _reach(means2d[point, 0], xx + BLUR, extent, width) and _reach(
-            means2d[point, 1], yy + BLUR, extent, height
-        )
-    return means2d, covariances, determinants, depths, visible
+        extent = math.sqrt(2 * math.log(opacity / ALPHA_MIN))
+        if not (
+            _reach(mean_x, xx + BLUR, extent, width) and _reach(mean_y, yy + BLUR, extent, height)
+        ):
+            continue
+        geometry[used, 0], geometry[used, 1] = mean_x, mean_y
+        geometry[used, 2], geometry[used, 4] = xx + BLUR, yy + BLUR
+        geometry[used, 3] = f[0, 0] * f[1, 0] + f[0, 1] * f[1, 1] + f[0, 2] * f[1, 2]
+        geometry[used, 5], geometry[used, 6], geometry[used, 7] = determinant, z, opacity
+        visible[point], index[used] = True, point
+        used += 1
+    return visible, index[:used].copy(), geometry[:used].copy()
 
 
 @kernel
@@ -137,20 +166,18 @@ def _slope_gradient(x, z, slope, lens, grad_focal, grad_slope):
 
 
 @kernel
-def project_backward(grad_means2d, grad_covariances, means, quats, scales, viewmat, lens, visible):
+def points_backward(grad_means2d, grad_covariances, means, quats, scales, viewmat, lens):
     """Gradients by means, quats and scales.
 
-    `grad_covariances` [N, 3] is the symmetric gradient matrix (xx, xy, yy), so that xy stands
+    `grad_covariances` [V, 3] is the symmetric gradient matrix (xx, xy, yy), so that xy stands
     for both off-diagonal elements.
     """
-    grad_means, grad_quats = np.zeros_like(means), np.zeros_like(quats)
-    grad_scales = np.zeros_like(scales)
+    n = means.shape[0]
+    grad_means, grad_quats, grad_scales = np.zeros((n, 3)), np.empty((n, 4)), np.empty((n, 3))
     rotation, grad_rotation = np.empty((3, 3)), np.empty((3, 3))
     to_image, oriented, factors = np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
     grad_to_image, grad_camera = np.empty((2, 3)), np.empty(3)
-    for point in range(means.shape[0]):
-        if not visible[point]:
-            continue
+    for point in range(n):
         x, y, z = _camera_space(means, point, viewmat)
         qw, qx, qy, qz, norm = _unit_quaternion(quats, point)
         _rotation(qw, qx, qy, qz, rotation)
@@ -159,7 +186,7 @@ def project_backward(grad_means2d, grad_covariances, means, quats, scales, viewm
         grad_rotation[:] = 0
         grad_to_image[:] = 0
         for k in range(3):
-            scale = math.exp(scales[point, k])
+            scale = math.exp(np.float64(scales[point, k]))
             # By J W R, from covariance = F F^T: 2 G F, then times S.
             first = 2 * scale * (xx * factors[0, k] + xy * factors[1, k])
             second = 2 * scale * (xy * factors[0, k] + yy * factors[1, k])

@@ -1,4 +1,4 @@
-"""The colours of `spherical_harmonics.py` and their gradients, compiled, in float64."""
+"""The colours of `spherical_harmonics.py` and their gradients, compiled, for visible points."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from splatting.numba_kernel import kernel
+from splatting.fast.kernel import kernel
 from splatting.spherical_harmonics import (
     SH_0,
     SH_1,
@@ -75,14 +75,12 @@ def _direction(means, point, viewpoint):
 
 
 @kernel
-def colors_forward(means, viewpoint, sh0, shN, degree, visible):
-    """The colours [N, 3] before max(., 0); points that are not visible stay at 0."""
+def colors_forward(means, viewpoint, sh0, shN, degree):
+    """The colours [V, 3] before max(., 0)."""
     count = (degree + 1) ** 2
     basis = np.zeros(16)
     colors = np.zeros((means.shape[0], 3))
     for point in range(means.shape[0]):
-        if not visible[point]:
-            continue
         x, y, z, _ = _direction(means, point, viewpoint)
         _basis(x, y, z, degree, basis)
         for channel in range(3):
@@ -94,17 +92,15 @@ def colors_forward(means, viewpoint, sh0, shN, degree, visible):
 
 
 @kernel
-def colors_backward(grad_colors, colors, means, viewpoint, sh0, shN, degree, visible):
+def colors_backward(grad_colors, colors, means, viewpoint, shN, degree):
     """Gradients by sh0, shN and means, from that by max(colors, 0); `colors` as returned above."""
     count = (degree + 1) ** 2
     basis = np.zeros(16)
     grad_basis = np.zeros(16)
-    grad_sh0 = np.zeros_like(sh0)
-    grad_shN = np.zeros_like(shN)
-    grad_means = np.zeros_like(means)
+    grad_sh0 = np.zeros((means.shape[0], 1, 3))
+    grad_shN = np.zeros(shN.shape)
+    grad_means = np.zeros((means.shape[0], 3))
     for point in range(means.shape[0]):
-        if not visible[point]:
-            continue
         x, y, z, distance = _direction(means, point, viewpoint)
         _basis(x, y, z, degree, basis)
         grad_basis[:] = 0

@@ -12,12 +12,14 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function at its first call, and keep the result on disk where that is possible.
 
     Without fastmath, so that infinities and NaNs behave as in the reference, and every sum has
-    one order. The kernels release the GIL and use one thread.
+    one order; a division by zero gives an infinity. The kernels release the GIL and use one
+    thread.
 
-    The cache knows only the source file of a kernel. So kernels call only functions of their own
-    file; when a constant that they import changes, delete `__pycache__`.
+    The cache knows only the source file of a kernel. So kernels call only kernels of their own
+    file; when a constant or `lanes.py`, which they import, changes, delete `__pycache__`.
     """
+    options = {"nogil": True, "error_model": "numpy"}
     try:
-        return numba.njit(nogil=True, cache=True)(function)
+        return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # numba finds no writable directory for its cache
-        return numba.njit(nogil=True)(function)
+        return numba.njit(**options)(function)
