@@ -114,6 +114,18 @@ def core() -> list[StudyArm]:
             preset=paper_scheduler,
         ),
         StudyArm(
+            "faded-3000",
+            "moments of random points faded ten times as often",
+            "faded",
+            fixed(fading=Fading(events=3_000)),
+        ),
+        StudyArm(
+            "defaults-3000",
+            "the defaults, faded ten times as often",
+            DEFAULTS,
+            fixed(**{**PARTS[DEFAULTS], "fading": Fading(events=3_000)}),
+        ),
+        StudyArm(
             "paper-constant",
             "a constant multiplier, the paper's mean nu",
             BASELINE,

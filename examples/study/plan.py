@@ -16,7 +16,10 @@ QUICK_SCENES = ("banana", "embedded")  # for the options of a part
 FEW_VIEWS_SCENES = ("brighton_beach", "plush")  # fewest views to speak of over-fitting, and most
 MANY_VIEWS_SCENES = ("bonsai", "lego", "plush")
 ROTATED_SCENES = (*MANY_VIEWS_SCENES, "embedded", "banana", "lund_door", "brighton_beach")
-ROTATED_ARMS = ("mcmc", DEFAULTS, "paper", "paper-constant", "faded", "rates-x2", POOLED)
+ROTATED_ARMS = (
+    *("mcmc", DEFAULTS, "defaults-3000", "faded", "paper", "paper-constant"),
+    *("faded-3000", "rates-x2", POOLED),
+)
 FULL_PARTS_SCENES = ("brighton_beach", "lund_door")  # where the defaults lose
 OVERFITTING = (
     *(f"{ALL_ANNEALED}{x}" for x in ("-means-1", "+decoupled", "+regularisers-0")),
