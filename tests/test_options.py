@@ -29,7 +29,7 @@ from opt3dgs_optim.curvature import history_from_pairs
 from opt3dgs_optim.lqnadam import CurvatureOptions
 from opt3dgs_optim.multiplier import ConstantMultiplier
 from opt3dgs_optim.noise import CovarianceNoise, IsotropicNoise
-from opt3dgs_optim.runlog import RunLog
+from opt3dgs_optim.runs import RunLog
 
 TORCH = "checked, or taken as truth values, by torch.optim.Adam"
 FREE = "any value is meaningful, or torch raises where it is used"

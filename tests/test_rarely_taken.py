@@ -17,8 +17,8 @@ from opt3dgs_optim._evidence import largest_noise
 from opt3dgs_optim._nonfinite import CAPACITY, FrozenRows
 from opt3dgs_optim._ranks import RankMean
 from opt3dgs_optim._visible import masked_adam
-from opt3dgs_optim.report import write_report
-from opt3dgs_optim.runlog import RunLog
+from opt3dgs_optim.runs import RunLog
+from opt3dgs_optim.runs.report import write_report
 
 
 class OnGpu(Tensor):
@@ -199,7 +199,7 @@ def test_half_precision_energies_are_summed_in_float32(
 
 
 def test_a_log_on_a_system_without_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from opt3dgs_optim import runfile
+    from opt3dgs_optim.runs import lines
 
     def refuse(file: Any, how: int) -> None:
         raise OSError("no locks here")
@@ -208,7 +208,7 @@ def test_a_log_on_a_system_without_locks(tmp_path: Path, monkeypatch: pytest.Mon
     for _ in "ab":
         with RunLog(tmp_path / "log.jsonl") as log:
             log.step(0, phase="exploration", loss=0.5)
-    monkeypatch.setattr(runfile, "fcntl", None)  # as on Windows
+    monkeypatch.setattr(lines, "fcntl", None)  # as on Windows
     with RunLog(tmp_path / "log.jsonl") as log:
         log.step(1, phase="exploration", loss=0.25)
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]

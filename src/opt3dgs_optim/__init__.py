@@ -14,6 +14,7 @@ from opt3dgs_optim.fading import Fading
 from opt3dgs_optim.lqnadam import LQNAdam
 from opt3dgs_optim.phases import Phase, PhaseScheduler
 from opt3dgs_optim.pooling import Pooling
+from opt3dgs_optim.runs import RunLog
 
 __all__ = [
     "AWSGLD",
@@ -25,6 +26,7 @@ __all__ = [
     "Phase",
     "PhaseScheduler",
     "Pooling",
+    "RunLog",
     "__version__",
     "backend_info",
     "two_loop",

@@ -10,7 +10,7 @@ from opt3dgs_optim._version import __version__
 
 COMMANDS = {
     "doctor": "versions, which backend runs and why, a self-test, and what a step costs here",
-    "report": "compare runs from their logs, or watch them while they train (--follow)",
+    "report": "compare runs from their logs: error against run time, as a table and plots",
     "hosts": "the lines to change in your trainer, as a diff or applied",
 }
 
@@ -45,7 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"opt3dgs_optim: no command {words[0]!r}\n\n{usage()}", file=sys.stderr)
         return 2
     try:
-        return importlib.import_module(f"opt3dgs_optim.{words[0]}").main(words[1:])
+        module = "runs.report" if words[0] == "report" else words[0]
+        return importlib.import_module(f"opt3dgs_optim.{module}").main(words[1:])
     except KeyboardInterrupt:
         return 130
 

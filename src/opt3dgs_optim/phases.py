@@ -35,7 +35,7 @@ from opt3dgs_optim.pooling import Pooling
 
 if TYPE_CHECKING:
     from opt3dgs_optim._adaptive import Adaptive
-    from opt3dgs_optim.runlog import RunLog
+    from opt3dgs_optim.runs import RunLog
 
 __all__ = ["PAPER_STEPS", "PAPER_SWITCH", "Phase", "PhaseScheduler"]
 
