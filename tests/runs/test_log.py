@@ -58,7 +58,7 @@ def test_steps_round_trip_exactly(tmp_path, rows):
     path.unlink(missing_ok=True)
     with RunLog(path) as log:
         for i, row in enumerate(rows):
-            log.step(i, phase="exploration", **row)
+            log.step(i, phase="exploration", **row)  # pyright: ignore[reportArgumentType]
     strict_lines(path)
     run = read_run(path)
     assert run.steps["iteration"].tolist() == list(range(len(rows)))
@@ -559,8 +559,8 @@ def test_what_is_no_writer_is_refused(tmp_path):
 
 @pytest.mark.filterwarnings("default")  # what tensorboard warns of is not ours
 def test_tensorboard_reads_back_what_was_mirrored(tmp_path):
-    pytest.importorskip("tensorboard", reason="tensorboard is not installed")
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+    name = "tensorboard.backend.event_processing.event_accumulator"
+    events = pytest.importorskip(name, reason="tensorboard is not installed")
     from torch.utils.tensorboard import SummaryWriter
 
     with SummaryWriter(str(tmp_path / "board")) as writer, RunLog(tmp_path / "run.jsonl") as log:
@@ -568,7 +568,7 @@ def test_tensorboard_reads_back_what_was_mirrored(tmp_path):
         for i in range(1, 4):
             log.step(i, phase="exploration", loss=torch.tensor(1 / i), nu=math.nan)
         log.evaluation(3, psnr=20.5)
-    found = EventAccumulator(str(tmp_path / "board"))
+    found = events.EventAccumulator(str(tmp_path / "board"))
     found.Reload()
     losses = [(event.step, event.value) for event in found.Scalars("step/loss")]
     assert losses == [(i, pytest.approx(1 / i)) for i in (1, 2, 3)]

@@ -54,16 +54,16 @@ def draw(comparison: Comparison, path: Path, footer: str) -> None:
         grid[-1, column].set_xlabel(name, fontsize=10, color=INK)
         _phases(grid[:, column], comparison, axis)
     for panel, step in zip(grid[:, 0], rows, strict=True):
-        name = LABELS.get(comparison.metric, comparison.metric) if step is None else step
-        panel.set_ylabel(
-            _cut(name, 40 if step is None else 16), fontsize=10, color=INK, parse_math=False
-        )
+        name = step or LABELS.get(comparison.metric, comparison.metric)
+        look = {"fontsize": 10, "color": INK, "parse_math": False}
+        panel.set_ylabel(_cut(name, 40 if step is None else 16), **look)
+    figure.align_ylabels(grid[:, 0])
     _words(figure, comparison, labels, columns)
     better = "higher" if higher_is_better(comparison.metric) else "lower"
     caption = f"Lines: mean over seeds; bands: least to greatest; {better} is better. Dashed: "
     caption += f"the baseline's final mean (above), 1 (below). Dotted: next phase. {footer}"
     small = {"fontsize": 7.5, "color": GREY, "va": "bottom", "parse_math": False}
-    figure.text(0.075, 0.1 / height, textwrap.fill(_cut(caption, 700), 175), **small)
+    figure.text(0.075, 0.1 / height, textwrap.fill(_cut(caption, 520), 175), **small)
     with warnings.catch_warnings():  # a name in letters that matplotlib's font lacks
         warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)
         figure.savefig(path)
@@ -101,9 +101,8 @@ def _panel(panel: Any, comparison: Comparison, axis: str, step: str | None) -> N
         seen += curves
     level = comparison.target if step is None else 1.0
     if not seen:
-        words = f"no finite evaluation of {_cut(comparison.metric, 40)}" if step is None else ""
-        place = {"transform": panel.transAxes, "ha": "center", "color": FAINT}
-        panel.text(0.5, 0.5, words, parse_math=False, **place)
+        words = "no finite evaluation" if step is None else "nothing finite"
+        panel.text(0.5, 0.5, words, transform=panel.transAxes, ha="center", color=FAINT)
         return
     if step is None:
         _zoom(panel, seen)
@@ -183,9 +182,9 @@ def _words(figure: Any, comparison: Comparison, labels: list[str], columns: int)
 
     height, metric = figure.get_figheight(), comparison.metric
     scene = "" if comparison.scene is None else f", {comparison.scene}"
-    title = f"{LABELS.get(metric, metric)} against run time and iterations{scene}"
+    title = f"{_cut(LABELS.get(metric, metric), 40)} against run time and iterations{scene}"
     look = {"fontsize": 13, "weight": "bold", "color": INK, "va": "top", "parse_math": False}
-    figure.text(0.075, 1 - 0.22 / height, _cut(title, 100), **look)
+    figure.text(0.075, 1 - 0.22 / height, _cut(title, 85), **look)
     legend = figure.legend(
         [Line2D([], [], lw=2.4, **_look(arm)) for arm in comparison.arms],
         [f" {label}" for label in labels],  # a leading underscore would hide it

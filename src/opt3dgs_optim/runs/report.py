@@ -88,7 +88,7 @@ def write_report(
 def _picture_names(scenes: list[str | None]) -> list[str]:
     if len(scenes) == 1:
         return ["report.png"]
-    names = ["report-" + re.sub(r"[^\w.-]+", "_", s or "")[:100] + ".png" for s in scenes]
+    names = ["report-" + re.sub(r"[^\w.-]+", "_", s or "")[:60] + ".png" for s in scenes]
     lower = [name.lower() for name in names]  # as some file systems see them
     for i, name in enumerate(lower):
         if (first := lower.index(name)) < i:

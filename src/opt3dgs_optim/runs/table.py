@@ -30,18 +30,11 @@ READING = (
 
 def as_json(comparisons: Sequence[Comparison], runs: Sequence[Run]) -> str:
     """The whole report; statistics are {mean, std, n} or null, NaN is the string "nan"."""
-    scenes = [
-        {
-            "scene": c.scene,
-            "metric": c.metric,
-            "higher_is_better": higher_is_better(c.metric),
-            "baseline": c.baseline,
-            "baseline_final": c.target,
-            "arms": [_arm_object(arm) for arm in c.arms],
-            "notes": c.notes,
-        }
-        for c in comparisons
-    ]
+    scenes = []
+    for c in comparisons:
+        scene = {"scene": c.scene, "metric": c.metric, "baseline": c.baseline, "notes": c.notes}
+        scene |= {"higher_is_better": higher_is_better(c.metric), "baseline_final": c.target}
+        scenes.append(scene | {"arms": [_arm_object(arm) for arm in c.arms]})
     report = {"format": 1, "origin": origin_lines(runs), "scenes": scenes}
     return json.dumps(plain("report", report), indent=2, allow_nan=False) + "\n"
 
