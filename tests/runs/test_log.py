@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import inspect
 import json
 import math
 import os
@@ -20,7 +21,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from opt3dgs_optim.runs import RunLog, read_run
+from opt3dgs_optim.runs import RunLog, lines, read_run
 from opt3dgs_optim.runs import log as log_module
 
 NUMBERS = st.one_of(
@@ -459,6 +460,54 @@ def test_real_clock_runs(tmp_path):
     with RunLog(tmp_path / "run.jsonl") as log:
         time.sleep(0.02)
         assert 0.02 <= log.seconds < 20
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        ({"every": 0}, ValueError),
+        ({"every": 1.5}, ValueError),
+        ({"every": None}, ValueError),
+        ({"metadata": {"a": object()}}, TypeError),
+        ({"path": None}, TypeError),
+    ],
+    ids=str,
+)
+def test_a_wrong_option_is_refused(options, error, tmp_path):
+    with pytest.raises(error):
+        RunLog(**{"path": tmp_path / "run.jsonl", **options})
+    assert set(inspect.signature(RunLog).parameters) == {"path", "metadata", "every"}
+
+
+def test_a_log_on_a_system_without_locks(tmp_path, monkeypatch):
+    def refuse(file, how):
+        raise OSError("no locks here")
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    for _ in "ab":
+        with RunLog(tmp_path / "log.jsonl") as log:
+            log.step(0, phase="exploration", loss=0.5)
+    monkeypatch.setattr(lines, "fcntl", None)  # as on Windows
+    with RunLog(tmp_path / "log.jsonl") as log:
+        log.step(1, phase="exploration", loss=0.25)
+    kinds = [line["kind"] for line in strict_lines(tmp_path / "log.jsonl")]
+    assert kinds.count("start") == 3
+
+
+def test_a_log_says_how_much_memory_a_gpu_has_given(tmp_path, monkeypatch):
+    waited = []
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "a GPU")
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda: 12345)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: waited.append(True))
+    with RunLog(tmp_path / "log.jsonl") as log:
+        log.step(0, phase="exploration", loss=0.5)
+        with log.paused():
+            log.evaluation(1, psnr=20.0)
+    said = (tmp_path / "log.jsonl").read_text()
+    assert '"gpu":"a GPU"' in said
+    assert "12345" in said
+    assert waited == [True, True]  # before the pause and after it
 
 
 # -- mirrors ---------------------------------------------------------------------------------------

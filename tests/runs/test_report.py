@@ -237,6 +237,11 @@ def test_an_arm_has_one_colour_on_all_scenes_and_the_first_is_the_baselines(tmp_
     assert "The baseline arm did not run" in (tmp_path / "out/report.md").read_text()
 
 
+def test_a_report_on_nothing(tmp_path):
+    with pytest.raises(ValueError, match="no runs; pass at least one"):
+        report.write_report([], tmp_path)
+
+
 def test_without_psnr_the_first_metric_is_compared(tmp_path):
     run = write_run(tmp_path / "a.jsonl", "a", 0, [(1, 1.0, 0.5)], metric="ssim")
     assert compare([run])[0].metric == "ssim"

@@ -17,6 +17,14 @@ STYLES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))  # one for each round through the
 INK, GREY, FAINT = "#222222", "#666666", "#8a8a8a"
 LABELS = {"psnr": "PSNR (dB)", "train_psnr": "training PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS"}
 AXES = {"seconds": "run time (s)", "iteration": "iteration"}
+STYLE: dict[str, Any] = dict.fromkeys(("axes.spines.top", "axes.spines.right"), False)
+STYLE |= dict.fromkeys(("text.usetex", "text.parse_math", "legend.frameon"), False)  # $ is a $
+STYLE |= dict.fromkeys(("axes.labelcolor", "xtick.color", "ytick.color", "legend.labelcolor"), INK)
+STYLE |= {"axes.facecolor": "white", "axes.edgecolor": "#999999", "axes.xmargin": 0.02}
+STYLE |= {"axes.grid": True, "axes.grid.axis": "y", "axes.axisbelow": True}
+STYLE |= {"grid.color": "#e4e4e4", "grid.linewidth": 0.6, "axes.labelsize": 10}
+STYLE |= {"xtick.labelsize": 9, "ytick.labelsize": 9, "xtick.major.size": 3, "ytick.major.size": 3}
+STYLE |= {"legend.fontsize": 9.5, "legend.handlelength": 1.8, "legend.columnspacing": 1.6}
 PANELS = 4  # step columns shown
 BINS = 50  # that a step column is averaged in: single steps are too noisy to look at
 LARGEST = 1e30  # far below where matplotlib's own arithmetic overflows
@@ -28,17 +36,27 @@ def draw(comparison: Comparison, path: Path, footer: str) -> None:
     """Draw `comparison` into the PNG file `path`, with `footer` in small print.
 
     Lines are means over seeds, bands reach from the least to the greatest. Uses matplotlib's Agg
-    canvas alone: no backend is chosen and no global setting changed.
+    canvas alone: no backend is chosen and no global setting stays changed.
 
     Raises:
         ModuleNotFoundError: matplotlib is not installed.
     """
+    import matplotlib
+
+    with matplotlib.rc_context(STYLE), warnings.catch_warnings():
+        # Names in letters that matplotlib's font lacks are drawn as boxes.
+        warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)
+        _figure(comparison, footer).savefig(path)
+
+
+def _figure(comparison: Comparison, footer: str) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
     rows = [None, *step_names([run for arm in comparison.arms for run in arm.runs])[:PANELS]]
     labels = [_label(arm, comparison) for arm in comparison.arms]
-    columns = max(1, min(4, len(labels), 150 // (max(map(len, labels)) + 8)))
+    columns = max(1, min(4, 150 // (max(map(len, labels)) + 8)))  # of the legend
     above = 0.8 + 0.25 * -(-len(labels) // columns)  # inches, as all here
     height = above + 3.4 + 1.3 * (len(rows) - 1) + 1.0
     figure = Figure(figsize=(11, height), dpi=150, facecolor="white")
@@ -47,26 +65,27 @@ def draw(comparison: Comparison, path: Path, footer: str) -> None:
     spacing |= {"wspace": 0.06, "hspace": 0.14, "height_ratios": [3.4, *[1.15] * (len(rows) - 1)]}
     shape = {"sharex": "col", "sharey": "row", "squeeze": False}
     grid = figure.subplots(len(rows), len(AXES), gridspec_kw=spacing, **shape)
-    for column, (axis, name) in enumerate(AXES.items()):
-        for panel, step in zip(grid[:, column], rows, strict=True):
+    for panels, (axis, name) in zip(grid.T, AXES.items(), strict=True):
+        for panel, step in zip(panels, rows, strict=True):
             _panel(panel, comparison, axis, step)
-            _plain(panel)
-        grid[-1, column].set_xlabel(name, fontsize=10, color=INK)
-        _phases(grid[:, column], comparison, axis)
+        _phases(panels, comparison, axis)
+        panels[-1].set_xlabel(name)
+    metric = _cut(LABELS.get(comparison.metric, comparison.metric), 40)
     for panel, step in zip(grid[:, 0], rows, strict=True):
-        name = step or LABELS.get(comparison.metric, comparison.metric)
-        look = {"fontsize": 10, "color": INK, "parse_math": False}
-        panel.set_ylabel(_cut(name, 40 if step is None else 16), **look)
+        panel.set_ylabel(_cut(step, 16) if step else metric)
     figure.align_ylabels(grid[:, 0])
-    _words(figure, comparison, labels, columns)
+    lines = [Line2D([], [], lw=2.4, **_look(arm)) for arm in comparison.arms]
+    place = {"loc": "upper left", "bbox_to_anchor": (0.068, 1 - 0.5 / height), "ncols": columns}
+    figure.legend(lines, [f" {label}" for label in labels], **place)  # " ": one may begin with "_"
+    scene = "" if comparison.scene is None else f", {comparison.scene}"
+    title = _cut(f"{metric} against run time and iterations{scene}", 85)
+    figure.text(0.075, 1 - 0.22 / height, title, fontsize=13, weight="bold", color=INK, va="top")
     better = "higher" if higher_is_better(comparison.metric) else "lower"
     caption = f"Lines: mean over seeds; bands: least to greatest; {better} is better. Dashed: "
     caption += f"the baseline's final mean (above), 1 (below). Dotted: next phase. {footer}"
-    small = {"fontsize": 7.5, "color": GREY, "va": "bottom", "parse_math": False}
-    figure.text(0.075, 0.1 / height, textwrap.fill(_cut(caption, 520), 175), **small)
-    with warnings.catch_warnings():  # a name in letters that matplotlib's font lacks
-        warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)
-        figure.savefig(path)
+    small = textwrap.fill(_cut(caption, 520), 175)
+    figure.text(0.075, 0.1 / height, small, fontsize=7.5, color=GREY, va="bottom")
+    return figure
 
 
 def _label(arm: Arm, comparison: Comparison) -> str:
@@ -161,36 +180,4 @@ def _phases(panels: Any, comparison: Comparison, axis: str) -> None:
             panel.axvline(x, lw=1.0, ls=(0, (1, 1.5)), color=FAINT, zorder=1)
     where = {"xycoords": ("data", "axes fraction"), "ha": "right", "fontsize": 8.5, "color": GREY}
     for name, x in dict(reversed(places)).items():
-        panels[0].annotate(f"{_cut(name, 40)} ", (x, 0.02), parse_math=False, **where)
-
-
-def _plain(panel: Any) -> None:
-    """White, two spines, a faint grid."""
-    panel.set_facecolor("white")
-    panel.grid(True, axis="y", lw=0.6, color="#e4e4e4")
-    panel.set_axisbelow(True)
-    for side, spine in panel.spines.items():
-        spine.set_visible(side in ("left", "bottom"))
-        spine.set_color("#999999")
-    panel.tick_params(labelsize=9, colors=INK, length=3)
-    panel.margins(x=0.02)
-
-
-def _words(figure: Any, comparison: Comparison, labels: list[str], columns: int) -> None:
-    """Title, legend and how to read the picture."""
-    from matplotlib.lines import Line2D
-
-    height, metric = figure.get_figheight(), comparison.metric
-    scene = "" if comparison.scene is None else f", {comparison.scene}"
-    title = f"{_cut(LABELS.get(metric, metric), 40)} against run time and iterations{scene}"
-    look = {"fontsize": 13, "weight": "bold", "color": INK, "va": "top", "parse_math": False}
-    figure.text(0.075, 1 - 0.22 / height, _cut(title, 85), **look)
-    legend = figure.legend(
-        [Line2D([], [], lw=2.4, **_look(arm)) for arm in comparison.arms],
-        [f" {label}" for label in labels],  # a leading underscore would hide it
-        **{"loc": "upper left", "bbox_to_anchor": (0.068, 1 - 0.5 / height), "ncols": columns},
-        **{"frameon": False, "fontsize": 9.5, "labelcolor": INK, "handlelength": 1.8},
-        columnspacing=1.6,
-    )
-    for text in legend.get_texts():  # a dollar sign in an arm's name is no formula
-        text.set_parse_math(False)
+        panels[0].annotate(f"{_cut(name, 40)} ", (x, 0.02), **where)
