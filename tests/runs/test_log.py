@@ -59,7 +59,7 @@ def test_steps_round_trip_exactly(tmp_path, rows):
     path.unlink(missing_ok=True)
     with RunLog(path) as log:
         for i, row in enumerate(rows):
-            log.step(i, phase="exploration", **row)  # pyright: ignore[reportArgumentType]
+            log.step(i, phase="exploration", **row)
     strict_lines(path)
     run = read_run(path)
     assert run.steps["iteration"].tolist() == list(range(len(rows)))
@@ -113,7 +113,7 @@ def test_what_no_page_or_terminal_takes_is_replaced_in_texts_and_refused_in_name
         log.step(1, phase="\udfff")
         log.event("\0", 1, error="c\0d")
         with pytest.raises(ValueError, match=r"RunLog\.step\('a\\x00'=.*printable"):
-            log.step(1, **{"a\0": 1.0})
+            log.step(1, phase=None, **{"a\0": 1.0})
         with pytest.raises(ValueError, match=r"nu=.*no float64"):
             log.step(1, nu=10**400)
         with pytest.raises(ValueError, match=r"iteration=1\d*\): .* below"):

@@ -1,10 +1,9 @@
 """The run log: one JSON object a line, written while a trainer runs, without slowing it down.
 
 Lines are `{"kind": "start" | "step" | "evaluation" | "event", "iteration": ..., "seconds": ...}`
-plus whatever the call adds; `read_run` reads them back. `seconds` are run seconds: wall
-clock since the log was opened, without what `RunLog.paused` enclosed, carried on over a
-resume. JSON has no NaN or infinity: they are written as the strings `"nan"`, `"inf"` and
-`"-inf"` and read back as floats.
+plus whatever the call adds; `read_run` reads them back. `seconds` are run seconds: wall clock since
+the log was opened, without what `RunLog.paused` enclosed, carried on over a resume. JSON has no NaN
+or infinity: they are written as the strings "nan", "inf" and "-inf" and read back as floats.
 """
 
 from __future__ import annotations
@@ -63,8 +62,7 @@ class RunLog:
     Raises:
         ValueError: `every` < 1, metadata nested too deep, or `path` is no run log.
         TypeError: metadata that JSON cannot hold.
-        BlockingIOError: another RunLog, here or in another process, has the file open (found out
-            where the system can lock files).
+        BlockingIOError: another RunLog has the file open (noticed where files can be locked).
 
     Examples:
         >>> import os, tempfile
@@ -179,8 +177,8 @@ class RunLog:
     def evaluation(self, iteration: int, **metrics: float | Tensor) -> None:
         """Log metrics (`psnr` in dB, `ssim`, `train_psnr`, `num_points`, ...), one number each.
 
-        Adds `peak_cuda_bytes` (torch's peak of the current device) if CUDA is in use, else
-        `peak_host_bytes` (peak resident set of the process). Errors as in `step`.
+        Adds torch's `peak_cuda_bytes` if CUDA is in use, else the process's `peak_host_bytes`.
+        Errors as in `step`.
         """
         line = self._line("evaluation", index("RunLog.evaluation", iteration)) | peak_memory()
         self._pending.append(_pack("RunLog.evaluation", line, metrics))
@@ -223,9 +221,9 @@ class RunLog:
     def close(self) -> None:
         """Write what is pending and release the file; a second call does nothing."""
         try:
-            if not self._file.closed:
-                self._drain(wait=True)
+            self._drain(wait=True)
         finally:
+            self._pending.clear()
             self._file.close()
 
     def __enter__(self) -> RunLog:
@@ -256,8 +254,8 @@ class RunLog:
                 self._send(line)
 
     def _send(self, line: dict[str, Any]) -> None:
-        names = line.keys() - {"kind", "iteration", "phase"}
-        values = {f"{line['kind']}/{name}": float(line[name]) for name in sorted(names)}
+        names = sorted(line.keys() - {"kind", "iteration", "phase"})
+        values = {f"{line['kind']}/{name}": float(line[name]) for name in names}
         for writer in list(self._mirrors):
             try:
                 if hasattr(writer, "add_scalar"):

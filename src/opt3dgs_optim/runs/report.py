@@ -126,7 +126,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         runs = [read_run(path) for path in logs]
         written = write_report(runs, options.out, metric=options.metric, baseline=options.baseline)
     except (OSError, ValueError) as error:
-        print("report:", " ".join(str(error).split()), file=sys.stderr)
+        line = "".join(c if c.isprintable() else " " for c in str(error))  # names from logs in it
+        print("report:", line, file=sys.stderr)
         return 2
     for path in written:
         print(path)
