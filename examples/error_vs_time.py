@@ -28,8 +28,8 @@ from splatting.stopping import stop_at_once
 from tqdm import tqdm
 from train import SHARED_OPTIONS, add_fit_options, recorded_command
 
-from opt3dgs_optim.report import write_report
-from opt3dgs_optim.runlog import Run, read_run
+from opt3dgs_optim.runs import Run, read_run
+from opt3dgs_optim.runs.report import write_report
 
 DEFAULT_ARMS = "adam,mcmc,mcmc+awsgld,mcmc+constant-multiplier,mcmc+l2+reset,opt3dgs,annealed+faded"
 POLL_SECONDS = 0.2

@@ -19,7 +19,7 @@ from splatting.fit import Fit, FitOptions, run
 from splatting.gaussians import load_ply
 from splatting.scenes import Scene
 
-from opt3dgs_optim.runlog import read_run
+from opt3dgs_optim.runs import read_run
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 OPTIONS = FitOptions(iterations=90, points=150, switch=2 / 3, evaluations=3)

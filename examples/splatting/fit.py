@@ -14,7 +14,7 @@ from torch.nn import Parameter
 
 from opt3dgs_optim import Phase, PhaseScheduler
 from opt3dgs_optim.noise import CovarianceNoise
-from opt3dgs_optim.runlog import RunLog
+from opt3dgs_optim.runs import RunLog
 from splatting.arms import NOISE_LR, Arm
 from splatting.density import MCMCDensityControl, regularisers
 from splatting.gaussians import (

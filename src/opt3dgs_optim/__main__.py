@@ -45,7 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"opt3dgs_optim: no command {words[0]!r}\n\n{usage()}", file=sys.stderr)
         return 2
     try:
-        return importlib.import_module(f"opt3dgs_optim.{words[0]}").main(words[1:])
+        module = "runs.report" if words[0] == "report" else words[0]
+        return importlib.import_module(f"opt3dgs_optim.{module}").main(words[1:])
     except KeyboardInterrupt:
         return 130
 

@@ -10,9 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from opt3dgs_optim.runfile import START
-
-__all__ = ["Run", "read_run"]
+from opt3dgs_optim.runs.lines import DEEPEST, NO_TEXT, START, text
 
 Columns = dict[str, np.ndarray]
 KINDS = ("start", "step", "evaluation", "event")
@@ -28,7 +26,8 @@ class Run:
         metadata: what the trainer passed; a later session's entries win.
         origin: `command`, `time` (ISO, UTC) and `machine` of the first session.
         steps: columns of equal length over the step lines: `iteration` (int64), `seconds`,
-            `phase` (str) and every logged value as float64, NaN where a line lacks it.
+            `phase` (str, "" where a line has none) and every logged value as float64, NaN where
+            a line lacks it.
         evaluations: the same over the evaluation lines, without `phase`.
         events: the event lines, as dictionaries with `event`, `iteration`, `seconds`.
         records: all lines kept, in order, as dictionaries; tells "logged as NaN" from "absent".
@@ -67,17 +66,13 @@ def read_run(path: str | os.PathLike[str]) -> Run:
     for line in _lines(path):
         if line["kind"] == "start":
             starts.append(line)
-        if line["kind"] == "event" and line.get("event") == "resumed":
+        if line["kind"] == "event" and line["event"] == "resumed":
             records = [r for r in records if r["iteration"] <= line["iteration"]]
         records.append(line)
-    metadata: dict[str, Any] = {}
-    for start in starts:
-        metadata |= start.get("metadata", {})
-    origin = {key: starts[0].get(key) for key in ("command", "time", "machine")} if starts else {}
     return Run(
-        name=path.stem,
-        metadata=metadata,
-        origin=origin,
+        name=text(path.stem),
+        metadata={key: item for line in starts for key, item in line.get("metadata", {}).items()},
+        origin={key: starts[0].get(key) for key in ("command", "time", "machine") if starts},
         steps=_columns([r for r in records if r["kind"] == "step"]),
         evaluations=_columns([r for r in records if r["kind"] == "evaluation"]),
         events=[r for r in records if r["kind"] == "event"],
@@ -86,37 +81,42 @@ def read_run(path: str | os.PathLike[str]) -> Run:
 
 
 def _lines(path: Path) -> list[dict[str, Any]]:
-    *whole, _torn = path.read_bytes().split(b"\n")
+    *whole, torn = path.read_bytes().split(b"\n")
     lines = []
     for i, raw in enumerate(whole):
         try:
             lines.append(_parse(raw))
-        except ValueError as error:
-            after = whole[i + 1] if i + 1 < len(whole) else _torn
+        except (ValueError, RecursionError) as error:
+            after = whole[i + 1] if i + 1 < len(whole) else torn
             if after and (after.startswith(START) or START.startswith(after)):
                 continue  # torn by a kill, closed off by the session that starts on the next line
-            raise ValueError(f"{path}, line {i + 1}: {error}") from None
+            shown = raw[:60].decode("utf-8", "backslashreplace")
+            what = "not a line of strict JSON" if isinstance(error, RecursionError) else error
+            raise ValueError(f"{path}, line {i + 1}: {what}: {shown!a}") from None
     return lines
 
 
 def _parse(raw: bytes) -> dict[str, Any]:
     try:
         line = json.loads(raw, parse_constant=_refuse_constant)
-    except (ValueError, RecursionError):
-        raise ValueError(f"not a line of strict JSON: {_shown(raw)}") from None
+    except ValueError:  # among them UnicodeDecodeError, and integers of more than 4,300 digits
+        raise ValueError("not a line of strict JSON") from None
     if not isinstance(line, dict) or line.get("kind") not in KINDS:
-        raise ValueError(f"not a run-log line (an object with kind one of {KINDS}): {_shown(raw)}")
-    line = {key: _decode(value) for key, value in line.items()}
-    if type(line.get("iteration")) is not int or type(line.get("seconds")) not in (int, float):
-        raise ValueError(f"iteration must be an integer and seconds a number: {_shown(raw)}")
+        raise ValueError(f"not a run-log line (an object with kind one of {KINDS})")
+    line = _decode(line)
+    iteration, seconds = line.get("iteration"), line.get("seconds")
+    if type(iteration) is not int or not 0 <= iteration < 2**53:
+        raise ValueError("iteration must be an integer >= 0, below 2**53")
+    if type(seconds) not in (int, float) or not 0 <= seconds < 1e12:
+        raise ValueError("seconds must be a number >= 0, below 1e12")
     if line["kind"] in ("step", "evaluation"):
         for key, value in line.items():
             if key not in ("kind", "phase") and not isinstance(value, (int, float)):
-                raise ValueError(f"{key} must be a number: {_shown(raw)}")
+                raise ValueError(f"{key!a} must be a number")
     if line["kind"] == "event" and "event" not in line:
-        raise ValueError(f"an event line without its event: {_shown(raw)}")
+        raise ValueError("an event line without its event")
     if line["kind"] == "start" and not isinstance(line.get("metadata", {}), dict):
-        raise ValueError(f"metadata must be an object: {_shown(raw)}")
+        raise ValueError("metadata must be an object")
     return line
 
 
@@ -124,19 +124,25 @@ def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name} is no JSON")
 
 
-def _shown(raw: bytes) -> str:
-    text = raw.decode("utf-8", "backslashreplace")
-    return repr(text if len(text) <= 60 else text[:57] + "...")
-
-
-def _decode(value: Any) -> Any:
+def _decode(value: Any, depth: int = 0) -> Any:
+    """`value` with its non-finite numbers; ValueError for what no report could show."""
+    if depth > DEEPEST + 1:  # the line itself, and what `plain` allows in it
+        raise ValueError(f"nested deeper than {DEEPEST}")
     if isinstance(value, str):
-        return NON_FINITE.get(value, value)
+        return NON_FINITE.get(value, _whole(value))
+    if isinstance(value, int) and abs(value) >= 2**1023:
+        raise ValueError("an integer that is no float64")
     if isinstance(value, list):
-        return [_decode(item) for item in value]
+        return [_decode(item, depth + 1) for item in value]
     if isinstance(value, dict):
-        return {key: _decode(item) for key, item in value.items()}
+        return {_whole(key): _decode(item, depth + 1) for key, item in value.items()}
     return value
+
+
+def _whole(text: str) -> str:
+    if NO_TEXT.search(text):
+        raise ValueError("text with NUL or with a lone surrogate")
+    return text
 
 
 def _columns(lines: list[dict[str, Any]]) -> Columns:

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-import csv
+import html
 import importlib.util
 import json
+import re
 import subprocess
 import sys
+import tempfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
-from opt3dgs_optim import report
-from opt3dgs_optim.report_stats import compare, higher_is_better
-from opt3dgs_optim.runread import read_run
+from opt3dgs_optim.runs import read_run, report
+from opt3dgs_optim.runs.stats import compare, higher_is_better
 
 NAN = "nan"
 
@@ -53,7 +57,7 @@ def two_arms(folder):
     ]
 
 
-def arms_of(runs, metric="psnr", baseline=None) -> tuple[Any, dict[str, Any]]:
+def arms_of(runs, metric=None, baseline=None) -> tuple[Any, dict[str, Any]]:
     (comparison,) = compare(runs, metric, baseline)
     return comparison, {arm.name: arm for arm in comparison.arms}
 
@@ -112,16 +116,14 @@ def test_means_of_nu_and_accepted_share(tmp_path):
     run = write_run(tmp_path / "a.jsonl", "a", 0, [(3, 3.0, 20.0)], steps=steps)
     arm = arms_of([run])[1]["a"]
     assert arm.numbers["mean_nu"].mean == 1.5
-    assert arm.numbers["accepted_share"].mean == 0.25
-    assert arm.numbers["peak_memory_bytes"].mean == 2**30
+    assert arm.numbers["mean_accepted"].mean == 0.25
+    assert arm.numbers["peak_host_bytes"].mean == 2**30
 
 
-def test_markdown_csv_and_json_agree(tmp_path):
+def test_markdown_and_json_agree(tmp_path):
     report.write_report(two_arms(tmp_path), tmp_path / "out")
     data = json.loads((tmp_path / "out/report.json").read_text())
     markdown = (tmp_path / "out/report.md").read_text()
-    with open(tmp_path / "out/report.csv", newline="") as file:
-        rows = {row["arm"]: row for row in csv.DictReader(file)}
     table = [line for line in markdown.splitlines() if line.startswith("| ")]
     head = [cell.strip() for cell in table[0].strip("|").split("|")]
     cells = {
@@ -129,22 +131,21 @@ def test_markdown_csv_and_json_agree(tmp_path):
         for row in ([c.strip() for c in line.strip("|").split("|")] for line in table[2:])
     }
     for arm in data["scenes"][0]["arms"]:
-        row, cell = rows[arm["arm"]], cells[arm["arm"]]
-        found = {
-            "final_psnr": (arm["final"]["psnr"], cell["final psnr"]),
-            "seconds": (arm["seconds"], cell["seconds"]),
-            "seconds_to_baseline": (arm["seconds_to_baseline"], cell["seconds to baseline psnr"]),
-            "gain_at_equal_seconds": (
-                arm["gain_at_equal_seconds"],
-                cell["psnr gain at equal seconds"],
-            ),
-        }
-        for name, (stat, text) in found.items():
-            assert row[f"{name}_mean"] == ("" if stat is None else str(stat["mean"]))
-            if stat is not None:
-                shown = text.split()[0]
-                digits = len(shown.partition(".")[2])
-                assert float(shown) == pytest.approx(stat["mean"], abs=0.51 * 10**-digits)
+        cell = cells[arm["arm"]]
+        found = [
+            (arm["final"]["psnr"], cell["final psnr"]),
+            (arm["seconds"], cell["seconds"]),
+            (arm["iterations_per_second"], cell["iterations/s"]),
+            (arm["seconds_to_baseline"], cell["seconds to baseline psnr"]),
+            (arm["gain_at_equal_seconds"], cell["psnr gain at equal seconds"]),
+        ]
+        for stat, text in found:
+            if stat is None:
+                assert text == "baseline"
+                continue
+            shown = text.split()[0]
+            digits = len(shown.partition(".")[2])
+            assert float(shown) == pytest.approx(stat["mean"], abs=0.51 * 10**-digits)
     assert "Testix-1, 3 CPUs" in markdown
     assert "75" in cells["mcmc"]["seconds to baseline psnr"]
     assert "(1 of 2)" in cells["mcmc"]["seconds to baseline psnr"]
@@ -208,64 +209,180 @@ def test_scenes_get_their_own_table_and_picture(tmp_path):
     points = [(1, 1.0, 20.0), (2, 2.0, 21.0)]
     runs = [write_run(tmp_path / f"{s}.jsonl", "a", 0, points, scene=s) for s in ("x", "y/z")]
     names = [path.name for path in report.write_report(runs, tmp_path / "out")]
-    assert names[:3] == ["report.md", "report.csv", "report.json"]
-    assert names[3:] in ([], ["report-x.png", "report-y_z.png"])
+    assert names[:2] == ["report.md", "report.json"]
+    assert names[2:] in ([], ["report-x.png", "report-y_z.png"])
     text = (tmp_path / "out/report.md").read_text()
     assert "## x" in text
     assert "## y/z" in text
 
 
-def command(*arguments, blocked=False):
-    """The command line in a process of its own, with matplotlib hidden if ``blocked``."""
-    call = [sys.executable, "-W", "error", "-m", "opt3dgs_optim.report", *map(str, arguments)]
-    if blocked:
-        code = (
-            "import sys, runpy; sys.modules['matplotlib'] = None; "
-            "runpy.run_module('opt3dgs_optim.report', run_name='__main__')"
-        )
-        call = [sys.executable, "-W", "error", "-c", code, *map(str, arguments)]
-    return subprocess.run(call, capture_output=True, text=True, check=False)
+def test_an_arm_has_one_colour_on_all_scenes_and_the_first_is_the_baselines(tmp_path):
+    points = [(1, 1.0, 20.0), (2, 2.0, 21.0)]
+    arms = {"x": ("b", "mcmc", "a"), "y": ("a", "b"), "z": ("a", "mcmc")}
+    runs = [
+        write_run(tmp_path / f"{scene}-{arm}.jsonl", arm, 0, points, scene=scene)
+        for scene, names in arms.items()
+        for arm in names
+    ]
+    found = compare(runs)
+    colours = [{arm.name: arm.colour for arm in each.arms} for each in found]
+    assert colours == [{"mcmc": 0, "b": 1, "a": 2}, {"b": 1, "a": 2}, {"mcmc": 0, "a": 2}]
+    assert [each.baseline for each in found] == ["mcmc", None, "mcmc"]
+    report.write_report(runs, tmp_path / "out")
+    for scene, names in arms.items():
+        image = picture(tmp_path / f"out/report-{scene}.png")[..., :3]
+        for arm, colour in (("b", (0x00, 0x72, 0xB2)), ("a", (0xD5, 0x5E, 0x00))):
+            near = np.abs(image * 255 - np.array(colour)).max(axis=-1) < 3
+            assert (near.sum() > 100) == (arm in names), (scene, arm)
+    assert "The baseline arm did not run" in (tmp_path / "out/report.md").read_text()
+
+
+def test_a_report_on_nothing(tmp_path):
+    with pytest.raises(ValueError, match="no runs; pass at least one"):
+        report.write_report([], tmp_path)
+
+
+def test_without_psnr_the_first_metric_is_compared(tmp_path):
+    run = write_run(tmp_path / "a.jsonl", "a", 0, [(1, 1.0, 0.5)], metric="ssim")
+    assert compare([run])[0].metric == "ssim"
+    assert compare([write_run(tmp_path / "b.jsonl", "b", 0, [])])[0].metric == "psnr"
+
+
+MARKUP = "<b>|*x*_y_[z](w)`c` ![i](j) &amp; $e$ ~s~ #"
+
+
+def test_names_with_markup_are_escaped(tmp_path):
+    points = [(1, 1.0, 20.0)]
+    about = {"scene": f"{MARKUP}\n# s", "command": f"train.py --beta={MARKUP}"}
+    runs = [write_run(tmp_path / f"{MARKUP.replace('/', '')}.jsonl", MARKUP, 0, points, **about)]
+    runs += [write_run(tmp_path / "b.jsonl", "1. snake_case", 0, points, metric=MARKUP, **about)]
+    report.write_report(runs, tmp_path / "out")
+    text = (tmp_path / "out/report.md").read_text()
+    for line in text.splitlines():
+        if not line.startswith(("Mean ±", "![psnr over seconds and iterations](report.png)")):
+            assert not re.search(r"[<>`$~\[\]]|\*|(?<=.)#(?!\d)(?! )", line), line
+    table = [line for line in text.splitlines() if line.startswith("|")]
+    assert len({line.count("|") for line in table}) == 1
+    assert len(table) == 4
+    assert "snake_case" in text
+    assert html.unescape(text).count(MARKUP) >= 6
+    assert "\n# s" not in text
+
+
+def test_names_in_any_script_and_of_any_length_are_drawn(tmp_path):
+    pytest.importorskip("matplotlib", reason="needs matplotlib")
+    name = "森林 🌲 \u202e $x^{ " + "long " * 100
+    steps = [(i, 1.0, name + "ab"[i > 4]) for i in range(10)]
+    points = [(1, 1.0, 20.0), (2, 2.0, 21.0)]
+    run = write_run(tmp_path / "a.jsonl", name, 0, points, steps=steps, metric=name, scene=name)
+    other = write_run(tmp_path / "b.jsonl", "b", 0, points, scene="b")
+    written = report.write_report([run, other], tmp_path / "out", metric=name)
+    assert all(picture(path).shape[1] == 1650 for path in written[2:])
+    assert len(written) == 4
+
+
+VALUES = st.sampled_from([0, 1, -1.5, 20, 1e200, -1e308, 10**300, "nan", "inf", "-inf", True])
+LINES = st.fixed_dictionaries(
+    {
+        "kind": st.sampled_from(["step", "evaluation"]),
+        "iteration": st.sampled_from([0, 1, 7, 2**52]),
+        "seconds": st.sampled_from([0, 0.0, 1e-9, 3, 5.5, 9e11]),
+    },
+    optional={"psnr": VALUES, "loss": VALUES, "nu": VALUES, "phase": st.sampled_from("ab")},
+)
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(logs=st.lists(st.lists(LINES, max_size=6), min_size=1, max_size=3))
+def test_any_readable_log_makes_a_report(tmp_path, monkeypatch, capsys, logs):
+    hide_matplotlib(monkeypatch)
+    folder = Path(tempfile.mkdtemp(dir=tmp_path))
+    for i, lines in enumerate(logs):
+        (folder / f"{i}.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert report.main([str(folder), "-o", str(folder / "out")]) == 0
+    json.loads((folder / "out/report.json").read_text(), parse_constant=pytest.fail)
+
+
+def test_extreme_numbers_are_drawn(tmp_path):
+    pytest.importorskip("matplotlib", reason="needs matplotlib")
+    values = [0.0, 1e200, -1e308, "nan", 1e29, 1e-300]
+    points = [(i, 9e11 * i / 6, value) for i, value in enumerate(values)]
+    runs = [write_run(tmp_path / f"{i}.jsonl", "a", i, points) for i in range(2)]
+    assert picture(report.write_report(runs, tmp_path / "out")[-1]).shape[1] == 1650
+
+
+def hide_matplotlib(monkeypatch):
+    for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
+        monkeypatch.setitem(sys.modules, name, None)
 
 
 def test_command_line(tmp_path):
     two_arms(tmp_path / "logs")
-    done = command(tmp_path / "logs", tmp_path / "logs/m0.jsonl", "-o", tmp_path / "out")
+    words = [tmp_path / "logs", tmp_path / "logs/m0.jsonl", "-o", tmp_path / "out"]
+    call = [sys.executable, "-W", "error", "-m", "opt3dgs_optim", "report", *map(str, words)]
+    done = subprocess.run(call, capture_output=True, text=True, check=False)
     said = "" if importlib.util.find_spec("matplotlib") else f"{report.NO_PICTURE}\n"
     assert (done.returncode, done.stderr) == (0, said)
     data = json.loads((tmp_path / "out/report.json").read_text())
     assert [len(arm["runs"]) for arm in data["scenes"][0]["arms"]] == [2, 2]  # m0 counts once
 
 
-def test_command_line_without_matplotlib(tmp_path):
+def test_command_line_without_matplotlib(tmp_path, monkeypatch, capsys):
+    hide_matplotlib(monkeypatch)
     two_arms(tmp_path / "logs")
-    done = command(tmp_path / "logs", "-o", tmp_path / "out", blocked=True)
-    assert done.returncode == 0
-    assert done.stderr.strip() == report.NO_PICTURE
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
-        "report.csv",
-        "report.json",
-        "report.md",
-    ]
+    assert report.main([str(tmp_path / "logs"), "-o", str(tmp_path / "out")]) == 0
+    assert capsys.readouterr().err.strip() == report.NO_PICTURE
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert names == ["report.json", "report.md"]
     assert ".png" not in (tmp_path / "out/report.md").read_text()
 
 
-def test_command_line_says_in_one_line_what_is_wrong(tmp_path, capsys):
+BAD_LINES = {
+    "digits": b'{"kind":"evaluation","iteration":1,"seconds":1,"psnr":%s}' % (b"9" * 400),
+    "nesting": b'{"kind":"start","iteration":1,"seconds":1,"metadata":%s1%s}'
+    % (b'{"a":' * 1000, b"}" * 1000),
+    "nul": b'{"kind":"start","iteration":1,"seconds":1,"metadata":{"arm":"\\u0000"}}',
+    "surrogate": b'{"kind":"start","iteration":1,"seconds":1,"metadata":{"arm":"\\ud800"}}',
+    "empty": b"{}",
+}
+
+
+def test_command_line_says_in_one_line_what_is_wrong_and_writes_nothing(tmp_path, capsys):
     two_arms(tmp_path / "logs")
     (tmp_path / "void").mkdir()
-    (tmp_path / "bad.jsonl").write_text("{}\n")
     (tmp_path / "file").write_text("")
+    for name, line in BAD_LINES.items():
+        (tmp_path / f"{name}.jsonl").write_bytes(line + b"\n")
+    for scene in ("a b", "A_b"):
+        points = [(1, 1.0, 20.0)]
+        write_run(tmp_path / f"scenes/{scene}.jsonl", "a", 0, points, metric="ssim", scene=scene)
     logs, out = str(tmp_path / "logs"), str(tmp_path / "out")
+    one_file = "the scenes 'A_b' and 'a b' would both be drawn into report-a_b.png"
     for arguments, message in (
         ([str(tmp_path / "nowhere"), "-o", out], "no such file or folder"),
         ([str(tmp_path / "void"), "-o", out], "no *.jsonl file in the folder"),
-        ([str(tmp_path / "bad.jsonl"), "-o", out], "bad.jsonl, line 1"),
+        *(([str(tmp_path / f"{n}.jsonl"), "-o", out], f"{n}.jsonl, line 1") for n in BAD_LINES),
         ([logs, "-o", out, "--baseline", "x"], "no such arm; there are faded, mcmc"),
+        ([logs, "-o", out, "--metric", "lpips"], "--metric 'lpips': in no log; there are psnr"),
+        ([str(tmp_path / "scenes"), "-o", out], one_file),
         ([logs, "-o", str(tmp_path / "file")], "file"),
+        ([logs, "-o", str(tmp_path / "file" / "folder")], "file"),
     ):
-        assert report.main(arguments) == 2
+        assert report.main(arguments) == 2, arguments
         error = capsys.readouterr().err
         assert message in error
         assert error.count("\n") == 1
-    done = command(tmp_path / "nowhere", "-o", out)
-    assert done.returncode == 2
-    assert done.stderr.startswith("report: no such file or folder")
+        assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
+
+
+def test_a_place_that_cannot_be_written_is_found_before_any_log_is_read(
+    tmp_path, monkeypatch, capsys
+):
+    def refuse(**_):
+        raise PermissionError(13, "Permission denied", str(tmp_path))
+
+    two_arms(tmp_path / "logs")
+    monkeypatch.setattr(report, "read_run", pytest.fail)
+    monkeypatch.setattr("tempfile.TemporaryFile", refuse)  # root may write anywhere
+    assert report.main([str(tmp_path / "logs"), "-o", str(tmp_path / "out")]) == 2
+    assert "Permission denied" in capsys.readouterr().err

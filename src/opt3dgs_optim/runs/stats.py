@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from opt3dgs_optim.runread import Run
+from opt3dgs_optim.runs.read import Run
 
-__all__ = ["Arm", "Comparison", "Stat", "compare", "higher_is_better", "memory_of", "metric_names"]
-
-NOT_METRICS = ("kind", "iteration", "seconds", "peak_cuda_bytes", "peak_host_bytes")
+KNOWN = ("psnr", "ssim", "train_psnr", "lpips")  # listed first
+MEMORY = ("peak_cuda_bytes", "peak_host_bytes")
+NO_NUMBERS = ("iteration", "seconds", "phase", *MEMORY)  # of the columns, not of interest
 LOWER_IS_BETTER = ("lpips", "loss", "error", "mse", "mae", "l1", "l2", "energy", "flip")
 
 
@@ -28,10 +29,9 @@ class Stat:
         """The statistic of `values`, or None if there are none; a NaN among them shows."""
         if len(values) == 0:
             return None
-        with np.errstate(invalid="ignore"):  # inf - inf
-            mean = float(np.mean(values))
+        with np.errstate(all="ignore"):  # inf - inf, squares of 1e200
             std = float(np.std(values, ddof=1)) if len(values) > 1 else None
-        return Stat(mean, std, len(values))
+            return Stat(float(np.mean(values)), std, len(values))
 
 
 @dataclass
@@ -40,6 +40,7 @@ class Arm:
 
     name: str
     runs: list[Run]
+    colour: int  # the same on every scene; 0 is the baseline's
     finals: dict[str, Stat | None] = field(default_factory=dict)  # last value of every metric
     numbers: dict[str, Stat | None] = field(default_factory=dict)  # seconds, iterations, ...
     to_baseline: Stat | None = None  # seconds to the baseline's final metric; n runs got there
@@ -53,61 +54,74 @@ class Comparison:
 
     scene: str | None
     metric: str
-    baseline: str | None
+    baseline: str | None  # None: it did not run on this scene
     target: float | None  # the baseline's mean final metric
     arms: list[Arm]
-    notes: list[str] = field(default_factory=list)
+    notes: list[str]
 
 
-def compare(runs: Sequence[Run], metric: str, baseline: str | None) -> list[Comparison]:
+def compare(
+    runs: Sequence[Run], metric: str | None = None, baseline: str | None = None
+) -> list[Comparison]:
     """Group `runs` by the metadata `scene` and `arm` (else the file's name) and compare.
 
-    `baseline` names the reference arm; None takes "mcmc" if there, else the first arm.
+    `metric` None takes psnr, else the first that is logged; `baseline` None takes "mcmc" if there,
+    else the first arm.
 
     Raises:
-        ValueError: no run has the arm `baseline`.
+        ValueError: no log has that metric, or no run that arm.
     """
     scenes: dict[str | None, dict[str, list[Run]]] = {}
     for run in runs:
         scene = run.metadata.get("scene")
         arms = scenes.setdefault(None if scene is None else str(scene), {})
         arms.setdefault(str(run.metadata.get("arm", run.name)), []).append(run)
-    known = sorted({name for arms in scenes.values() for name in arms})
-    if baseline is not None and baseline not in known:
-        raise ValueError(f"--baseline {baseline!r}: no such arm; there are {', '.join(known)}")
-    return [_compare_scene(scene, arms, metric, baseline) for scene, arms in scenes.items()]
+    names = list(dict.fromkeys(name for arms in scenes.values() for name in arms))
+    metrics = metric_names(runs)
+    if metric is None:
+        metric = metrics[0] if metrics else KNOWN[0]
+    elif metric not in metrics:
+        there = ", ".join(metrics) or "no metrics at all"
+        raise ValueError(f"--metric {metric!r}: in no log; there are {there}")
+    if baseline is None:
+        baseline = "mcmc" if "mcmc" in names else names[0]
+    elif baseline not in names:
+        raise ValueError(f"--baseline {baseline!r}: no such arm; there are {', '.join(names)}")
+    colours = {name: i for i, name in enumerate(dict.fromkeys([baseline, *names]))}
+    return [
+        _compare_scene(scene, [Arm(n, arms[n], colours[n]) for n in colours if n in arms], metric)
+        for scene, arms in scenes.items()
+    ]
 
 
-def _compare_scene(
-    scene: str | None, grouped: dict[str, list[Run]], metric: str, baseline: str | None
-) -> Comparison:
-    arms = [Arm(name, runs) for name, runs in grouped.items()]
-    name = baseline or ("mcmc" if "mcmc" in grouped else arms[0].name)
-    reference = next((arm for arm in arms if arm.name == name), None)
-    if reference:  # listed first
-        arms = [reference, *(arm for arm in arms if arm is not reference)]
+def _compare_scene(scene: str | None, arms: list[Arm], metric: str) -> Comparison:
+    reference = arms[0] if arms[0].colour == 0 else None
     names = metric_names([run for arm in arms for run in arm.runs])
     for arm in arms:
-        arm.finals = {m: Stat.of([v for r in arm.runs for v in _final(r, m)]) for m in names}
+        arm.finals = {name: _stat(arm.runs, name, lambda values: values[-1]) for name in names}
         arm.numbers = _numbers(arm.runs)
     final = reference.finals.get(metric) if reference else None
     target = final.mean if final and np.isfinite(final.mean) else None
     for arm in arms:
         if target is not None:
             reached = [_first_time(run, metric, target) for run in arm.runs]
-            arm.to_baseline = Stat.of([t for t in reached if t is not None])
+            arm.to_baseline = Stat.of([seconds for seconds in reached if seconds is not None])
         if reference and arm is not reference:
             arm.gain, arm.paired = _gain(arm.runs, reference.runs, metric)
-    return Comparison(
-        scene, metric, name if reference else None, target, arms, _notes(arms, metric)
-    )
+    baseline = reference.name if reference else None
+    return Comparison(scene, metric, baseline, target, arms, _notes(arms, metric))
 
 
 def metric_names(runs: Sequence[Run]) -> list[str]:
     """Every metric the runs evaluated, PSNR, SSIM and training PSNR first."""
-    found = dict.fromkeys(key for run in runs for key in run.evaluations if key not in NOT_METRICS)
-    known = [name for name in ("psnr", "ssim", "train_psnr", "lpips") if name in found]
-    return known + [name for name in found if name not in known]
+    found = dict.fromkeys(key for run in runs for key in run.evaluations if key not in NO_NUMBERS)
+    return [name for name in KNOWN if name in found] + [n for n in found if n not in KNOWN]
+
+
+def step_names(runs: Sequence[Run]) -> list[str]:
+    """The columns of the step lines that are no loss: what the parts say of themselves."""
+    found = dict.fromkeys(key for run in runs for key in run.steps if key not in NO_NUMBERS)
+    return [name for name in found if higher_is_better(name)]
 
 
 def higher_is_better(metric: str) -> bool:
@@ -115,41 +129,23 @@ def higher_is_better(metric: str) -> bool:
     return not any(word in metric.lower() for word in LOWER_IS_BETTER)
 
 
-def _final(run: Run, metric: str) -> list[float]:
-    values = run.series(metric)[2]
-    return [float(values[-1])] if len(values) else []
-
-
 def _numbers(runs: list[Run]) -> dict[str, Stat | None]:
     seconds = [max((r["seconds"] for r in run.records), default=0.0) for run in runs]
     iterations = [max((r["iteration"] for r in run.records), default=0) for run in runs]
-    memory = [memory_of(run) for run in runs]
-    return {
-        "seconds": Stat.of(seconds),
-        "iterations": Stat.of(iterations),
-        "iterations_per_second": Stat.of(
-            [i / s for i, s in zip(iterations, seconds, strict=True) if s > 0]
-        ),
-        "peak_memory_bytes": Stat.of([m[1] for m in memory if m]),
-        "mean_nu": Stat.of([v for run in runs for v in _step_mean(run, "nu")]),
-        "accepted_share": Stat.of([v for run in runs for v in _step_mean(run, "accepted")]),
-    }
+    rates = [i / s for i, s in zip(iterations, seconds, strict=True) if s > 0]
+    numbers = {"seconds": Stat.of(seconds), "iterations": Stat.of(iterations)}
+    numbers |= {"iterations_per_second": Stat.of(rates)}
+    numbers |= {name: _stat(runs, name, np.max) for name in MEMORY}
+    return numbers | {f"mean_{n}": _stat(runs, n, np.mean, "step") for n in step_names(runs)}
 
 
-def memory_of(run: Run) -> tuple[str, float] | None:
-    """("cuda" or "host", peak bytes) of a run, None if not logged."""
-    for where in ("cuda", "host"):
-        values = run.series(f"peak_{where}_bytes")[2]
-        if len(values):
-            return where, float(values.max())
-    return None
-
-
-def _step_mean(run: Run, name: str) -> list[float]:
-    """The mean over the finite values in the step lines, as a list of at most one."""
-    values = run.series(name, "step")[2]
-    values = values[np.isfinite(values)]
-    return [float(values.mean())] if len(values) else []
+def _stat(runs: list[Run], name: str, of: Any, kind: str = "evaluation") -> Stat | None:
+    """Over the runs that log a number: `of` its values, in steps of the finite ones."""
+    series = [run.series(name, kind)[2] for run in runs]
+    if kind == "step":
+        series = [values[np.isfinite(values)] for values in series]
+    with np.errstate(over="ignore"):
+        return Stat.of([float(of(values)) for values in series if len(values)])
 
 
 def _curve(run: Run, metric: str) -> tuple[np.ndarray, np.ndarray]:
@@ -168,14 +164,7 @@ def _first_time(run: Run, metric: str, target: float) -> float | None:
     i = int(reached[0])
     if i == 0 or not np.isfinite(values[i - 1 : i + 1]).all():
         return float(seconds[i])
-    share = (goal - values[i - 1]) / (values[i] - values[i - 1])
-    return float(seconds[i - 1] + share * (seconds[i] - seconds[i - 1]))
-
-
-def _at(run: Run, metric: str, time: float) -> float | None:
-    """The metric at `time` seconds, linear between evaluations; None before the first."""
-    seconds, values = _curve(run, metric)
-    return float(np.interp(time, seconds, values)) if len(seconds) and time >= seconds[0] else None
+    return float(np.interp(goal, values[i - 1 : i + 1], seconds[i - 1 : i + 1]))
 
 
 def _gain(runs: list[Run], references: list[Run], metric: str) -> tuple[Stat | None, bool]:
@@ -190,17 +179,17 @@ def _gain(runs: list[Run], references: list[Run], metric: str) -> tuple[Stat | N
 
 
 def _difference(runs: list[Run], references: list[Run], metric: str) -> Stat | None:
-    """Difference of the means at the last second that all runs share."""
-    last = [_curve(run, metric)[0][-1:] for run in (*runs, *references)]
-    if any(len(end) == 0 for end in last):
+    """Difference of the means at the last second that all runs share; None before some begins."""
+    curves = [_curve(run, metric) for run in (*runs, *references)]
+    if any(len(seconds) == 0 for seconds, _ in curves):
         return None
-    time = float(np.min(last))
-    ours = [_at(run, metric, time) for run in runs]
-    theirs = [_at(run, metric, time) for run in references]
-    a = Stat.of([value for value in ours if value is not None])
-    b = Stat.of([value for value in theirs if value is not None])
-    if a is None or b is None or a.n < len(runs) or b.n < len(references):
+    time = min(seconds[-1] for seconds, _ in curves)
+    if any(time < seconds[0] for seconds, _ in curves):
         return None
+    values = [float(np.interp(time, *curve)) for curve in curves]
+    a, b = Stat.of(values[: len(runs)]), Stat.of(values[len(runs) :])
+    assert a is not None
+    assert b is not None
     std = None if a.std is None or b.std is None else float(np.hypot(a.std, b.std))
     return Stat(a.mean - b.mean, std, a.n)
 
@@ -211,13 +200,16 @@ def _notes(arms: list[Arm], metric: str) -> list[str]:
     for arm in arms:
         for run in arm.runs:
             values = run.series(metric)[2]
-            if not any(r["kind"] != "start" for r in run.records):
-                notes.append(f"{run.name} ({arm.name}): empty run, nothing logged")
+            odd = int((~np.isfinite(values)).sum())
+            if all(r["kind"] == "start" for r in run.records):
+                note = "empty run, nothing logged"
             elif len(values) == 0:
-                notes.append(f"{run.name} ({arm.name}): no evaluation of {metric}")
-            elif not np.isfinite(values).all():
-                count = int((~np.isfinite(values)).sum())
-                notes.append(f"{run.name} ({arm.name}): {metric} not finite in {count} evaluations")
+                note = f"no evaluation of {metric}"
+            elif odd:
+                note = f"{metric} not finite in {odd} evaluations"
             elif len(values) == 1:
-                notes.append(f"{run.name} ({arm.name}): a single evaluation of {metric}")
+                note = f"a single evaluation of {metric}"
+            else:
+                continue
+            notes.append(f"{run.name} ({arm.name}): {note}")
     return notes

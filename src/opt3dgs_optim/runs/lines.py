@@ -1,4 +1,4 @@
-"""The file under a run log: strict JSON values, whole-line appends, one writer at a time."""
+"""The lines of a run log: strict JSON values, whole-line appends, one writer at a time."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ import json
 import math
 import operator
 import os
-import platform
-import sys
+import re
 from collections.abc import Mapping
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 try:
@@ -22,10 +19,9 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-__all__ = ["START", "LineFile", "index", "number", "plain", "start_line"]
-
-FORMAT = 1
 START = b'{"kind":"start"'  # how the first line of every session begins
+DEEPEST = 32  # lists in lists; far below Python's limit for calls in calls
+NO_TEXT = re.compile("[\0\ud800-\udfff]")  # what no file name, page or terminal takes
 
 
 class LineFile:
@@ -71,10 +67,9 @@ class LineFile:
         self._file.close()
 
     def _lock(self) -> None:
-        if fcntl is None:
-            return
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if fcntl is not None:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise BlockingIOError(
                 f"RunLog({str(self.path)!r}): another RunLog is writing this file; close that one "
@@ -85,33 +80,9 @@ class LineFile:
 
     def _is_torn(self) -> bool:
         with open(self.path, "rb") as file:
-            if file.seek(0, os.SEEK_END) == 0:
-                return False
-            file.seek(-1, os.SEEK_END)
-            return file.read(1) != b"\n"
-
-
-def start_line(iteration: int, seconds: float, metadata: dict[str, Any]) -> dict[str, Any]:
-    """The first line of a session: what runs, where and since when; no host name, no folders."""
-    machine: dict[str, Any] = {"platform": platform.platform(), "cpus": os.cpu_count()}
-    if torch.cuda.is_initialized():
-        machine["gpu"] = torch.cuda.get_device_name()
-    return {
-        "kind": "start",
-        "iteration": iteration,
-        "seconds": round(seconds, 6),
-        "format": FORMAT,
-        "time": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "command": " ".join(_base_name(argument) for argument in sys.argv),
-        "machine": machine | {"python": platform.python_version(), "torch": torch.__version__},
-        "metadata": metadata,
-    }
-
-
-def _base_name(argument: str) -> str:
-    """An argument without folders: "--data=/home/me/plush" becomes "--data=plush"."""
-    option, equals, value = argument.rpartition("=")
-    return option + equals + value.replace("\\", "/").rstrip("/").rpartition("/")[2]
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(size - 1, 0))
+            return file.read(1) not in (b"", b"\n")
 
 
 def index(call: str, iteration: int) -> int:
@@ -120,8 +91,8 @@ def index(call: str, iteration: int) -> int:
         value = operator.index(iteration)
     except TypeError:
         raise TypeError(f"{call}(iteration={iteration!r}): must be an integer >= 0") from None
-    if value < 0:
-        raise ValueError(f"{call}(iteration={value}): must be an integer >= 0")
+    if not 0 <= value < 2**53:
+        raise ValueError(f"{call}(iteration={value}): must be an integer >= 0, below 2**53")
     return value
 
 
@@ -134,22 +105,31 @@ def number(call: str, name: str, value: Any) -> float | int | str:
             )
         value = value.item()
     if isinstance(value, int):  # and bool: False is 0, True is 1
+        if abs(value) >= 2**1023:
+            raise ValueError(f"{call}({name}=...): an integer above 2**1023 is no float64")
         return int(value)
     if isinstance(value, float):
         return value if math.isfinite(value) else str(value)
     raise TypeError(f"{call}({name}={value!r}): must be a number or a one-element tensor")
 
 
-def plain(call: str, value: Any) -> Any:
+def text(value: str) -> str:
+    """`value` with a replacement character for each NUL and lone surrogate."""
+    return NO_TEXT.sub("\ufffd", value)
+
+
+def plain(call: str, value: Any, depth: int = 0) -> Any:
     """`value` (metadata, event details) as strict JSON holds it; TypeError if it cannot."""
-    if value is None or isinstance(value, (bool, str)):
+    if depth > DEEPEST:
+        raise ValueError(f"{call}: lists or mappings nested deeper than {DEEPEST}")
+    if value is None or isinstance(value, bool):
         return value
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
+    if isinstance(value, (str, os.PathLike)):
+        return text(os.fsdecode(value))
     if isinstance(value, Mapping):
-        return {str(key): plain(f"{call}[{key!r}]", item) for key, item in value.items()}
+        return {text(str(key)): plain(call, item, depth + 1) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(call, item) for item in value]
+        return [plain(call, item, depth + 1) for item in value]
     try:
         return number(call, "value", value)
     except TypeError:

@@ -1,19 +1,18 @@
 """The run log: one JSON object a line, written while a trainer runs, without slowing it down.
 
 Lines are `{"kind": "start" | "step" | "evaluation" | "event", "iteration": ..., "seconds": ...}`
-plus whatever the call adds; `read_run` reads them back. `seconds` are run seconds: wall
-clock since the log was opened, without what `RunLog.paused` enclosed, carried on over a
-resume. JSON has no NaN or infinity: they are written as the strings `"nan"`, `"inf"` and
-`"-inf"` and read back as floats.
+plus whatever the call adds; `read_run` reads them back. `seconds` are run seconds: wall clock since
+the log was opened, without what `RunLog.paused` enclosed, carried on over a resume. JSON has no NaN
+or infinity: they are written as the strings "nan", "inf" and "-inf" and read back as floats.
 """
 
 from __future__ import annotations
 
+import logging
 import os
-import sys
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path
@@ -22,11 +21,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.runfile import LineFile, index, number, plain, start_line
-from opt3dgs_optim.runread import Run, read_run
+from opt3dgs_optim.runs.lines import LineFile, index, number, plain, text
+from opt3dgs_optim.runs.machine import origin, peak_memory, synchronize
+from opt3dgs_optim.runs.read import read_run
 
-__all__ = ["Run", "RunLog", "read_run"]
-
+LOGGER = logging.getLogger("opt3dgs_optim")
 RESERVED = frozenset(
     {"kind", "iteration", "seconds", "phase", "event", "peak_cuda_bytes", "peak_host_bytes"}
 )
@@ -36,18 +35,17 @@ class _Pending(NamedTuple):
     """A line that waits for numbers on their way from a GPU (or for a line before it)."""
 
     line: dict[str, Any]
-    names: list[str]
-    host: Tensor | None  # [len(names)] float64, pinned
-    ready: Any  # torch.cuda.Event, recorded after the copy into `host`
+    names: Sequence[str] = ()
+    host: Tensor | None = None  # [len(names)] float64, pinned
+    ready: Any = None  # torch.cuda.Event, recorded after the copy into `host`
 
 
 class RunLog:
     """Append the course of one training run to the JSON-lines file `path`.
 
-    Every line goes out in one unbuffered write, so a killed process loses at most the line it was
-    writing (and, on a GPU, the few step lines whose numbers the GPU had not delivered yet). An
-    existing log is continued: a torn last line is closed off, the clock goes on from the last
-    recorded second. To continue from a checkpoint use `resume`.
+    Every line goes out in one unbuffered write: a killed process loses at most the line it was
+    writing and, on a GPU, the few step lines whose numbers were still on their way. An existing
+    log is continued, its clock too; to go on from a checkpoint use `resume`.
 
     A step line costs no host synchronisation: 0-d CUDA tensors are copied to pinned memory in
     stream order and written at a later call, once the copy has completed. CPU tensors and floats
@@ -62,10 +60,9 @@ class RunLog:
         every: write step lines only at iterations that are multiples of `every`.
 
     Raises:
-        ValueError: `every` < 1, or `path` holds something else than a run log.
+        ValueError: `every` < 1, metadata nested too deep, or `path` is no run log.
         TypeError: metadata that JSON cannot hold.
-        BlockingIOError: another RunLog, here or in another process, has the file open (checked
-            where `fcntl` exists and the file system can lock).
+        BlockingIOError: another RunLog has the file open (noticed where files can be locked).
 
     Examples:
         >>> import os, tempfile
@@ -92,15 +89,15 @@ class RunLog:
         self.path = Path(path)
         self.every = every
         self._pending: deque[_Pending] = deque()
+        self._mirrors: list[Any] = []
         self._pauses = 0
         self._file = LineFile(self.path)
         try:
             last = read_run(self.path).records[-1:]
             self._base: float = last[0]["seconds"] if last else 0.0
             self._since: float | None = time.perf_counter()
-            self._file.append(
-                start_line(last[0]["iteration"] if last else 0, self._base, described)
-            )
+            start = self._line("start", last[0]["iteration"] if last else 0)
+            self._file.append(start | origin() | {"metadata": described})
         except BaseException:
             self._file.close()
             raise
@@ -130,18 +127,40 @@ class RunLog:
         log.event("resumed", iteration)
         return log
 
+    def mirror(self, writer: Any) -> None:
+        """Send every number that is logged from now on to TensorBoard or Weights & Biases too.
+
+        `log.mirror(SummaryWriter("runs/garden"))`, of `torch.utils.tensorboard`; in gsplat's
+        trainer, which has one, `log.mirror(self.writer)`; `log.mirror(wandb.init(project="3dgs"))`.
+        Tags are `step/NAME` and `evaluation/NAME`, run seconds among them.
+
+        Numbers go out with their line: nothing waits for a GPU, and `every` holds. A writer that
+        raises gets nothing more; the logger `opt3dgs_optim` says so, training and log go on. W&B
+        drops what comes with a smaller step than something before it.
+
+        Args:
+            writer: has `add_scalar(tag, value, step)`, or `log({tag: value}, step=step)`.
+
+        Raises:
+            TypeError: it has neither.
+        """
+        if not callable(getattr(writer, "add_scalar", getattr(writer, "log", None))):
+            raise TypeError(f"RunLog.mirror({writer!r}): must have add_scalar() or log()")
+        self._mirrors.append(writer)
+
     @property
     def seconds(self) -> float:
         """Run seconds so far: wall clock, without pauses, of all sessions of this run."""
         running = 0.0 if self._since is None else time.perf_counter() - self._since
         return self._base + running
 
-    def step(self, iteration: int, *, phase: str, **values: float | int | Tensor) -> None:
-        """Log one optimization step; `values` are numbers or one-element tensors.
+    def step(
+        self, iteration: int, *, phase: str | Enum | None = None, **columns: float | Tensor
+    ) -> None:
+        """Log one optimization step; `columns` are numbers or one-element tensors.
 
-        The report knows `nu`, `accepted` (share of curvature pairs, 0 to 1) and `phase`
-        ("exploration", "exploitation"); every other name (`energy`, `loss`, `skipped_rows`)
-        is kept as well.
+        Any name will do, and a column may begin or end at any step. The report marks where
+        `phase` changes, and shows the means of the columns that are no loss.
 
         Raises:
             ValueError: a negative iteration, a reserved name or a tensor of several elements.
@@ -149,18 +168,19 @@ class RunLog:
         """
         iteration = index("RunLog.step", iteration)
         if iteration % self.every == 0:
-            phase = str(phase.value) if isinstance(phase, Enum) else phase
-            line = self._line("step", iteration) | {"phase": phase}
-            self._pending.append(_pack("RunLog.step", line, values))
+            line = self._line("step", iteration)
+            if phase is not None:
+                line["phase"] = text(str(phase.value if isinstance(phase, Enum) else phase))
+            self._pending.append(_pack("RunLog.step", line, columns))
         self._drain(wait=False)
 
-    def evaluation(self, iteration: int, **metrics: float | int | Tensor) -> None:
+    def evaluation(self, iteration: int, **metrics: float | Tensor) -> None:
         """Log metrics (`psnr` in dB, `ssim`, `train_psnr`, `num_points`, ...), one number each.
 
-        Adds `peak_cuda_bytes` (torch's peak of the current device) if CUDA is in use, else
-        `peak_host_bytes` (peak resident set of the process). Errors as in `step`.
+        Adds torch's `peak_cuda_bytes` if CUDA is in use, else the process's `peak_host_bytes`.
+        Errors as in `step`.
         """
-        line = self._line("evaluation", index("RunLog.evaluation", iteration)) | _peak_memory()
+        line = self._line("evaluation", index("RunLog.evaluation", iteration)) | peak_memory()
         self._pending.append(_pack("RunLog.evaluation", line, metrics))
         self._drain(wait=True)
 
@@ -169,10 +189,9 @@ class RunLog:
 
         `info` may hold what `metadata` may, and one-element tensors. Raises as `step`.
         """
-        _refuse_reserved("RunLog.event", info)
-        line = self._line("event", index("RunLog.event", iteration)) | {"event": kind}
-        line |= plain("RunLog.event", info)
-        self._pending.append(_Pending(line, [], None, None))
+        _check_names("RunLog.event", info)
+        line = self._line("event", index("RunLog.event", iteration)) | {"event": text(kind)}
+        self._pending.append(_Pending(line | plain("RunLog.event", info)))
         self._drain(wait=True)
 
     @contextmanager
@@ -183,7 +202,7 @@ class RunLog:
         inside does not.
         """
         if self._pauses == 0:
-            _synchronize()
+            synchronize()
             self._base, self._since = self.seconds, None
         self._pauses += 1
         try:
@@ -191,7 +210,7 @@ class RunLog:
         finally:
             self._pauses -= 1
             if self._pauses == 0:
-                _synchronize()
+                synchronize()
                 self._since = time.perf_counter()
 
     def flush(self) -> None:
@@ -201,11 +220,10 @@ class RunLog:
 
     def close(self) -> None:
         """Write what is pending and release the file; a second call does nothing."""
-        if self._file.closed:
-            return
         try:
             self._drain(wait=True)
         finally:
+            self._pending.clear()
             self._file.close()
 
     def __enter__(self) -> RunLog:
@@ -228,24 +246,35 @@ class RunLog:
                     ready.synchronize()
                 elif not ready.query():
                     return
-                line |= {
-                    k: number("RunLog", k, v) for k, v in zip(names, host.tolist(), strict=True)
-                }
+                values = zip(names, host.tolist(), strict=True)
+                line |= {name: number("RunLog", name, value) for name, value in values}
             self._pending.popleft()
             self._file.append(line)
+            if self._mirrors and line["kind"] != "event":
+                self._send(line)
+
+    def _send(self, line: dict[str, Any]) -> None:
+        names = sorted(line.keys() - {"kind", "iteration", "phase"})
+        values = {f"{line['kind']}/{name}": float(line[name]) for name in names}
+        for writer in list(self._mirrors):
+            try:
+                if hasattr(writer, "add_scalar"):
+                    for tag, value in values.items():
+                        writer.add_scalar(tag, value, line["iteration"])
+                else:
+                    writer.log(values, step=line["iteration"])
+            except Exception as error:  # whatever it is, the training is worth more
+                self._mirrors.remove(writer)
+                LOGGER.warning("RunLog.mirror: %r failed and gets no more: %r", writer, error)
 
 
 def _pack(call: str, line: dict[str, Any], values: Mapping[str, Any]) -> _Pending:
     """Put host numbers into `line` and send CUDA ones on their way to pinned memory."""
-    _refuse_reserved(call, values)
-    on_gpu = {}
-    for name, value in values.items():
-        if _on_gpu(value):
-            on_gpu[name] = value
-        else:
-            line[name] = number(call, name, value)
-    host, ready = _to_pinned(list(on_gpu.values())) if on_gpu else (None, None)
-    return _Pending(line, list(on_gpu), host, ready)
+    _check_names(call, values)
+    on_gpu = {name: value for name, value in values.items() if _on_gpu(value)}
+    line |= {n: number(call, n, value) for n, value in values.items() if n not in on_gpu}
+    sent = _to_pinned(list(on_gpu.values())) if on_gpu else ()
+    return _Pending(line, list(on_gpu), *sent)
 
 
 def _on_gpu(value: Any) -> bool:
@@ -263,25 +292,9 @@ def _to_pinned(values: list[Tensor]) -> tuple[Tensor, Any]:
     return host, ready
 
 
-def _refuse_reserved(call: str, values: Mapping[str, Any]) -> None:
+def _check_names(call: str, values: Mapping[str, Any]) -> None:
     for name in values:
-        if name in RESERVED:
+        if name in RESERVED or not name.isprintable():
             raise ValueError(
-                f"{call}({name}=...): reserved; choose a name not in {sorted(RESERVED)}"
+                f"{call}({name!a}=...): reserved; choose a printable name not in {sorted(RESERVED)}"
             )
-
-
-def _synchronize() -> None:
-    if torch.cuda.is_initialized():
-        torch.cuda.synchronize()
-
-
-def _peak_memory() -> dict[str, int]:
-    if torch.cuda.is_initialized():  # asking earlier would initialize CUDA
-        return {"peak_cuda_bytes": torch.cuda.max_memory_allocated()}
-    try:
-        import resource
-    except ImportError:  # Windows
-        return {}
-    unit = 1 if sys.platform == "darwin" else 1024
-    return {"peak_host_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit}
