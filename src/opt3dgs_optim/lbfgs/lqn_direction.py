@@ -68,7 +68,7 @@ def lqn_direction(
     )
 
 
-def _lqn_direction(
+def step(
     position: Tensor,
     grad: Tensor,
     history: Tensor,
@@ -78,6 +78,7 @@ def _lqn_direction(
     graft: bool,
     backend: str,
 ) -> tuple[Tensor, Tensor, Tensor]:
+    """What the operator does: see `lqn_direction`."""
     check_history("lqn_direction", grad, history, history_size)
     if uses_kernel(backend, grad.device, grad.dtype, grad.shape[1]):
         check_alike(grad, position=position, history=history)
@@ -167,7 +168,7 @@ def direction(
     return torch.where(usable, result, grad)
 
 
-def _fake_lqn_direction(
+def _fake(
     position: Tensor, grad: Tensor, history: Tensor, history_size: int, **options: object
 ) -> tuple[Tensor, Tensor, Tensor]:
     flags = [grad.new_empty(grad.shape[0], dtype=torch.bool) for _ in range(2)]
@@ -175,6 +176,6 @@ def _fake_lqn_direction(
     return fed, flags[0], flags[1]
 
 
-_LIBRARY.impl("lqn_direction", _lqn_direction, "CompositeExplicitAutograd")
-torch.library.register_fake("opt3dgs_optim::lqn_direction", _fake_lqn_direction, lib=_LIBRARY)
+_LIBRARY.impl("lqn_direction", step, "CompositeExplicitAutograd")
+torch.library.register_fake("opt3dgs_optim::lqn_direction", _fake, lib=_LIBRARY)
 _OPERATOR = torch.ops.opt3dgs_optim.lqn_direction.default

@@ -8,10 +8,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import dense_bfgs
+from points_first import direction, record
 from torch import Tensor
 
-from opt3dgs_optim import curvature, two_loop
-from opt3dgs_optim.curvature import history_from_pairs
+from opt3dgs_optim.lbfgs import history_from_pairs, new_history, two_loop
+from opt3dgs_optim.lbfgs.history import header
 
 SIZES = st.tuples(st.integers(1, 6), st.integers(1, 4), st.integers(1, 9), st.integers(0, 2**31))
 
@@ -134,12 +135,12 @@ def test_ring_keeps_the_newest_pairs(sizes: tuple[int, int, int, int], more: int
     feed(ring, k, s, y)
     last = history_from_pairs(s[-k:], y[-k:])
     assert torch.equal(two_loop(g, ring, k), two_loop(g, last, k))
-    assert float(curvature.header(ring, k).counter.max()) <= 2 * k  # never near float32's 2^24
+    assert float(header(ring, k).counter.max()) <= 2 * k  # never near float32's 2^24
 
 
 def empty(n: int, d: int, size: int) -> Tensor:
-    history = curvature.new_history(torch.zeros(n, d, dtype=torch.float64), size)
-    curvature.header(history, size).counter.fill_(1)
+    history = new_history(torch.zeros(n, d, dtype=torch.float64), size)
+    header(history, size).counter.fill_(1)
     return history
 
 
@@ -152,22 +153,22 @@ def feed(history: Tensor, size: int, s: Tensor, y: Tensor) -> None:
     history.zero_()
     x, g = torch.zeros(n, d, dtype=s.dtype), torch.zeros(n, d, dtype=s.dtype)
     visible = torch.ones(n, dtype=torch.bool)
-    curvature.record(history, size, x, g, visible, min_cosine=0.0)
+    record(history, size, x, g, visible, min_cosine=0.0)
     for k in range(s.shape[0]):
         x, g = x + s[k], g + y[k]
-        curvature.record(history, size, x, g, visible, min_cosine=0.0)
+        record(history, size, x, g, visible, min_cosine=0.0)
 
 
 def test_empty_history_returns_the_gradient_bit_for_bit() -> None:
     g = torch.randn(5, 3)
-    history = curvature.new_history(g, 5)
-    assert torch.equal(curvature.direction(g, history, 5, graft=True), g)
-    assert torch.equal(curvature.direction(g, history, 5, graft=False), g)
+    history = new_history(g, 5)
+    assert torch.equal(direction(g, history, 5, graft=True), g)
+    assert torch.equal(direction(g, history, 5, graft=False), g)
     torch.testing.assert_close(two_loop(g, history, 5), g, rtol=1e-6, atol=0)
 
 
 def test_160_bytes_per_point_for_five_pairs() -> None:
-    history = curvature.new_history(torch.zeros(10, 3), 5)
+    history = new_history(torch.zeros(10, 3), 5)
     assert history.shape == (10, 5, 8)
     assert history.element_size() * history[0].numel() == 160
 
@@ -175,8 +176,8 @@ def test_160_bytes_per_point_for_five_pairs() -> None:
 @pytest.mark.parametrize("size", [1, 3, 4, 5, 16])
 @pytest.mark.parametrize("dim", [1, 2, 3, 4, 7])
 def test_header_and_pairs_do_not_overlap(size: int, dim: int) -> None:
-    history = curvature.new_history(torch.zeros(2, dim, dtype=torch.float64), size)
-    head = curvature.header(history, size)
+    history = new_history(torch.zeros(2, dim, dtype=torch.float64), size)
+    head = header(history, size)
     head.position.fill_(1)
     head.gradient.fill_(2)
     head.counter.fill_(3)
@@ -191,9 +192,9 @@ def test_grafting_keeps_the_gradients_length() -> None:
     s, y, _ = convex_pairs(4, 3, 20, 3)
     g = gradients(20, 3, 3) * 10.0 ** torch.arange(-10, 10, dtype=torch.float64).unsqueeze(1)
     history = history_from_pairs(s * 1e-3, y)
-    grafted = curvature.direction(g, history, 4, graft=True)
+    grafted = direction(g, history, 4, graft=True)
     torch.testing.assert_close(grafted.norm(dim=1), g.norm(dim=1), rtol=1e-12, atol=0)
-    free = curvature.direction(g, history, 4, graft=False)
+    free = direction(g, history, 4, graft=False)
     torch.testing.assert_close(free, two_loop(g, history, 4))
 
 
@@ -203,9 +204,9 @@ def test_no_overflow_or_underflow_in_float32(exponent: int) -> None:
     s, y, _ = convex_pairs(5, 3, 50, 11)
     g = gradients(50, 3, 5)
     size = 10.0**exponent
-    expected = curvature.direction(g, history_from_pairs(s, y), 5, graft=True)
+    expected = direction(g, history_from_pairs(s, y), 5, graft=True)
     history = history_from_pairs((s * 1e-4).float(), (y * size).float())
-    result = curvature.direction((g * size).float(), history, 5, graft=True)
+    result = direction((g * size).float(), history, 5, graft=True)
     assert bool(torch.isfinite(result).all())
     # float32 inputs, condition about 100
     torch.testing.assert_close(result.double() / size, expected, rtol=1e-3, atol=1e-3)
@@ -213,13 +214,13 @@ def test_no_overflow_or_underflow_in_float32(exponent: int) -> None:
 
 def test_record_rejects_negative_curvature_and_equal_points() -> None:
     visible = torch.ones(4, dtype=torch.bool)
-    history = curvature.new_history(torch.zeros(4, 3), 5)
+    history = new_history(torch.zeros(4, 3), 5)
     x0, g0 = torch.zeros(4, 3), torch.ones(4, 3)
-    accepted, candidates = curvature.record(history, 5, x0, g0, visible, min_cosine=1e-6)
+    accepted, candidates = record(history, 5, x0, g0, visible, min_cosine=1e-6)
     assert not candidates.any()
     x1 = torch.tensor([[1.0, 0, 0], [1, 0, 0], [0, 0, 0], [1, 0, 0]])
     y = torch.tensor([[2.0, 0, 0], [-2, 0, 0], [1, 0, 0], [0, 0, 0]])
-    accepted, candidates = curvature.record(history, 5, x1, g0 + y, visible, min_cosine=1e-6)
+    accepted, candidates = record(history, 5, x1, g0 + y, visible, min_cosine=1e-6)
     assert candidates.all()
     assert accepted.tolist() == [True, False, False, False]
 
@@ -227,11 +228,9 @@ def test_record_rejects_negative_curvature_and_equal_points() -> None:
 def test_acceptance_is_relative_not_absolute() -> None:
     """torch's LBFGS asks for s.y > 1e-10; the pairs of a splat have s.y of 1e-13."""
     visible = torch.ones(1, dtype=torch.bool)
-    history = curvature.new_history(torch.zeros(1, 3), 5)
-    curvature.record(
-        history, 5, torch.zeros(1, 3), torch.full((1, 3), 1e-6), visible, min_cosine=1e-6
-    )
-    accepted, _ = curvature.record(
+    history = new_history(torch.zeros(1, 3), 5)
+    record(history, 5, torch.zeros(1, 3), torch.full((1, 3), 1e-6), visible, min_cosine=1e-6)
+    accepted, _ = record(
         history, 5, torch.full((1, 3), 1e-7), torch.full((1, 3), 2e-6), visible, min_cosine=1e-6
     )
     assert accepted.all()
@@ -243,56 +242,20 @@ def test_invisible_rows_keep_their_history() -> None:
     history = history_from_pairs(s, y)
     before = history.clone()
     visible = torch.tensor([True, False] * 3)
-    curvature.record(history, 3, gradients(6, 3, 1), gradients(6, 3, 2), visible, min_cosine=0.0)
+    record(history, 3, gradients(6, 3, 1), gradients(6, 3, 2), visible, min_cosine=0.0)
     assert torch.equal(history[~visible], before[~visible])
     assert not torch.equal(history[visible], before[visible])
 
 
-def test_powell_damping_makes_every_pair_acceptable() -> None:
-    torch.manual_seed(3)
-    visible = torch.ones(64, dtype=torch.bool)
-    histories = [curvature.new_history(torch.zeros(64, 3, dtype=torch.float64), 5) for _ in "ab"]
-    shares = []
-    for history, powell in zip(histories, (False, True), strict=True):
-        generator = torch.Generator().manual_seed(5)
-        accepted = torch.zeros(64, dtype=torch.bool)
-        x = torch.zeros(64, 3, dtype=torch.float64)
-        g = torch.zeros(64, 3, dtype=torch.float64)
-        for k in range(12):
-            s = torch.randn(64, 3, generator=generator, dtype=torch.float64)
-            x, g = x + s, g + (s if k == 1 else torch.randn(64, 3, generator=generator).double())
-            accepted, _ = curvature.record(
-                history, 5, x, g, visible, min_cosine=1e-6, powell=powell
-            )
-        shares.append(float(accepted.double().mean()))
-    assert shares[0] < 0.7
-    assert shares[1] == 1.0
-
-
-def test_powell_damped_pair_has_a_fifth_of_the_model_curvature() -> None:
-    history = history_from_pairs(
-        torch.tensor([[[1.0, 0, 0]]], dtype=torch.float64),
-        torch.tensor([[[2.0, 0, 0]]], dtype=torch.float64),  # gamma 0.5, B = 2
-    )
-    pair = curvature.normalised_pair(
-        torch.tensor([[0.0, 1, 0]], dtype=torch.float64).T,  # coordinates first
-        torch.tensor([[0.0, -1, 0]], dtype=torch.float64).T,
-    )
-    damped = curvature.damped_pair(pair, curvature.newest_gamma(history, 1))
-    ratio = float((damped.s * damped.y).sum() / (damped.s * damped.s).sum())
-    length = 1 / float(damped.s.norm())  # s was 1 long before it was divided by |y|
-    assert ratio == pytest.approx(0.2 * 2.0 / length * float(damped.y.norm()) * length)
-
-
 def test_non_descent_falls_back_to_the_gradient() -> None:
     """A pair of negative curvature that somebody wrote by hand must not turn the step around."""
-    history = curvature.new_history(torch.zeros(1, 3, dtype=torch.float64), 5)
-    head = curvature.header(history, 5)
+    history = new_history(torch.zeros(1, 3, dtype=torch.float64), 5)
+    head = header(history, 5)
     head.counter.fill_(2)
     history[0, 0, :3] = torch.tensor([-1.0, 0, 0])
     history[0, 0, 4:7] = torch.tensor([1.0, 0, 0])
     g = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
-    assert torch.equal(curvature.direction(g, history, 5, graft=False), g)
+    assert torch.equal(direction(g, history, 5, graft=False), g)
 
 
 @pytest.mark.parametrize("poison", [float("nan"), float("inf")])
@@ -301,31 +264,24 @@ def test_poisoned_history_falls_back_to_the_gradient(poison: float) -> None:
     history = history_from_pairs(s, y)
     history[1, 2, 0] = poison
     g = gradients(4, 3, 0)
-    result = curvature.direction(g, history, 5, graft=True)
+    result = direction(g, history, 5, graft=True)
     assert torch.equal(result[1], g[1])
     assert bool(torch.isfinite(result).all())
 
 
-def test_gamma_clamp() -> None:
-    s, y, _ = convex_pairs(1, 3, 4, 0)
-    g = torch.cross(s[0], y[0], dim=1)  # orthogonal to s and y: H g = gamma g
-    history = history_from_pairs(s, y)
-    torch.testing.assert_close(two_loop(g, history, 1, gamma_clamp=(1e-9, 1e-3)), 1e-3 * g)
-
-
 def test_wrong_shapes_are_named() -> None:
     with pytest.raises(ValueError, match=r"two_loop: history has shape \(4, 5, 8\)"):
-        two_loop(torch.zeros(4, 2), curvature.new_history(torch.zeros(4, 3), 5), 5)
+        two_loop(torch.zeros(4, 2), new_history(torch.zeros(4, 3), 5), 5)
     with pytest.raises(ValueError, match="two_loop"):
-        two_loop(torch.zeros(3, 3), curvature.new_history(torch.zeros(4, 3), 5), 5)
+        two_loop(torch.zeros(3, 3), new_history(torch.zeros(4, 3), 5), 5)
     with pytest.raises(ValueError, match="two_loop"):
-        two_loop(torch.zeros(4, 3), curvature.new_history(torch.zeros(4, 3), 5), 7)
+        two_loop(torch.zeros(4, 3), new_history(torch.zeros(4, 3), 5), 7)
 
 
 @pytest.mark.parametrize("n", [0, 1])
 def test_no_points_and_one_point(n: int) -> None:
     g = torch.ones(n, 3)
-    history = curvature.new_history(g, 5)
+    history = new_history(g, 5)
     visible = torch.ones(n, dtype=torch.bool)
-    curvature.record(history, 5, g, g, visible, min_cosine=0.0)
-    assert curvature.direction(g, history, 5, graft=True).shape == (n, 3)
+    record(history, 5, g, g, visible, min_cosine=0.0)
+    assert direction(g, history, 5, graft=True).shape == (n, 3)

@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
+import os
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 import opt3dgs_optim
-from opt3dgs_optim import curvature
+from opt3dgs_optim.covariance import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
 from opt3dgs_optim.cuda import BLOCK, macros
-from opt3dgs_optim.noise import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
+from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
 
 HERE = Path(__file__).parent
 SOURCES = Path(opt3dgs_optim.__file__).parent / "cuda"
 GUARD_ROWS = 300  # written by nobody: more than one block beyond the last row
 GUARD = 12345.0
-OPTIONS = {"min_cosine": 1e-6, "powell": False, "graft": True, "gamma_clamp": None}
+OPTIONS = {"min_cosine": 1e-6, "graft": True}
+BUILDS = Path(tempfile.gettempdir()) / "opt3dgs_optim_host_kernels"
 
 
 def compiler() -> str | None:
@@ -44,10 +48,35 @@ def compile_host(
     return out
 
 
-def compile_all(jobs: list[Callable[[], Path]]) -> list[Path]:
-    """Run compilations two at a time."""
-    with ThreadPoolExecutor(2) as pool:
-        return list(pool.map(lambda job: job(), jobs))
+@cache
+def host_kernels(size: int, dtype: torch.dtype) -> HostKernels:
+    """The kernels for one history size; see `built`."""
+    return HostKernels.load(built(size, dtype), dtype)
+
+
+def built(size: int, dtype: torch.dtype, *extra: str) -> Path:
+    """`compile_host` of the package's sources, once for all processes and runs.
+
+    The name says what went in: sources, flags and compiler. Two workers that build the same thing
+    at a time each rename a whole file of their own into place.
+    """
+    digest = hashlib.sha256(repr((_digest(), size, dtype, extra)).encode()).hexdigest()[:24]
+    path = BUILDS / f"k{size}_{dtype.itemsize}_{digest}"
+    if not path.exists():
+        BUILDS.mkdir(parents=True, exist_ok=True)
+        own = path.with_suffix(f".{os.getpid()}")
+        compile_host(own, size, dtype, SOURCES, *extra)
+        own.replace(path)
+    return path
+
+
+@cache
+def _digest() -> str:
+    """Of all that a build is made of."""
+    files = sorted([*SOURCES.glob("*.cu*"), *HERE.glob("cuda_host_*"), Path(__file__)])
+    version = subprocess.run(["g++", "--version"], check=True, capture_output=True).stdout
+    contents = b"".join(file.name.encode() + file.read_bytes() for file in files)
+    return hashlib.sha256(version + contents).hexdigest()
 
 
 @dataclass
@@ -65,10 +94,7 @@ class HostKernels:
         real = ctypes.c_double if self.dtype == torch.float64 else ctypes.c_float
         values = [real(v) if isinstance(v, float) else v for v in scalars]
         pointers = [ctypes.c_void_p(t.data_ptr()) for t in tensors]
-        if name == "run_lqn":
-            values = [ctypes.c_longlong(rows), *values]
-        else:
-            values = [*values, ctypes.c_longlong(rows)]
+        values.insert(0 if name == "run_lqn" else len(values), ctypes.c_longlong(rows))
         getattr(self.library, name)(ctypes.c_uint(BLOCK), *pointers, *values)
 
     def lqn(
@@ -78,26 +104,31 @@ class HostKernels:
         history: Tensor,
         *,
         min_cosine: float,
-        powell: bool,
         graft: bool,
-        gamma_clamp: tuple[float, float] | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """As `curvature.step`; raises AssertionError if a row beyond the last one was written."""
+        """As `lqn_direction`; raises AssertionError if a row beyond the last one was written."""
         n = grad.shape[0]
-        low, high = gamma_clamp or (0.0, 0.0)
         inputs = [t.to(self.dtype).contiguous() for t in (position, grad)]
         cells = guarded(history.to(self.dtype))
         direction = guarded(torch.zeros(n, 3, dtype=self.dtype))
         flags = [guarded(torch.zeros(n, dtype=torch.uint8)) for _ in range(2)]
         # The inputs end with the last row: room for what a missing tail guard reads.
         tensors = [guarded(t) for t in inputs] + [cells, direction, *flags]
-        scalars = (float(min_cosine), float(low), float(high))
-        switches = (int(powell), int(graft), int(gamma_clamp is not None))
-        self._call("run_lqn", tensors, n, *scalars, *switches)
+        self._call("run_lqn", tensors, n, float(min_cosine), int(graft))
         for tensor in tensors:
             check_guard(tensor, n)
         history.copy_(cells[:n])
         return direction[:n], flags[0][:n].bool(), flags[1][:n].bool()
+
+    def two_loop(self, grad: Tensor, history: Tensor) -> Tensor:
+        """As `lbfgs.two_loop`; `history` must stay as it is."""
+        n = grad.shape[0]
+        tensors = [guarded(t.to(self.dtype).contiguous()) for t in (grad, history, 0 * grad)]
+        self._call("run_two_loop", tensors, n)
+        for tensor in tensors:
+            check_guard(tensor, n)
+        assert torch.equal(tensors[1][:n], history.to(self.dtype))
+        return tensors[2][:n]
 
     def noise(
         self, means: Tensor, gaussians: dict[str, Tensor], eta: Tensor, lr: float, scale: float
@@ -161,7 +192,7 @@ def free_run(
 ) -> list[Tensor]:
     """Positions, directions, flags and history of a run on its own state."""
     x = problem.start.clone()
-    history = curvature.new_history(x, size, contiguous=True)
+    history = new_history(x, size, contiguous=True)
     problem.generator.manual_seed(1)
     seen = []
     for noise, kind, reset in problem.views(steps):
@@ -177,9 +208,25 @@ def compare_runs(kernels: HostKernels, n: int, size: int, **changed: object) -> 
     """The largest relative difference from pure torch over 13 free-running steps, in float64."""
     options = {**OPTIONS, **changed}
     problem = Problem(n)
-    reference = free_run(lambda x, g, h: curvature.step(x, g, h, size, **options), problem, size)  # pyright: ignore
+    reference = free_run(lambda x, g, h: lqn_direction(x, g, h, size, **options), problem, size)  # pyright: ignore
     result = free_run(lambda x, g, h: kernels.lqn(x, g, h, **options), problem, size)  # pyright: ignore
     return max(map(relative_difference, result, reference), default=0.0)
+
+
+def compare_two_loops(kernels: HostKernels, n: int, size: int) -> float:
+    """The largest relative difference of the recursion alone, in float64.
+
+    Of gradients of all sizes, zeros among them, and with points that have no pair.
+    """
+    g = torch.Generator().manual_seed(n + size)
+    s = torch.randn(size, n, 3, generator=g, dtype=torch.float64)
+    hessian = torch.randn(n, 3, 3, generator=g, dtype=torch.float64)
+    hessian = hessian @ hessian.mT + torch.eye(3)
+    history = history_from_pairs(s, torch.einsum("nij,knj->kni", hessian, s))
+    grad = torch.randn(n, 3, generator=g, dtype=torch.float64)
+    grad *= 10.0 ** (60 * torch.rand(n, 1, generator=g, dtype=torch.float64) - 30)
+    history[::7], grad[::5] = 0, 0
+    return relative_difference(kernels.two_loop(grad, history), two_loop(grad, history, size))
 
 
 def relative_difference(result: Tensor, reference: Tensor) -> float:

@@ -1,5 +1,5 @@
 // The kernels as a program, for the sanitizers: every buffer is exactly as long as it has to be.
-// Reads and writes float64: see tests/test_kernel_host.py, _write_input.
+// Reads and writes float64: see tests/cuda/test_kernel_host.py, _write_input.
 #include <cstdio>
 #include <vector>
 
@@ -23,7 +23,7 @@ int main(int, char** arguments) {
   const Buffer header = take(in, 2);
   const size_t rows = static_cast<size_t>(header[0]);
   const size_t row = 8 * History<double, HISTORY_SIZE>::slots;
-  Buffer history(rows * row), direction(3 * rows);
+  Buffer history(rows * row), direction(3 * rows), result(3 * rows);
   std::vector<unsigned char> accepted(rows), candidates(rows);
   for (int step = 0; step < header[1]; ++step) {
     const Buffer position = take(in, 3 * rows), grad = take(in, 3 * rows), reset = take(in, rows);
@@ -31,8 +31,10 @@ int main(int, char** arguments) {
       if (reset[i / row] != 0) history[i] = 0;
     }
     run_lqn(128, position.data(), grad.data(), history.data(), direction.data(), accepted.data(), candidates.data(),
-            static_cast<long long>(rows), 1e-6, 0.0, 0.0, 0, 1, 0);
+            static_cast<long long>(rows), 1e-6, 1);
     give(out, direction);
+    run_two_loop(128, position.data(), history.data(), result.data(), static_cast<long long>(rows));
+    give(out, result);
   }
   Buffer means = take(in, 3 * rows);
   const Buffer scales = take(in, 3 * rows), quats = take(in, 4 * rows), opacities = take(in, rows),

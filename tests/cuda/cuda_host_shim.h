@@ -1,7 +1,6 @@
 // Lets a host compiler run the package's unchanged .cu files: every thread of the grid, in turn.
 #pragma once
 #include <cmath>
-#include <cstring>
 
 #define __host__
 #define __device__
@@ -16,17 +15,6 @@ using std::exp;
 using std::fabs;
 using std::isfinite;
 using std::sqrt;
-
-inline unsigned __float_as_uint(float x) {
-  unsigned bits;
-  std::memcpy(&bits, &x, sizeof bits);
-  return bits;
-}
-inline float __uint_as_float(unsigned bits) {
-  float x;
-  std::memcpy(&x, &bits, sizeof x);
-  return x;
-}
 
 struct HostIndex { unsigned x = 0; };
 static HostIndex blockIdx, blockDim, threadIdx;

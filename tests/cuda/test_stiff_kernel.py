@@ -7,78 +7,45 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from kernel_host import HostKernels, compile_host, compiler
+from kernel_host import compiler, host_kernels
 from line_search import minimise
+from opt3dgs_optim.curvature import header, new_history
 from oracles import dense_bfgs
-from problems import SMOOTH, gradient, hessians, log_uniform, placed, quadratic, rotations, to_world
+from problems import SMOOTH, hessians, log_uniform, placed, quadratic, rotations, to_world
 from torch import Tensor
-
-from opt3dgs_optim import LQNAdam, cuda, lqnadam, ops
-from opt3dgs_optim.curvature import header, new_history, step
 
 ROWS, SIZE = 2_000, 5
 CONDITIONS = (1.0, 1e3, 1e6, 1e12)
 GRADIENTS = (1e-44, 1e-38, 1e-30, 1e-10, 1.0, 1e10, 1e30, 3e37)
 STEPS = (1e-30, 1e-12, 1e-6, 1.0, 1e6, 1e20)
-OPTIONS = {"min_cosine": 1e-14, "powell": False, "gamma_clamp": None}
-Step = Callable[..., tuple[Tensor, Tensor, Tensor]]  # as `curvature.step`
+OPTIONS = {"min_cosine": 1e-14}
+Step = Callable[..., tuple[Tensor, Tensor, Tensor]]  # as `lqn_direction`
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="g++ is not installed")
 BACKENDS = ["torch", pytest.param("kernel", marks=needs_compiler, id="kernel on the host")]
 
 
-@pytest.fixture(scope="module")
-def kernels(tmp_path_factory: pytest.TempPathFactory) -> dict[torch.dtype, HostKernels]:
-    folder: Path = tmp_path_factory.mktemp("kernels")
-    return {
-        dtype: HostKernels.load(compile_host(folder / f"{dtype.itemsize}.so", SIZE, dtype), dtype)
-        for dtype in (torch.float32, torch.float64)
-    }
-
-
-def host_step(kernels: dict[torch.dtype, HostKernels]) -> Step:
-    """`curvature.step` by the compiled source, for a history in either layout."""
+def host_step() -> Step:
+    """`lqn_direction` by the compiled source, for a history in either layout."""
 
     def run(x: Tensor, g: Tensor, history: Tensor, size: int, **options: Any) -> Any:
         assert size == SIZE
         cells = history.contiguous()
-        found = kernels[g.dtype].lqn(x, g, cells, **options)
+        found = host_kernels(SIZE, g.dtype).lqn(x, g, cells, **options)
         history.copy_(cells)
         return found
 
     return run
 
 
-def put_into_optimizers(run: Step, patch: pytest.MonkeyPatch) -> None:
-    """Let LQNAdam's operator take `run` for the CUDA kernel, as it would on a GPU."""
-
-    def kernel(x: Tensor, g: Tensor, history: Tensor, size: int, *options: Any) -> Any:
-        assert history.is_contiguous()  # laid out for the kernel
-        names = ("min_cosine", "powell", "graft", "gamma_clamp")
-        return run(x, g, history, size, **dict(zip(names, options, strict=True)))
-
-    patch.setattr(cuda, "lqn_direction", kernel)
-    for module in (lqnadam, ops):
-        patch.setattr(module, "uses_kernel", lambda *_: True)
-
-
 @pytest.fixture(params=BACKENDS)
 def lqn(request: pytest.FixtureRequest) -> Step:
-    """`curvature.step` by either backend."""
-    return step if request.param == "torch" else host_step(request.getfixturevalue("kernels"))
-
-
-@pytest.fixture
-def optimizer_of(lqn: Step, monkeypatch: pytest.MonkeyPatch) -> type[LQNAdam]:
-    """LQNAdam on the backend of `lqn`."""
-    if lqn is not step:
-        put_into_optimizers(lqn, monkeypatch)
-    return LQNAdam
+    """`lqn_direction` by either backend."""
+    return lqn_direction if request.param == "torch" else host_step()
 
 
 def walk(rows: int, steps: int = 6) -> Tensor:
@@ -200,56 +167,3 @@ def test_line_search_in_the_helical_valley(lqn: Step) -> None:
     value = placed(problem, scale, turn)
     end = minimise(value, to_world(problem.starts(50), scale, turn), 150, step=lqn)[-1]
     assert float(value(end).max()) < 1e-25 * problem.start_value
-
-
-@pytest.mark.parametrize(("condition", "left"), [(1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-7)])
-def test_lqnadam_converges(optimizer_of: type[LQNAdam], condition: float, left: float) -> None:
-    """1,000 steps, the learning rate decayed to 1e-6 of a tenth of the distance."""
-    hessian = hessians(300, condition)
-    x = torch.nn.Parameter(torch.ones(300, 3, dtype=torch.float64))
-    optimizer = optimizer_of([x], lr=0.1, betas=(0.9, 0.95))
-    decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, 1e-6 ** (1 / 1000))
-    for _ in range(1000):
-        x.grad = gradient(quadratic(hessian), x)
-        optimizer.step()
-        decay.step()
-    assert float(x.detach().norm(dim=1).median()) < left
-
-
-@pytest.mark.parametrize("condition", CONDITIONS)
-def test_lqnadam_survives_any_condition(optimizer_of: type[LQNAdam], condition: float) -> None:
-    """Float32, losses in units of 1e-8 to 1e8 in one batch: finite, and never far off."""
-    unit = log_uniform(ROWS, 1e-8, 1e8).float()[:, None]
-    hessian = hessians(ROWS, condition).float()
-    x = torch.nn.Parameter(torch.ones(ROWS, 3))
-    optimizer = optimizer_of([x], lr=0.01, eps=1e-30)
-    for _ in range(100):
-        x.grad = torch.einsum("nij,nj->ni", hessian, x.detach()) * unit
-        optimizer.step()
-    assert bool(torch.isfinite(x).all())
-    # Adam's steps are about 0.01 a coordinate: 100 of them reach no further than 1
-    assert float((x.detach() - 1).abs().max()) < 1.5
-    loss = 0.5 * torch.einsum("ni,nij,nj->n", x.detach(), hessian, x.detach())
-    assert float((loss < 0.5 * hessian.sum((1, 2))).double().mean()) > 0.9
-
-
-@needs_compiler
-def test_both_backends_take_the_same_path(
-    kernels: dict[torch.dtype, HostKernels], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """100 steps of LQNAdam at condition 1e3, by either: the same points, to rounding."""
-    hessian, ends = hessians(200, 1e3), []
-    for patched in (False, True):
-        if patched:
-            put_into_optimizers(host_step(kernels), monkeypatch)
-        x = torch.nn.Parameter(torch.ones(200, 3, dtype=torch.float64))
-        optimizer = LQNAdam([x], lr=0.01)
-        for _ in range(100):
-            x.grad = gradient(quadratic(hessian), x)
-            optimizer.step()
-        ends.append(x.detach())
-    error = (ends[0] - ends[1]).abs()
-    # rounding, amplified where pairs are nearly parallel; a row near the bound of acceptance may go
-    # another way by a step
-    assert float(error.quantile(0.9)) < 1e-9
-    assert float(error.max()) < 1e-2

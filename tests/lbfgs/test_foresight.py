@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from opt3dgs_optim import LQNAdam, lqnadam
-from opt3dgs_optim._adaptive import MIN_FORESIGHT
-from opt3dgs_optim._evidence import foresight
-from opt3dgs_optim.curvature import header, history_from_pairs
+from opt3dgs_optim.lbfgs import columns as columns_of
+from opt3dgs_optim.lbfgs import foresight, history_from_pairs, lqn_direction, new_history
+from opt3dgs_optim.lbfgs.history import header
 
 POINTS, VIEWS, STEPS = 300, 30, 150
+MIN_FORESIGHT = 0.1  # below it, `adaptive` leaves the curvature out
 
 
 def trained(disagree: float, own_curvature: float) -> tuple[float, float]:
@@ -27,19 +27,20 @@ def trained(disagree: float, own_curvature: float) -> tuple[float, float]:
     hessians = (1 - own_curvature) * common + own_curvature * 20 * slopes.mT @ slopes
     minima = disagree * torch.randn(VIEWS, POINTS, 3, generator=draw)
     points = torch.nn.Parameter(torch.randn(POINTS, 3, generator=draw))
-    optimizer = LQNAdam([points], lr=0.02, eps=1e-15)
+    optimizer = torch.optim.Adam([points], lr=0.02, eps=1e-15)
+    history = new_history(points.detach(), 5)
     seen, shares = torch.zeros(2, dtype=torch.float64), []
     for _ in range(STEPS):
         view = int(torch.randint(VIEWS, (), generator=draw))
         off = points.detach() - minima[view]
         gradient = (hessians[view] @ off[..., None])[..., 0]
-        points.grad = gradient
-        history = optimizer.state[points].get(lqnadam.HISTORY)
-        if history is not None:
-            seen += foresight(history, 5, points.detach(), gradient)
+        position = points.detach()
+        seen += foresight(history, 5, position, gradient)
+        points.grad, accepted, candidates = lqn_direction(
+            position, gradient, history, 5, min_cosine=1e-6, graft=True
+        )
         optimizer.step()
-        if optimizer.accepted_share is not None:
-            shares.append(optimizer.accepted_share)
+        shares.append(accepted.sum() / candidates.sum().clamp(min=1))
     return float(seen[0] / seen[1]), float(torch.stack(shares).mean())
 
 
@@ -87,3 +88,18 @@ def test_points_without_a_pair_or_a_gradient_do_not_count() -> None:
     gradient[3] = torch.nan
     _, points = foresight(history, 2, torch.ones(6, 3), gradient)
     assert float(points) == 3
+
+
+def test_rows_are_taken_a_chunk_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 10^7 points its intermediates would be as large as the pairs."""
+    draw = torch.Generator().manual_seed(3)
+    pairs = torch.randn(2, 100, 3, generator=draw, dtype=torch.float64)
+    history = history_from_pairs(pairs, pairs * torch.tensor([1.0, 3.0, 9.0]))
+    position, gradient = torch.randn(2, 100, 3, generator=draw, dtype=torch.float64)
+    whole = foresight(history, 2, position, gradient)
+    monkeypatch.setattr(columns_of, "CHUNK", 7)
+    chunks = columns_of.row_chunks(gradient)
+    assert (len(chunks), chunks[-1]) == (15, slice(98, 100))
+    # the same 100 numbers, summed in another order
+    torch.testing.assert_close(foresight(history, 2, position, gradient), whole, rtol=1e-12, atol=0)
+    assert float(whole[1]) == 100
