@@ -180,7 +180,7 @@ def _compiled(obstacle: str) -> str:
         return f"not compiled, not launched: {obstacle}, and cuda.core is not installed"
     try:
         begin = time.perf_counter()
-        for name in cuda.KERNELS:
+        for name in set(cuda.KERNELS.values()):
             size = HISTORY_SIZE if name == "lqn.cu" else None
             cuda.compile_cubin(name, torch.float32, PROBE, history_size=size)
     except Exception as error:  # an incomplete NVRTC: no harm where there is no device
