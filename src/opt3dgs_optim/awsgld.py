@@ -8,11 +8,12 @@ from torch import Tensor
 
 from opt3dgs_optim.checks import check_choice, warn_user
 from opt3dgs_optim.course import Course
+from opt3dgs_optim.lending import AdamOptions
 from opt3dgs_optim.names import slot
 from opt3dgs_optim.part import Group, Part
 from opt3dgs_optim.parts.histogram import EnergyHistogram
 from opt3dgs_optim.parts.noise import IsotropicNoise, PositionNoise
-from opt3dgs_optim.stepadam import AdamOptions, StepAdam
+from opt3dgs_optim.stepadam import StepAdam
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -170,8 +170,9 @@ class Course:
         known = [(name, part, seen) for name, part, seen in shown if seen is not None]
         if not known:
             return []
-        packed = torch.cat([seen.detach().to(known[-1][2].device, torch.float64)
-                            for _, _, seen in known])  # fmt: skip
+        device = known[-1][2].device
+        widest = torch.float32 if device.type == "mps" else torch.float64
+        packed = torch.cat([seen.detach().to(device, widest) for _, _, seen in known])
         numbers = (packed if over_ranks is None else over_ranks(packed)).tolist()
         changes = []
         for name, part, seen in known:

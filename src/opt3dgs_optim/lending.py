@@ -2,12 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
+import logging
+import math
+from typing import Any, TypedDict
 
 import torch
 from torch import Tensor
 
+from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Group
+
+LOGGER = logging.getLogger("opt3dgs_optim")
+
+
+class AdamOptions(TypedDict, total=False):
+    """torch.optim.Adam's keyword-only options."""
+
+    foreach: bool | None
+    maximize: bool
+    capturable: bool
+    differentiable: bool
+    fused: bool | None
+    decoupled_weight_decay: bool
 
 
 class Lent:
@@ -65,3 +81,31 @@ class Lent:
         if theirs is not None:
             flag = torch.maximum(flag, theirs.reshape(()).to(flag.device))
         self.attribute(optimizer, "found_inf", flag)
+
+
+def guard(grad: Tensor, course: Course, told: bool) -> bool:
+    """Take a gradient that is not finite as zero, number by number, in place.
+
+    Returns:
+        Whether there was such a number; False where only the device knows.
+    """
+    on_host = grad.device.type == "cpu"
+    # The sum is finite unless a summand is not, or it overflows.
+    if on_host and math.isfinite(abs(grad.sum().item())):
+        return False
+    grad.nan_to_num_(0.0, 0.0, 0.0)
+    if on_host and not told:
+        LOGGER.warning(
+            "iteration %d: a gradient of shape %s is not finite; such numbers are taken as zero, "
+            "here and later",
+            course.current,
+            tuple(grad.shape),
+        )
+    return on_host
+
+
+def times(factor: float | Tensor | None, other: float | Tensor | None) -> float | Tensor | None:
+    """The product of two factors on a step, of which None is 1."""
+    if factor is None or other is None:
+        return other if factor is None else factor
+    return factor * other

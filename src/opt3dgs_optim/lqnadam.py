@@ -8,8 +8,9 @@ from torch import Tensor
 
 from opt3dgs_optim.backend import Backend
 from opt3dgs_optim.course import Course
+from opt3dgs_optim.lending import AdamOptions
 from opt3dgs_optim.parts.curvature import Curvature
-from opt3dgs_optim.stepadam import AdamOptions, StepAdam
+from opt3dgs_optim.stepadam import StepAdam
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

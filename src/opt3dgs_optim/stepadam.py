@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import inspect
-import logging
-import math
-from collections.abc import Callable, Mapping
-from typing import Any, TypedDict
+from collections.abc import Callable
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -15,26 +13,21 @@ from torch.optim import Adam
 
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.describe import block, group_lines
-from opt3dgs_optim.lending import Lent
+from opt3dgs_optim.lending import Lent, guard, times
 from opt3dgs_optim.names import SLOT, slot
 from opt3dgs_optim.part import Group, Part
-from opt3dgs_optim.rows import Frozen, Ledger, check_mask, check_rows, shaped
+from opt3dgs_optim.rows import (
+    Frozen,
+    Ledger,
+    check_mask,
+    check_mask_rows,
+    check_rows,
+    shaped,
+)
 
 # Unwrapped: torch's step hooks and its profiler are around our step already.
 ADAM_STEP = inspect.unwrap(Adam.step)
 STATE_KEY = "opt3dgs"  # in param_groups[0] of a state_dict: the course's state
-LOGGER = logging.getLogger("opt3dgs_optim")
-
-
-class AdamOptions(TypedDict, total=False):
-    """torch.optim.Adam's keyword-only options."""
-
-    foreach: bool | None
-    maximize: bool
-    capturable: bool
-    differentiable: bool
-    fused: bool | None
-    decoupled_weight_decay: bool
 
 
 class StepAdam(Adam):
@@ -127,42 +120,62 @@ class StepAdam(Adam):
                 loss = closure()
         with torch.set_grad_enabled(self.defaults["differentiable"]):
             acting = self.course.stepping(loss)
-            if not acting:
-                self._step_base(mask)
-            elif self.course.valid is not False:
-                self._step_parts(mask)
+            if self.course.valid is not False:
+                self._step(mask, acting)
         return loss
 
     # Learning-rate schedulers, which would wrap `step` on the instance, need not: `step` tells.
     step._wrapped_by_lr_sched = True  # pyright: ignore[reportFunctionMemberAccess]
 
-    def _step_parts(self, mask: Tensor | None) -> None:
+    def _step(self, mask: Tensor | None, acting: bool) -> None:
         course, lent, frozen, moved = self.course, Lent(), [], []
+        names = ("before", "factor", "after")
+        hooks = [course.hooks(name) if acting else [] for name in names]
         if mask is not None:
             self._check_mask(mask)
-        befores, factors = course.hooks("before"), course.hooks("factor")
         try:
             for group in self.param_groups:
-                parts = [part for part in befores if self.acts_on(part, group)]
-                for param in group["params"]:
-                    if param.grad is not None and not param.grad.is_sparse:
-                        self._prepare(group, param, mask, parts, lent, frozen)
-                        moved.append((group, param))
-                factor = None
-                for part in factors:
-                    if self.acts_on(part, group):
-                        factor = _times(factor, part.factor(group, course))
-                if factor is not None:
-                    lent.rate(group, factor, course.valid)
+                own = [[part for part in parts if self.acts_on(part, group)] for parts in hooks]
+                moved += self._prepare(group, mask, *own, lent, frozen)
             if isinstance(course.valid, Tensor) and self._drops_on_device():
                 lent.flag(self, course.valid)
             self._step_base(mask)
         finally:
             lent.take_back()
-        for group, param in moved:
-            self._finish(group, param)
+        for group, param, parts in moved:
+            for part in parts:
+                part.after(group, param, self.state[param], course)
+            if course.keys:
+                self._ledger.remember(param, self.state[param], course.keys)
         for rows in frozen:
             rows.put_back()
+
+    def _prepare(
+        self,
+        group: Group,
+        mask: Tensor | None,
+        befores: list[Part],
+        factors: list[Part],
+        afters: list[Part],
+        lent: Lent,
+        frozen: list[Frozen],
+    ) -> list[tuple[Group, Tensor, list[Part]]]:
+        """Lend the group what its step needs; return what is to come after it."""
+        moved, with_parts = [], bool(befores or afters)
+        for param in group["params"]:
+            if param.grad is None or param.grad.is_sparse:
+                continue
+            self._told |= guard(param.grad, self.course, self._told)
+            moving = self._moving(group, param, mask, with_parts)
+            if moving is not None or befores:
+                self._lend_gradient(group, param, moving, befores, lent, frozen)
+            moved.append((group, param, afters))
+        factor = None
+        for part in factors:
+            factor = times(factor, part.factor(group, self.course))
+        if factor is not None:
+            lent.rate(group, factor, self.course.valid)
+        return moved
 
     def _step_base(self, mask: Tensor | None) -> None:
         if self._base is Adam:
@@ -177,78 +190,49 @@ class StepAdam(Adam):
         takes_number = len(inspect.signature(step).parameters) > 2  # INRIA's: step(mask, N)
         step(self, mask, mask.numel()) if takes_number else step(self, mask)
 
-    def _prepare(
+    def _lend_gradient(
         self,
         group: Group,
         param: Tensor,
-        mask: Tensor | None,
+        moving: Tensor | None,
         parts: list[Part],
         lent: Lent,
         frozen: list[Frozen],
     ) -> None:
         """Put what Adam is to be fed into `param.grad`."""
-        grad = param.grad
-        assert grad is not None
-        fed = grad
-        self._guard(grad)
-        moving = self._moving(group, param, mask)
-        if moving is None and not parts:
-            return
-        state = self.state[param]
+        fed, state = cast(Tensor, param.grad), self.state[param]
         if not state:  # torch makes its moments only where there is nothing else yet
             self._init_group({**group, "params": [param]}, [], [], [], [], [], [])
         if moving is not None:
             frozen.append(Frozen(moving, param, state))
-            fed = torch.where(shaped(moving, grad), grad, 0.0)
-        if parts:
-            self._ledger.drop_strangers(param, state, self.course.keys)
-            # Parts get the gradient of what is minimised, in unscaled units.
-            scale = getattr(self, "grad_scale", None)
-            unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
-            plain = scale is None and unit == 1.0
-            fed = fed if plain else fed / unit
-            for part in parts:
-                fed = part.before(group, param, fed, state, self.course)
-            fed = fed if plain else fed * unit
-        if fed is not grad:
+            fed = torch.where(shaped(moving, fed), fed, 0.0)
+        self._ledger.drop_strangers(param, state, self.course.keys)
+        # Parts get the gradient of what is minimised, in unscaled units.
+        scale = getattr(self, "grad_scale", None)
+        unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
+        plain = not parts or (scale is None and unit == 1.0)
+        fed = fed if plain else fed / unit
+        for part in parts:
+            fed = part.before(group, param, fed, state, self.course)
+        fed = fed if plain else fed * unit
+        if fed is not param.grad:
             lent.attribute(param, "grad", fed)
 
-    def _guard(self, grad: Tensor) -> None:
-        """Take a gradient that is not finite as zero, number by number, in place."""
-        if grad.device.type == "cpu":
-            # The sum is finite unless a summand is not, or it overflows.
-            if math.isfinite(abs(grad.sum().item())):
-                return
-            if not self._told:
-                self._told = True
-                LOGGER.warning(
-                    "iteration %d: a gradient of shape %s is not finite; such numbers are taken "
-                    "as zero, here and later", self.course.current, tuple(grad.shape)
-                )  # fmt: skip
-        grad.nan_to_num_(0.0, 0.0, 0.0)
-
-    def _moving(self, group: Group, param: Tensor, mask: Tensor | None) -> Tensor | None:
-        """The rows that this step may move, [N] or 0-d bool; None: all."""
+    def _moving(
+        self, group: Group, param: Tensor, mask: Tensor | None, with_parts: bool
+    ) -> Tensor | None:
+        """The rows that may move, [N] or 0-d bool; None: all, or the base's own step knows."""
+        valid = self.course.valid
         if mask is not None and self._takes_mask(group, mask.numel()):
-            if self._base is not Adam and not self.course.hooks("after"):
-                return None  # its own masked step leaves the others alone
+            if self._base is not Adam and not with_parts:
+                return None
             rows = mask.to(param.device)
-            return rows & self.course.valid if isinstance(self.course.valid, Tensor) else rows
-        dropped = isinstance(self.course.valid, Tensor) and not self._drops_on_device()
-        return self.course.valid if dropped else None  # pyright: ignore[reportReturnType]
+            return rows & valid if isinstance(valid, Tensor) else rows
+        return valid if isinstance(valid, Tensor) and not self._drops_on_device() else None
 
     def _drops_on_device(self) -> bool:
         """Whether torch's own step can be told on the device not to be made."""
         return self._base is Adam and all(group["fused"] for group in self.param_groups)
-
-    def _finish(self, group: Group, param: Tensor) -> None:
-        """After the parameter has moved and the group's rate is its own again."""
-        state = self.state[param]
-        for part in self.course.hooks("after"):
-            if self.acts_on(part, group):
-                part.after(group, param, state, self.course)
-        if self.course.keys:
-            self._ledger.remember(param, state, self.course.keys)
 
     # -- masks ---------------------------------------------------------------------------------
 
@@ -259,46 +243,19 @@ class StepAdam(Adam):
         return self.any_group and any(p.shape[:1] == (rows,) for p in group["params"])
 
     def _check_mask(self, mask: Tensor) -> None:
-        """Only against parameters with a gradient: a mask may be older than the others' rows."""
         call, rows = f"{type(self).__name__}.step", mask.numel()
-        present = [
-            (self._takes_mask(group, rows), param)
-            for group in self.param_groups
-            for param in group["params"]
-            if param.grad is not None
-        ]
-        shapes = [tuple(param.shape) for takes, param in present if takes]
-        if present and (not shapes or any(shape[:1] != (rows,) for shape in shapes)):
-            shapes = shapes or [tuple(param.shape) for _, param in present]
-            raise ValueError(
-                f"{call}: the mask has {rows} rows, but the parameters have shapes {shapes}; a "
-                "mask of their first dimension is needed"
-            )
+        taking = [self._takes_mask(group, rows) for group in self.param_groups]
+        every = list(zip(taking, self.param_groups, strict=True))
+        check_mask_rows(call, rows, [(takes, p) for takes, g in every for p in g["params"]])
         if self.defaults["differentiable"]:
             raise ValueError(f"{call}: a mask with differentiable=True is not possible")
 
     def reset_points(self, rows: Tensor, *, moments: bool = False) -> None:
         """Say which points have moved by other means than `step()`; see `reset_points`."""
-        mask = rows.dtype == torch.bool
         groups = [g for g in self.param_groups if self.any_group or slot(g) is not None]
-        every = [p for group in groups for p in group["params"]]
-        fitting = [p for p in every if p.dim() > 0 and (not mask or rows.shape == p.shape[:1])]
-        if every and not fitting:
-            raise ValueError(
-                f"{type(self).__name__}.reset_points: rows has shape {tuple(rows.shape)}, but a "
-                f"mask of the first dimension of {[tuple(p.shape) for p in every]} is needed"
-            )
-        for param in fitting:
-            state = self.state.get(param, {})
-            for key in [key for key in self.course.keys if key in state]:
-                if self._ledger.edited_along(param, state, key):
-                    state[key][rows.to(param.device)] = 0
-                    self._ledger.remember(param, state, (key,))
-                else:
-                    del state[key]
-            for key in ("exp_avg", "exp_avg_sq", "max_exp_avg_sq") if moments else ():
-                if key in state and state[key].shape[0] == param.shape[0]:
-                    state[key][rows.to(param.device)] = 0
+        states = [(p, self.state.get(p, {})) for group in groups for p in group["params"]]
+        call = f"{type(self).__name__}.reset_points"
+        self._ledger.forget(call, states, self.course.keys, rows, moments)
 
     # -- copies and checkpoints ----------------------------------------------------------------
 
@@ -365,31 +322,3 @@ class StepAdam(Adam):
     def __repr__(self) -> str:
         lines = [str(part) for part in self.course.parts] + group_lines(self.param_groups)
         return block(type(self).__name__, lines)
-
-
-def _times(factor: float | Tensor | None, other: float | Tensor | None) -> float | Tensor | None:
-    if factor is None or other is None:
-        return other if factor is None else factor
-    return factor * other
-
-
-def reset_points(optimizers: Any, rows: Tensor, *, moments: bool = False) -> None:
-    """Say which points have moved by other means than the optimizers: what parts kept of them goes.
-
-    For a trainer that knows what its density control did. Call it after each edit of the
-    parameters: curvature pairs of all other points stay in use, where they would otherwise be
-    dropped with the exchanged Parameter object. The state's rows must have been edited along
-    (gsplat does; INRIA's edits leave the pairs behind, and they are dropped).
-
-    Args:
-        optimizers: an upgraded optimizer, or a dict of them (others in it are left alone).
-        rows: [N] bool mask or a vector of indices, of the points as they are now.
-        moments: whether to start their Adam moments anew too.
-
-    Raises:
-        ValueError: a mask fits no parameter.
-    """
-    every = optimizers.values() if isinstance(optimizers, Mapping) else [optimizers]
-    for optimizer in every:
-        if isinstance(optimizer, StepAdam):
-            optimizer.reset_points(rows, moments=moments)
