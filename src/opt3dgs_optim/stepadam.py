@@ -135,8 +135,10 @@ class StepAdam(Adam):
             self._check_mask(mask)
         try:
             for group in self.param_groups:
-                own = [[part for part in parts if self.acts_on(part, group)] for parts in hooks]
-                moved += self._prepare(group, mask, *own, lent, frozen)
+                before, factor, after = (
+                    [part for part in parts if self.acts_on(part, group)] for parts in hooks
+                )
+                moved += self._prepare(group, mask, before, factor, after, lent, frozen)
             if isinstance(course.valid, Tensor) and self._drops_on_device():
                 lent.flag(self, course.valid)
             self._step_base(mask)
