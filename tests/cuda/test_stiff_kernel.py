@@ -13,10 +13,12 @@ import pytest
 import torch
 from kernel_host import compiler, host_kernels
 from line_search import minimise
-from opt3dgs_optim.curvature import header, new_history
 from oracles import dense_bfgs
 from problems import SMOOTH, hessians, log_uniform, placed, quadratic, rotations, to_world
 from torch import Tensor
+
+from opt3dgs_optim.lbfgs import lqn_direction, new_history
+from opt3dgs_optim.lbfgs.history import header
 
 ROWS, SIZE = 2_000, 5
 CONDITIONS = (1.0, 1e3, 1e6, 1e12)
