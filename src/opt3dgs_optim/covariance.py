@@ -7,7 +7,7 @@ from torch import Tensor
 
 from opt3dgs_optim import cuda
 from opt3dgs_optim.backend import uses_kernel
-from opt3dgs_optim.lbfgs.columns import columns, row_chunks
+from opt3dgs_optim.lbfgs.pairs import columns, row_chunks
 
 GATE_SHARPNESS = 100.0  # k of eq. 2's gate
 GATE_OPACITY = 0.005  # t of eq. 2's gate: the opacity under which a Gaussian counts as dead

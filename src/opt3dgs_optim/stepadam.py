@@ -14,7 +14,7 @@ from torch.optim import Adam
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.describe import block, group_lines
 from opt3dgs_optim.lending import Lent, guard, times
-from opt3dgs_optim.names import SLOT, slot
+from opt3dgs_optim.names import SLOT, canonical_name
 from opt3dgs_optim.part import Group, Part
 from opt3dgs_optim.rows import (
     Frozen,
@@ -73,9 +73,15 @@ class StepAdam(Adam):
                 if state:
                     state["step"] = state["step"].to(param.device, torch.float32)
 
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """As torch's; notes which Gaussian parameter the group's name says that it holds."""
+        super().add_param_group(param_group)
+        group = self.param_groups[-1]
+        group.setdefault(SLOT, canonical_name(group.get("name")))
+
     def acts_on(self, part: Part, group: Group) -> bool:
         """Whether a part acts on a group."""
-        name = slot(group)
+        name = group.get(SLOT)
         return part.names is None or name in part.names or (name is None and self.any_group)
 
     # -- the step ------------------------------------------------------------------------------
@@ -240,7 +246,7 @@ class StepAdam(Adam):
 
     def _takes_mask(self, group: Group, rows: int) -> bool:
         """Whether a mask of so many rows is about this group."""
-        if slot(group) is not None:
+        if group.get(SLOT) is not None:
             return True
         return self.any_group and any(p.shape[:1] == (rows,) for p in group["params"])
 
@@ -254,7 +260,7 @@ class StepAdam(Adam):
 
     def reset_points(self, rows: Tensor, *, moments: bool = False) -> None:
         """Say which points have moved by other means than `step()`; see `reset_points`."""
-        groups = [g for g in self.param_groups if self.any_group or slot(g) is not None]
+        groups = [g for g in self.param_groups if self.any_group or g.get(SLOT) is not None]
         states = [(p, self.state.get(p, {})) for group in groups for p in group["params"]]
         call = f"{type(self).__name__}.reset_points"
         self._ledger.forget(call, states, self.course.keys, rows, moments)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from opt3dgs_optim.lbfgs.columns import columns
 from opt3dgs_optim.lbfgs.history import header, stored_pairs
-from opt3dgs_optim.lbfgs.lqn_direction import direction as direction_of_columns
-from opt3dgs_optim.lbfgs.lqn_direction import take_pairs
-from opt3dgs_optim.lbfgs.pairs import dot
+from opt3dgs_optim.lbfgs.pairs import columns, dot
+from opt3dgs_optim.lbfgs.two_loop import direction as direction_of_columns
+from opt3dgs_optim.lbfgs.two_loop import take_pairs
 
 
 def record(

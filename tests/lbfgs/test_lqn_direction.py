@@ -18,7 +18,7 @@ import opt3dgs_optim
 from opt3dgs_optim import cuda
 from opt3dgs_optim.lbfgs import columns as columns_of
 from opt3dgs_optim.lbfgs import foresight, laid_out, lqn_direction, new_history, two_loop
-from opt3dgs_optim.lbfgs.lqn_direction import step
+from opt3dgs_optim.lbfgs.two_loop import step
 
 OPERATOR = torch.ops.opt3dgs_optim.lqn_direction.default
 # inductor imports parts of torch that torch itself has deprecated

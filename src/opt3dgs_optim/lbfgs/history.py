@@ -27,8 +27,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.lbfgs.columns import columns
-from opt3dgs_optim.lbfgs.pairs import Pair, normalised_pair
+from opt3dgs_optim.lbfgs.pairs import Pair, columns, normalised_pair
 
 MAX_HISTORY = 16
 
