@@ -272,7 +272,7 @@ def test_few_operators() -> None:
 def test_a_part_of_a_course() -> None:
     course = Course([histogram := EnergyHistogram(warmup=8)], total_steps=100)
     assert histogram.factor({}, course) is None
-    alone = EnergyHistogram(warmup=8)
+    alone, nu = EnergyHistogram(warmup=8), 1.0
     for k, energy in enumerate(stream(30)):
         course.current = k
         course.take(torch.tensor(energy))

@@ -113,29 +113,18 @@ class EnergyHistogram(Part):
         self._allocate(torch.device("cpu"))
 
     @classmethod
-    def paper(
-        cls,
-        num_partitions: int = 200,
-        energy_range: tuple[float, float] = PAPER_RANGE,
-        *,
-        zeta: float = 0.75,
-        temperature: float = PAPER_TEMPERATURE,
-        warmup: int = 2500,
-        clamp: tuple[float, float] | None = PAPER_CLAMP,
-    ) -> EnergyHistogram:
-        """The paper's update with the paper's settings.
+    def paper(cls, **overrides: Any) -> EnergyHistogram:
+        """The paper's update with its settings: range [0, 0.2], zeta .75, warm-up 2,500.
 
-        The temperature, the clamp and lambda's schedule (min(1e-2, 10 / (k^0.8 + 100))) are not in
-        the paper.
+        The temperature (2e-3), the clamp (-5 to 5) and lambda's schedule are not in the paper.
         """
-        return cls(
-            num_partitions,
-            energy_range,
-            zeta=zeta,
-            temperature=temperature,
-            warmup=warmup,
-            clamp=clamp,
-        )
+        settings: dict[str, Any] = {
+            "energy_range": PAPER_RANGE,
+            "temperature": PAPER_TEMPERATURE,
+            "warmup": 2500,
+            **overrides,
+        }
+        return cls(**settings)
 
     def _allocate(self, device: torch.device) -> None:
         self._device = device
@@ -155,7 +144,7 @@ class EnergyHistogram(Part):
     # -- one energy ----------------------------------------------------------------------------
 
     @torch.no_grad()
-    def observe(
+    def observe(  # pyright: ignore[reportIncompatibleMethodOverride]
         self,
         energy: Tensor | float,
         valid: Tensor | bool | None = None,
