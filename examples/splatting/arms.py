@@ -15,6 +15,7 @@ from opt3dgs_optim import (
     EnergyHistogram,
     FreshMoments,
     Part,
+    Phase,
     PhaseScheduler,
     PositionNoise,
     SquaredLoss,
@@ -40,6 +41,7 @@ class Arm:
     parts: MakeParts | None = None  # None: torch's own Adam in the trainer
     mcmc: bool = True  # relocation, growth, noise and regularisers of 3DGS-MCMC
     needs: str | None = None  # the arm whose mean nu it takes, seed by seed
+    noise_during: Phase | None = None  # None: in both phases
 
     def make(
         self, iterations: int, switch: float, nu: float | None, gaussians: dict[str, Tensor]
@@ -55,7 +57,8 @@ class Arm:
         if self.needs is not None and nu is None:
             raise ValueError(f"arm {self.name}: needs the mean nu of {self.needs}; run it first")
         parts = [] if self.parts is None else self.parts(iterations, nu)
-        return PhaseScheduler(iterations, switch, [*parts, PositionNoise(gaussians, NOISE_LR)])
+        noise = PositionNoise(gaussians, NOISE_LR, during=self.noise_during)
+        return PhaseScheduler(iterations, switch, [*parts, noise])
 
 
 def fixed(*parts: Callable[[], Part]) -> MakeParts:
