@@ -10,13 +10,8 @@ import pytest
 import torch
 from oracles import covariance
 
-from opt3dgs_optim.noise import (
-    GATE_OPACITY,
-    GATE_SHARPNESS,
-    CovarianceNoise,
-    IsotropicNoise,
-    covariance_noise,
-)
+from opt3dgs_optim import Course, IsotropicNoise, PositionNoise
+from opt3dgs_optim.covariance import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
 
 
 def gaussians(n: int, seed: int = 0) -> dict[str, torch.Tensor]:
@@ -65,7 +60,7 @@ def test_added_noise_has_the_covariance_squared() -> None:
     one["opacities"] = torch.full((n,), -12.0, dtype=torch.float64)
     means = torch.zeros(n, 3, dtype=torch.float64)
     torch.manual_seed(0)
-    CovarianceNoise(one, scale=20.0).add_to(means, 0.05)
+    PositionNoise(one, scale=20.0).add_to(means, 0.05)
     sigma = covariance(one["scales"][0].numpy(), one["quats"][0].numpy())
     gate = 1 / (1 + np.exp(100 * (1 / (1 + np.exp(12.0)) - 0.005)))
     expected = gate**2 * sigma @ sigma
@@ -75,7 +70,7 @@ def test_added_noise_has_the_covariance_squared() -> None:
 
 def test_host_dict_is_read_anew() -> None:
     g = gaussians(4)
-    noise = CovarianceNoise(g, scale=1.0)
+    noise = PositionNoise(g, scale=1.0)
     more = gaussians(6)
     g.update(more)
     means = torch.zeros(6, 3, dtype=torch.float64)
@@ -85,7 +80,7 @@ def test_host_dict_is_read_anew() -> None:
 
 def test_function_as_source() -> None:
     means = torch.zeros(4, 3, dtype=torch.float64)
-    CovarianceNoise(lambda: gaussians(4), scale=1.0).add_to(means, 1.0)
+    PositionNoise(lambda: gaussians(4), scale=1.0).add_to(means, 1.0)
     assert bool(means.any())
 
 
@@ -94,7 +89,7 @@ def test_generator_makes_it_reproducible() -> None:
     for _ in "ab":
         means = torch.zeros(4, 3, dtype=torch.float64)
         generator = torch.Generator().manual_seed(5)
-        CovarianceNoise(gaussians(4), scale=1.0, generator=generator).add_to(means, 1.0)
+        PositionNoise(gaussians(4), scale=1.0, generator=generator).add_to(means, 1.0)
         draws.append(means)
     assert torch.equal(*draws)
 
@@ -102,14 +97,14 @@ def test_generator_makes_it_reproducible() -> None:
 def test_mistakes_are_named() -> None:
     means = torch.zeros(4, 3, dtype=torch.float64)
     with pytest.raises(ValueError, match=re.escape("['quats', 'opacities']")):
-        CovarianceNoise({"scales": means}).add_to(means, 1.0)
+        PositionNoise({"scales": means}).add_to(means, 1.0)
     with pytest.raises(ValueError, match="5 scales for 4 means"):
-        CovarianceNoise(gaussians(5)).add_to(means, 1.0)
+        PositionNoise(gaussians(5)).add_to(means, 1.0)
 
 
 def test_the_constants_are_the_trainers() -> None:
     """noise_lr, k and 1 - x0 of 3dgs-mcmc."""
-    assert CovarianceNoise({}).scale == 5e5
+    assert PositionNoise({}).scale == 5e5
     assert (GATE_SHARPNESS, GATE_OPACITY) == (100.0, 0.005)
 
 
@@ -135,7 +130,7 @@ def test_added_noise_is_scale_times_learning_rate_times_the_draw(lr: float | tor
     g = gaussians(7)
     start = torch.randn(7, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     means = start.clone()
-    noise = CovarianceNoise(g, scale=0.25, generator=torch.Generator().manual_seed(5))
+    noise = PositionNoise(g, scale=0.25, generator=torch.Generator().manual_seed(5))
     noise.add_to(means, lr)
     eta = torch.randn(7, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     drawn = covariance_noise(g["scales"], g["quats"], g["opacities"], eta)
@@ -156,7 +151,7 @@ def test_isotropic_noise_is_the_deviation_times_the_draw(options: dict, deviatio
     start = torch.randn(6, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     point = start.clone()
     noise = IsotropicNoise(**options, generator=torch.Generator().manual_seed(5))
-    noise.add_to(point, 0.02)
+    noise.after({"lr": 0.02}, point, {}, Course())
     eta = torch.randn(6, 2, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     torch.testing.assert_close(point, start + deviation * eta, rtol=1e-14, atol=0)
 
@@ -174,11 +169,11 @@ def test_isotropic_noise_is_given_in_one_way() -> None:
 
 def test_a_scale_of_a_half_or_none() -> None:
     for scale in (0.5, 0.0):
-        assert CovarianceNoise({}, scale=scale).scale == scale
+        assert PositionNoise({}, scale=scale).scale == scale
     with pytest.raises(ValueError, match=r"scale=-0\.5"):
-        CovarianceNoise({}, scale=-0.5)
+        PositionNoise({}, scale=-0.5)
     with pytest.raises(ValueError, match="backend='fast'"):
-        CovarianceNoise({}, backend="fast")  # pyright: ignore[reportArgumentType]
+        PositionNoise({}, backend="fast")  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("rows", [3, 5])
@@ -186,6 +181,6 @@ def test_gaussians_of_another_scene(rows: int) -> None:
     """Also where the number of points is that of the coordinates."""
     means = torch.zeros(rows, 3, dtype=torch.float64)
     with pytest.raises(ValueError, match=f"6 scales for {rows} means"):
-        CovarianceNoise(gaussians(6)).add_to(means, 1.0)
-    CovarianceNoise(gaussians(rows)).add_to(means, 1.0)
+        PositionNoise(gaussians(6)).add_to(means, 1.0)
+    PositionNoise(gaussians(rows)).add_to(means, 1.0)
     assert bool(means.any())
