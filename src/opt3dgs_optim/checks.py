@@ -75,11 +75,11 @@ def check_interval(call: str, name: str, value: Any) -> tuple[float, float]:
 
 def warn_user(message: str) -> None:
     """Warn at the line outside of this package and torch from which the call came."""
-    inside = (os.path.dirname(__file__), os.path.dirname(torch.__file__))
+    inside = tuple(os.path.dirname(each) + os.sep for each in (__file__, torch.__file__))
     frame, level = sys._getframe(1), 2
     while frame.f_back is not None and frame.f_code.co_filename.startswith(inside):
         frame, level = frame.f_back, level + 1
-    warnings.warn(message, stacklevel=level - 1)
+    warnings.warn(message, stacklevel=level)
 
 
 def check_keys(call: str, state: Any, needed: tuple[str, ...]) -> None:

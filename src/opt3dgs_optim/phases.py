@@ -11,12 +11,12 @@ from torch.optim import Optimizer
 
 from opt3dgs_optim.checks import check_count, check_flag, check_number, warn_user
 from opt3dgs_optim.course import CHECK_STEPS, Course
-from opt3dgs_optim.describe import block, group_name
-from opt3dgs_optim.names import GAUSSIAN_NAMES, canonical_name, slot
+from opt3dgs_optim.describe import block
+from opt3dgs_optim.names import GAUSSIAN_NAMES, canonical_name
 from opt3dgs_optim.part import Part, Phase
 from opt3dgs_optim.presets import DEFAULTS, PAPER_STEPS, PAPER_SWITCH, paper_parts
 from opt3dgs_optim.ranks import RankMean
-from opt3dgs_optim.upgrading import say, take
+from opt3dgs_optim.upgrading import look_at, say, take
 from opt3dgs_optim.version import __version__
 
 if TYPE_CHECKING:
@@ -168,23 +168,21 @@ class PhaseScheduler(Course):
                 f"{CALL}.upgrade: optimizers is a {type(optimizers).__name__}, but a dict of "
                 "optimizers, or one optimizer with named groups, is needed"
             )
-        taken: list[str] = []
-        left: list[str] = []
-        for key, optimizer, shown in found:
-            if key is not None and canonical_name(key) is None:
-                left.append(str(key))
-                continue
-            names, is_new = take(optimizer, self, shown, key)
-            taken += names
-            groups = enumerate(optimizer.param_groups)
-            left += [group_name(i, group) for i, group in groups if slot(group) is None]
-            self._num_optimizers += is_new
+        known = [each for each in found if each[0] is None or canonical_name(each[0]) is not None]
+        # All are looked at before the first is changed.
+        plans = [look_at(optimizer, self, shown, key) for key, optimizer, shown in known]
+        taken = [name for plan in plans for name in plan.names]
+        left = [str(key) for key, *_ in found if key is not None and canonical_name(key) is None]
+        left += [name for plan in plans for name in plan.left]
         if not taken:
             names = sorted(alias for aliases in GAUSSIAN_NAMES.values() for alias in aliases)
             raise ValueError(
                 f"{CALL}.upgrade: none of the names {left} is a Gaussian parameter's; allowed are "
                 f"{', '.join(names)}"
             )
+        for plan in plans:
+            take(plan, self)
+            self._num_optimizers += plan.base is not None
         parts = ", ".join(str(part) for part in self.parts) or "none"
         others = f"; left alone: {', '.join(left)}" if left else ""
         again = f" from iteration {self.iteration}" if self.iteration else ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import logging
 import sys
-from typing import Any
+from typing import Any, NamedTuple
 
 from torch.optim import Adam
 
@@ -18,8 +18,18 @@ CALL = "PhaseScheduler.upgrade"
 LOGGER = logging.getLogger("opt3dgs_optim")
 
 
-def take(optimizer: Any, course: Course, shown: str, key: str | None) -> tuple[list[str], bool]:
-    """Put the parts of `course` into an optimizer, in place.
+class Found(NamedTuple):
+    """An optimizer that can have the parts of a course."""
+
+    optimizer: Any
+    base: type[Adam] | None  # whose step the parts surround; None: it has them already
+    slots: list[str | None]  # the Gaussian parameter that each group holds
+    names: list[str]  # of the groups that hold one, as the trainer calls them
+    left: list[str]  # of the others
+
+
+def look_at(optimizer: Any, course: Course, shown: str, key: str | None) -> Found:
+    """What an optimizer holds; it is not changed.
 
     Args:
         optimizer: a `torch.optim.Adam`, or one of this course already.
@@ -27,36 +37,40 @@ def take(optimizer: Any, course: Course, shown: str, key: str | None) -> tuple[l
         shown: how messages call the optimizer.
         key: what a dict of optimizers says that it holds; None: its groups' names say.
 
-    Returns:
-        The names of the groups that have the parts now; whether the optimizer is new to them.
-
     Raises:
         TypeError, ValueError: as `PhaseScheduler.upgrade`.
     """
-    groups = optimizer.param_groups if isinstance(optimizer, Adam) else []
-    if isinstance(optimizer, StepAdam):
-        if optimizer.course is not course:
-            kind = type(optimizer).__name__
-            raise TypeError(f"{CALL}: {shown} is a {kind} with parts of its own")
-        return [group_name(i, g) for i, g in enumerate(groups) if g.get(SLOT) is not None], False
-    base = _base_of(optimizer, shown)
+    base = None
+    if not isinstance(optimizer, StepAdam):
+        base = _base_of(optimizer, shown)
+    elif optimizer.course is not course:
+        raise TypeError(f"{CALL}: {shown} is a {type(optimizer).__name__} with parts of its own")
+    groups = optimizer.param_groups
     # A dict's key says what its optimizer holds, whatever the group is called.
     slots = [canonical_name(key or group.get("name")) for group in groups]
+    if base is None:
+        slots = [group.get(SLOT) for group in groups]
     known = [name for name in slots if name is not None]
     twice = sorted({name for name in known if known.count(name) > 1})
     if twice:
         raise ValueError(f"{CALL}: two groups of {shown} hold {twice[0]!r}")
-    if not known:
-        return [], False
-    for group, name in zip(groups, slots, strict=True):
+    called = [key or group_name(i, group) for i, group in enumerate(groups)]
+    names = [name for name, slot in zip(called, slots, strict=True) if slot is not None]
+    left = [name for name, slot in zip(called, slots, strict=True) if slot is None]
+    return Found(optimizer, base if known else None, slots, names, left)
+
+
+def take(found: Found, course: Course) -> None:
+    """Put the parts of `course` into an optimizer, in place."""
+    if found.base is None:
+        return
+    optimizer = found.optimizer
+    for group, name in zip(optimizer.param_groups, found.slots, strict=True):
         group[SLOT] = name
     vars(optimizer).pop("step", None)  # a learning-rate scheduler's wrapper of the old class's
     optimizer.__class__ = StepAdam
-    upgraded: Any = optimizer
-    upgraded.follow(course, base)
-    upgraded.take_loaded()
-    named = zip(range(len(groups)), groups, slots, strict=True)
-    return [key or group_name(i, group) for i, group, name in named if name is not None], True
+    optimizer.follow(course, found.base)
+    optimizer.take_loaded()
 
 
 def _base_of(optimizer: Any, shown: str) -> type[Adam]:

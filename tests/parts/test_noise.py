@@ -10,11 +10,8 @@ import pytest
 import torch
 from oracles import covariance
 
+from opt3dgs_optim import Course, IsotropicNoise, PositionNoise
 from opt3dgs_optim.covariance import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
-from opt3dgs_optim.noise import (
-    CovarianceNoise,
-    IsotropicNoise,
-)
 
 
 def gaussians(n: int, seed: int = 0) -> dict[str, torch.Tensor]:
@@ -27,6 +24,35 @@ def gaussians(n: int, seed: int = 0) -> dict[str, torch.Tensor]:
     return draw
 
 
+def test_is_gate_times_covariance_times_eta() -> None:
+    g = gaussians(40)
+    eta = torch.randn(40, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
+    noise = covariance_noise(g["scales"], g["quats"], g["opacities"], eta).numpy()
+    for i in range(40):
+        opacity = 1 / (1 + np.exp(-g["opacities"][i].item()))
+        gate = 1 / (1 + np.exp(100 * (opacity - 0.005)))
+        sigma = covariance(g["scales"][i].numpy(), g["quats"][i].numpy())
+        np.testing.assert_allclose(noise[i], gate * sigma @ eta[i].numpy(), rtol=1e-9, atol=1e-13)
+
+
+def test_gate_is_the_trainers_op_sigmoid() -> None:
+    """op_sigmoid(1 - o, k=100, x0=0.995) of 3dgs-mcmc."""
+    opacity = torch.tensor([0.0005, 0.005, 0.05, 0.9], dtype=torch.float64)
+    ones = torch.ones(4, 3, dtype=torch.float64)
+    quats = torch.tensor([[1.0, 0, 0, 0]] * 4, dtype=torch.float64)
+    noise = covariance_noise(0 * ones, quats, opacity.logit(), ones)[:, 0]
+    expected = 1 / (1 + torch.exp(-100 * ((1 - opacity) - 0.995)))
+    torch.testing.assert_close(noise, expected, rtol=1e-9, atol=1e-15)
+
+
+def test_nerfstudio_opacities_have_a_second_dimension() -> None:
+    g = gaussians(5)
+    eta = torch.ones(5, 3, dtype=torch.float64)
+    flat = covariance_noise(g["scales"], g["quats"], g["opacities"], eta)
+    column = covariance_noise(g["scales"], g["quats"], g["opacities"].unsqueeze(1), eta)
+    assert torch.equal(flat, column)
+
+
 def test_added_noise_has_the_covariance_squared() -> None:
     """Cov(gate Sigma eta) = gate^2 Sigma^2, times (lr scale)^2."""
     n = 40_000
@@ -34,7 +60,7 @@ def test_added_noise_has_the_covariance_squared() -> None:
     one["opacities"] = torch.full((n,), -12.0, dtype=torch.float64)
     means = torch.zeros(n, 3, dtype=torch.float64)
     torch.manual_seed(0)
-    CovarianceNoise(one, scale=20.0).add_to(means, 0.05)
+    PositionNoise(one, scale=20.0).add_to(means, 0.05)
     sigma = covariance(one["scales"][0].numpy(), one["quats"][0].numpy())
     gate = 1 / (1 + np.exp(100 * (1 / (1 + np.exp(12.0)) - 0.005)))
     expected = gate**2 * sigma @ sigma
@@ -44,7 +70,7 @@ def test_added_noise_has_the_covariance_squared() -> None:
 
 def test_host_dict_is_read_anew() -> None:
     g = gaussians(4)
-    noise = CovarianceNoise(g, scale=1.0)
+    noise = PositionNoise(g, scale=1.0)
     more = gaussians(6)
     g.update(more)
     means = torch.zeros(6, 3, dtype=torch.float64)
@@ -54,7 +80,7 @@ def test_host_dict_is_read_anew() -> None:
 
 def test_function_as_source() -> None:
     means = torch.zeros(4, 3, dtype=torch.float64)
-    CovarianceNoise(lambda: gaussians(4), scale=1.0).add_to(means, 1.0)
+    PositionNoise(lambda: gaussians(4), scale=1.0).add_to(means, 1.0)
     assert bool(means.any())
 
 
@@ -63,7 +89,7 @@ def test_generator_makes_it_reproducible() -> None:
     for _ in "ab":
         means = torch.zeros(4, 3, dtype=torch.float64)
         generator = torch.Generator().manual_seed(5)
-        CovarianceNoise(gaussians(4), scale=1.0, generator=generator).add_to(means, 1.0)
+        PositionNoise(gaussians(4), scale=1.0, generator=generator).add_to(means, 1.0)
         draws.append(means)
     assert torch.equal(*draws)
 
@@ -71,15 +97,30 @@ def test_generator_makes_it_reproducible() -> None:
 def test_mistakes_are_named() -> None:
     means = torch.zeros(4, 3, dtype=torch.float64)
     with pytest.raises(ValueError, match=re.escape("['quats', 'opacities']")):
-        CovarianceNoise({"scales": means}).add_to(means, 1.0)
+        PositionNoise({"scales": means}).add_to(means, 1.0)
     with pytest.raises(ValueError, match="5 scales for 4 means"):
-        CovarianceNoise(gaussians(5)).add_to(means, 1.0)
+        PositionNoise(gaussians(5)).add_to(means, 1.0)
 
 
 def test_the_constants_are_the_trainers() -> None:
     """noise_lr, k and 1 - x0 of 3dgs-mcmc."""
-    assert CovarianceNoise({}).scale == 5e5
+    assert PositionNoise({}).scale == 5e5
     assert (GATE_SHARPNESS, GATE_OPACITY) == (100.0, 0.005)
+
+
+def test_quaternions_of_any_length_and_of_none() -> None:
+    """As torch.nn.functional.normalize: below 1e-12 there is no direction, and no NaN."""
+    g = gaussians(5)
+    eta = torch.ones(5, 3, dtype=torch.float64)
+    sizes = torch.tensor([1e-6, 0.1, 1.0, 1e6, 1.0], dtype=torch.float64)[:, None]
+    unit = torch.nn.functional.normalize(g["quats"])
+    found = covariance_noise(g["scales"], unit * sizes, g["opacities"], eta)
+    expected = covariance_noise(g["scales"], unit, g["opacities"], eta)
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)
+    none = covariance_noise(g["scales"], 0 * unit, g["opacities"], eta)
+    # R = 1 where there is no quaternion: the variances along the axes
+    upright = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(5, 4)
+    assert torch.equal(none, covariance_noise(g["scales"], upright, g["opacities"], eta))
 
 
 @pytest.mark.parametrize(
@@ -89,7 +130,7 @@ def test_added_noise_is_scale_times_learning_rate_times_the_draw(lr: float | tor
     g = gaussians(7)
     start = torch.randn(7, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     means = start.clone()
-    noise = CovarianceNoise(g, scale=0.25, generator=torch.Generator().manual_seed(5))
+    noise = PositionNoise(g, scale=0.25, generator=torch.Generator().manual_seed(5))
     noise.add_to(means, lr)
     eta = torch.randn(7, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     drawn = covariance_noise(g["scales"], g["quats"], g["opacities"], eta)
@@ -110,7 +151,7 @@ def test_isotropic_noise_is_the_deviation_times_the_draw(options: dict, deviatio
     start = torch.randn(6, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     point = start.clone()
     noise = IsotropicNoise(**options, generator=torch.Generator().manual_seed(5))
-    noise.add_to(point, 0.02)
+    noise.after({"lr": 0.02}, point, {}, Course())
     eta = torch.randn(6, 2, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     torch.testing.assert_close(point, start + deviation * eta, rtol=1e-14, atol=0)
 
@@ -128,11 +169,11 @@ def test_isotropic_noise_is_given_in_one_way() -> None:
 
 def test_a_scale_of_a_half_or_none() -> None:
     for scale in (0.5, 0.0):
-        assert CovarianceNoise({}, scale=scale).scale == scale
+        assert PositionNoise({}, scale=scale).scale == scale
     with pytest.raises(ValueError, match=r"scale=-0\.5"):
-        CovarianceNoise({}, scale=-0.5)
+        PositionNoise({}, scale=-0.5)
     with pytest.raises(ValueError, match="backend='fast'"):
-        CovarianceNoise({}, backend="fast")  # pyright: ignore[reportArgumentType]
+        PositionNoise({}, backend="fast")  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("rows", [3, 5])
@@ -140,6 +181,6 @@ def test_gaussians_of_another_scene(rows: int) -> None:
     """Also where the number of points is that of the coordinates."""
     means = torch.zeros(rows, 3, dtype=torch.float64)
     with pytest.raises(ValueError, match=f"6 scales for {rows} means"):
-        CovarianceNoise(gaussians(6)).add_to(means, 1.0)
-    CovarianceNoise(gaussians(rows)).add_to(means, 1.0)
+        PositionNoise(gaussians(6)).add_to(means, 1.0)
+    PositionNoise(gaussians(rows)).add_to(means, 1.0)
     assert bool(means.any())

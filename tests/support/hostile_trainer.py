@@ -16,18 +16,18 @@ from torch import Tensor
 from torch.nn import Parameter
 from trainers import everything
 
-from opt3dgs_optim import PhaseScheduler
-from opt3dgs_optim.lqnadam import CurvatureOptions
+from opt3dgs_optim import ConstantMultiplier, Curvature, PhaseScheduler
 
 TOTAL, SWITCH = 400, 8
 RATES = {"means": 1e-2, "opacities": 5e-2}
 INRIA = {"means": "xyz", "opacities": "opacity"}
 MOMENTS = ("exp_avg", "exp_avg_sq")
-PAIRS = ("history", "epoch")
+PAIRS = "history"
+FRESH = "fresh_since"  # the group's note of what happened at the switch
 
 
 def make_phases() -> PhaseScheduler:
-    return everything(TOTAL, SWITCH, multiplier=1.5, curvature=CurvatureOptions(history_size=3))
+    return everything(TOTAL, SWITCH, nu=ConstantMultiplier(1.5), curvature=Curvature(3))
 
 
 def build(kind: str, splats: dict[str, Parameter]) -> Any:
@@ -191,7 +191,7 @@ class HostileTrainer:
     def follow(self, name: str, twin: Splats, *, new: bool, zeroed: bool, told: bool) -> None:
         """What the edit means for one row: its pairs are gone, and the moments where they are 0."""
         optimizer, param = twin.optimizer(name), twin.params[name]
-        optimizer.switched = self.ours.optimizer(name).switched
+        twin.group(name)[FRESH] = self.ours.group(name).get(FRESH)
         ours = self.ours.optimizer(name).state.get(self.ours.params[name])
         if ours is None:
             return
@@ -203,18 +203,7 @@ class HostileTrainer:
             for key in MOMENTS:
                 state[key].zero_()
         if new or zeroed or not told:
-            for key in PAIRS:
-                state.pop(key, None)
-        self.follow_counts(state, ours)
-
-    def follow_counts(self, state: dict[str, Tensor], ours: dict[str, Tensor]) -> None:
-        """The row's own step count: edited along by gsplat, estimated anew after INRIA's edits."""
-        if "row_steps" not in ours:
-            return
-        if bool((state["exp_avg"] == 0).all()):
-            state["row_steps"] = torch.zeros(1)
-        elif self.kind == "inria":
-            state["row_steps"] = state["step"].reshape(1).clone()
+            state.pop(PAIRS, None)
 
     # -- checkpoints -----------------------------------------------------------------------------
 

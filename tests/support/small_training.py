@@ -1,6 +1,6 @@
 """A small real training that can be killed at any time: Gaussians fitted to a few images.
 
-    python tests/small_training.py FOLDER --steps 400 --every 20
+    python tests/support/small_training.py FOLDER --steps 400 --every 20
 
 Continues from FOLDER/checkpoint.pt where there is one, and writes FOLDER/memory.txt: resident bytes
 at each tenth of the run. Runs by itself, so that a test can kill it.
@@ -57,7 +57,7 @@ class Training:
         self.folder, self.steps = folder, steps
         self.checkpoint = folder / "checkpoint.pt"
         self.phases = everything(
-            steps, steps * 2 // 3, multiplier=EnergyHistogram(warmup=max(8, steps // 12))
+            steps, steps * 2 // 3, nu=EnergyHistogram(warmup=max(8, steps // 12))
         )
         saved = None
         if self.checkpoint.exists():
@@ -81,7 +81,7 @@ class Training:
         view = self.phases.iteration % VIEWS
         loss = self.phases.pixel_loss(render(self.splats, view), self.targets[view])  # pyright: ignore
         loss.backward()
-        self.phases.observe(loss, view=view)
+        self.phases.observe(loss)
         for optimizer in self.optimizers.values():
             optimizer.step()
             optimizer.zero_grad()

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from opt3dgs_optim import PhaseScheduler
-from opt3dgs_optim.lqnadam import CurvatureOptions
-from opt3dgs_optim.phases import PAPER_SWITCH
+from opt3dgs_optim import (
+    Curvature,
+    EnergyHistogram,
+    FreshMoments,
+    Part,
+    PhaseScheduler,
+    SquaredLoss,
+)
+
+PAPER_SWITCH = 29 / 30
 
 RATES = {
     "means": 1e-2,
@@ -39,36 +46,36 @@ INRIA_NAMES = {
 }
 
 
-EVERYTHING: dict[str, Any] = {
-    "multiplier": "histogram",
-    "curvature": CurvatureOptions(),
-    "squared_loss": True,
-    "reset_moments": "auto",
-    "annealing": None,
-    "fading": None,
-    "pooling": None,
-}
-NOTHING: dict[str, Any] = {
-    "multiplier": None,
-    "curvature": None,
-    "squared_loss": False,
-    "reset_moments": False,
-    "annealing": None,
-    "fading": None,
-    "pooling": None,
-}
-
-
 def everything(
-    total_steps: int, switch: float | int = PAPER_SWITCH, **options: Any
+    total_steps: int,
+    switch: float | int = PAPER_SWITCH,
+    *others: Part,
+    nu: Part | None = None,
+    curvature: Part | None = None,
+    settling: int = 100,
+    **options: Any,
 ) -> PhaseScheduler:
-    """Both phases of the paper on, which the defaults leave off, and nothing else."""
-    return PhaseScheduler(total_steps, switch, **{**EVERYTHING, **options})
+    """Both phases of the paper on, which the defaults leave off, and `others`.
+
+    Args:
+        nu: instead of an `EnergyHistogram` with a warm-up of a twelfth of the run.
+        curvature: instead of `Curvature()`.
+        settling: of `FreshMoments`.
+        options: of `PhaseScheduler`.
+    """
+    parts: list[Part] = [
+        nu or EnergyHistogram(warmup=max(4, total_steps // 12)),
+        FreshMoments(settling),
+        SquaredLoss(),
+        curvature or Curvature(),
+        *others,
+    ]
+    return PhaseScheduler(total_steps, switch, parts, **options)
 
 
-def only(total_steps: int, **options: Any) -> PhaseScheduler:
-    """These options on, and nothing else."""
-    return PhaseScheduler(total_steps, **NOTHING | options)
+def only(total_steps: int, *parts: Part, switch: float | int = PAPER_SWITCH) -> PhaseScheduler:
+    """These parts, and nothing else."""
+    return PhaseScheduler(total_steps, switch, list(parts))
 
 
 def make_splats(n: int = 12, seed: int = 0) -> dict[str, Parameter]:
@@ -80,7 +87,7 @@ def make_splats(n: int = 12, seed: int = 0) -> dict[str, Parameter]:
     }
 
 
-def gsplat_optimizers(splats: dict[str, Parameter], **options) -> dict[str, torch.optim.Optimizer]:
+def gsplat_optimizers(splats: dict[str, Parameter], **options: Any) -> dict[str, torch.optim.Adam]:
     """One Adam per parameter, built as gsplat's simple_trainer does."""
     return {
         name: torch.optim.Adam(
@@ -117,20 +124,35 @@ def view_loss(
     return loss
 
 
+def every_one(optimizers: Any) -> list[Any]:
+    """The optimizers of a dict, or the only one."""
+    return list(optimizers.values()) if isinstance(optimizers, dict) else [optimizers]
+
+
+def state_of(optimizers: Any, param: Any) -> dict[str, Any]:
+    """A parameter's state, in whichever optimizer it is."""
+    return next(each.state[param] for each in every_one(optimizers) if param in each.state)
+
+
+def values_of(splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Copies of the parameters."""
+    return {name: param.detach().clone() for name, param in splats.items()}
+
+
 def train(
     splats: dict[str, Parameter],
-    optimizers: dict[str, torch.optim.Optimizer] | torch.optim.Optimizer,
+    optimizers: Mapping[str, torch.optim.Optimizer] | torch.optim.Optimizer,
     phases: PhaseScheduler | None,
     first: int,
     last: int,
 ) -> None:
     """Iterations first .. last - 1 in gsplat's order: backward, (observe), step, zero_grad."""
-    every = optimizers.values() if isinstance(optimizers, dict) else [optimizers]
+    every = every_one(optimizers)
     for iteration in range(first, last):
         loss = view_loss(splats, iteration % 5, phases)
         loss.backward()
         if phases is not None:
-            phases.observe(loss, view=iteration % 5)
+            phases.observe(loss)
         for optimizer in every:
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
@@ -161,7 +183,7 @@ def check_resume(make: Any, phases: Callable[[], PhaseScheduler], total: int, at
 
 def edit_rows(
     splats: dict[str, Parameter],
-    optimizers: dict[str, torch.optim.Optimizer],
+    optimizers: Mapping[str, torch.optim.Optimizer],
     rows: Tensor,
     new: int,
 ) -> None:

@@ -10,8 +10,7 @@ import torch
 from torch.nn import Parameter
 from trainers import INRIA_NAMES
 
-from opt3dgs_optim import EnergyHistogram, PhaseScheduler
-from opt3dgs_optim.lqnadam import CurvatureOptions
+from opt3dgs_optim import Curvature, EnergyHistogram, Part, PhaseScheduler, PositionNoise
 
 POINTS, TOTAL, SWITCH = 120, 170, 110
 RATES = {"means": 2e-2, "scales": 1e-4, "quats": 1e-4, "opacities": 1e-2}
