@@ -172,7 +172,7 @@ def modules(which: str, bases: dict) -> dict[str, Any]:
 
 @pytest.fixture(params=["call sequence", "real Optimizers"])
 def ours(request: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """The module opt3dgs_optim.nerfstudio and the Optimizers class in use."""
+    """The module opt3dgs_optim.hosts.nerfstudio and the Optimizers class in use."""
     bases = {name: method(name, kind) for name, kind in BASES.items()}
     for name, module in modules(request.param, bases).items():
         monkeypatch.setitem(sys.modules, name, module)
@@ -182,9 +182,9 @@ def ours(request: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         source = compile(REAL.read_text(), str(REAL), "exec")
         exec(source, sys.modules["nerfstudio.engine.optimizers"].__dict__)
         monkeypatch.setitem(globals(), "AdamConfig", optimizers_module().AdamOptimizerConfig)
-    monkeypatch.delitem(sys.modules, "opt3dgs_optim.nerfstudio", raising=False)
-    yield importlib.import_module("opt3dgs_optim.nerfstudio")
-    sys.modules.pop("opt3dgs_optim.nerfstudio", None)
+    monkeypatch.delitem(sys.modules, "opt3dgs_optim.hosts.nerfstudio", raising=False)
+    yield importlib.import_module("opt3dgs_optim.hosts.nerfstudio")
+    sys.modules.pop("opt3dgs_optim.hosts.nerfstudio", None)
 
 
 BASES = {"splatfacto": "default", "splatfacto-mcmc": "mcmc"}
@@ -314,10 +314,10 @@ def test_parameters_of_another_model_are_refused(ours: Any) -> None:
 
 
 def test_without_nerfstudio_the_import_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "opt3dgs_optim.nerfstudio", raising=False)
+    monkeypatch.delitem(sys.modules, "opt3dgs_optim.hosts.nerfstudio", raising=False)
     monkeypatch.setitem(sys.modules, "nerfstudio.engine.optimizers", None)
     with pytest.raises(ImportError, match="pip install nerfstudio"):
-        importlib.import_module("opt3dgs_optim.nerfstudio")
+        importlib.import_module("opt3dgs_optim.hosts.nerfstudio")
 
 
 def test_entry_points_are_registered() -> None:
@@ -326,6 +326,6 @@ def test_entry_points_are_registered() -> None:
     if not ours:
         pytest.skip("opt3dgs_optim was installed before it had entry points: pip install -e .")
     assert ours == {
-        "splatfacto-opt3dgs": "opt3dgs_optim.nerfstudio:splatfacto_opt3dgs",
-        "splatfacto-mcmc-opt3dgs": "opt3dgs_optim.nerfstudio:splatfacto_mcmc_opt3dgs",
+        "splatfacto-opt3dgs": "opt3dgs_optim.hosts.nerfstudio:splatfacto_opt3dgs",
+        "splatfacto-mcmc-opt3dgs": "opt3dgs_optim.hosts.nerfstudio:splatfacto_mcmc_opt3dgs",
     }

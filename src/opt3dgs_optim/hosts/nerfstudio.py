@@ -33,7 +33,7 @@ try:
     )
 except ImportError as error:
     raise ImportError(
-        "opt3dgs_optim.nerfstudio needs nerfstudio and gsplat: pip install nerfstudio "
+        "opt3dgs_optim.hosts.nerfstudio needs nerfstudio and gsplat: pip install nerfstudio "
         f"(the import said: {error})"
     ) from error
 
