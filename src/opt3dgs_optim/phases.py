@@ -234,8 +234,13 @@ class PhaseScheduler(Course):
                 f"{tuple(target.shape)}, but one shape is needed"
             )
         error = render - target
+        part = self.pixel_part()
+        return error.abs().mean() if part is None else part.pixel_loss(error)
+
+    def pixel_part(self) -> Part | None:
+        """The part whose photometric term holds for the iteration whose loss comes next."""
         parts = self._hooks[self.phase, "pixel_loss"]
-        return parts[-1].pixel_loss(error) if parts else error.abs().mean()
+        return parts[-1] if parts else None
 
     # -- mistakes of a set-up, said early ------------------------------------------------------
 

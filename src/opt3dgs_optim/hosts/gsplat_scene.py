@@ -6,18 +6,25 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor
+
+from opt3dgs_optim.rows import reset_points
 
 # gsplat edits every tensor of the state by the same rows, and new rows are zero: after these the
 # pairs belong to their points.
 FOLLOWED = ("on_duplicate", "on_split", "on_remove", "on_sample_add", "on_permute")
 
 
-def follow(scene: Any, reset_points: Callable[[Tensor], None]) -> None:
-    """Call `reset_points(rows)` after each of the scene's row edits, with the rows that moved.
+def follow_scene(scene: Any, optimizers: Any) -> None:
+    """Let a scene of gsplat 1.6 tell which rows its density control moved.
 
-    The scene's `on_*` methods are wrapped on this instance. Relocation moves the dead rows onto
-    live ones but leaves their state: those are the ones that are reset.
+    Without it every edit drops all curvature pairs; with it only those of moved points: after each
+    of the scene's row edits `reset_points` is called with the rows that moved. The scene's `on_*`
+    methods are wrapped on this instance. Relocation moves the dead rows onto live ones but leaves
+    their state: those are the ones that are reset.
+
+    Args:
+        scene: gsplat's.
+        optimizers: the upgraded ones, as for `reset_points`; a dict is read anew at each edit.
 
     Raises:
         TypeError: `scene` has no such methods (gsplat before 1.6: pass nothing, edits are noticed).
@@ -25,12 +32,14 @@ def follow(scene: Any, reset_points: Callable[[Tensor], None]) -> None:
     missing = [name for name in (*FOLLOWED, "on_relocate") if not hasattr(scene, name)]
     if missing:
         raise TypeError(
-            f"PhaseScheduler.follow_scene: a {type(scene).__name__} has no {missing[0]}; a scene "
+            f"follow_scene: a {type(scene).__name__} has no {missing[0]}; a scene "
             "of gsplat 1.6 or later is needed (earlier ones need no call, edits are noticed)"
         )
     for name in FOLLOWED:
-        _after(scene, name, lambda *_: reset_points(torch.zeros(0, dtype=torch.long)))
-    _after(scene, "on_relocate", lambda dead, *_: reset_points(dead))
+        nothing = torch.zeros(0, dtype=torch.long)
+    for name in FOLLOWED:
+        _after(scene, name, lambda *_: reset_points(optimizers, nothing))
+    _after(scene, "on_relocate", lambda dead, *_: reset_points(optimizers, dead))
 
 
 def _after(scene: Any, name: str, then: Callable[..., None]) -> None:
