@@ -35,8 +35,7 @@ def follow_scene(scene: Any, optimizers: Any) -> None:
             f"follow_scene: a {type(scene).__name__} has no {missing[0]}; a scene "
             "of gsplat 1.6 or later is needed (earlier ones need no call, edits are noticed)"
         )
-    for name in FOLLOWED:
-        nothing = torch.zeros(0, dtype=torch.long)
+    nothing = torch.zeros(0, dtype=torch.long)
     for name in FOLLOWED:
         _after(scene, name, lambda *_: reset_points(optimizers, nothing))
     _after(scene, "on_relocate", lambda dead, *_: reset_points(optimizers, dead))
