@@ -208,7 +208,7 @@ class PhaseScheduler(Course):
         self.current = self.iteration if iteration is None else iteration
         self._watch_clock()
         value = loss if isinstance(loss, Tensor) else torch.tensor(float(loss))
-        value = value.detach().reshape(())
+        value = value.detach().reshape(()) if value.dim() else value.detach()
         self.take(value if self._over_ranks is None else self._over_ranks(value))
         if self.log is not None:
             phase = self.phase_of(self.current)
