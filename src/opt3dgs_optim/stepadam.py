@@ -115,8 +115,14 @@ class StepAdam(Adam):
 
         Raises:
             ValueError: several masks, or one that fits no parameter with a gradient.
+            RuntimeError: a CUDA graph is being captured, and there are parts.
         """
         self._opt_called = True  # what learning-rate schedulers would note by wrapping this method
+        if self.course.parts and _is_captured():
+            raise RuntimeError(
+                f"{type(self).__name__}.step: a CUDA graph is being captured, but its replays would "
+                "repeat this iteration's factors and phase; leave the optimizers' steps out of it"
+            )
         masks: list[Any] = [each for each in (visible, visibility) if each is not None]
         if isinstance(closure, Tensor):
             masks, closure = [closure, *masks], None
@@ -127,20 +133,47 @@ class StepAdam(Adam):
                 loss = closure()
         with torch.set_grad_enabled(self.defaults["differentiable"]):
             acting = self.course.stepping(loss)
-            if not acting:
-                self._step_base(mask)
-            elif self.course.valid is not False:
-                self._step_parts(mask)
+            if not acting and mask is None:
+                self._step_base(None)
+            elif self.course.valid is not False and not self._overflowed_on_host():
+                self._step_parts(mask, acting)
         return loss
 
     # Learning-rate schedulers, which would wrap `step` on the instance, need not: `step` tells.
     step._wrapped_by_lr_sched = True  # pyright: ignore[reportFunctionMemberAccess]
 
-    def _step_parts(self, mask: Tensor | None) -> None:
-        course, lent, frozen, moved = self.course, Lent(), [], []
+    def _overflowed_on_host(self) -> bool:
+        """Whether a GradScaler has told a fused optimizer on a CPU that the step is not made."""
+        found = getattr(self, "found_inf", None)
+        return found is not None and found.device.type == "cpu" and bool(found)
+
+    def _step_parts(self, mask: Tensor | None, acting: bool) -> None:
+        """A step with the parts, unless they do not act yet, of the rows of a mask."""
         if mask is not None:
             self._check_mask(mask)
-        befores, factors = course.hooks("before"), course.hooks("factor")
+        course, shared = self.course, Lent()
+        found = getattr(self, "found_inf", None)
+        if found is not None:  # a GradScaler's, of which parts know nothing
+            fits = found.reshape(()) == 0
+            shared.attribute(course, "valid", fits & course.valid)
+        try:
+            moved, frozen = self._step_lent(mask, acting)
+            for group, param in moved if acting else ():
+                self._finish(group, param)
+            for rows in frozen:
+                rows.put_back()
+        finally:
+            shared.take_back()
+
+    def _step_lent(
+        self, mask: Tensor | None, acting: bool
+    ) -> tuple[list[tuple[Group, Tensor]], list[Frozen]]:
+        """The step of torch's Adam; what has moved, and what is to be put back."""
+        course, lent = self.course, Lent()
+        frozen: list[Frozen] = []
+        moved: list[tuple[Group, Tensor]] = []
+        befores = course.hooks("before") if acting else []
+        factors = course.hooks("factor") if acting else []
         try:
             for group in self.param_groups:
                 parts = [part for part in befores if self.acts_on(part, group)]
@@ -159,10 +192,7 @@ class StepAdam(Adam):
             self._step_base(mask)
         finally:
             lent.take_back()
-        for group, param in moved:
-            self._finish(group, param)
-        for rows in frozen:
-            rows.put_back()
+        return moved, frozen
 
     def _step_base(self, mask: Tensor | None) -> None:
         if self._base is Adam:
@@ -343,7 +373,7 @@ class StepAdam(Adam):
             params = [p for group in self.param_groups for p in group["params"]]
             check_rows(call, params, self.course.keys, self.state)
             self.take_loaded()
-        except ValueError:
+        except Exception:
             self.state, self.param_groups = before
             raise
         for group, name in zip(self.param_groups, names, strict=True):
@@ -365,6 +395,10 @@ class StepAdam(Adam):
     def __repr__(self) -> str:
         lines = [str(part) for part in self.course.parts] + group_lines(self.param_groups)
         return block(type(self).__name__, lines)
+
+
+def _is_captured() -> bool:
+    return torch.cuda.is_initialized() and torch.cuda.is_current_stream_capturing()
 
 
 def _times(factor: float | Tensor | None, other: float | Tensor | None) -> float | Tensor | None:
