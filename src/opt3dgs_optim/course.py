@@ -220,13 +220,14 @@ class Course:
             value = state[name]
             if isinstance(value, bool) or not isinstance(value, int) or value < 0:
                 raise ValueError(f"{call}: {name}={value!r}, but a whole number is needed")
-        check_keys(f"{call}: parts", state["parts"], ())
+        for name in ("parts", "switched_off"):
+            check_keys(f"{call}: {name}", state[name], ())
         old = {name: part.state_dict() for name, part in self._named()}
         try:
             for name, part in self._named():
                 if name in state["parts"]:
                     part.load_state_dict(state["parts"][name])
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, LookupError, TypeError, AttributeError) as error:
             for name, part in self._named():
                 if old[name]:
                     part.load_state_dict(old[name])

@@ -76,11 +76,8 @@ class Lent:
         self.item(group, "lr", rate * factor)
 
     def flag(self, optimizer: Any, valid: Tensor) -> None:
-        """Merge "the loss is not finite" with the GradScaler's flag, on the device."""
-        flag, theirs = (~valid).to(torch.float32), getattr(optimizer, "found_inf", None)
-        if theirs is not None:
-            flag = torch.maximum(flag, theirs.reshape(()).to(flag.device))
-        self.attribute(optimizer, "found_inf", flag)
+        """Tell torch's step on the device whether it is to be made, as a GradScaler would."""
+        self.attribute(optimizer, "found_inf", (~valid).to(torch.float32))
 
 
 def guard(grad: Tensor, course: Course, told: bool) -> bool:
@@ -102,6 +99,15 @@ def guard(grad: Tensor, course: Course, told: bool) -> bool:
             tuple(grad.shape),
         )
     return on_host
+
+
+def refuse_capture(call: str, course: Course) -> None:
+    """RuntimeError in the capture of a CUDA graph: its replays would repeat what parts say now."""
+    if course.parts and torch.cuda.is_initialized() and torch.cuda.is_current_stream_capturing():
+        raise RuntimeError(
+            f"{call}.step: a CUDA graph is being captured, but its replays would repeat this "
+            "iteration's factors and phase; leave the optimizers' steps out of it"
+        )
 
 
 def times(factor: float | Tensor | None, other: float | Tensor | None) -> float | Tensor | None:

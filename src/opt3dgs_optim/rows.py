@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
-from opt3dgs_optim.checks import warn_user
+from opt3dgs_optim.checks import check_keys, warn_user
 
 
 class _Seen(NamedTuple):
@@ -159,8 +159,9 @@ def check_rows(call: str, params: list[Tensor], keys: Iterable[str], state: Any)
     """
     for param in params:
         own = state.get(param)
-        if not own:
+        if not own and isinstance(own, (Mapping, type(None))):
             continue
+        check_keys(call, own, ())
         for key in ("exp_avg", "exp_avg_sq"):
             value = own.get(key)
             if not isinstance(value, Tensor) or value.shape[1:] != param.shape[1:]:

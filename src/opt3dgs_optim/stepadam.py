@@ -13,7 +13,7 @@ from torch.optim import Adam
 
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.describe import block, group_lines
-from opt3dgs_optim.lending import Lent, guard, times
+from opt3dgs_optim.lending import Lent, guard, refuse_capture, times
 from opt3dgs_optim.names import SLOT, canonical_name
 from opt3dgs_optim.part import Group, Part
 from opt3dgs_optim.rows import (
@@ -114,8 +114,10 @@ class StepAdam(Adam):
 
         Raises:
             ValueError: several masks, or one that fits no parameter with a gradient.
+            RuntimeError: a CUDA graph is being captured, and there are parts.
         """
         self._opt_called = True  # what learning-rate schedulers would note by wrapping this method
+        refuse_capture(type(self).__name__, self.course)
         masks: list[Any] = [each for each in (visible, visibility) if each is not None]
         if isinstance(closure, Tensor):
             masks, closure = [closure, *masks], None
@@ -134,6 +136,19 @@ class StepAdam(Adam):
     step._wrapped_by_lr_sched = True  # pyright: ignore[reportFunctionMemberAccess]
 
     def _step(self, mask: Tensor | None, acting: bool) -> None:
+        """A step that a GradScaler may tell not to be made, of which parts know nothing."""
+        found, shared = getattr(self, "found_inf", None), Lent()
+        if found is not None and found.device.type == "cpu":
+            if bool(found):
+                return
+        elif found is not None:
+            shared.attribute(self.course, "valid", (found.reshape(()) == 0) & self.course.valid)
+        try:
+            self._step_parts(mask, acting)
+        finally:
+            shared.take_back()
+
+    def _step_parts(self, mask: Tensor | None, acting: bool) -> None:
         course, lent, frozen, moved = self.course, Lent(), [], []
         names = ("before", "factor", "after")
         hooks = [course.hooks(name) if acting else [] for name in names]
@@ -308,7 +323,7 @@ class StepAdam(Adam):
             params = [p for group in self.param_groups for p in group["params"]]
             check_rows(call, params, self.course.keys, self.state)
             self.take_loaded()
-        except ValueError:
+        except Exception:
             self.state, self.param_groups = before
             raise
         for group, name in zip(self.param_groups, names, strict=True):

@@ -275,7 +275,9 @@ def _dict_of(loop: ast.For, name: str) -> str | None:
     for node in within(loop.body):
         if isinstance(node, ast.For) and isinstance(node.target, ast.Name):
             values = _method(node.iter, "values")
-            steps = [n for n in within(node.body) if (r := _method(n, "step")) and name == ast.unparse(r)]
+            steps = [
+                n for n in within(node.body) if (r := _method(n, "step")) and name == ast.unparse(r)
+            ]
             if values is not None and node.target.id == name and steps:
                 return ast.unparse(values)
     return None
@@ -292,7 +294,11 @@ def _model(folder: Path | None) -> tuple[set[str], set[str]]:
             continue
         for node in ast.walk(tree):
             if isinstance(node, ast.Dict):
-                keys = {k.value: v for k, v in zip(node.keys, node.values) if isinstance(k, ast.Constant)}
+                keys = {
+                    k.value: v
+                    for k, v in zip(node.keys, node.values)
+                    if isinstance(k, ast.Constant)
+                }
                 name = keys.get("name")
                 if "params" in keys and isinstance(name, ast.Constant):
                     groups.add(str(name.value))

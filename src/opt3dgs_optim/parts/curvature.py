@@ -104,6 +104,8 @@ class Curvature(Part):
             return grad
         position = param.detach().reshape(param.shape[0] if param.dim() else 1, -1)
         gradient = grad.reshape(position.shape)
+        if isinstance(course.valid, Tensor):  # a gradient of zero leaves no pair
+            gradient = torch.where(course.valid, gradient, 0.0)
         history = self._history(state, position)
         if course.adaptive and course.num_observed % PROBE_STEPS == 0:
             self._look(foresight(history, self.history_size, position, gradient))

@@ -1,15 +1,20 @@
-"""Row edits of a trainer, in any order: no row ever sees another row's curvature history."""
+"""Row edits of a trainer, in any order: no row ever sees what another row has collected."""
 
 from __future__ import annotations
 
+import re
+from typing import Any
+
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import Parameter
+from trainers import edit_rows, everything, gsplat_optimizers, make_splats, train
 
-from opt3dgs_optim import LQNAdam
-from opt3dgs_optim.curvature import header
+from opt3dgs_optim import LQNAdam, Part, PhaseScheduler, reset_points
+from opt3dgs_optim.lbfgs.history import header
 
 LR, SIZE = 0.01, 3
 EDITS = ("step", "invisible", "prune", "grow", "relocate", "shuffle", "exp_avg_only", "resume")
@@ -134,3 +139,123 @@ def test_zeroed_row_is_an_empty_history() -> None:
     trainer.edit("relocate", 0)
     counters = header(trainer.optimizer.state[trainer.x]["history"], SIZE).counter
     assert sorted(counters.bool().tolist()) == [False, True]
+
+
+# -- reset_points -----------------------------------------------------------------------------
+
+
+def exploited(steps: int = 8) -> tuple[dict, Any, PhaseScheduler]:
+    splats, phases = make_splats(), everything(40, 0)
+    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    train(splats, optimizers, phases, 0, steps)
+    return splats, optimizers, phases
+
+
+def exchange(splats: dict, optimizers: Any) -> None:
+    edit_rows(splats, optimizers, torch.arange(12), 0)
+
+
+@pytest.mark.parametrize("rows", [torch.arange(12) == 4, torch.tensor([4])], ids=["mask", "index"])
+def test_reset_points_keeps_the_pairs_of_the_others(rows: Tensor) -> None:
+    splats, optimizers, phases = exploited()
+    held = optimizers["means"].state[splats["means"]]["history"].clone()
+    exchange(splats, optimizers)  # a new Parameter: unknown rows
+    reset_points(optimizers, rows)
+    train(splats, optimizers, phases, 8, 9)
+    counters = optimizers["means"].state[splats["means"]]["history"]
+    assert bool(held[4].any())
+    others = torch.arange(12) != 4
+    kept = (counters[others] != 0).flatten(1).sum(1) >= (held[others] != 0).flatten(1).sum(1)
+    assert bool(kept.all())
+    splats2, optimizers2, phases2 = exploited()
+    exchange(splats2, optimizers2)  # nothing said: all pairs are dropped
+    train(splats2, optimizers2, phases2, 8, 9)
+    dropped = optimizers2["means"].state[splats2["means"]]["history"]
+    assert int((dropped != 0).sum()) < int((counters != 0).sum())
+
+
+def test_reset_points_moments_too() -> None:
+    splats, optimizers, phases = exploited()
+    reset_points(optimizers, torch.arange(12) == 4, moments=True)
+    for name, optimizer in optimizers.items():
+        state = optimizer.state[splats[name]]
+        assert not bool(state["exp_avg"][4].any())
+        assert bool(state["exp_avg"][5].any())
+    assert not bool(optimizers["means"].state[splats["means"]]["history"][4].any())
+
+
+def test_reset_points_of_another_number() -> None:
+    _, optimizers, _ = exploited()
+    with pytest.raises(ValueError, match=re.escape("rows has shape (5,)")):
+        reset_points(optimizers, torch.zeros(5, dtype=torch.bool))
+    with pytest.raises(ValueError, match="reset_points"):
+        optimizers["means"].reset_points(torch.zeros(5, dtype=torch.bool))
+
+
+# -- a part's own rows ------------------------------------------------------------------------------
+
+
+class Age(Part):
+    """Counts each point's steps: [N] and [N, 3] tensors, whose zero rows mean nothing."""
+
+    keys = ("age", "travelled")
+
+    def before(self, group: Any, param: Any, grad: Tensor, state: Any, course: Any) -> Tensor:
+        if "age" not in state:
+            state["age"] = torch.zeros(len(param))
+            state["travelled"] = torch.zeros_like(param)
+        state["age"] += 1
+        state["travelled"] += grad
+        return grad
+
+
+def aged(steps: int = 5) -> tuple[dict[str, Parameter], Any, Any, Any]:
+    splats = make_splats()
+    phases = PhaseScheduler(60, parts=[Age()])
+    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    train(splats, optimizers, phases, 0, steps)
+    return splats, optimizers, phases, optimizers["means"]
+
+
+def test_rows_follow_gsplats_edits_where_they_are_told() -> None:
+    splats, optimizers, phases, means = aged()
+    edit_rows(splats, optimizers, torch.arange(6), 2)
+    reset_points(optimizers, torch.tensor([6, 7]))
+    train(splats, optimizers, phases, 5, 6)
+    assert means.state[splats["means"]]["age"].tolist() == [6.0] * 6 + [1.0] * 2
+
+
+def test_rows_begin_anew_where_nobody_tells() -> None:
+    """Also where the number of rows is what it was: other rows, for all that is known."""
+    for keep, new in ((torch.arange(6), 2), (torch.arange(11), 1), (torch.arange(12).flip(0), 0)):
+        splats, optimizers, phases, means = aged()
+        edit_rows(splats, optimizers, keep, new)
+        train(splats, optimizers, phases, 5, 6)
+        assert means.state[splats["means"]]["age"].tolist() == [1.0] * (len(keep) + new)
+
+
+def test_what_was_kept_of_other_rows_is_in_no_checkpoint() -> None:
+    splats, optimizers, _, means = aged()
+    edit_rows(splats, optimizers, torch.arange(6), 2)
+    assert "age" not in means.state_dict()["state"][0]
+
+
+def test_a_checkpoint_of_other_rows_is_said() -> None:
+    """Trainers that load the optimizer before they resize the points."""
+    _, _, _, means = aged()
+    saved = means.state_dict()
+    for key in ("exp_avg", "exp_avg_sq"):
+        saved["state"][0][key] = saved["state"][0][key][:4]
+    x = Parameter(torch.ones(4, 3))
+    other = PhaseScheduler(60, parts=[Age()]).upgrade({"means": torch.optim.Adam([x])})["means"]
+    with pytest.warns(UserWarning, match="of 12 rows for a parameter of 4: dropped"):
+        other.load_state_dict(saved)
+    assert "age" not in other.state[x]
+    assert "exp_avg" in other.state[x]
+
+
+def test_reset_points_leaves_other_optimizers_alone() -> None:
+    splats, optimizers, _, _ = aged()
+    pose = torch.optim.Adam([Parameter(torch.ones(3))])
+    reset_points({**optimizers, "pose": pose}, torch.tensor([0]), moments=True)
+    assert float(optimizers["means"].state[splats["means"]]["age"][0]) == 0.0
