@@ -181,7 +181,11 @@ def _changes(file: File, tree: ast.Module, trainer: Trainer) -> list[Change]:
     changes += [file.after(statement, [observe]) for statement in trainer.backwards]
     changes += [file.after(statement, upgrade) for statement in trainer.setups]
     for value, (render, photo) in trainer.pixel:
-        changes.append(Change(*file.span(value), f"{name}.pixel_loss({ast.unparse(render)}, {ast.unparse(photo)})"))
+        changes.append(
+            Change(
+                *file.span(value), f"{name}.pixel_loss({ast.unparse(render)}, {ast.unparse(photo)})"
+            )
+        )
     return changes
 
 
