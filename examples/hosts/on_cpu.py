@@ -1,7 +1,7 @@
 """Run a trainer's real script on a machine without a GPU, to try it before renting one.
 
-    python examples/hosts/on_cpu.py gsplat/examples/simple_trainer.py mcmc --data-dir SCENE ...
-    python examples/hosts/on_cpu.py 3dgs-mcmc/train.py -s SCENE --iterations 200 --cap_max 12000
+    python examples/hosts/on_cpu.py simple_trainer.py mcmc --data_dir SCENE --max_steps 100
+    python examples/hosts/on_cpu.py train.py -s SCENE --iterations 100
 
 Everything after the script's path is the script's own. CUDA is mapped to the CPU, the CUDA
 rasterizers are replaced by the examples' own (`pip install "opt3dgs_optim[examples]"`), viewers and
@@ -20,20 +20,20 @@ import runpy
 import sys
 from pathlib import Path
 
-FOLDER = Path(__file__).resolve().parent
+EXAMPLES = Path(__file__).resolve().parents[1]
 
 
 def prepare(script: Path) -> None:
     """Make this process able to run `script`: paths, CUDA, modules."""
-    sys.path[:0] = [str(FOLDER), str(FOLDER.parent)]
-    from cpu_host import cuda, gsplat_modules, inria_modules, stand_ins
+    sys.path.insert(0, str(EXAMPLES))
+    from hosts.cpu_host import cuda, gsplat_modules, inria_modules, stand_ins
 
     folder = script.resolve().parent
     sys.path.insert(0, str(folder))
     if (folder.parent / "gsplat" / "__init__.py").is_file():  # its own gsplat, not another version
         sys.path.insert(1, str(folder.parent))
     stand_ins.install()
-    inria_modules.install()
+    inria_modules.install(folder)
     cuda.install()
     text = script.read_text(errors="ignore")
     if "gsplat" in text or "nerfstudio" in text:
@@ -42,8 +42,12 @@ def prepare(script: Path) -> None:
 
 def main() -> None:
     """Run the script of the command line."""
+    usage = f"{__doc__}\nusage: on_cpu.py [--help] SCRIPT [the script's own arguments]"
+    if sys.argv[1:2] in (["--help"], ["-h"]):
+        print(usage)
+        return
     if len(sys.argv) < 2 or not Path(sys.argv[1]).is_file():
-        sys.exit(f"{__doc__}\nusage: on_cpu.py SCRIPT [the script's own arguments]")
+        sys.exit(usage)
     script = Path(sys.argv[1])
     prepare(script)
     sys.argv = sys.argv[1:]

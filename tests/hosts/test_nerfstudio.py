@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
-import importlib.metadata
+import re
 import sys
 import types
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,6 +19,12 @@ from torch.nn import Parameter
 from trainers import edit_rows, make_splats
 
 from opt3dgs_optim import Annealing, Phase
+
+# Until upgrade() works in place: nerfstudio builds its learning-rate schedulers before.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:PhaseScheduler.upgrade. a learning-rate"),
+    pytest.mark.filterwarnings("ignore:Seems like `optimizer.step... has been overridden"),
+]
 
 TOTAL = 40
 NAMES = {"sh0": "features_dc", "shN": "features_rest"}
@@ -123,6 +131,15 @@ class Model(torch.nn.Module):
         rgb = sum(p.reshape(p.shape[0], -1).mean(1) for p in self.gauss_params.values())
         return {"rgb": rgb.reshape(-1, 1), "background": None}  # type: ignore[union-attr]
 
+    def get_training_callbacks(self, training_callback_attributes: Any) -> list:
+        return []
+
+    def load_state_dict(self, state: Any, **_: Any) -> Any:  # pyright: ignore
+        for name, value in self.gauss_params.items():
+            shape = (len(state["gauss_params.means"]), *value.shape[1:])
+            self.gauss_params[name] = Parameter(torch.zeros(shape))
+        return super().load_state_dict(state)
+
     def get_loss_dict(self, outputs: Any, batch: Any, metrics_dict: Any = None) -> dict:
         target, render = batch["image"], outputs["rgb"]
         if "mask" in batch:
@@ -197,7 +214,7 @@ def optimizers_module() -> Any:
 class Training:
     """nerfstudio's Trainer: set-up, and one iteration with its GradScaler."""
 
-    def __init__(self, ours: Any, spec: Any, *, paper: bool = True) -> None:
+    def __init__(self, ours: Any, spec: Any, *, paper: bool = True, checkpoint: Any = None) -> None:
         config = spec.config.pipeline.model
         config.paper = paper
         config._target = ours.Opt3DGSSplatfactoModel
@@ -206,6 +223,22 @@ class Training:
         groups["camera_opt"] = [Parameter(torch.zeros(1, 6))]
         self.optimizers = optimizers_module().Optimizers(spec.config.optimizers.copy(), groups)
         self.scaler = torch.amp.GradScaler("cpu", enabled=False)  # pyright: ignore
+        if checkpoint is not None:
+            pipeline, optimizers, schedulers = checkpoint
+            self.model.load_state_dict(pipeline)
+            self.optimizers.load_optimizers(optimizers)
+            for name, scheduler in self.optimizers.schedulers.items():
+                scheduler.load_state_dict(schedulers[name])
+        attributes = types.SimpleNamespace(
+            optimizers=self.optimizers, trainer=types.SimpleNamespace(config=spec.config)
+        )
+        self.model.get_training_callbacks(attributes)
+
+    def checkpoint(self) -> Any:
+        """What nerfstudio saves."""
+        optimizers = {name: o.state_dict() for name, o in self.optimizers.optimizers.items()}
+        schedulers = {name: s.state_dict() for name, s in self.optimizers.schedulers.items()}
+        return copy.deepcopy((self.model.state_dict(), optimizers, schedulers))
 
     def run(self, first: int, last: int) -> None:
         """Iterations first .. last - 1; mixed_precision is off for splatfacto."""
@@ -257,21 +290,35 @@ def test_the_package_defaults_unless_the_paper_is_asked_for(ours: Any) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::FutureWarning")
-def test_resume(ours: Any) -> None:
+@pytest.mark.parametrize("at", [12, 39])
+def test_resume(ours: Any, at: int) -> None:
+    """The Parameters are new after loading: the optimizers hold them, with the loaded state."""
     whole = Training(ours, ours.splatfacto_opt3dgs)
     whole.run(0, TOTAL)
-    for at in (12, 39):
-        first = Training(ours, ours.splatfacto_opt3dgs)
-        first.run(0, at)
-        second = Training(ours, ours.splatfacto_opt3dgs)
-        second.model.load_state_dict(first.model.state_dict())
-        states = {name: o.state_dict() for name, o in first.optimizers.optimizers.items()}
-        second.optimizers.load_optimizers(states)
-        for name, scheduler in second.optimizers.schedulers.items():
-            scheduler.load_state_dict(first.optimizers.schedulers[name].state_dict())
-        second.run(at, TOTAL)
-        for name, p in whole.model.gauss_params.items():
-            assert torch.equal(p, second.model.gauss_params[name]), (at, name)
+    first = Training(ours, ours.splatfacto_opt3dgs)
+    first.run(0, at)
+    second = Training(ours, ours.splatfacto_opt3dgs, checkpoint=first.checkpoint())
+    assert second.model.phases.iteration == at
+    second.run(at, TOTAL)
+    for name, p in whole.model.gauss_params.items():
+        assert torch.equal(p, second.model.gauss_params[name]), name
+        assert second.optimizers.parameters[name][0] is second.model.gauss_params[name]
+
+
+@pytest.mark.parametrize(("given", "steps"), [(None, 25), (31, 31)])
+def test_the_trainers_number_of_iterations(ours: Any, given: int | None, steps: int) -> None:
+    """--max-num-iterations alone: annealing ends where the training ends."""
+    spec = ours.splatfacto_opt3dgs
+    spec.config.max_num_iterations = 25
+    spec.config.pipeline.model.total_steps = given
+    assert Training(ours, spec).model.phases.total_steps == steps
+
+
+def test_without_a_number_of_iterations(ours: Any) -> None:
+    training = Training(ours, ours.splatfacto_opt3dgs)
+    attributes = types.SimpleNamespace(optimizers=training.optimizers, trainer=None)
+    with pytest.raises(ValueError, match=r"set pipeline\.model\.total_steps"):
+        training.model.get_training_callbacks(attributes)
 
 
 def test_the_pixel_loss_is_squared_in_exploitation_only(ours: Any) -> None:
@@ -299,18 +346,13 @@ def test_methods_keep_what_nerfstudio_set(ours: Any) -> None:
     assert isinstance(spec, Spec)
     assert spec.config.method_name == "splatfacto-mcmc-opt3dgs"
     assert spec.config.pipeline.model.strategy == "mcmc"
-    assert spec.config.pipeline.model.total_steps == TOTAL
+    assert spec.config.pipeline.model.total_steps is None
     assert spec.config.optimizers["means"]["optimizer"].lr == 5e-3
     assert spec.config.optimizers["means"]["optimizer"].eps == 1e-15
     del sys.modules["nerfstudio.configs.method_configs"].method_configs["splatfacto-mcmc"]
     assert "needs a nerfstudio" in ours.splatfacto_mcmc_opt3dgs  # 1.1.5: said, and skipped
     with pytest.raises(AttributeError, match="nerfacto"):
         _ = ours.nerfacto
-
-
-def test_parameters_of_another_model_are_refused(ours: Any) -> None:
-    with pytest.raises(ValueError, match=r"set pipeline\.model to Opt3DGSSplatfactoModelConfig"):
-        ours.Opt3DGSAdamOptimizerConfig(lr=1e-3).setup([Parameter(torch.zeros(3))])
 
 
 def test_without_nerfstudio_the_import_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -320,12 +362,11 @@ def test_without_nerfstudio_the_import_says_so(monkeypatch: pytest.MonkeyPatch) 
         importlib.import_module("opt3dgs_optim.hosts.nerfstudio")
 
 
-def test_entry_points_are_registered() -> None:
-    found = importlib.metadata.entry_points(group="nerfstudio.method_configs")
-    ours = {e.name: e.value for e in found if e.value.startswith("opt3dgs_optim.")}
-    if not ours:
-        pytest.skip("opt3dgs_optim was installed before it had entry points: pip install -e .")
-    assert ours == {
-        "splatfacto-opt3dgs": "opt3dgs_optim.hosts.nerfstudio:splatfacto_opt3dgs",
-        "splatfacto-mcmc-opt3dgs": "opt3dgs_optim.hosts.nerfstudio:splatfacto_mcmc_opt3dgs",
-    }
+def test_entry_points_name_what_there_is(ours: Any) -> None:
+    text = (Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8")
+    found = dict(
+        re.findall(r'^(splatfacto[\w-]*) = "opt3dgs_optim\.hosts\.nerfstudio:(\w+)"', text, re.M)
+    )
+    assert set(found) == {"splatfacto-opt3dgs", "splatfacto-mcmc-opt3dgs"}
+    for name, attribute in found.items():
+        assert getattr(ours, attribute).config.method_name == name

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import math
 from typing import Any
 
 import torch
+from hosts.cpu_host.rendering import Drawn, View, draw, view_colors
 from splatting.relocation import relocated_values
 from torch import Tensor
 
-from cpu_host.rendering import Drawn, View, draw, view_colors
-
-IGNORED = """near_plane far_plane radius_clip eps2d tile_size channel_chunk segmented rays
-    global_z_order radial_coeffs tangential_coeffs thin_prism_coeffs ftheta_coeffs lidar_coeffs
-    external_distortion_coeffs rolling_shutter viewmats_rs ut_params renderer_config""".split()
+Geometry = tuple[Tensor, Tensor, Tensor, Tensor]  # means, quats, scales, opacities
+IGNORED = (
+    *("near_plane", "far_plane", "radius_clip", "eps2d", "tile_size", "channel_chunk", "segmented"),
+    *("rays", "global_z_order", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs"),
+    *("ftheta_coeffs", "lidar_coeffs", "external_distortion_coeffs", "rolling_shutter"),
+    *("viewmats_rs", "ut_params", "renderer_config"),
+)
 REFUSED = ("covars", "with_ut", "with_eval3d", "return_normals", "extra_signals", "distributed")
 
 
@@ -35,10 +39,9 @@ def install() -> None:
     gsplat.rasterization = rendering.rasterization = rasterization
     ops.compute_relocation = _relocation
     ops.quat_scale_to_covar_preci = torch_impl._quat_scale_to_covar_preci
-    try:
-        importlib.import_module("gsplat.optimizers.selective_adam").adam = masked_adam  # type: ignore
-    except ImportError:
-        pass  # gsplat before 1.5
+    with contextlib.suppress(ImportError):  # gsplat before 1.5 has none
+        selective: Any = importlib.import_module("gsplat.optimizers.selective_adam")
+        selective.adam = masked_adam
 
 
 def rasterize(
@@ -95,7 +98,7 @@ def rasterize(
     return torch.stack(images), torch.stack(alphas), info
 
 
-def _channels(one: Drawn, mode: str, geometry: tuple[Tensor, ...], view: View) -> Tensor:
+def _channels(one: Drawn, mode: str, geometry: Geometry, view: View) -> Tensor:
     """The image, the (expected) depth, or both."""
     if mode == "RGB":
         return one.image
@@ -174,9 +177,10 @@ def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = 
 
     border = 5 if padding == "valid" else 0
     maps = [
-        ssim_map(a.permute(1, 2, 0), b.permute(1, 2, 0))
-        for a, b in zip(img1, img2, strict=True)
+        ssim_map(a.permute(1, 2, 0), b.permute(1, 2, 0)) for a, b in zip(img1, img2, strict=True)
     ]
     height, width = maps[0].shape[:2]
     inner = [m[border : height - border, border : width - border] for m in maps]
-    return torch.stack([m.mean() for m in inner]).mean() if math.prod(inner[0].shape) else img1.sum()
+    return (
+        torch.stack([m.mean() for m in inner]).mean() if math.prod(inner[0].shape) else img1.sum()
+    )

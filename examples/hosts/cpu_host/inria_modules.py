@@ -5,15 +5,15 @@ from __future__ import annotations
 import sys
 import types
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
-from scipy.spatial import cKDTree
+from hosts.cpu_host.gsplat_modules import fused_ssim, masked_adam
+from hosts.cpu_host.rendering import Drawn, View, draw, view_colors
+from splatting.gaussians import neighbour_distance
 from splatting.relocation import relocated_values
 from torch import Tensor
-
-from cpu_host.gsplat_modules import fused_ssim, masked_adam
-from cpu_host.rendering import Drawn, View, draw, view_colors
 
 
 @dataclass
@@ -45,7 +45,7 @@ class GaussianRasterizationSettings:
 class GaussianRasterizer(torch.nn.Module):
     """INRIA's rasterizer; what it returns follows from the settings that the trainer gives."""
 
-    importances = 0  # of mini-splatting's module
+    extra: str | None = None  # what a derivative's module returns besides
 
     def __init__(self, raster_settings: GaussianRasterizationSettings) -> None:
         super().__init__()
@@ -79,7 +79,9 @@ class GaussianRasterizer(torch.nn.Module):
         geometry = (means3D, rotations, scales, opacities.reshape(-1))
         drawn = draw(*geometry, colors, view, settings.bg, offset)
         image, radii = drawn.image.permute(2, 0, 1), drawn.radii.int()
-        if self.importances:
+        if self.extra == "is_used":
+            return image, radii, drawn.visible.float()
+        if self.extra == "weights":
             weights = self._weights(geometry, view)
             return image, radii, weights, *self._areas(drawn, weights)
         if settings.pixel_weights != "none":
@@ -89,7 +91,7 @@ class GaussianRasterizer(torch.nn.Module):
             return image, radii, torch.zeros(1, view.height, view.width)
         return image, radii
 
-    def markVisible(self, positions: Tensor) -> Tensor:
+    def markVisible(self, positions: Tensor) -> Tensor:  # noqa: N802 (its name)
         """[N] bool, in front of the camera."""
         depth = positions @ self.raster_settings.viewmatrix[:3, 2]
         return depth + self.raster_settings.viewmatrix[3, 2] > 0.2
@@ -123,7 +125,13 @@ class GaussianRasterizer(torch.nn.Module):
 class ImportanceRasterizer(GaussianRasterizer):
     """mini-splatting's, which returns weights and areas too."""
 
-    importances = 3
+    extra = "weights"
+
+
+class UsedRasterizer(GaussianRasterizer):
+    """3dgs-mcmc's, which returns who was used too."""
+
+    extra = "is_used"
 
 
 class SparseGaussianAdam(torch.optim.Adam):
@@ -146,9 +154,9 @@ class SparseGaussianAdam(torch.optim.Adam):
                 state["exp_avg_sq"] = torch.zeros_like(param)
             if visibility.numel() != N or len(param) != N:
                 raise RuntimeError(f"sparse Adam: {len(param)} rows, a mask of {N}")
-            moments = (state["exp_avg"], state["exp_avg_sq"])
-            options = (group["lr"], *group["betas"], group["eps"])
-            masked_adam(param, param.grad, *moments, visibility, *options)
+            first, second, (beta1, beta2) = state["exp_avg"], state["exp_avg_sq"], group["betas"]
+            rest = (visibility, group["lr"], beta1, beta2, group["eps"])
+            masked_adam(param, param.grad, first, second, *rest)
 
 
 def compute_relocation(
@@ -159,22 +167,24 @@ def compute_relocation(
     return opacities.reshape(opacity_old.shape), scales
 
 
-def distCUDA2(points: Tensor) -> Tensor:
+def distCUDA2(points: Tensor) -> Tensor:  # noqa: N802 (its name)
     """[P] mean squared distance to the three nearest other points."""
-    distances, _ = cKDTree(points.detach().numpy()).query(points.detach().numpy(), k=4)
-    return torch.from_numpy(distances[:, 1:]).square().mean(1).to(points.dtype)
+    return neighbour_distance(points).square()
 
 
-def install() -> None:
-    """Put the modules into sys.modules."""
+def install(folder: Path) -> None:
+    """Put the modules that the trainer in `folder` needs into sys.modules."""
+    mcmc = (folder / "utils" / "reloc_utils.py").is_file()
     usual = {
         "GaussianRasterizationSettings": GaussianRasterizationSettings,
-        "GaussianRasterizer": GaussianRasterizer,
+        "GaussianRasterizer": UsedRasterizer if mcmc else GaussianRasterizer,
         "SparseGaussianAdam": SparseGaussianAdam,
         "compute_relocation": compute_relocation,
     }
     _module("diff_gaussian_rasterization", **usual)
-    _module("diff_gaussian_rasterization_ms", **usual | {"GaussianRasterizer": ImportanceRasterizer})
+    _module(
+        "diff_gaussian_rasterization_ms", **usual | {"GaussianRasterizer": ImportanceRasterizer}
+    )
     _module("simple_knn")
     _module("simple_knn._C", distCUDA2=distCUDA2)
     _module("fused_ssim", fused_ssim=fused_ssim)

@@ -54,7 +54,7 @@ class Nothing:
 class Empty(types.ModuleType):
     """A module in which every name is a class that does nothing."""
 
-    __path__: list[str] = []  # noqa: RUF012 (a package: submodules are empty too)
+    __path__ = []  # noqa: RUF012  # pyright: ignore  # a package: submodules are empty too
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -69,7 +69,7 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> Any:
         """A spec for the modules named above."""
-        if name.split(".")[0] in ABSENT:
+        if name.split(".", maxsplit=1)[0] in ABSENT:
             return importlib.machinery.ModuleSpec(name, self, is_package=True)
         return None
 
@@ -120,7 +120,7 @@ def _torchvision() -> None:
     if not isinstance(module, Empty):
         return
     transforms: Any = importlib.import_module("torchvision.transforms")
-    module.transforms = transforms
+    setattr(module, "transforms", transforms)  # noqa: B010
 
     class ToPILImage:
         def __call__(self, image: Tensor) -> Any:
@@ -167,7 +167,7 @@ class SceneManager:
     def load_cameras(self) -> None:
         """They are loaded."""
 
-    load_images = load_points3D = load_cameras
+    load_images = load_points3D = load_cameras  # noqa: N815 (their names)
 
 
 class _Image:
@@ -175,7 +175,7 @@ class _Image:
         self.name, self.camera_id = image.name, index
         self._rotation, self.tvec = image.viewmat[:3, :3], image.viewmat[:3, 3]
 
-    def R(self) -> np.ndarray:
+    def R(self) -> np.ndarray:  # noqa: N802 (its name)
         """World to camera."""
         return self._rotation
 

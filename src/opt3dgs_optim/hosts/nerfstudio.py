@@ -6,9 +6,7 @@ nerfstudio finds them through the entry point `nerfstudio.method_configs`, so th
     ns-train splatfacto-opt3dgs --data DATA
 
 just works. In a config of your own: `Opt3DGSSplatfactoModelConfig` in place of
-`SplatfactoModelConfig`, and `Opt3DGSAdamOptimizerConfig` in place of `AdamOptimizerConfig` for the
-six Gaussian parameters. Give the number of iterations to the model too
-(`--pipeline.model.total-steps`), and leave gradient accumulation at 1.
+`SplatfactoModelConfig`. Leave gradient accumulation at 1.
 
 Importing this module needs nerfstudio; nothing else in the package does.
 """
@@ -24,10 +22,9 @@ from torch import Tensor
 
 from opt3dgs_optim.names import canonical_name
 from opt3dgs_optim.phases import PhaseScheduler
-from opt3dgs_optim.presets import PAPER_STEPS, PAPER_SWITCH
+from opt3dgs_optim.presets import PAPER_SWITCH
 
 try:
-    from nerfstudio.engine.optimizers import AdamOptimizerConfig  # pyright: ignore
     from nerfstudio.models.splatfacto import (  # pyright: ignore
         SplatfactoModel,
         SplatfactoModelConfig,
@@ -38,25 +35,7 @@ except ImportError as error:
         f"(the import said: {error})"
     ) from error
 
-TAG = "opt3dgs_slot"  # attribute of a Parameter: its scheduler and its name
 _DESCRIPTION = "Gaussian Splatting with Opt3DGS's two-phase optimizer"
-
-
-@dataclass
-class Opt3DGSAdamOptimizerConfig(AdamOptimizerConfig):
-    """nerfstudio's Adam with both phases inside; needs an `Opt3DGSSplatfactoModel`."""
-
-    def setup(self, params: Any) -> torch.optim.Optimizer:
-        """Build nerfstudio's own Adam and upgrade it."""
-        slot = getattr(params[0], TAG, None) if len(params) == 1 else None
-        if slot is None:
-            raise ValueError(
-                "Opt3DGSAdamOptimizerConfig: these parameters are not Gaussians of an "
-                "Opt3DGSSplatfactoModel; set pipeline.model to Opt3DGSSplatfactoModelConfig, and "
-                "use AdamOptimizerConfig for all other parameters"
-            )
-        phases, name = slot
-        return phases.upgrade({name: super().setup(params)})[name]
 
 
 @dataclass
@@ -64,8 +43,8 @@ class Opt3DGSSplatfactoModelConfig(SplatfactoModelConfig):
     """Splatfacto with the two phases of Opt3DGS."""
 
     _target: type = field(default_factory=lambda: Opt3DGSSplatfactoModel)
-    total_steps: int = PAPER_STEPS
-    """iterations of the training: give the same number as --max-num-iterations"""
+    total_steps: int | None = None
+    """iterations of the training; by default the trainer's --max-num-iterations"""
     switch: float = PAPER_SWITCH
     """where exploitation starts, as a fraction of total_steps"""
     paper: bool = False
@@ -77,36 +56,49 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
 
     config: Opt3DGSSplatfactoModelConfig
 
-    def populate_modules(self) -> None:
-        """As splatfacto's, with a phase scheduler."""
-        super().populate_modules()
-        config = self.config
-        # Held in a tuple: a Module must not take it for one of its parts.
-        self._phases = (
-            PhaseScheduler.paper(config.total_steps, switch=config.switch)
-            if config.paper
-            else PhaseScheduler(config.total_steps, config.switch),
-        )
+    _phases: tuple[PhaseScheduler, ...] = ()  # a Module must not take it for one of its parts
 
     @property
     def phases(self) -> PhaseScheduler:
-        """The phase scheduler of this training."""
+        """The phase scheduler of this training; it exists once the trainer is set up."""
         return self._phases[0]
 
-    def get_gaussian_param_groups(self) -> dict[str, Any]:
-        """As splatfacto's; the parameters say which optimizer they belong into."""
-        groups = super().get_gaussian_param_groups()
-        for name, params in groups.items():
-            if canonical_name(name) is not None:
-                setattr(params[0], TAG, (self.phases, name))
-        return groups
+    def get_training_callbacks(self, training_callback_attributes: Any) -> Any:
+        """As splatfacto's; upgrades the trainer's optimizers.
+
+        The trainer calls it last in its set-up, when a checkpoint has been loaded.
+
+        Raises:
+            ValueError: neither the config nor a trainer says the number of iterations.
+        """
+        attributes, config = training_callback_attributes, self.config
+        total = config.total_steps
+        if total is None and attributes.trainer is not None:
+            total = attributes.trainer.config.max_num_iterations
+        if total is None:
+            raise ValueError(
+                "Opt3DGSSplatfactoModel: total_steps=None and no trainer, but the number of "
+                "iterations is needed; set pipeline.model.total_steps"
+            )
+        make = PhaseScheduler.paper if config.paper else PhaseScheduler
+        phases = make(total, switch=config.switch)
+        optimizers = attributes.optimizers
+        for name, (param,) in self.get_gaussian_param_groups().items():
+            _hold(optimizers.optimizers[name], param)
+            optimizers.parameters[name] = [param]
+        names = [n for n in optimizers.optimizers if canonical_name(n) is not None]
+        optimizers.optimizers.update(
+            phases.upgrade({name: optimizers.optimizers[name] for name in names})
+        )
+        self._phases = (phases,)
+        return super().get_training_callbacks(attributes)
 
     def get_loss_dict(
         self, outputs: Any, batch: Any, metrics_dict: Any = None
     ) -> dict[str, Tensor]:
         """As splatfacto's, squared while exploiting; observes the sum of all terms."""
         losses = super().get_loss_dict(outputs, batch, metrics_dict)
-        if not self.training:
+        if not self.training or not self._phases:
             return losses
         if self.phases.pixel_part() is not None:
             render, target = self._images(outputs, batch)
@@ -126,8 +118,22 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
         return outputs["rgb"] * mask, target * mask
 
 
+def _hold(optimizer: torch.optim.Optimizer, param: torch.nn.Parameter) -> None:
+    """Let an optimizer of one parameter step this one.
+
+    On a resume nerfstudio builds its optimizers first and makes new Parameters then, which none of
+    them would ever step; the loaded state is the new one's.
+    """
+    (group,) = optimizer.param_groups
+    (old,) = group["params"]
+    if old is not param:
+        group["params"] = [param]
+        if old in optimizer.state:
+            optimizer.state[param] = optimizer.state.pop(old)
+
+
 def _method(base: str) -> Any:
-    """nerfstudio's method `base` with our model and optimizers, under the name `base`-opt3dgs."""
+    """nerfstudio's method `base` with our model, under the name `base`-opt3dgs."""
     from nerfstudio.configs.method_configs import method_configs  # pyright: ignore
     from nerfstudio.plugins.types import MethodSpecification  # pyright: ignore
 
@@ -136,13 +142,7 @@ def _method(base: str) -> Any:
     config = copy.deepcopy(method_configs[base])
     config.method_name = f"{base}-opt3dgs"
     options = {k: v for k, v in vars(config.pipeline.model).items() if k != "_target"}
-    config.pipeline.model = Opt3DGSSplatfactoModelConfig(
-        **options, total_steps=config.max_num_iterations
-    )
-    for name, slot in config.optimizers.items():
-        if canonical_name(name) is not None:
-            kept = {k: v for k, v in vars(slot["optimizer"]).items() if k != "_target"}
-            slot["optimizer"] = Opt3DGSAdamOptimizerConfig(**kept)
+    config.pipeline.model = Opt3DGSSplatfactoModelConfig(**options)
     return MethodSpecification(config=config, description=f"{_DESCRIPTION} ({base})")
 
 

@@ -157,10 +157,10 @@ def _bound(function: Function, name: str, before: ast.stmt) -> ast.expr | None:
 
 def _shift(start: ast.expr | None, end: ast.expr) -> tuple[int, ast.expr]:
     """(1, n) for a range that ends at n + 1, else (0, n)."""
-    one = isinstance(end, ast.BinOp) and isinstance(end.op, ast.Add)
-    if one and isinstance(end.right, ast.Constant) and end.right.value == 1 and start is not None:
-        return 1, end.left
-    return 0, end
+    if start is None or not isinstance(end, ast.BinOp) or not isinstance(end.op, ast.Add):
+        return 0, end
+    one = isinstance(end.right, ast.Constant) and end.right.value == 1
+    return (1, end.left) if one else (0, end)
 
 
 def _constant(function: Function, start: ast.expr | None) -> bool:
@@ -230,8 +230,8 @@ def _find_optimizers(trainer: Trainer, tree: ast.Module, folder: Path | None) ->
         ]
         if groups and not groups & {"xyz", "means"}:
             trainer.notes.append(
-                "no group of its optimizer is named xyz or means: only those with Gaussian "
-                f"parameters' names are acted on (groups: {', '.join(sorted(groups))})"
+                "no group of its optimizer is named xyz or means; those with a Gaussian "
+                f"parameter's name are acted on (all: {', '.join(sorted(groups))})"
             )
     else:
         raise ValueError(
@@ -294,11 +294,8 @@ def _model(folder: Path | None) -> tuple[set[str], set[str]]:
             continue
         for node in ast.walk(tree):
             if isinstance(node, ast.Dict):
-                keys = {
-                    k.value: v
-                    for k, v in zip(node.keys, node.values)
-                    if isinstance(k, ast.Constant)
-                }
+                pairs = zip(node.keys, node.values, strict=True)
+                keys = {k.value: v for k, v in pairs if isinstance(k, ast.Constant)}
                 name = keys.get("name")
                 if "params" in keys and isinstance(name, ast.Constant):
                     groups.add(str(name.value))
@@ -320,16 +317,16 @@ def _find_pixel_loss(trainer: Trainer) -> None:
         value = node.value
         inner = _method(value, "mean")
         call = value if inner is None else inner
-        if isinstance(call, ast.Call) and ast.unparse(call.func).split(".")[-1] == "l1_loss":
-            if len(call.args) == 2 and not call.keywords:
-                found.setdefault(ast.unparse(node.targets[0]), []).append((value, call.args))
+        if not isinstance(call, ast.Call) or len(call.args) != 2 or call.keywords:
+            continue
+        if ast.unparse(call.func).split(".")[-1] == "l1_loss":
+            found.setdefault(ast.unparse(node.targets[0]), []).append((value, call.args))
     usual = [name for name in found if name.lower() in ("ll1", "l1loss", "l1_loss", "ll1_render")]
     names = usual or list(found)
     if len(names) == 1:
         trainer.pixel = found[names[0]]
     else:
         trainer.notes.append(
-            f"no L1 term = l1_loss(render, photo) was found (candidates: {len(names)}): the part "
-            "SquaredLoss of the paper needs phases.pixel_loss(render, photo) in its place; the "
-            "defaults do not"
+            "no L1 = l1_loss(render, photo) was found: the paper's squared loss needs "
+            "phases.pixel_loss(render, photo) in its place, the defaults do not"
         )
