@@ -25,7 +25,7 @@ from scene_files import (
 )
 from splatting.scenes import load_scene
 
-_SHARED = Path(__file__).resolve().parents[2] / "shared" / "scenes"
+_SHARED = Path(__file__).resolve().parents[4] / "shared" / "scenes"
 _REAL = ("banana", "brighton_beach", "lund_door", "plush")
 
 

@@ -12,9 +12,9 @@ import numpy as np
 import problems
 import pytest
 import torch
-from study import landscape_laws, landscape_tables, landscapes
-from study.landscape_chains import Chains, Dynamics
-from study.landscape_energies import (
+from studies.landscapes import laws, run, tables
+from studies.landscapes.chains import Chains, Dynamics
+from studies.landscapes.energies import (
     GRID,
     exact_rate,
     flattened_potential,
@@ -25,8 +25,7 @@ from study.landscape_energies import (
     well_potential,
 )
 
-from opt3dgs_optim import AWSGLD, EnergyHistogram
-from opt3dgs_optim.noise import IsotropicNoise
+from opt3dgs_optim import AWSGLD, Course, EnergyHistogram, IsotropicNoise, Part
 
 STEPS = 150
 DYNAMICS = {
@@ -50,16 +49,16 @@ def starts(how: Dynamics) -> np.ndarray:
     return np.array([[2.0, 2.0], [0.1, -0.2], [2.499, -2.499]])
 
 
-class Constant:
-    """A constant multiplier, for AWSGLD."""
+class Constant(Part):
+    """A constant multiplier of everything."""
 
-    num_observed, last_finite = 0, torch.ones((), dtype=torch.bool)
+    names = None
 
     def __init__(self, value: float) -> None:
-        self.multiplier = torch.tensor(value, dtype=torch.float64)
+        self.value = value
 
-    def observe(self, energy: torch.Tensor) -> None:
-        self.num_observed += 1
+    def factor(self, group: Any, course: Course) -> float:
+        return self.value
 
 
 def real_chain(
@@ -67,7 +66,7 @@ def real_chain(
 ) -> tuple[np.ndarray, Any, float]:
     """One chain of the package's own classes: its positions, its histogram, its sum of nu."""
     x = torch.nn.Parameter(torch.from_numpy(start[None].copy()))
-    histogram: Any = Constant(how.constant)
+    histogram = None
     if how.partitions:
         histogram = EnergyHistogram(
             how.partitions,
@@ -78,6 +77,8 @@ def real_chain(
         )
     noise = IsotropicNoise(temperature=how.temperature if how.std is None else None, std=how.std)
     optimizer = AWSGLD([x], how.lr, histogram=histogram, noise=noise, preconditioner=how.drift)
+    if histogram is None:
+        optimizer.follow(Course([*optimizer.course.parts, Constant(how.constant)]))
     dim, positions, nus = x.shape[1], [], 0.0
     normals = torch.from_numpy(draws)
     for draw in normals:
@@ -90,10 +91,11 @@ def real_chain(
         )
         (gradient,) = torch.autograd.grad(energy.sum(), leaf)
         x.grad = gradient + how.stream_noise * draw[1 : 1 + dim]
-        histogram.observe(energy.detach()[0] + how.stream_noise * draw[0])
+        if histogram is not None:
+            histogram.observe(energy.detach()[0] + how.stream_noise * draw[0])
         stream.append(draw[None, 1 + dim :])
         optimizer.step()
-        nus += float(histogram.multiplier)
+        nus += how.constant if histogram is None else float(histogram.multiplier)
         if float(x.detach().abs().max()) > how.boundary:
             x.data = torch.from_numpy(positions[-1][None].copy())
     return np.array(positions), histogram, nus
@@ -107,7 +109,9 @@ def test_the_kernel_is_the_package(name: str, monkeypatch: pytest.MonkeyPatch) -
     for a few hundred steps at 1e-3; on a wrong formula the difference is of the size of a step.
     """
     how, stream = options_of(name), []
-    monkeypatch.setattr("opt3dgs_optim.noise._normal_like", lambda tensor, generator: stream.pop())
+    monkeypatch.setattr(
+        "opt3dgs_optim.parts.noise._normal_like", lambda tensor, generator: stream.pop()
+    )
     chains = Chains(how, starts(how), seed=5, heights=HEIGHTS)
     draws = Chains(how, starts(how), seed=5).draws(STEPS)
     found: list[np.ndarray] = []
@@ -169,7 +173,7 @@ def test_a_flattening_of_nothing_is_the_well() -> None:
 
 def test_gaussian_law() -> None:
     """The plain drift's variance, with the O(lr) bias of the discretisation."""
-    found = landscape_laws.gaussian_law(
+    found = laws.gaussian_law(
         "sgld", chains=2000, seeds=1, rates=[0.25], betas=[0.9, 0.999], progress=lambda n: None
     )
     (row,) = found["rows"]
@@ -186,7 +190,7 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(FloatingPointError, match="is not finite"):
         chains.run(20)
     with pytest.raises(ValueError, match="<!-- nine -->"):
-        landscape_tables.renewed("a page without markers", {"nine": "text"})
+        tables.renewed("a page without markers", {"nine": "text"})
 
 
 @pytest.fixture
@@ -206,22 +210,22 @@ def test_quick_run_interrupted_and_resumed(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(landscape_laws, "escape_rates", interrupted)
-        assert landscapes.main(arguments) == 130
+        patch.setattr(laws, "escape_rates", interrupted)
+        assert run.main(arguments) == 130
     before = {path: path.read_bytes() for path in tmp_path.glob("*.json")}
-    assert len(before) == len(landscapes.experiments(True)) - 2
-    assert landscapes.main(arguments) == 0
+    assert len(before) == len(run.experiments(True)) - 2
+    assert run.main(arguments) == 0
     assert all(path.read_bytes() == content for path, content in before.items())
     names = {path.name for path in tmp_path.iterdir()}
     assert {"nine.png", "modes.png", "well.png", "kramers.png", "tables.md"} <= names
     assert not [name for name in names if name.endswith(".part")]
-    assert len(landscapes.load(tmp_path)) == len(landscapes.experiments(True))
+    assert len(run.load(tmp_path)) == len(run.experiments(True))
     capsys.readouterr()
 
 
 def test_quick_results_stay_out_of_the_docs(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        landscapes.main(["--quick"])
+        run.main(["--quick"])
     assert "--quick needs -o" in capsys.readouterr().err
 
 
@@ -229,7 +233,7 @@ def test_quick_results_stay_out_of_the_docs(capsys: pytest.CaptureFixture[str]) 
 
 
 def seeds_of(name: str) -> list[dict[str, Any]]:
-    return landscapes.load(landscapes.RESULTS)[f"nine-{name}"]["result"]["seeds"]
+    return run.load(run.RESULTS)[f"nine-{name}"]["result"]["seeds"]
 
 
 def mean(name: str, figure: str) -> float:
@@ -237,15 +241,15 @@ def mean(name: str, figure: str) -> float:
 
 
 def test_the_page_has_the_committed_figures() -> None:
-    results = landscapes.load(landscapes.RESULTS)
-    settings = {name: found[2] for name, found in landscapes.experiments(False).items()}
+    results = run.load(run.RESULTS)
+    settings = {name: found[2] for name, found in run.experiments(False).items()}
     assert {name: entry["settings"] for name, entry in results.items()} == settings
     results = {name: results[name] for name in settings}  # the tables' order
-    sections = landscape_tables.sections(results)
-    page = landscapes.PAGE.read_text(encoding="utf-8")
-    assert landscape_tables.renewed(page, sections) == page
-    tables = (landscapes.RESULTS / "tables.md").read_text(encoding="utf-8")
-    assert tables == "\n\n".join(sections.values()) + "\n"
+    sections = tables.sections(results)
+    page = run.PAGE.read_text(encoding="utf-8")
+    assert tables.renewed(page, sections) == page
+    written = (run.RESULTS / "tables.md").read_text(encoding="utf-8")
+    assert written == "\n\n".join(sections.values()) + "\n"
 
 
 def test_what_the_page_says_of_the_nine_modes() -> None:
@@ -265,15 +269,15 @@ def test_what_the_page_says_of_the_nine_modes() -> None:
 
 def test_renewing_a_page_twice_is_renewing_it_once() -> None:
     page = "before\n<!-- one -->\n<!-- end -->\nbetween\n<!-- two -->\nold\n<!-- end -->\n"
-    tables = {"one": "1", "two": "2"}
-    renewed = landscape_tables.renewed(page, tables)
+    texts = {"one": "1", "two": "2"}
+    renewed = tables.renewed(page, texts)
     assert renewed == page.replace("one -->", "one -->\n1").replace("old", "2")
-    assert landscape_tables.renewed(renewed, tables) == renewed
+    assert tables.renewed(renewed, texts) == renewed
 
 
 def test_what_the_page_says_of_the_rates() -> None:
     """SGLD's rate is the exact one, AWSGLD's grows with the barrier and follows its theory."""
-    results = landscapes.load(landscapes.RESULTS)
+    results = run.load(run.RESULTS)
     for row in results["escape-sgld"]["result"]["rows"]:
         # A count of n has a relative deviation of 1 / sqrt(n); 5 % for the step's own bias
         bound = 4 / row["crossings"] ** 0.5 + 0.05

@@ -15,7 +15,7 @@ from PIL import Image
 
 from opt3dgs_optim.runs import read_run
 
-EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 TINY = ["--iterations", "40", "--points", "120", "--seeds", "1", "--switch", "0.75"]
 
 

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import stability
-import stability_page
 from mutants import TARGETS, reasons, survivor_key
+from studies.stability import stability, stability_page
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
+DOCS = Path(__file__).resolve().parents[3] / "docs"
 FOLDER = DOCS / "results/stability"
 
 

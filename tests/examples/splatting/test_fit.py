@@ -13,15 +13,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from splatting.arms import ARMS, CONSTANT_ARM, HISTOGRAM_ARM, find_arm, in_order
+from splatting.arms import ARMS, HISTOGRAM_ARM, find_arm, in_order
 from splatting.embedded import embedded_scene
 from splatting.fit import Fit, FitOptions, run
 from splatting.gaussians import load_ply
 from splatting.scenes import Scene
 
+from opt3dgs_optim import Phase, PhaseScheduler
 from opt3dgs_optim.runs import read_run
 
-EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+CONSTANT_ARM = "mcmc+constant-multiplier"
+EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 OPTIONS = FitOptions(iterations=90, points=150, switch=2 / 3, evaluations=3)
 
 
@@ -58,17 +60,31 @@ def test_every_arm_trains_and_resumes_bit_for_bit(scene: Scene, name: str, tmp_p
     assert all(torch.equal(a, b) for a, b in zip(values(whole), values(third), strict=True))
 
 
-def test_scheduler_with_everything_off_is_the_trainers_own_adam(scene: Scene) -> None:
+def test_without_parts_it_is_the_trainers_own_adam(scene: Scene) -> None:
     """Noise apart (another order within the step): the arms differ by what they name, no more."""
-    from splatting import arms
-
-    off = arms._scheduler(noise_scale=0.0)
-    plain = Fit(scene, replace(ARMS["adam"], mcmc=False), OPTIONS)
-    ours = Fit(scene, replace(ARMS["adam"], mcmc=False, make=off), OPTIONS)
+    plain = Fit(scene, ARMS["adam"], OPTIONS)
+    ours = Fit(scene, ARMS["adam"], OPTIONS)
+    PhaseScheduler(OPTIONS.iterations, parts=[]).upgrade(ours.optimizers)
     for _ in range(90):
         plain.step()
         ours.step()
     assert all(torch.equal(a, b) for a, b in zip(values(plain), values(ours), strict=True))
+
+
+def test_a_branch_starts_where_its_trunk_was(scene: Scene, tmp_path: Path) -> None:
+    """Clock and phase are the trunk's, whether its checkpoint has a clock or is a stock one's."""
+    for trunk in ("mcmc", "annealed+faded"):
+        whole, branch = (Fit(scene, ARMS[name], OPTIONS) for name in (trunk, "mcmc+l2+reset"))
+        for _ in range(60):
+            whole.step()
+        whole.save(tmp_path / "at.pt")
+        branch.load(tmp_path / "at.pt", trunk=trunk)
+        assert branch.phase is Phase.EXPLOITATION
+        branch.step()
+        assert branch.phases is not None
+        assert branch.phases.iteration == 61
+        state = branch.optimizers["means"].state[branch.gaussians["means"]]
+        assert float(state["step"]) == 1.0  # the moments started anew
 
 
 def test_run_logs_what_the_report_needs(scene: Scene, tmp_path: Path) -> None:
