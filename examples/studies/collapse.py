@@ -56,7 +56,7 @@ class Frozen(Part):
                 return
             weights = (1 - 8 / (self.warmup // 2)) ** np.arange(len(self._first))[::-1]
             mean = np.average(self._first, weights=weights)
-            deviation = np.sqrt(np.average((self._first - mean) ** 2, weights=weights))
+            deviation = np.sqrt(np.average((np.array(self._first) - mean) ** 2, weights=weights))
             self.histogram = EnergyHistogram.paper(
                 energy_range=(max(mean - 30 * deviation, 0.0), mean + 4 * deviation),
                 temperature=deviation / 6,

@@ -98,12 +98,12 @@ def draw(record: dict[str, Any], path: Path) -> None:
     line = np.array([-3.0, 3.0])
     scatter.plot(line, 1 - line / 2, color="0.6", lw=1, label="design, 1 − z / 2")
     scatter.set(xlabel="z, deviations of the energy", ylabel="ν", ylim=(-4, 6), xlim=(-3, 3))
-    for name in COLORS:
+    for name, color in COLORS.items():
         update, zeta = ("default", 0.75) if name == "default" else ("paper", float(name))
         rows = [r for r in record["rows"] if (r["update"], r["zeta"]) == (update, zeta)]
         ends = [r["energies"][1] for r in rows]
-        spread.plot(ends, [r["deviation"] for r in rows], "o-", ms=4, color=COLORS[name])
-        bias.plot(ends, [r["slope"] for r in rows], "o-", ms=4, color=COLORS[name])
+        spread.plot(ends, [r["deviation"] for r in rows], "o-", ms=4, color=color)
+        bias.plot(ends, [r["slope"] for r in rows], "o-", ms=4, color=color)
     spread.axhspan(0.4, 0.6, color="0.9")
     spread.axhline(0.5, color="0.6", lw=1)
     spread.set(xscale="log", yscale="log", xlabel="energies", ylabel="deviation of ν")

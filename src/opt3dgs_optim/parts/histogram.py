@@ -14,7 +14,7 @@ from opt3dgs_optim.checks import check_count, check_interval, check_keys, check_
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Group, Part, Phase
 from opt3dgs_optim.partitions import REACH, FixedPartitions, MovingPartitions
-from opt3dgs_optim.parts.constant import ConstantMultiplier
+from opt3dgs_optim.parts.constant import Constancy
 
 PAPER_RANGE = (0.0, 0.2)
 PAPER_TEMPERATURE = 2e-3  # not given in the paper; zeta * tau / du = 1.5 at its zeta and du
@@ -24,9 +24,6 @@ CLAMP = (-1.0, 3.0)  # twice as far from 1 as nu is two deviations out
 LOGGER = logging.getLogger("opt3dgs_optim")
 CONSTANT = 1e-9  # smallest deviation of an energy that varies, as a share of its size
 TINY = 1e-100  # smallest deviation of an energy around zero that varies
-# Where a constant would do as well: nu's deviation over so many energies, or share of the run.
-WINDOW, WINDOW_SHARE = 300, 1 / 30
-EFFECT = 0.1  # relative: learning rates that differ by less are taken as the same
 TOP_SHARE = 0.5  # of Theta, in the open partition above the range: the loss may yet fall into it
 
 
@@ -102,14 +99,8 @@ class EnergyHistogram(Part):
         else:
             self.energy_range = check_interval(CALL, "energy_range", energy_range)
             self.temperature = check_number(CALL, "temperature", temperature, 0.0)
-            self._law = FixedPartitions(
-                self.num_partitions,
-                self.energy_range,
-                self.zeta,
-                self.temperature,
-                self.warmup,
-                self.clamp,
-            )
+            fixed = (self.energy_range, self.zeta, self.temperature, self.warmup, self.clamp)
+            self._law = FixedPartitions(self.num_partitions, *fixed)
         self._allocate(torch.device("cpu"))
 
     @classmethod
@@ -137,9 +128,7 @@ class EnergyHistogram(Part):
         self._sums = torch.zeros_like(self._powers)
         self._host_sums = [0.0, 0.0, 0.0]  # the same, of energies on a CPU
         self._factor: float | Tensor = 1.0
-        self._windows: list[list[float]] = []
-        self._constant: ConstantMultiplier | None = None
-        self._verdict: str | None = None
+        self._constancy = Constancy()
 
     # -- one energy ----------------------------------------------------------------------------
 
@@ -192,7 +181,7 @@ class EnergyHistogram(Part):
                 powers = (1.0, nu, nu * nu)
                 self._host_sums = [a + b for a, b in zip(self._host_sums, powers, strict=True)]
             elif self._taken == self.warmup and isinstance(law, MovingPartitions):
-                self._say_if_constant(law)
+                self._say_if_constant()
         else:
             self._factor = law.nu
             if warm:
@@ -213,8 +202,8 @@ class EnergyHistogram(Part):
             energy = energy.reshape(())
         return energy.detach() if energy.requires_grad else energy
 
-    def _say_if_constant(self, law: MovingPartitions) -> None:
-        low, high, _ = law.coordinates()
+    def _say_if_constant(self) -> None:
+        low, high = self.calibrated_range
         if high - low <= max(CONSTANT * REACH * abs(high + low), TINY):
             LOGGER.warning(
                 "%s: the first %d energies are all %g, so nu is 1 until they vary; is it the "
@@ -280,42 +269,18 @@ class EnergyHistogram(Part):
     # -- leaving it out ------------------------------------------------------------------------
 
     def evidence(self, course: Course) -> Tensor | None:
-        """[4]: energies after the warm-up, their sum of nu and of its square; and Theta's share in
-        the open partition above the range.
-        """
+        """[4]: sums of nu's powers 0, 1 and 2; Theta's share in the open partition at the top."""
         moments = self._moments()
         return torch.cat([moments, self._law.weights[-1:].to(moments.dtype)])
 
     def useless(self, evidence: list[float], course: Course) -> str | None:
         """Where nu has been nearly constant for 300 energies, or for a thirtieth of the run."""
-        *now, above = evidence
-        if self._verdict is not None or now[0] <= 0:
-            return self._verdict
-        window = max(WINDOW, WINDOW_SHARE * course.total_steps)
-        self._windows.append(now)
-        old = [each for each in self._windows if now[0] - each[0] >= window]
-        if not old:
-            return None
-        self._windows = self._windows[len(old) - 1 :]
-        count, total, squares = (new - before for new, before in zip(now, old[-1], strict=True))
-        mean = total / count
-        deviation = math.sqrt(max(squares / count - mean * mean, 0.0))
-        if above > TOP_SHARE or deviation > EFFECT * abs(mean):
-            return None
-        # Its mean is a learning rate that this training has been running with: leaving it would be
-        # a change of its own. A mean of 0 or less would never come down again.
-        near_one = mean <= 0 or abs(mean - 1) <= EFFECT
-        self._constant = None if near_one else ConstantMultiplier(mean)
-        follow = "off" if near_one else f"a constant {mean:.3g} from now on"
-        self._verdict = (
-            f"nu was {mean:.3f} with a deviation of {deviation:.3f} over {count:.0f} energies: "
-            f"{follow}"
-        )
-        return self._verdict
+        *powers, above = evidence
+        return self._constancy.judge("nu", powers, course.total_steps, above <= TOP_SHARE)
 
     def instead(self) -> Part | None:
         """A constant of nu's mean, unless that is 1."""
-        return self._constant
+        return self._constancy.constant
 
     # -- state ---------------------------------------------------------------------------------
 
@@ -325,6 +290,7 @@ class EnergyHistogram(Part):
             "num_observed": self.num_observed,
             "num_taken": self._taken,
             "sums": self._moments().tolist(),
+            "constant": self._constancy.state(),
             **self._law.state(),
         }
 
@@ -335,18 +301,18 @@ class EnergyHistogram(Part):
             ValueError: it is damaged, or of other partitions; nothing is changed then.
         """
         call = f"{CALL}.load_state_dict"
-        check_keys(call, state, tuple(self.state_dict()))
-        for name, here in self.state_dict().items():
+        here = self.state_dict()
+        check_keys(call, state, tuple(here))
+        for name, own in here.items():
             saved = state[name]
-            rows = saved if isinstance(here, list) else [saved]
-            if not isinstance(rows, list) or (isinstance(here, list) and len(rows) != len(here)):
-                found = len(rows) if isinstance(rows, list) else repr(saved)
+            rows, length = (saved, len(own)) if isinstance(own, list) else ([saved], 1)
+            plain = isinstance(rows, list) and all(isinstance(v, (int, float)) for v in rows)
+            known = plain and (len(rows) == length or (name == "constant" and len(rows) <= 1))
+            if not known or not all(map(math.isfinite, rows)):
                 raise ValueError(
-                    f"{call}: {name} has {found} numbers, but a histogram with "
-                    f"num_partitions={self.num_partitions} has {len(here)}"
+                    f"{call}: {name}={saved!r}, but a histogram with num_partitions="
+                    f"{self.num_partitions} has {length} finite numbers there"
                 )
-            if not all(isinstance(v, (int, float)) and math.isfinite(v) for v in rows):
-                raise ValueError(f"{call}: {name}={saved!r}, but finite numbers are needed")
         self._law.check(call, state)
         self._allocate(self._device)
         self._restore(state)
@@ -357,6 +323,7 @@ class EnergyHistogram(Part):
             self._host_sums = list(state["sums"])
         else:
             self._sums.copy_(torch.tensor(state["sums"], dtype=self._sums.dtype))
+        self._constancy.load("nu", state["constant"])
         self.num_observed, self._taken = int(state["num_observed"]), int(state["num_taken"])
         self._factor = self._law.nu.item() if self._device.type == "cpu" else self._law.nu
 
