@@ -138,11 +138,10 @@ class StepAdam(Adam):
     def _step(self, mask: Tensor | None, acting: bool) -> None:
         """A step that a GradScaler may tell not to be made, of which parts know nothing."""
         found, shared = getattr(self, "found_inf", None), Lent()
-        if found is not None and found.device.type == "cpu":
-            if bool(found):
-                return
-        elif found is not None:
+        if found is not None and isinstance(self.course.valid, Tensor):
             shared.attribute(self.course, "valid", (found.reshape(()) == 0) & self.course.valid)
+        elif found is not None and bool(found):
+            return
         try:
             self._step_parts(mask, acting)
         finally:
