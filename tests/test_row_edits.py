@@ -12,8 +12,8 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-# A row's own bias correction is float32: one unit in its last place of a step of 0.075 is 1e-8,
-# and pairs of condition 30 amplify it over some 40 steps. A foreign pair shows as 1e-4 and more.
+# Float64, but the pairs' header: pairs of condition 30 amplify its rounding over some 40 steps. A
+# foreign pair shows as 1e-4 and more.
 TOLERANCE = 1e-5
 ROWS = 4
 weights = st.lists(st.sampled_from([0.0, 1.0, 1.0]), min_size=ROWS, max_size=ROWS)

@@ -290,8 +290,13 @@ class StepAdam(Adam):
         return {**super().__getstate__(), "course": self.course, "_base": self._base}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
+        is_copy = "course" in state
+        if not is_copy:  # called by torch's load_state_dict, after its hooks
+            call = f"{type(self).__name__}.load_state_dict"
+            params = [p for group in state["param_groups"] for p in group["params"]]
+            check_rows(call, params, self.course.keys, state["state"])
         super().__setstate__(state)
-        if "course" in state:  # a copy: the parameters are other objects, the rows the same
+        if is_copy:  # the parameters are other objects, the rows the same
             self._ledger = Ledger()
             self._trust_rows()
 
@@ -314,15 +319,12 @@ class StepAdam(Adam):
         Raises:
             ValueError: it does not fit; then nothing has been loaded.
         """
-        call = f"{type(self).__name__}.load_state_dict"
         before = self.state, self.param_groups
         names = [group.get(SLOT) for group in self.param_groups]
         super().load_state_dict(state_dict)
         try:
-            params = [p for group in self.param_groups for p in group["params"]]
-            check_rows(call, params, self.course.keys, self.state)
             self.take_loaded()
-        except Exception:
+        except ValueError:
             self.state, self.param_groups = before
             raise
         for group, name in zip(self.param_groups, names, strict=True):

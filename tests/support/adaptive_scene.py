@@ -8,17 +8,23 @@ from typing import Any
 
 import torch
 from torch.nn import Parameter
-from trainers import INRIA_NAMES
+from trainers import INRIA_NAMES, every_one
 
-from opt3dgs_optim import Curvature, EnergyHistogram, Part, PhaseScheduler, PositionNoise
+from opt3dgs_optim import Curvature, Part, PhaseScheduler, PositionNoise
 
 POINTS, TOTAL, SWITCH = 120, 170, 110
 RATES = {"means": 2e-2, "scales": 1e-4, "quats": 1e-4, "opacities": 1e-2}
 SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": ()}
-SHORTENED = {"CHECK_STEPS": 20, "NU_WINDOW": 60, "PROBE_STEPS": 3, "ONE_VIEW": 40}
+CHECK, PROBE = 20, 3  # shortened: the same decisions after a fifth of the iterations
 
 
-CONSECUTIVE = CurvatureOptions()
+def shorten(monkeypatch: Any) -> None:
+    """Look at the evidence more often."""
+    from opt3dgs_optim import phases
+    from opt3dgs_optim.parts import curvature
+
+    monkeypatch.setattr(phases, "CHECK_STEPS", CHECK)
+    monkeypatch.setattr(curvature, "PROBE_STEPS", PROBE)
 
 
 @dataclass(frozen=True)
@@ -26,20 +32,18 @@ class Scene:
     """As it stands, every part has something to do."""
 
     views: int = 20
-    energies_differ: float = 0.3  # between views, without a gradient: nu moves
     views_disagree: float = 0.0  # share of a view's own curvature: a pair then holds none
     concave: bool = False  # no pair is accepted
     opacity: float = -5.3  # logit of all points: 0.005, at the gate
-    range: tuple[float, float] = (0.0, 2.0)  # of the energies, in which they lie
-    pairs: Any = CONSECUTIVE
-    energy: Any = "raw"
+    curvature: bool = True
     noise_scale: float = 1.0
+    history_size: int = 5
 
 
 class Training:
     """Points on quadratics of condition 100, each with axes of its own; views look at them."""
 
-    def __init__(self, scene: Scene, layout: str = "dict", **options: Any) -> None:
+    def __init__(self, scene: Scene, layout: str = "dict", *others: Part, **options: Any) -> None:
         draw = torch.Generator().manual_seed(0)
         self.scene, self.layout = scene, layout
         axes = torch.linalg.qr(torch.randn(POINTS, 3, 3, generator=draw))[0]
@@ -49,29 +53,20 @@ class Training:
         hessians = (1 - share) * (axes @ stiff @ axes.mT) + share * 20 * slopes.mT @ slopes
         self.hessians = hessians * (-0.01 if scene.concave else 0.01)
         self.minima = torch.randn(scene.views, POINTS, 3, generator=draw) * 0.1 * share
-        self.energies = torch.randn(scene.views, generator=draw) * scene.energies_differ
         self.splats = {
             name: Parameter(torch.randn(POINTS, *shape, generator=draw) * 0.5)
             for name, shape in SHAPES.items()
         }
         with torch.no_grad():
             self.splats["opacities"].fill_(scene.opacity)
-        histogram = EnergyHistogram(
-            20, scene.range, temperature=0.05, warmup=20, step_size=0.05, energy=scene.energy
-        )
-        self.phases = PhaseScheduler(
-            TOTAL,
-            SWITCH,
-            multiplier=options.pop("multiplier", histogram),
-            curvature=scene.pairs,
-            noise_scale=scene.noise_scale,
-            annealing=None,
-            pooling=None,
-            adaptive=options.pop("adaptive", True),
-            **options,
-        )
-        self.optimizers: Any = self.phases.upgrade(self._plain(), lambda: self.splats)
-        self.noise = torch.Generator().manual_seed(1)
+        self.noise = PositionNoise(lambda: self.splats, scene.noise_scale)
+        self.curvature = Curvature(scene.history_size)
+        parts: list[Part] = [*others]
+        parts += [self.curvature] if scene.curvature else []
+        parts += [self.noise] if scene.noise_scale else []
+        options = {"adaptive": True, **options}
+        self.phases = PhaseScheduler(TOTAL, SWITCH, parts, **options)
+        self.optimizers: Any = self.phases.upgrade(self._plain())
 
     def _plain(self) -> Any:
         if self.layout == "single":
@@ -87,7 +82,7 @@ class Training:
 
     @property
     def every(self) -> list[Any]:
-        return [self.optimizers] if self.layout == "single" else list(self.optimizers.values())
+        return every_one(self.optimizers)
 
     @property
     def positions_state(self) -> dict[str, Any]:
@@ -100,9 +95,9 @@ class Training:
         view = int(order[at])
         off = self.splats["means"] - self.minima[view, : len(self.splats["means"])]
         hessian = self.hessians[view, : len(off)]
-        loss = 0.5 * (off[:, None] @ hessian @ off[..., None]).mean() + 1 + self.energies[view]
+        loss = 0.5 * (off[:, None] @ hessian @ off[..., None]).mean() + 1
         loss.backward()
-        self.phases.observe(loss, view=view)
+        self.phases.observe(loss)
         for optimizer in self.every:
             optimizer.step()
             optimizer.zero_grad()

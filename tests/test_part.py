@@ -1,0 +1,275 @@
+"""The protocol's proof: a part of a stranger's gets everything without the package knowing it."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+from trainers import (
+    edit_rows,
+    gsplat_optimizers,
+    inria_optimizer,
+    make_splats,
+    only,
+    state_of,
+    train,
+)
+
+import opt3dgs_optim
+from opt3dgs_optim import Annealing, Part, Phase, PhaseScheduler, reset_points
+
+SOURCE = Path(opt3dgs_optim.__file__).parent
+TOTAL = 40
+
+
+class SignAgreement(Part):  # fifteen lines
+    """A coordinate whose gradient disagrees with the mean of the last ones is not stepped."""
+
+    during, keys = Phase.EXPLOITATION, ("disagreed",)  # per point: how often
+
+    def __init__(self, patience: float = 0.5) -> None:
+        self.patience, self.share = patience, 0.0
+
+    def before(self, group: Any, param: Tensor, grad: Tensor, state: Any, course: Any) -> Tensor:
+        against = grad * state["exp_avg"] < 0
+        self.share = self.share * self.patience + (1 - self.patience) * against.float().mean()
+        seen = state.setdefault("disagreed", torch.zeros(len(param)))
+        seen += against.reshape(len(param), -1).any(1)
+        return torch.where(against, 0.0, grad)
+
+    def numbers(self, course: Any) -> dict[str, Any]:
+        return {"disagreeing": self.share}
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"share": float(self.share)}
+
+    def load_state_dict(self, state: Any) -> None:
+        self.share = torch.tensor(state["share"])
+
+    def evidence(self, course: Any) -> Tensor:
+        return torch.as_tensor(self.share, dtype=torch.float32).reshape(1)
+
+    def useless(self, evidence: list[float], course: Any) -> str | None:
+        return "all agree" if course.exploiting and evidence[0] < 1e-3 else None
+
+
+def pulled(splats: dict[str, Parameter], optimizers: Any, phases: Any, steps: int) -> None:
+    """Gradients whose sign changes in every other point and step."""
+    every = optimizers.values() if isinstance(optimizers, dict) else [optimizers]
+    for _ in range(steps):
+        phases.observe(0.1)
+        flip = -1.0 if phases.iteration % 2 else 1.0
+        for param in splats.values():
+            odd = (torch.arange(len(param)) % 2 == 1).reshape(-1, *[1] * (param.dim() - 1))
+            param.grad = torch.where(odd, flip, 1.0).expand_as(param).clone()
+        for optimizer in every:
+            optimizer.step()
+
+
+@pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
+def test_it_acts_in_its_phase_only_and_does_what_it_says(make: Any) -> None:
+    splats = make_splats()
+    phases = only(TOTAL, SignAgreement(), switch=20)
+    optimizers = phases.upgrade(make(splats))
+    pulled(splats, optimizers, phases, 20)
+    assert "disagreed" not in state_of(optimizers, splats["means"])
+    before = state_of(optimizers, splats["means"])["exp_avg"].clone()
+    pulled(splats, optimizers, phases, 1)
+    state = state_of(optimizers, splats["means"])
+    assert state["disagreed"].tolist() == [0.0, 1.0] * 6
+    torch.testing.assert_close(state["exp_avg"][1::2], 0.9 * before[1::2])
+
+
+@pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
+@pytest.mark.parametrize("at", [12, 27])
+def test_its_rows_and_its_state_are_in_checkpoints(make: Any, at: int, tmp_path: Path) -> None:
+    ends = []
+    for cut in (False, True):
+        splats, part = make_splats(), SignAgreement()
+        phases = only(TOTAL, Annealing(), part, switch=20)
+        optimizers: Any = phases.upgrade(make(splats))
+        pulled(splats, optimizers, phases, at)
+        if cut:
+            every = optimizers if isinstance(optimizers, dict) else {"all": optimizers}
+            torch.save({n: o.state_dict() for n, o in every.items()}, tmp_path / "state.pt")
+            saved = torch.load(tmp_path / "state.pt", weights_only=True)
+            part = SignAgreement()
+            phases = only(TOTAL, Annealing(), part, switch=20)
+            optimizers = phases.upgrade(make(splats))
+            every = optimizers if isinstance(optimizers, dict) else {"all": optimizers}
+            for name, optimizer in every.items():
+                optimizer.load_state_dict(saved[name])
+        pulled(splats, optimizers, phases, TOTAL - at)
+        ends.append((splats, float(part.share), state_of(optimizers, splats["quats"])))
+    for name in ends[0][0]:
+        assert torch.equal(ends[0][0][name], ends[1][0][name]), name
+    assert ends[0][1] == ends[1][1] > 0
+    assert torch.equal(ends[0][2]["disagreed"], ends[1][2]["disagreed"])
+
+
+def test_masks_leave_its_other_rows_alone() -> None:
+    splats = make_splats()
+    phases = only(TOTAL, SignAgreement(), switch=0)
+    means: Any = phases.upgrade(gsplat_optimizers(splats))["means"]
+    for step in range(6):
+        phases.observe(0.1)
+        splats["means"].grad = torch.full((12, 3), (-1.0) ** step)
+        means.step(visible=torch.arange(12) < (12 if step < 3 else 4))
+    # against in each second step, for the others in the first three only
+    assert means.state[splats["means"]]["disagreed"].tolist() == [3.0] * 4 + [1.0] * 8
+
+
+def test_its_rows_follow_the_trainers_edits() -> None:
+    for told in (True, False):
+        splats = make_splats()
+        phases = only(TOTAL, SignAgreement(), switch=0)
+        optimizers = phases.upgrade(gsplat_optimizers(splats))
+        pulled(splats, optimizers, phases, 5)
+        edit_rows(splats, optimizers, torch.arange(1, 12), 2)
+        if told:
+            reset_points(optimizers, torch.tensor([11, 12]))
+        pulled(splats, optimizers, phases, 1)
+        counts = state_of(optimizers, splats["scales"])["disagreed"]
+        assert len(counts) == 13
+        assert bool((counts[:11] > 1).any()) == told
+
+
+def test_it_is_in_the_repr_and_in_the_upgrades_line(caplog: pytest.LogCaptureFixture) -> None:
+    phases = only(TOTAL, SignAgreement(), Annealing())
+    with caplog.at_level("INFO", "opt3dgs_optim"):
+        means = phases.upgrade(gsplat_optimizers(make_splats()))["means"]
+    for said in (repr(phases), repr(means), caplog.text):
+        assert "SignAgreement()" in said
+
+
+def test_its_numbers_are_columns_of_the_run_log(tmp_path: Path) -> None:
+    from opt3dgs_optim.runlog import RunLog
+
+    splats = make_splats()
+    with RunLog(tmp_path / "run.jsonl") as log:
+        phases = PhaseScheduler(TOTAL, 20, [SignAgreement(), Annealing()], log=log)
+        optimizers = phases.upgrade(gsplat_optimizers(splats))
+        pulled(splats, optimizers, phases, TOTAL)
+    lines = [json.loads(line) for line in (tmp_path / "run.jsonl").read_text().splitlines()]
+    columns = [set(line) & {"disagreeing", "annealing"} for line in lines if line["kind"] == "step"]
+    assert columns == [{"annealing"}] * 20 + [{"annealing", "disagreeing"}] * 20
+
+
+def test_an_adaptive_training_switches_it_off() -> None:
+    splats, part = make_splats(), SignAgreement()
+    phases = PhaseScheduler(200, 0, [part], adaptive=True)
+    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    train_agreeing = torch.ones(12, 3)
+    for _ in range(100):
+        phases.observe(0.1)
+        splats["means"].grad = train_agreeing.clone()
+        optimizers["means"].step()
+    assert phases.switched_off == {"SignAgreement": "all agree"}
+    assert "SignAgreement(): switched off, all agree" in repr(phases)
+    assert phases.hooks("before") == []
+    assert phases.numbers() == {}
+
+
+class Everywhere(Part):
+    """Acts on every group, Gaussian or not."""
+
+    names = None
+
+    def factor(self, group: Any, course: Any) -> float:
+        return 0.0
+
+
+@pytest.mark.parametrize("names", [None, ("means",), ("sh0", "quats")])
+def test_a_part_says_which_parameters_it_acts_on(names: Any) -> None:
+    class Some(Everywhere):
+        pass
+
+    Some.names = names
+    splats, exposure = make_splats(), Parameter(torch.ones(4))
+    optimizer = inria_optimizer(splats)
+    optimizer.add_param_group({"params": [exposure], "lr": 0.1, "name": "exposure"})
+    phases = only(TOTAL, Some())
+    phases.upgrade(optimizer)
+    everything = {**splats, "exposure": exposure}
+    before = {name: p.detach().clone() for name, p in everything.items()}
+    for param in everything.values():
+        param.grad = torch.ones_like(param)
+    phases.observe(0.1)
+    optimizer.step()
+    still = {name for name, p in everything.items() if torch.equal(before[name], p)}
+    assert still == (set(everything) if names is None else set(names))
+
+
+def test_factors_of_all_parts_multiply() -> None:
+    class Two(Part):
+        def factor(self, group: Any, course: Any) -> Tensor:
+            return torch.tensor(2.0, dtype=torch.float64)
+
+    class Quarter(Part):
+        def factor(self, group: Any, course: Any) -> float | None:
+            return None if group["name"] == "sh0" else 0.25
+
+    splats = make_splats()
+    before = {name: p.detach().clone() for name, p in splats.items()}
+    phases = only(TOTAL, Two(), Quarter(), Two())
+    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    phases.observe(0.1)
+    for name, factor in (("means", 1.0), ("sh0", 4.0)):
+        splats[name].grad = torch.ones_like(splats[name])
+        optimizers[name].step()
+        moved = (before[name] - splats[name].detach()).mean()
+        rate = optimizers[name].param_groups[0]["lr"]
+        assert float(moved) == pytest.approx(rate * factor, rel=1e-3)
+
+
+def test_the_last_part_with_a_pixel_loss_wins() -> None:
+    class Cubed(Part):
+        def pixel_loss(self, error: Tensor) -> Tensor:
+            return error.abs().pow(3).mean()
+
+    phases = only(TOTAL, opt3dgs_optim.SquaredLoss(), Cubed(), switch=0)
+    assert float(phases.pixel_loss(torch.full((2,), 0.5), torch.zeros(2))) == 0.125
+
+
+def test_a_hook_that_is_not_overridden_is_never_called() -> None:
+    class Quiet(Part):
+        pass
+
+    phases = only(TOTAL, Quiet())
+    for hook in ("observe", "pixel_loss", "factor", "before", "after"):
+        assert phases.hooks(hook) == []
+
+
+# -- pooling: one short file, and nobody knows its name ------------------------------------------
+
+
+def test_pooling_is_one_short_file_that_nobody_else_knows() -> None:
+    pooling = SOURCE / "parts" / "pooling.py"
+    assert len(pooling.read_text().splitlines()) <= 60
+    knows = {
+        path.relative_to(SOURCE).as_posix()
+        for path in SOURCE.rglob("*.py")
+        if re.search(r"\bpooling\b", path.read_text(), re.IGNORECASE)
+    }
+    assert knows == {"__init__.py", "parts/pooling.py"}
+
+
+def test_the_core_knows_no_part() -> None:
+    """What the course and the steps are made of imports none of the parts."""
+    for name in ("part", "course", "stepadam", "lending", "rows", "upgrading", "names", "checks"):
+        text = (SOURCE / f"{name}.py").read_text()
+        assert "opt3dgs_optim.parts" not in text, name
+
+
+def test_train_is_the_trainers() -> None:
+    """The helper of these tests calls what a trainer calls, and nothing else."""
+    splats = make_splats()
+    phases = only(TOTAL, SignAgreement())
+    train(splats, phases.upgrade(gsplat_optimizers(splats)), phases, 0, 2)
+    assert phases.iteration == 2
