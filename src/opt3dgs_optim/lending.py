@@ -11,6 +11,7 @@ from torch import Tensor
 
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Group
+from opt3dgs_optim.rows import Frozen
 
 LOGGER = logging.getLogger("opt3dgs_optim")
 
@@ -27,9 +28,14 @@ class AdamOptions(TypedDict, total=False):
 
 
 class Lent:
-    """Learning rates, gradients and flags that stand in place of others for one step."""
+    """Learning rates, gradients and flags that stand in place of others for one step.
+
+    Attributes:
+        frozen: rows that are to be put back after it.
+    """
 
     def __init__(self) -> None:
+        self.frozen: list[Frozen] = []
         self._items: list[tuple[dict[str, Any], str, Any]] = []
         self._attributes: list[tuple[Any, str, Any]] = []
 

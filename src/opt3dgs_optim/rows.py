@@ -10,8 +10,6 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
-from opt3dgs_optim.checks import check_keys, warn_user
-
 
 class _Seen(NamedTuple):
     """What belonged together after a parameter's last step: an edit of one alone shows."""
@@ -150,34 +148,6 @@ def check_mask_rows(call: str, rows: int, params: list[tuple[bool, Tensor]]) -> 
             f"{call}: the mask has {rows} rows, but the parameters have shapes {shapes}; a mask of "
             "their first dimension is needed"
         )
-
-
-def check_rows(call: str, params: list[Tensor], keys: Iterable[str], state: Any) -> None:
-    """ValueError unless loaded moments fit the parameters; what parts kept of other rows goes.
-
-    The number of rows may differ: some trainers load the optimizer first, the points afterwards.
-    """
-    for param in params:
-        own = state.get(param)
-        if not own and isinstance(own, (Mapping, type(None))):
-            continue
-        check_keys(call, own, ())
-        for key in ("exp_avg", "exp_avg_sq"):
-            value = own.get(key)
-            if not isinstance(value, Tensor) or value.shape[1:] != param.shape[1:]:
-                shape = tuple(value.shape) if isinstance(value, Tensor) else value
-                raise ValueError(
-                    f"{call}: {key} has shape {shape}, but the parameter has {tuple(param.shape)}"
-                )
-        if "step" not in own:
-            raise ValueError(f"{call}: no 'step' among {list(own)}; an Adam's state is needed")
-        for key in keys:
-            if key in own and own[key].shape[0] != rows_of(param):
-                warn_user(
-                    f"{call}: {key} of {own[key].shape[0]} rows for a parameter of "
-                    f"{rows_of(param)}: dropped, and collected anew"
-                )
-                del own[key]
 
 
 def reset_points(optimizers: Any, rows: Tensor, *, moments: bool = False) -> None:

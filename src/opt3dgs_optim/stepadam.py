@@ -11,6 +11,7 @@ from torch import Tensor
 from torch._compile import _disable_dynamo
 from torch.optim import Adam
 
+from opt3dgs_optim.checkpoint import STATE_KEY, check_rows, loading
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.describe import block, group_lines
 from opt3dgs_optim.lending import Lent, guard, refuse_capture, times
@@ -21,13 +22,11 @@ from opt3dgs_optim.rows import (
     Ledger,
     check_mask,
     check_mask_rows,
-    check_rows,
     shaped,
 )
 
 # Unwrapped: torch's step hooks and its profiler are around our step already.
 ADAM_STEP = inspect.unwrap(Adam.step)
-STATE_KEY = "opt3dgs"  # in param_groups[0] of a state_dict: the course's state
 
 
 class StepAdam(Adam):
@@ -40,7 +39,7 @@ class StepAdam(Adam):
 
     course: Course
     any_group = False  # whether the parts act on groups that are no Gaussian parameter's, too
-    _base: type[Adam] = Adam  # whose step it is that the parts surround
+    base: type[Adam] = Adam  # whose step it is that the parts surround
     _ledger: Ledger
     _told = False  # of a gradient that is not finite
 
@@ -52,17 +51,17 @@ class StepAdam(Adam):
             base: the class whose step the parts surround: torch's Adam, or one with arithmetic of
                 its own, whose step then gets the mask.
         """
-        self.course, self._base, self._ledger = course, base, Ledger()
+        self.course, self.base, self._ledger = course, base, Ledger()
         self._patch_step_function()  # torch's, for a class that was given to a made optimizer
         groups = self.param_groups
         own_path = any(g[k] is not None for g in groups for k in ("fused", "foreach"))
         own_path = own_path or any(g["capturable"] for g in groups)
         tensors = [p for group in groups for p in group["params"]]
         if base is Adam and not own_path and tensors and all(p.is_cuda for p in tensors):
-            self._use_fused()
-        self._trust_rows()
+            self.use_fused()
+        self.trust_rows()
 
-    def _use_fused(self) -> None:
+    def use_fused(self) -> None:
         """Only torch's fused path takes a factor, and drops a step, on the device."""
         self.defaults["fused"] = True
         self._step_supports_amp_scaling = True
@@ -148,17 +147,18 @@ class StepAdam(Adam):
             shared.take_back()
 
     def _step_parts(self, mask: Tensor | None, acting: bool) -> None:
-        course, lent, frozen, moved = self.course, Lent(), [], []
+        course, lent = self.course, Lent()
         names = ("before", "factor", "after")
         hooks = [course.hooks(name) if acting else [] for name in names]
         if mask is not None:
             self._check_mask(mask)
+        moved: list[tuple[Group, Tensor, list[Part]]] = []
         try:
             for group in self.param_groups:
-                before, factor, after = (
-                    [part for part in parts if self.acts_on(part, group)] for parts in hooks
-                )
-                moved += self._prepare(group, mask, before, factor, after, lent, frozen)
+                own = [[part for part in parts if self.acts_on(part, group)] for parts in hooks]
+                params = [p for p in group["params"] if p.grad is not None and not p.grad.is_sparse]
+                self._prepare(group, params, mask, own, lent)
+                moved += [(group, param, own[2]) for param in params]
             if isinstance(course.valid, Tensor) and self._drops_on_device():
                 lent.flag(self, course.valid)
             self._step_base(mask)
@@ -169,41 +169,35 @@ class StepAdam(Adam):
                 part.after(group, param, self.state[param], course)
             if course.keys:
                 self._ledger.remember(param, self.state[param], course.keys)
-        for rows in frozen:
+        for rows in lent.frozen:
             rows.put_back()
 
     def _prepare(
         self,
         group: Group,
+        params: list[Tensor],
         mask: Tensor | None,
-        befores: list[Part],
-        factors: list[Part],
-        afters: list[Part],
+        own: list[list[Part]],
         lent: Lent,
-        frozen: list[Frozen],
-    ) -> list[tuple[Group, Tensor, list[Part]]]:
-        """Lend the group what its step needs; return what is to come after it."""
-        moved, with_parts = [], bool(befores or afters)
-        for param in group["params"]:
-            if param.grad is None or param.grad.is_sparse:
-                continue
-            self._told |= guard(param.grad, self.course, self._told)
-            moving = self._moving(group, param, mask, with_parts)
+    ) -> None:
+        """Lend the group what its step needs; `own` has the parts before, in and after it."""
+        befores, factors, afters = own
+        for param in params:
+            self._told |= guard(cast(Tensor, param.grad), self.course, self._told)
+            moving = self._moving(group, param, mask, bool(befores or afters))
             if moving is not None or befores:
-                self._lend_gradient(group, param, moving, befores, lent, frozen)
-            moved.append((group, param, afters))
+                self._lend_gradient(group, param, moving, befores, lent)
         factor = None
         for part in factors:
             factor = times(factor, part.factor(group, self.course))
         if factor is not None:
             lent.rate(group, factor, self.course.valid)
-        return moved
 
     def _step_base(self, mask: Tensor | None) -> None:
-        if self._base is Adam:
+        if self.base is Adam:
             ADAM_STEP(self)
             return
-        step = inspect.unwrap(self._base.step)
+        step = inspect.unwrap(self.base.step)
         if mask is None:
             step(self)
             return
@@ -219,14 +213,13 @@ class StepAdam(Adam):
         moving: Tensor | None,
         parts: list[Part],
         lent: Lent,
-        frozen: list[Frozen],
     ) -> None:
         """Put what Adam is to be fed into `param.grad`."""
         fed, state = cast(Tensor, param.grad), self.state[param]
         if not state:  # torch makes its moments only where there is nothing else yet
             self._init_group({**group, "params": [param]}, [], [], [], [], [], [])
         if moving is not None:
-            frozen.append(Frozen(moving, param, state))
+            lent.frozen.append(Frozen(moving, param, state))
             fed = torch.where(shaped(moving, fed), fed, 0.0)
         self._ledger.drop_strangers(param, state, self.course.keys)
         # Parts get the gradient of what is minimised, in unscaled units.
@@ -246,7 +239,7 @@ class StepAdam(Adam):
         """The rows that may move, [N] or 0-d bool; None: all, or the base's own step knows."""
         valid = self.course.valid
         if mask is not None and self._takes_mask(group, mask.numel()):
-            if self._base is not Adam and not with_parts:
+            if self.base is not Adam and not with_parts:
                 return None
             rows = mask.to(param.device)
             return rows & valid if isinstance(valid, Tensor) else rows
@@ -254,7 +247,7 @@ class StepAdam(Adam):
 
     def _drops_on_device(self) -> bool:
         """Whether torch's own step can be told on the device not to be made."""
-        return self._base is Adam and all(group["fused"] for group in self.param_groups)
+        return self.base is Adam and all(group["fused"] for group in self.param_groups)
 
     # -- masks ---------------------------------------------------------------------------------
 
@@ -281,13 +274,13 @@ class StepAdam(Adam):
 
     # -- copies and checkpoints ----------------------------------------------------------------
 
-    def _trust_rows(self) -> None:
+    def trust_rows(self) -> None:
         """Take what the parts have kept as that of the parameters' present rows."""
         for param, state in self.state.items():
             self._ledger.remember(param, state, self.course.keys)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "course": self.course, "_base": self._base}
+        return {**super().__getstate__(), "course": self.course, "base": self.base}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         is_copy = "course" in state
@@ -298,7 +291,7 @@ class StepAdam(Adam):
         super().__setstate__(state)
         if is_copy:  # the parameters are other objects, the rows the same
             self._ledger = Ledger()
-            self._trust_rows()
+            self.trust_rows()
 
     def state_dict(self) -> dict[str, Any]:
         """torch's, with the course's inside `param_groups[0]`, and nothing of strangers' rows."""
@@ -319,29 +312,8 @@ class StepAdam(Adam):
         Raises:
             ValueError: it does not fit; then nothing has been loaded.
         """
-        before = self.state, self.param_groups
-        names = [group.get(SLOT) for group in self.param_groups]
-        super().load_state_dict(state_dict)
-        try:
-            self.take_loaded()
-        except ValueError:
-            self.state, self.param_groups = before
-            raise
-        for group, name in zip(self.param_groups, names, strict=True):
-            if name is not None:
-                group[SLOT] = name
-        if self._base is Adam and self.defaults["fused"]:
-            self._use_fused()
-        self._trust_rows()
-
-    def take_loaded(self) -> None:
-        """Take the course's state out of the groups, where a checkpoint has put it."""
-        shared = self.param_groups[0].pop(STATE_KEY, None)
-        if shared is not None:
-            self.course.load_state_dict(shared)
-        else:
-            steps = [float(state["step"]) for state in self.state.values() if "step" in state]
-            self.course.expect(int(max(steps, default=0)))
+        with loading(self):
+            super().load_state_dict(state_dict)
 
     def __repr__(self) -> str:
         lines = [str(part) for part in self.course.parts] + group_lines(self.param_groups)
