@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.optim import Adam
 
 from opt3dgs_optim.checks import check_keys, warn_user
+from opt3dgs_optim.lending import use_fused
 from opt3dgs_optim.names import SLOT
 from opt3dgs_optim.rows import rows_of
 
@@ -31,7 +32,7 @@ def loading(optimizer: Any) -> Iterator[None]:
         if name is not None:  # a plain Adam's checkpoint does not say it
             group[SLOT] = name
     if optimizer.base is Adam and optimizer.defaults["fused"]:
-        optimizer.use_fused()
+        use_fused(optimizer)
     optimizer.trust_rows()
 
 

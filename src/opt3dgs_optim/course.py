@@ -93,6 +93,12 @@ class Course:
         """Whether the iteration observed last, whose step comes next, is exploitation."""
         return self._has_phases and self.current >= self.switch_step
 
+    @property
+    def check_steps(self) -> int:
+        """Iterations between looks at the evidence: a tenth of a short exploitation."""
+        left = self.total_steps - self.switch_step
+        return min(CHECK_STEPS, max(left // 10, 10)) if self.exploiting else CHECK_STEPS
+
     def phase_of(self, iteration: int) -> Phase | None:
         """The phase of an iteration; None where there are no phases."""
         if not self._has_phases:

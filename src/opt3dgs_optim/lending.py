@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.part import Group
+from opt3dgs_optim.part import Group, Part
 from opt3dgs_optim.rows import Frozen
 
 LOGGER = logging.getLogger("opt3dgs_optim")
@@ -84,6 +84,36 @@ class Lent:
     def flag(self, optimizer: Any, valid: Tensor) -> None:
         """Tell torch's step on the device whether it is to be made, as a GradScaler would."""
         self.attribute(optimizer, "found_inf", (~valid).to(torch.float32))
+
+
+def use_fused(optimizer: Any) -> None:
+    """Only torch's fused path takes a factor, and drops a step, on the device."""
+    optimizer.defaults["fused"] = True
+    optimizer._step_supports_amp_scaling = True
+    for group in optimizer.param_groups:
+        group["fused"] = True
+        for param in group["params"]:
+            state = optimizer.state.get(param)
+            if state:
+                state["step"] = state["step"].to(param.device, torch.float32)
+
+
+def feed(
+    parts: list[Part],
+    group: Group,
+    param: Tensor,
+    grad: Tensor,
+    state: dict[str, Any],
+    course: Course,
+    scale: Tensor | None,
+) -> Tensor:
+    """What parts make of a gradient; they see that of what is minimised, without AMP's scale."""
+    unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
+    plain = scale is None and unit == 1.0
+    fed = grad if plain else grad / unit
+    for part in parts:
+        fed = part.before(group, param, fed, state, course)
+    return fed if plain else fed * unit
 
 
 def guard(grad: Tensor, course: Course, told: bool) -> bool:

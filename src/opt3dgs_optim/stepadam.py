@@ -14,7 +14,7 @@ from torch.optim import Adam
 from opt3dgs_optim.checkpoint import STATE_KEY, check_rows, loading
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.describe import block, group_lines
-from opt3dgs_optim.lending import Lent, guard, refuse_capture, times
+from opt3dgs_optim.lending import Lent, feed, guard, refuse_capture, times, use_fused
 from opt3dgs_optim.names import SLOT, canonical_name
 from opt3dgs_optim.part import Group, Part
 from opt3dgs_optim.rows import (
@@ -58,19 +58,8 @@ class StepAdam(Adam):
         own_path = own_path or any(g["capturable"] for g in groups)
         tensors = [p for group in groups for p in group["params"]]
         if base is Adam and not own_path and tensors and all(p.is_cuda for p in tensors):
-            self.use_fused()
+            use_fused(self)
         self.trust_rows()
-
-    def use_fused(self) -> None:
-        """Only torch's fused path takes a factor, and drops a step, on the device."""
-        self.defaults["fused"] = True
-        self._step_supports_amp_scaling = True
-        for group in self.param_groups:
-            group["fused"] = True
-            for param in group["params"]:
-                state = self.state.get(param)
-                if state:
-                    state["step"] = state["step"].to(param.device, torch.float32)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """As torch's; notes which Gaussian parameter the group's name says that it holds."""
@@ -97,9 +86,9 @@ class StepAdam(Adam):
     ) -> Any:
         """One step: of all rows, or only of those that a camera saw.
 
-        With a mask, the other rows keep parameters and state, whatever the parts do; the bias
-        correction is that of the whole parameter. It costs a copy of both. Parameters without a
-        gradient are left alone, whatever the mask, as in INRIA's and gsplat's own masked steps.
+        With a mask, the other rows keep parameters and state, whatever the parts do, for a copy of
+        both; the bias correction is the whole parameter's. Parameters without a gradient are left
+        alone, whatever the mask, as in INRIA's and gsplat's own masked steps.
 
         Args:
             closure: evaluates the model and returns the loss; or the mask, as gsplat
@@ -207,12 +196,7 @@ class StepAdam(Adam):
         step(self, mask, mask.numel()) if takes_number else step(self, mask)
 
     def _lend_gradient(
-        self,
-        group: Group,
-        param: Tensor,
-        moving: Tensor | None,
-        parts: list[Part],
-        lent: Lent,
+        self, group: Group, param: Tensor, moving: Tensor | None, parts: list[Part], lent: Lent
     ) -> None:
         """Put what Adam is to be fed into `param.grad`."""
         fed, state = cast(Tensor, param.grad), self.state[param]
@@ -222,14 +206,9 @@ class StepAdam(Adam):
             lent.frozen.append(Frozen(moving, param, state))
             fed = torch.where(shaped(moving, fed), fed, 0.0)
         self._ledger.drop_strangers(param, state, self.course.keys)
-        # Parts get the gradient of what is minimised, in unscaled units.
-        scale = getattr(self, "grad_scale", None)
-        unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
-        plain = not parts or (scale is None and unit == 1.0)
-        fed = fed if plain else fed / unit
-        for part in parts:
-            fed = part.before(group, param, fed, state, self.course)
-        fed = fed if plain else fed * unit
+        if parts:
+            scale = getattr(self, "grad_scale", None)
+            fed = feed(parts, group, param, fed, state, self.course, scale)
         if fed is not param.grad:
             lent.attribute(param, "grad", fed)
 
@@ -249,8 +228,6 @@ class StepAdam(Adam):
         """Whether torch's own step can be told on the device not to be made."""
         return self.base is Adam and all(group["fused"] for group in self.param_groups)
 
-    # -- masks ---------------------------------------------------------------------------------
-
     def _takes_mask(self, group: Group, rows: int) -> bool:
         """Whether a mask of so many rows is about this group."""
         if group.get(SLOT) is not None:
@@ -266,7 +243,7 @@ class StepAdam(Adam):
             raise ValueError(f"{call}: a mask with differentiable=True is not possible")
 
     def reset_points(self, rows: Tensor, *, moments: bool = False) -> None:
-        """Say which points have moved by other means than `step()`; see `reset_points`."""
+        """See the function `reset_points`."""
         groups = [g for g in self.param_groups if self.any_group or g.get(SLOT) is not None]
         states = [(p, self.state.get(p, {})) for group in groups for p in group["params"]]
         call = f"{type(self).__name__}.reset_points"
