@@ -287,8 +287,7 @@ class PhaseScheduler(Course):
 
     def expect(self, steps: int) -> None:
         """Moments came without a state of ours; the next energy's iteration should fit them."""
-        if steps:
-            self._adam_steps = steps
+        self._adam_steps = steps or self._adam_steps
 
     def __repr__(self) -> str:
         switch = f"switch at {self.switch_step}"
