@@ -44,13 +44,14 @@ def train(name: str, arm: str, scene: Scene, seed: int, iterations: int) -> Trai
     fit = Fit(scene, find_arm(arm), FitOptions(iterations, POINTS, seed))
     fit.compile_kernels()
     found.psnr.append(fit.evaluate()["psnr"])
-    every = max(iterations // LOOKS, 1)
-    for _ in tqdm(range(0, iterations, every), desc=name, unit_scale=every, unit="it"):
-        begin = time.perf_counter()
-        for _ in range(every):
-            fit.step()
-        found.seconds.append(found.seconds[-1] + time.perf_counter() - begin)
-        found.psnr.append(fit.evaluate()["psnr"])
+    begin, spent = time.perf_counter(), 0.0
+    for iteration in tqdm(range(1, iterations + 1), desc=name, unit="it"):
+        fit.step()
+        if iteration % max(iterations // LOOKS, 1) == 0 or iteration == iterations:
+            spent += time.perf_counter() - begin
+            found.seconds.append(spent)
+            found.psnr.append(fit.evaluate()["psnr"])
+            begin = time.perf_counter()
     found.image = fit.image(scene.test[0])
     return found
 
