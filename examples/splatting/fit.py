@@ -190,8 +190,9 @@ class Fit:
     def compile_kernels(self) -> None:
         """Have the rasterizer compiled, or loaded from its cache, before the run's clock starts."""
         copy = {name: param.detach().requires_grad_() for name, param in self.gaussians.items()}
-        camera = self.scene.train[0].camera
-        render(copy, camera, sh_degree=self.options.sh_degree).image.sum().backward()
+        view = self.scene.train[0]
+        image = render(copy, view.camera, sh_degree=self.options.sh_degree).image
+        photometric_loss(image, view.image).backward()
 
     def evaluate(self) -> dict[str, float]:
         """PSNR and SSIM of the test views, PSNR of a few train views, number of Gaussians."""

@@ -64,7 +64,8 @@ def test_without_parts_it_is_the_trainers_own_adam(scene: Scene) -> None:
     """Noise apart (another order within the step): the arms differ by what they name, no more."""
     plain = Fit(scene, ARMS["adam"], OPTIONS)
     ours = Fit(scene, ARMS["adam"], OPTIONS)
-    PhaseScheduler(OPTIONS.iterations, parts=[]).upgrade(ours.optimizers)
+    ours.phases = PhaseScheduler(OPTIONS.iterations, parts=[])
+    ours.phases.upgrade(ours.optimizers)
     for _ in range(90):
         plain.step()
         ours.step()
