@@ -26,10 +26,10 @@ from splatting.gallery import draw_gallery
 from splatting.scenes import load_scene
 from splatting.stopping import stop_at_once
 from tqdm import tqdm
-from train import add_fit_options, recorded_command
+from train import SHARED_OPTIONS, add_fit_options, recorded_command
 
-from opt3dgs_optim.report import write_report
-from opt3dgs_optim.runlog import Run, read_run
+from opt3dgs_optim.runs import Run, read_run
+from opt3dgs_optim.runs.report import write_report
 
 DEFAULT_ARMS = "adam,mcmc,mcmc+awsgld,mcmc+constant-multiplier,mcmc+l2+reset,opt3dgs,annealed+faded"
 POLL_SECONDS = 0.2
@@ -90,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name in ("seeds", "jobs"):
             if getattr(args, name) < 1:
                 raise ValueError(f"--{name} {getattr(args, name)}: must be at least 1")
-        scene = load_scene(args.scene, args.size)
+        scene = load_scene(args.scene, args.size, background=args.background)
         out = args.out or Path("runs") / f"{scene.name}-{args.size}"
         trainings = [
             Training(arm, seed, out / arm.name / f"seed-{seed}")
@@ -128,6 +128,8 @@ def _refuse_other_options(
         "points": args.points,
         "init": args.init,
         "sh_degree": args.sh_degree,
+        "sh_degree_interval": args.sh_degree_interval,
+        "background": args.background,
     }
     for training in trainings:
         if not training.log.exists():
@@ -179,7 +181,7 @@ def _start(
     training: Training, trainings: list[Training], args: argparse.Namespace, command: str
 ) -> None:
     words = [sys.executable, str(Path(__file__).with_name("train.py")), "--quiet"]
-    for name in ("scene", "size", "points", "iterations", "init", "sh_degree", "switch"):
+    for name in SHARED_OPTIONS:
         words += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     words += ["--arm", training.arm.name, "--seed", str(training.seed)]
     words += ["-o", str(training.folder), "--command", command]

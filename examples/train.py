@@ -10,13 +10,19 @@ import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import get_args
 
 import torch
 from splatting.arms import ARMS, find_arm
 from splatting.fit import Fit, FitOptions, Progress, run
 from splatting.gaussians import save_ply
-from splatting.scenes import load_scene
+from splatting.scenes import Background, Size, load_scene
 from tqdm import tqdm
+
+SHARED_OPTIONS = (
+    *("scene", "size", "background", "points", "iterations"),
+    *("init", "sh_degree", "sh_degree_interval", "switch"),
+)
 
 
 def add_fit_options(parser: argparse.ArgumentParser) -> None:
@@ -24,11 +30,13 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
     defaults = FitOptions()
     add = parser.add_argument
     add("--scene", default="embedded", metavar="DIR", help="scene folder, or 'embedded'")
-    add("--size", default="small", choices=("small", "large"), help="image size")
+    add("--size", default="images_4", choices=get_args(Size), help="folder of the photos")
+    add("--background", default="black", choices=get_args(Background))
     add("--points", type=int, default=defaults.points, help="the most Gaussians")
     add("--iterations", type=int, default=defaults.iterations)
     add("--init", default=defaults.init, choices=("sfm", "random"), help="first Gaussians")
     add("--sh-degree", type=int, default=defaults.sh_degree, choices=range(4))
+    add("--sh-degree-interval", type=int, default=defaults.sh_degree_interval, help="iterations")
     add("--switch", type=float, default=defaults.switch, help="where exploitation starts, 0..1")
 
 
@@ -65,15 +73,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     torch.set_num_threads(1)
     try:
         options = FitOptions(
-            args.iterations, args.points, args.seed, args.init, args.sh_degree, args.switch
+            args.iterations,
+            args.points,
+            args.seed,
+            args.init,
+            args.sh_degree,
+            args.switch,
+            sh_degree_interval=args.sh_degree_interval,
         )
-        scene = load_scene(args.scene, args.size)
+        scene = load_scene(args.scene, args.size, background=args.background)
         fit = Fit(scene, find_arm(args.arm), options, args.mean_nu)
     except (OSError, ValueError) as error:
         print(f"train: {error}", file=sys.stderr)
         return 2
     command = args.command or recorded_command("train.py", _parser(), args)
-    about = {"size": args.size, "command": command}
+    about = {"size": args.size, "background": args.background, "command": command}
     bar = tqdm(total=options.iterations, desc=args.arm, unit="it", disable=args.quiet)
 
     def show(progress: Progress) -> None:

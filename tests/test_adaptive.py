@@ -21,7 +21,7 @@ from opt3dgs_optim._evidence import largest_noise
 from opt3dgs_optim.lqnadam import EPOCH, HISTORY, CurvatureOptions
 from opt3dgs_optim.multiplier import ConstantMultiplier
 from opt3dgs_optim.noise import covariance_noise
-from opt3dgs_optim.runlog import RunLog, read_run
+from opt3dgs_optim.runs import RunLog, read_run
 
 ALL = frozenset({"multiplier", "curvature", "noise"})
 

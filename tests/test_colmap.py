@@ -12,7 +12,7 @@ from splatting.scenes import load_scene
 def test_simple_pinhole_has_one_focal_length(tmp_path):
     write_images(tmp_path, 4)
     write_binary(tmp_path / "sparse" / "0", 4, model=0)
-    camera = load_scene(tmp_path, "large").train[0].camera
+    camera = load_scene(tmp_path, "images").train[0].camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50.0, 50.0, 19.0, 12.5)
 
 

@@ -48,7 +48,7 @@ def test_another_seed_is_another_scene():
 
 
 def test_large_is_the_same_scene_with_more_pixels():
-    small, large = _small(), embedded_scene("large")
+    small, large = _small(), embedded_scene("images")
     assert large.extent == small.extent
     assert large.train[0].image.shape == (192, 256, 3)
     for one, other in zip(small.test, large.test, strict=True):

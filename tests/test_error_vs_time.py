@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from opt3dgs_optim.runlog import read_run
+from opt3dgs_optim.runs import read_run
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 TINY = ["--iterations", "40", "--points", "120", "--seeds", "1", "--switch", "0.75"]

@@ -19,7 +19,7 @@ from splatting.fit import Fit, FitOptions, run
 from splatting.gaussians import load_ply
 from splatting.scenes import Scene
 
-from opt3dgs_optim.runlog import read_run
+from opt3dgs_optim.runs import read_run
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 OPTIONS = FitOptions(iterations=90, points=150, switch=2 / 3, evaluations=3)
@@ -138,11 +138,31 @@ def test_random_initialisation_grows_to_the_budget(scene: Scene) -> None:
 
 
 def test_spherical_harmonics_are_trained(scene: Scene) -> None:
-    fit = Fit(scene, ARMS["opt3dgs"], replace(OPTIONS, sh_degree=2))
-    for _ in range(20):
-        fit.step()
+    options = replace(OPTIONS, sh_degree=2, sh_degree_interval=5)
+    fit = Fit(scene, ARMS["opt3dgs"], options)
     assert fit.gaussians["shN"].shape[1:] == (8, 3)
-    assert bool(fit.gaussians["shN"].detach().any())
+    trained, degrees = [], []
+    for _ in range(12):
+        degrees.append(fit.active_sh_degree)
+        fit.step()
+        # Degree 1 is the first three coefficients, degree 2 the other five.
+        shN = fit.gaussians["shN"].detach()
+        trained.append((bool(shN[:, :3].any()), bool(shN[:, 3:].any())))
+    assert degrees == [0] * 5 + [1] * 5 + [2] * 2
+    assert trained == [(False, False)] * 5 + [(True, False)] * 5 + [(True, True)] * 2
+
+
+def test_checkpoint_from_before_an_option_is_read(scene: Scene, tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.pt"
+    fit = Fit(scene, ARMS["adam"], OPTIONS)
+    fit.step()
+    fit.save(path)
+    state = torch.load(path, weights_only=True)
+    del state["options"]["sh_degree_interval"]
+    torch.save(state, path)
+    again = Fit(scene, ARMS["adam"], OPTIONS)
+    again.load(path)
+    assert again.iteration == 1
 
 
 def test_checkpoint_of_another_run_is_refused(scene: Scene, tmp_path: Path) -> None:
@@ -165,6 +185,7 @@ def test_control_runs_after_what_it_controls() -> None:
         (lambda: find_arm("sgd"), "'sgd' is unknown; there are adam, mcmc"),
         (lambda: FitOptions(iterations=0), "iterations=0"),
         (lambda: FitOptions(points=0), "points=0"),
+        (lambda: FitOptions(sh_degree_interval=0), "sh_degree_interval=0"),
         (lambda: FitOptions(init="colmap"), "init='colmap'"),  # pyright: ignore[reportArgumentType]
         (lambda: FitOptions(switch=0.0), "switch=0.0"),
     ],

@@ -109,7 +109,7 @@ def test_imports_never_go_in_a_circle() -> None:
         "phases energy _running",
         "awsgld noise _covariance _columns",
         "lqnadam ops cuda",
-        "report report_stats runread runfile",
+        "runs.report runs.stats runs.read runs.lines",
     ],
 )
 def test_the_first_stands_on_the_next(chain: str) -> None:
@@ -120,7 +120,7 @@ def test_the_first_stands_on_the_next(chain: str) -> None:
 
 
 def test_a_report_needs_no_optimizer() -> None:
-    needed = reached(f"{PACKAGE}.report") | reached(f"{PACKAGE}.hosts")
+    needed = reached(f"{PACKAGE}.runs.report") | reached(f"{PACKAGE}.hosts")
     optimizers = {"awsgld", "lqnadam", "phases", "curvature", "energy", "_adam"}
     assert needed & {f"{PACKAGE}.{name}" for name in optimizers} == set()
 

@@ -128,3 +128,33 @@ def test_pixel_loss_must_be_a_scalar():
     render, target = _pair(8, 8)
     with pytest.raises(ValueError, match="must return a scalar"):
         photometric_loss(render, target, lambda r, t: (r - t).abs())
+
+
+@pytest.mark.parametrize("shape", [(40, 53, 3), (5, 3, 3), (1, 1, 3), (11, 8, 1), (16, 64, 4)])
+def test_compiled_ssim_is_that_of_the_map(shape):
+    generator = torch.Generator().manual_seed(0)
+    render = torch.rand(shape, generator=generator)
+    target = render + 0.2 * torch.randn(shape, generator=generator)
+    exact = render.double().requires_grad_()
+    expected = photometric_loss(exact, target.double())
+    expected.backward()
+    results = []
+    for _ in range(2):
+        fast = render.clone().requires_grad_()
+        loss = photometric_loss(fast, target)
+        loss.backward()
+        results.append((loss.detach(), fast.grad))
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+    loss, grad = results[0]
+    assert abs(loss.item() - expected.item()) < 1e-6
+    # float32 moments, of which the variance is a difference
+    assert (grad - exact.grad).abs().max() < 1e-5 * exact.grad.abs().max()
+
+
+def test_loss_is_compiled_only_where_its_gradient_is_enough():
+    images = torch.rand(2, 9, 8, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    loss = photometric_loss(images[0], images[1])  # the target has a gradient too
+    (first,) = torch.autograd.grad(loss, images, create_graph=True)
+    (second,) = torch.autograd.grad(first.square().sum(), images)
+    assert first[1].abs().max() > 0
+    assert second.isfinite().all()

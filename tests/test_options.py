@@ -8,7 +8,6 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -29,7 +28,6 @@ from opt3dgs_optim.curvature import history_from_pairs
 from opt3dgs_optim.lqnadam import CurvatureOptions
 from opt3dgs_optim.multiplier import ConstantMultiplier
 from opt3dgs_optim.noise import CovarianceNoise, IsotropicNoise
-from opt3dgs_optim.runlog import RunLog
 
 TORCH = "checked, or taken as truth values, by torch.optim.Adam"
 FREE = "any value is meaningful, or torch raises where it is used"
@@ -248,23 +246,6 @@ def test_gaussians_that_do_not_fit_are_named() -> None:
         CovarianceNoise(lambda: short).add_to(means, 0.1)
 
 
-@pytest.mark.parametrize(
-    ("options", "error"),
-    [
-        ({"every": 0}, ValueError),
-        ({"every": 1.5}, ValueError),
-        ({"every": None}, ValueError),
-        ({"metadata": {"a": object()}}, TypeError),
-        ({"path": None}, TypeError),
-    ],
-    ids=str,
-)
-def test_run_log(options: dict, error: type[Exception], tmp_path: Path) -> None:
-    with pytest.raises(error):
-        RunLog(**{"path": tmp_path / "run.jsonl", **options})
-    assert set(inspect.signature(RunLog).parameters) == {"path", "metadata", "every"}
-
-
 def test_functions() -> None:
     for value in CHOICES:
         with pytest.raises(ValueError, match="backend_info: backend="):
@@ -282,4 +263,4 @@ def test_every_public_name_is_here() -> None:
     classes = {
         name for name in opt3dgs_optim.__all__ if inspect.isclass(getattr(opt3dgs_optim, name))
     }
-    assert classes - set(TABLE) == {"BackendInfo", "Phase"}  # nothing that a user constructs
+    assert classes - set(TABLE) == {"BackendInfo", "Phase", "RunLog"}  # RunLog: tests/runs

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import io
+import logging
+import pickle
 import re
 from typing import Any
 
@@ -15,28 +18,42 @@ from trainers import (
     gsplat_optimizers,
     inria_optimizer,
     make_splats,
+    only,
+    state_of,
     train,
+    values_of,
     view_loss,
 )
 
-from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam, Phase, PhaseScheduler
-from opt3dgs_optim.lqnadam import CurvatureOptions
+from opt3dgs_optim import (
+    AWSGLD,
+    DEFAULTS,
+    Annealing,
+    ConstantMultiplier,
+    Curvature,
+    EnergyHistogram,
+    Fading,
+    FreshMoments,
+    LQNAdam,
+    Part,
+    Phase,
+    PhaseScheduler,
+    Pooling,
+    PositionNoise,
+    SquaredLoss,
+    StepAdam,
+)
 
 TOTAL, SWITCH = 60, 40
 
 
-def scheduler(**options: Any) -> PhaseScheduler:
-    options.setdefault("multiplier", EnergyHistogram(warmup=10, step_size=0.1))
-    return everything(TOTAL, SWITCH, **options)
-
-
-def snapshot(splats: dict) -> dict:
-    return {name: param.detach().clone() for name, param in splats.items()}
+def scheduler(*others: Part, **options: Any) -> PhaseScheduler:
+    return everything(TOTAL, SWITCH, *others, **{"settling": 0, **options})
 
 
 def test_everything_off_is_the_trainers_adam_bit_for_bit() -> None:
     ours, theirs = make_splats(), make_splats()
-    phases = scheduler(multiplier=None, curvature=None, squared_loss=False, reset_moments=False)
+    phases = only(TOTAL)
     upgraded = phases.upgrade(gsplat_optimizers(ours))
     train(ours, upgraded, phases, 0, TOTAL)
     train(theirs, gsplat_optimizers(theirs), None, 0, TOTAL)
@@ -53,32 +70,44 @@ def test_gsplat_and_inria_ways_agree() -> None:
         assert torch.equal(ours[name], theirs[name])
 
 
-def test_upgrade_keeps_what_the_trainer_set() -> None:
+def test_upgrade_works_in_place_and_keeps_what_the_trainer_set() -> None:
     splats = make_splats()
     before = gsplat_optimizers(splats, betas=(0.8, 0.95), fused=True)
     train(splats, before, None, 0, 3)
+    held = dict(before)
     groups = {name: dict(opt.param_groups[0]) for name, opt in before.items()}
     moments = {name: opt.state[splats[name]]["exp_avg"] for name, opt in before.items()}
     after = scheduler().upgrade(before)
-    assert list(after) == list(before)
+    assert after is before
     for name, optimizer in after.items():
+        assert optimizer is held[name]
         assert isinstance(optimizer, torch.optim.Adam)
-        assert optimizer.param_groups[0] == groups[name]
+        assert groups[name].items() <= optimizer.param_groups[0].items()
         assert optimizer.state[splats[name]]["exp_avg"] is moments[name]
         assert optimizer.defaults["betas"] == (0.8, 0.95)
 
 
-def test_learning_rate_schedule_made_before_the_upgrade_goes_on_working() -> None:
-    splats = make_splats()
-    optimizers = gsplat_optimizers(splats)
-    decay = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], 0.9)
-    phases = scheduler()
-    with pytest.warns(UserWarning, match="build learning-rate schedulers on what upgrade"):
-        upgraded = phases.upgrade(optimizers)
-    train(splats, upgraded, phases, 0, 3)
-    with pytest.warns(UserWarning, match="lr_scheduler|learning rate scheduler"):
-        decay.step()
-    assert upgraded["means"].param_groups[0]["lr"] == pytest.approx(1e-2 * 0.9)
+@pytest.mark.parametrize("when", ["before", "after"])
+@pytest.mark.parametrize("kind", [gsplat_optimizers, inria_optimizer])
+def test_a_learning_rate_schedule_built_before_or_after_the_upgrade(kind: Any, when: str) -> None:
+    """Its rates are those without us, and so is its silence: warnings are errors here."""
+    rates = []
+    for upgrades in (False, True):
+        splats, phases = make_splats(), scheduler()
+        optimizers = kind(splats)
+        first = optimizers if kind is inria_optimizer else optimizers["means"]
+        if upgrades and when == "after":
+            phases.upgrade(optimizers)
+        decay = torch.optim.lr_scheduler.ExponentialLR(first, 0.9)
+        if upgrades and when == "before":
+            phases.upgrade(optimizers)
+        seen = []
+        for iteration in range(TOTAL):
+            train(splats, optimizers, phases if upgrades else None, iteration, iteration + 1)
+            decay.step()
+            seen.append([group["lr"] for group in first.param_groups])
+        rates.append(seen)
+    assert rates[0] == rates[1]
 
 
 def test_learning_rates_are_never_changed_by_us() -> None:
@@ -98,9 +127,9 @@ def test_only_gaussian_groups_get_nu_and_only_positions_get_curvature() -> None:
     optimizers: dict[str, Any] = gsplat_optimizers(splats)
     pose = torch.nn.Parameter(torch.ones(3))
     optimizers["pose_opt"] = torch.optim.Adam([pose], lr=0.1)
-    phases = scheduler(multiplier=3.0)
+    phases = scheduler(nu=ConstantMultiplier(3.0))
     upgraded = phases.upgrade(optimizers)
-    assert upgraded["pose_opt"] is optimizers["pose_opt"]
+    assert type(upgraded["pose_opt"]) is torch.optim.Adam
     train(splats, upgraded_gaussians(upgraded), phases, 0, SWITCH)
     assert not any("history" in opt.state[p] for opt, p in pairs(upgraded, splats))
     train(splats, upgraded_gaussians(upgraded), phases, SWITCH, SWITCH + 3)
@@ -122,7 +151,7 @@ def test_extra_groups_of_one_optimizer_stay_plain_adam() -> None:
     twin = torch.nn.Parameter(torch.ones(4))
     optimizer = inria_optimizer(splats)
     optimizer.add_param_group({"params": [exposure], "lr": 0.1, "name": "exposure"})
-    phases = scheduler(multiplier=3.0, reset_moments=False)
+    phases = scheduler(nu=ConstantMultiplier(3.0))
     upgraded = phases.upgrade(optimizer)
     plain = torch.optim.Adam([twin], lr=0.1, eps=1e-15)
     for iteration in range(TOTAL):
@@ -157,26 +186,10 @@ def test_phase_and_pixel_loss() -> None:
 
 
 def test_pixel_loss_stays_l1_when_told() -> None:
-    phases = everything(10, 0, squared_loss=False)
+    phases = only(10, Curvature(), switch=0)
+    assert phases.exploiting is False  # nothing observed yet
+    assert phases.phase is Phase.EXPLOITATION
     assert float(phases.pixel_loss(torch.full((2,), 0.5), torch.zeros(2))) == 0.5
-
-
-def test_moments_start_anew_at_the_switch_or_are_kept() -> None:
-    for reset in (True, False):
-        splats = make_splats()
-        phases = scheduler(reset_moments=reset)
-        upgraded = phases.upgrade(gsplat_optimizers(splats))
-        train(splats, upgraded, phases, 0, SWITCH + 1)
-        steps = {float(opt.state[p]["step"]) for opt, p in pairs(upgraded, splats)}
-        assert steps == ({1.0} if reset else {SWITCH + 1.0})
-
-
-def test_moments_start_anew_by_themselves_where_the_phase_is_long_enough() -> None:
-    assert everything(30_000).reset_moments
-    assert everything(3_000).reset_moments
-    assert not everything(300).reset_moments
-    assert everything(300, 0.5).reset_moments
-    assert PhaseScheduler.paper(300).reset_moments
 
 
 def test_the_object_is_the_same_before_and_after_the_switch() -> None:
@@ -214,7 +227,7 @@ def test_resume_is_bit_exact(kind: str, at: int, order: str) -> None:
     optimizers: Any = phases.upgrade(make(first))  # type: ignore[arg-type]
     train(first, optimizers, phases, 0, at)
     buffer = io.BytesIO()
-    torch.save({"splats": snapshot(first), "optimizers": states(optimizers)}, buffer)
+    torch.save({"splats": values_of(first), "optimizers": states(optimizers)}, buffer)
     buffer.seek(0)
     saved = torch.load(buffer, weights_only=True)
 
@@ -256,7 +269,7 @@ def test_density_control_between_steps_is_survived_in_both_phases() -> None:
             edit_rows(splats, upgraded, keep, 2)
     assert splats["means"].shape[0] > 12
     assert all(bool(torch.isfinite(p).all()) for p in splats.values())
-    assert upgraded["means"].state[splats["means"]]["history"].shape[0] == splats["means"].shape[0]
+    assert state_of(upgraded, splats["means"])["history"].shape[0] == len(splats["means"])
 
 
 def test_iterations_without_gradients_count_for_the_switch() -> None:
@@ -281,7 +294,7 @@ def test_the_trainers_own_iteration_is_followed() -> None:
 def test_histogram_is_left_alone_in_exploitation() -> None:
     """The L2 loss is another energy."""
     splats, histogram = make_splats(), EnergyHistogram(warmup=10)
-    phases = scheduler(multiplier=histogram)
+    phases = scheduler(nu=histogram)
     train(splats, phases.upgrade(gsplat_optimizers(splats)), phases, 0, TOTAL)
     assert histogram.num_observed == SWITCH
 
@@ -291,7 +304,7 @@ def test_non_finite_loss_skips_the_step_in_both_phases() -> None:
         splats, phases = make_splats(), scheduler()
         upgraded = phases.upgrade(gsplat_optimizers(splats))
         train(splats, upgraded, phases, 0, at)
-        before = snapshot(splats)
+        before = values_of(splats)
         loss = view_loss(splats, 0, phases) * float("nan")
         loss.backward()
         phases.observe(loss)
@@ -303,63 +316,34 @@ def test_non_finite_loss_skips_the_step_in_both_phases() -> None:
         assert all(bool(torch.isfinite(p).all()) for p in splats.values())
 
 
-def test_noise_is_ours_only_when_asked() -> None:
-    results = []
-    for scale in (0.0, 1.0):
-        torch.manual_seed(0)
-        splats = make_splats()
-        splats["opacities"].data.fill_(-9.0)
-        phases = scheduler(noise_scale=scale)
-        upgraded = phases.upgrade(gsplat_optimizers(splats), splats if scale else None)
-        train(splats, upgraded, phases, 0, 2)
-        results.append(snapshot(splats))
-    assert not torch.equal(results[0]["means"], results[1]["means"])
-
-
-def test_noise_needs_the_gaussians() -> None:
-    with pytest.raises(ValueError, match="gaussians=None"):
-        scheduler(noise_scale=5e5).upgrade(gsplat_optimizers(make_splats()))
-
-
-def test_noise_can_stop_at_the_switch() -> None:
-    splats = make_splats()
-    phases = scheduler(noise_scale=1.0, noise_in_exploitation=False)
-    upgraded = phases.upgrade(gsplat_optimizers(splats), splats)
-    train(splats, upgraded, phases, 0, SWITCH)
-    assert phases.noise is not None
-    train(splats, upgraded, phases, SWITCH, SWITCH + 1)
-    assert phases.noise is None
-    train(splats, upgraded, phases, SWITCH + 1, TOTAL)  # our own steps are nobody else's noise
-
-
 def test_accepted_share_is_reported() -> None:
     splats, phases = make_splats(), scheduler()
     upgraded = phases.upgrade(gsplat_optimizers(splats))
+    curvature = phases.part(Curvature)
+    assert curvature is not None
     train(splats, upgraded, phases, 0, SWITCH)
-    assert phases.accepted_share is None
+    assert curvature.accepted_share is None
     train(splats, upgraded, phases, SWITCH, SWITCH + 5)
-    assert phases.accepted_share is not None
-    assert 0 <= float(phases.accepted_share) <= 1
+    assert curvature.accepted_share is not None
+    assert 0 <= float(curvature.accepted_share) <= 1
+    assert float(phases.numbers()["accepted"]) == float(curvature.accepted_share)
 
 
-def test_never_observed_is_said_once() -> None:
-    splats = make_splats()
-    upgraded = scheduler().upgrade(inria_optimizer(splats))
-    view_loss(splats, 0).backward()
-    with pytest.warns(UserWarning, match="PhaseScheduler.*no energy has been observed yet"):
-        upgraded.step()
-
-
-def test_paper_preset() -> None:
+def test_presets() -> None:
     phases = PhaseScheduler.paper()
     assert (phases.total_steps, phases.switch_step) == (30_000, 29_000)
-    assert isinstance(phases.multiplier, EnergyHistogram)
-    assert phases.multiplier.warmup == 2_500
-    assert phases.multiplier.energy_range == (0.0, 0.2)
-    assert phases.curvature_options == CurvatureOptions()
+    histogram = phases.part(EnergyHistogram)
+    assert histogram is not None
+    assert (histogram.warmup, histogram.energy_range) == (2_500, (0.0, 0.2))
+    kinds = [EnergyHistogram, FreshMoments, SquaredLoss, Curvature]
+    assert [type(part) for part in phases.parts] == kinds
     short = PhaseScheduler.paper(3_000)
-    assert isinstance(short.multiplier, EnergyHistogram)
-    assert (short.switch_step, short.multiplier.warmup) == (2_900, 250)
+    warmup = short.part(EnergyHistogram)
+    assert warmup is not None
+    assert (short.switch_step, warmup.warmup) == (2_900, 250)
+    assert PhaseScheduler(10).parts == [*DEFAULTS] == [Annealing(), Fading()]
+    assert PhaseScheduler(10, parts=[]).parts == []
+    assert PhaseScheduler(10, parts=[*DEFAULTS, Pooling()]).parts[-1] == Pooling()
 
 
 def test_inria_names() -> None:
@@ -376,18 +360,21 @@ def test_inria_names() -> None:
         ({"switch": 11}, "switch=11"),
         ({"switch": 1.1}, "switch=1.1"),
         ({"switch": -1}, "switch=-1"),
-        ({"multiplier": "nu"}, "multiplier='nu'"),
-        ({"multiplier": True}, "multiplier=True"),
-        ({"noise_scale": -1.0}, "noise_scale=-1.0"),
-        ({"squared_loss": "l2"}, "squared_loss='l2'"),
-        ({"reset_moments": 1}, "reset_moments=1"),
-        ({"noise_in_exploitation": None}, "noise_in_exploitation=None"),
+        ({"adaptive": 1}, "adaptive=1"),
+        ({"log": "run.jsonl"}, "log='run.jsonl'"),
+        ({"process_group": 3}, "process_group=3"),
     ],
 )
 def test_bad_options(options: dict, message: str) -> None:
     with pytest.raises(ValueError, match=re.escape(message)) as error:
-        everything(**{"total_steps": 10, **options})
+        PhaseScheduler(**{"total_steps": 10, **options})
     assert "PhaseScheduler" in str(error.value)
+
+
+@pytest.mark.parametrize("part", ["annealing", Annealing, 4.0, None, torch.optim.Adam])
+def test_what_is_no_part_is_refused(part: Any) -> None:
+    with pytest.raises(TypeError, match="PhaseScheduler: parts has .*, but a Part is needed"):
+        PhaseScheduler(10, parts=[Annealing(), part])
 
 
 def test_optimizers_that_cannot_be_upgraded_are_named() -> None:
@@ -396,22 +383,24 @@ def test_optimizers_that_cannot_be_upgraded_are_named() -> None:
     mixed["scales"] = torch.optim.SGD([splats["scales"]], lr=0.1)
     with pytest.raises(TypeError, match=re.escape("optimizers['scales'] is a torch.optim.sgd.SGD")):
         scheduler().upgrade(mixed)
+    assert {type(each) for each in mixed.values()} == {torch.optim.Adam, torch.optim.SGD}
     with pytest.raises(TypeError, match="a dict of optimizers"):
         scheduler().upgrade([torch.optim.Adam([splats["means"]])])  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="positions"):
-        scheduler().upgrade({"sh0": gsplat_optimizers(splats)["sh0"]})
-    with pytest.raises(ValueError, match="positions"):
+    with pytest.raises(ValueError, match=r"none of the names \['pose'\]"):
+        scheduler().upgrade({"pose": gsplat_optimizers(splats)["sh0"]})
+    with pytest.raises(ValueError, match="none of the names"):
         scheduler().upgrade(torch.optim.Adam([splats["means"]]))
-    phases = scheduler()
-    upgraded = phases.upgrade(gsplat_optimizers(splats))
-    with pytest.raises(TypeError, match="already"):
-        phases.upgrade(upgraded)
+    with pytest.raises(ValueError, match="none of the names"):
+        scheduler().upgrade({})
+    upgraded = scheduler().upgrade(gsplat_optimizers(splats))
+    with pytest.raises(TypeError, match="with parts of its own"):
+        scheduler().upgrade(upgraded)
     for own in (AWSGLD, LQNAdam):
-        with pytest.raises(TypeError, match="already"):
-            phases.upgrade(own([{"params": [splats["means"]], "name": "means"}]))
+        with pytest.raises(TypeError, match=f"a {own.__name__} with parts of its own"):
+            scheduler().upgrade(own([{"params": [splats["means"]], "name": "means"}]))
     twice = inria_optimizer(splats)
     twice.param_groups[1]["name"] = "xyz"
-    with pytest.raises(ValueError, match="two groups are named 'xyz'"):
+    with pytest.raises(ValueError, match="two groups of the optimizer hold 'means'"):
         scheduler().upgrade(twice)
 
 
@@ -426,14 +415,22 @@ def test_a_subclass_with_its_own_step_is_refused() -> None:
     splats = make_splats()
     optimizers: dict[str, Any] = gsplat_optimizers(splats)
     optimizers["means"] = OwnStep([{"params": [splats["means"]], "name": "means"}])
-    with pytest.raises(TypeError, match="OwnStep"):
+    with pytest.raises(TypeError, match="OwnStep with a step of its own"):
+        scheduler().upgrade(optimizers)
+    assert not any(isinstance(each, StepAdam) for each in optimizers.values())
+
+
+def test_a_step_that_somebody_has_replaced_is_refused() -> None:
+    optimizers: dict[str, Any] = gsplat_optimizers(make_splats())
+    optimizers["scales"].step = lambda: None
+    with pytest.raises(TypeError, match=r"replaced the step of optimizers\['scales'\]"):
         scheduler().upgrade(optimizers)
 
 
 def test_adamw_is_upgraded_with_its_decay() -> None:
     x, y = [torch.nn.Parameter(torch.ones(4, 3)) for _ in "ab"]
     plain = torch.optim.AdamW([x], lr=0.1, weight_decay=0.3)
-    phases = scheduler(multiplier=None)
+    phases = only(TOTAL)
     ours = phases.upgrade({"means": torch.optim.AdamW([y], lr=0.1, weight_decay=0.3)})
     for _ in range(5):
         x.grad, y.grad = torch.ones(4, 3), torch.ones(4, 3)
@@ -451,3 +448,225 @@ def test_bad_state_is_refused() -> None:
 def test_images_of_two_shapes() -> None:
     with pytest.raises(ValueError, match=re.escape("(2, 3)")):
         scheduler().pixel_loss(torch.zeros(2, 3), torch.zeros(3, 2))
+
+
+# -- what an upgrade takes, and says ---------------------------------------------------------------
+
+
+def test_a_dicts_key_wins_over_the_groups_name() -> None:
+    """nerfstudio's own names, or anybody's: what the key says is upgraded."""
+    splats = make_splats()
+    optimizers = gsplat_optimizers(splats)
+    for name, optimizer in optimizers.items():
+        optimizer.param_groups[0]["name"] = f"gauss_params.{name}"
+    nu = ConstantMultiplier(0.0)
+    phases = only(TOTAL, nu)
+    phases.upgrade(optimizers)
+    before = values_of(splats)
+    train(splats, optimizers, phases, 0, 2)
+    assert all(torch.equal(before[name], splats[name]) for name in splats)  # nu = 0
+    assert optimizers["means"].param_groups[0]["name"] == "gauss_params.means"
+    state = copy.deepcopy(optimizers["means"].state_dict())
+    optimizers["means"].load_state_dict(state)
+    train(splats, optimizers, phases, 2, 4)
+    assert torch.equal(before["means"], splats["means"])
+
+
+def test_a_second_optimizer_without_positions_is_upgraded() -> None:
+    """And one that the trainer has made anew in mid-training goes on in step with the others."""
+    splats = make_splats()
+    optimizers = gsplat_optimizers(splats)
+    rest = {"means": optimizers.pop("means")}
+    phases = only(TOTAL, Annealing(8.0, 0.5))
+    phases.upgrade(optimizers)
+    phases.upgrade(rest)
+    both = {**optimizers, **rest}
+    assert phases.upgrade(both) is both  # again: nothing happens
+    train(splats, both, phases, 0, 10)
+    both["means"] = gsplat_optimizers(splats)["means"]  # training_setup, again
+    phases.upgrade(both)
+    assert phases.iteration == 10
+    phases.observe(0.1, iteration=30)
+    for param in splats.values():
+        param.grad = torch.ones_like(param)
+    before = values_of(splats)
+    both["means"].step()
+    # a first step of Adam is a learning rate long, times the factor at half time
+    moved = before["means"] - splats["means"].detach()
+    torch.testing.assert_close(moved, torch.full((12, 3), 0.01 * 2.0), rtol=1e-4, atol=0)
+
+
+def test_what_is_upgraded_and_what_is_not_is_said_once(
+    caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    splats = make_splats()
+    optimizer = inria_optimizer(splats)
+    optimizer.add_param_group({"params": [torch.nn.Parameter(torch.ones(3))], "name": "exposure"})
+    phases = PhaseScheduler(500)
+    with caplog.at_level(logging.INFO, "opt3dgs_optim"):
+        phases.upgrade(optimizer)
+    (record,) = caplog.records
+    said = record.getMessage()
+    for words in ("opt3dgs_optim 0.", "total_steps=500", "Annealing(", "Fading(", "xyz", "rotation"):
+        assert words in said
+    assert said.endswith("left alone: exposure")
+    assert (record.name, record.levelname) == ("opt3dgs_optim", "INFO")
+    assert capsys.readouterr().out == ""
+
+
+def test_without_logging_it_is_said_on_stderr(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(logging.Logger, "hasHandlers", lambda self: False)
+    PhaseScheduler(500).upgrade(gsplat_optimizers(make_splats()))
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "total_steps=500" in err
+    assert err.count("\n") == 1
+
+
+# -- clocks that do not fit ------------------------------------------------------------------------
+
+
+def test_an_energy_that_nobody_steps_after() -> None:
+    """A host that calls training_setup again: its new optimizers are not ours."""
+    phases = PhaseScheduler(500)
+    phases.upgrade(gsplat_optimizers(make_splats()))
+    for _ in range(20):
+        phases.observe(0.1)
+    with pytest.warns(UserWarning, match=r"20 losses were observed and no upgraded.*Annealing, Fad"):
+        phases.observe(0.1)
+    for _ in range(50):
+        phases.observe(0.1)  # once
+
+
+def test_optimizers_that_step_without_an_energy() -> None:
+    splats = make_splats()
+    optimizers = PhaseScheduler(500).upgrade(gsplat_optimizers(splats))
+    train(splats, optimizers, None, 0, 20)
+    with pytest.warns(UserWarning, match=r"20 times without an energy at all.*Annealing, Fad") as told:
+        train(splats, optimizers, None, 20, 21)
+    (warning,) = told
+    assert warning.filename.endswith("trainers.py")  # the user's line, not ours or torch's
+    train(splats, optimizers, None, 21, 60)  # once
+
+
+def test_an_energy_that_stops_coming() -> None:
+    splats, phases = make_splats(), PhaseScheduler(500)
+    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    train(splats, optimizers, phases, 0, 5)
+    with pytest.warns(UserWarning, match="20 times without an energy, so"):
+        train(splats, optimizers, None, 5, 30)
+
+
+def test_steps_before_the_first_energy_are_plain_adams() -> None:
+    ours, theirs = make_splats(), make_splats()
+    optimizers = PhaseScheduler(500, parts=[Annealing(), Pooling()]).upgrade(gsplat_optimizers(ours))
+    train(ours, optimizers, None, 0, 15)
+    train(theirs, gsplat_optimizers(theirs), None, 0, 15)
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+
+
+@pytest.mark.parametrize("order", ["upgrade, load", "load, upgrade"])
+@pytest.mark.parametrize("told", [False, True])
+def test_a_checkpoint_of_the_stock_trainer(order: str, told: bool) -> None:
+    """Adam's state at step 200: the schedule is told where it is, or says that it is not."""
+    splats = make_splats()
+    stock = gsplat_optimizers(splats)
+    train(splats, stock, None, 0, 200)
+    phases = PhaseScheduler(400)
+    fresh = gsplat_optimizers(splats)
+    if order == "upgrade, load":
+        phases.upgrade(fresh)
+    for name, optimizer in fresh.items():
+        optimizer.load_state_dict(stock[name].state_dict())
+    if order == "load, upgrade":
+        phases.upgrade(fresh)
+    assert float(fresh["means"].state[splats["means"]]["step"]) == 200
+    if told:
+        phases.observe(0.1, iteration=205)  # not to the step: some trainers restart their Adam
+        assert phases.numbers()["annealing"] < 1.3
+    else:
+        with pytest.warns(UserWarning, match=r"made 200 steps, but this is iteration 0 of 400"):
+            phases.observe(0.1)
+    phases.observe(0.1)  # once
+
+
+def test_a_longer_run_from_an_exploiting_checkpoint_starts_the_moments_anew_again() -> None:
+    splats = make_splats()
+    short = only(60, FreshMoments(), switch=40)
+    first = short.upgrade(gsplat_optimizers(splats))
+    train(splats, first, short, 0, 50)
+    long = only(120, FreshMoments(), switch=90)
+    second = long.upgrade(gsplat_optimizers(splats))
+    for name, optimizer in second.items():
+        optimizer.load_state_dict(first[name].state_dict())
+    assert long.iteration == 50
+    assert long.phase is Phase.EXPLORATION
+    train(splats, second, long, 50, 93)
+    assert {float(state_of(second, p)["step"]) for p in splats.values()} == {3.0}
+
+
+def test_a_run_longer_than_announced() -> None:
+    """A switch that comes too early for the run it is in."""
+    splats, phases = make_splats(), everything(10)
+    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    train(splats, optimizers, phases, 0, 10)
+    phases.observe(0.1, iteration=10)  # a trainer that counts from 1
+    with pytest.warns(UserWarning, match=r"total_steps=10.*pass the training's number"):
+        phases.observe(0.1)
+    phases.observe(0.1)  # once
+
+
+@pytest.mark.parametrize("iteration", [-1, 1.5, "3", True])
+def test_an_iteration_that_is_none(iteration: Any) -> None:
+    phases = PhaseScheduler(10)
+    with pytest.raises(ValueError, match=r"PhaseScheduler\.observe: iteration="):
+        phases.observe(0.1, iteration=iteration)
+    assert phases.iteration == 0
+
+
+# -- copies ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_copies_go_on_alike(copied: Any) -> None:
+    splats, phases = make_splats(), scheduler(Annealing(), Fading(), Pooling())
+    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    train(splats, optimizers, phases, 0, SWITCH + 4)
+    twins, other, adams = copied((splats, phases, optimizers))
+    train(splats, optimizers, phases, SWITCH + 4, TOTAL)
+    train(twins, adams, other, SWITCH + 4, TOTAL)
+    assert all(torch.equal(splats[name], twins[name]) for name in splats)
+    assert other.iteration == phases.iteration == TOTAL
+
+
+def test_a_loss_given_to_step_is_observed() -> None:
+    splats = make_splats()
+    phases = scheduler()
+    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    closure: Any = lambda: torch.tensor(0.5)  # noqa: E731
+    optimizers["means"].step(closure)
+    assert phases.num_observed == 1
+
+
+def test_losses_that_move_to_another_device() -> None:
+    phases = only(40, SquaredLoss())
+    splats = make_splats()
+    train(splats, phases.upgrade(gsplat_optimizers(splats)), phases, 0, 3)
+    phases.observe(torch.zeros((), device="meta"))
+    assert isinstance(phases.valid, torch.Tensor)
+    assert phases.valid.device.type == "meta"
+
+
+def test_positions_noise_is_added_where_the_part_is() -> None:
+    results = []
+    for scale in (0.0, 1.0):
+        torch.manual_seed(0)
+        splats = make_splats()
+        splats["opacities"].data.fill_(-9.0)
+        phases = only(TOTAL, PositionNoise(splats, scale))
+        train(splats, phases.upgrade(gsplat_optimizers(splats)), phases, 0, 2)
+        results.append(values_of(splats))
+    assert not torch.equal(results[0]["means"], results[1]["means"])
+    assert torch.equal(results[0]["sh0"], results[1]["sh0"])

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,8 +15,6 @@ from opt3dgs_optim._evidence import largest_noise
 from opt3dgs_optim._nonfinite import CAPACITY, FrozenRows
 from opt3dgs_optim._ranks import RankMean
 from opt3dgs_optim._visible import masked_adam
-from opt3dgs_optim.report import write_report
-from opt3dgs_optim.runlog import RunLog
 
 
 class OnGpu(Tensor):
@@ -193,57 +189,6 @@ def test_half_precision_energies_are_summed_in_float32(
     assert mean.shape == ()
     assert float(mean) == float(energy)
     assert mean.dtype == (dtype if dtype.itemsize > 2 else torch.float32)
-
-
-# -- files -----------------------------------------------------------------------------------------
-
-
-def test_a_log_on_a_system_without_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from opt3dgs_optim import runfile
-
-    def refuse(file: Any, how: int) -> None:
-        raise OSError("no locks here")
-
-    monkeypatch.setattr("fcntl.flock", refuse)
-    for _ in "ab":
-        with RunLog(tmp_path / "log.jsonl") as log:
-            log.step(0, phase="exploration", loss=0.5)
-    monkeypatch.setattr(runfile, "fcntl", None)  # as on Windows
-    with RunLog(tmp_path / "log.jsonl") as log:
-        log.step(1, phase="exploration", loss=0.25)
-    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert [line["kind"] for line in lines].count("start") == 3
-
-
-def test_a_log_says_how_much_memory_a_gpu_has_given(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    waited = []
-    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
-    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "a GPU")
-    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda: 12345)
-    monkeypatch.setattr(torch.cuda, "synchronize", lambda: waited.append(True))
-    with RunLog(tmp_path / "log.jsonl") as log:
-        log.step(0, phase="exploration", loss=0.5)
-        with log.paused():
-            log.evaluation(1, psnr=20.0)
-    said = (tmp_path / "log.jsonl").read_text()
-    assert '"gpu":"a GPU"' in said
-    assert "12345" in said
-    assert waited == [True, True]  # before the pause and after it
-
-
-def test_a_number_that_json_cannot_hold(tmp_path: Path) -> None:
-    with RunLog(tmp_path / "log.jsonl") as log:
-        with pytest.raises(ValueError, match=r"loss=tensor of shape \(2,\)"):
-            log.step(0, phase="exploration", loss=torch.zeros(2))
-        with pytest.raises(TypeError, match="must be a number or a one-element tensor"):
-            log.step(0, phase="exploration", loss="high")  # pyright: ignore[reportArgumentType]
-
-
-def test_a_report_on_nothing(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no runs; pass at least one"):
-        write_report([], tmp_path)
 
 
 # -- the rest --------------------------------------------------------------------------------------

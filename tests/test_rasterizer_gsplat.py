@@ -113,7 +113,7 @@ def test_colors(degree: int):
     torch.testing.assert_close(actual, torch.clamp_min(expected + 0.5, 0))
 
 
-@pytest.mark.parametrize("backend", ["reference", "numba"])
+@pytest.mark.parametrize("backend", ["reference", "fast"])
 def test_image_from_gsplats_projection_and_colors(backend: Backend):
     """Its compositing needs a GPU (or nerfacc): here its rules stand in a loop."""
     gaussians, camera = wide_scene(), turned_camera()
@@ -137,5 +137,8 @@ def test_image_from_gsplats_projection_and_colors(backend: Backend):
                 break
             image[row, column] += transmittance * alpha * colors[i]
             transmittance *= 1 - alpha
+    if backend == "fast":
+        gaussians = {name: value.float() for name, value in gaussians.items()}
     actual = render(gaussians, camera, backend=backend).image
-    torch.testing.assert_close(actual, image, rtol=1e-9, atol=1e-9)
+    tolerance = 1e-9 if backend == "reference" else 1e-5
+    torch.testing.assert_close(actual.double(), image, rtol=tolerance, atol=tolerance)

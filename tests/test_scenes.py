@@ -30,7 +30,7 @@ _REAL = ("banana", "brighton_beach", "lund_door", "plush")
 
 
 @pytest.mark.parametrize("layout", ["bin", "txt", "json"])
-@pytest.mark.parametrize(("size", "scale"), [("small", 0.25), ("large", 1.0)])
+@pytest.mark.parametrize(("size", "scale"), [("images_4", 0.25), ("images", 1.0)])
 def test_every_layout_gives_the_scene_that_was_written(tmp_path, layout, size, scale):
     scene = load_scene(write_scene(tmp_path / "toy", layout), size)
     assert scene.name == "toy"
@@ -53,7 +53,7 @@ def test_every_layout_gives_the_scene_that_was_written(tmp_path, layout, size, s
         assert got == tuple(scale * number for number in (*PINHOLE, WIDTH, HEIGHT))
         assert view.image.shape == (camera.height, camera.width, 3)
         assert view.image.dtype == torch.float32
-        folder = tmp_path / "toy" / ("images_4" if size == "small" else "images")
+        folder = tmp_path / "toy" / size
         pixels = torch.from_numpy(np.array(Image.open(folder / view.name)))
         assert torch.equal((view.image * 255).round().byte(), pixels)
         if view in scene.train:
@@ -110,7 +110,7 @@ def test_bad_images_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"photo_03.png: missing"):
         load_scene(folder)
     shutil.rmtree(folder / "images_4")
-    with pytest.raises(FileNotFoundError, match=r"images_4: missing.*size='small'"):
+    with pytest.raises(FileNotFoundError, match=r"images_4: missing.*size='images_4'"):
         load_scene(folder)
 
 

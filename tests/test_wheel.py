@@ -104,7 +104,7 @@ def test_wheel_is_small_and_holds_the_package_alone(wheel: Path) -> None:
     names = set(contents(wheel))
     for name in ("two_loop.cuh", "packed.cuh", "lqn.cu", "noise.cu", "__init__.py"):
         assert f"opt3dgs_optim/cuda/{name}" in names
-    for name in ("py.typed", "__main__.py", "doctor.py", "follow.py"):
+    for name in ("py.typed", "__main__.py", "doctor.py", "runs/report.py"):
         assert f"opt3dgs_optim/{name}" in names
     tops = {name.split("/")[0] for name in names}
     assert tops == {"opt3dgs_optim", f"opt3dgs_optim-{opt3dgs_optim.__version__}.dist-info"}

@@ -87,7 +87,7 @@ def stock_loss(image: Tensor, target: Tensor) -> Tensor:
 def train(package: Any, seed: int, make: Any = None, iterations: int = ITERATIONS) -> Result:
     """simple_trainer's loop in gsplat 1.5.3's order; `make` returns (phases, optimizers)."""
     torch.manual_seed(seed)
-    scene = embedded_scene("small", seed=0)
+    scene = embedded_scene(seed=0)
     views = [crop(view) for view in scene.train]
     splats: Any = torch.nn.ParameterDict(
         gaussians_from_points(

@@ -14,19 +14,21 @@ _VIEWS, _TEST_EVERY, _FIRST_TEST = 28, 7, 3  # test views lie inside the orbit, 
 _POINTS = 2000
 _POINT_NOISE = 0.01  # world units, about what a good reconstruction of this size leaves
 # Width, height and rays a side of each pixel: 16 and 4 rays, averaged, keep the edges smooth.
-_SIZES = {"small": (96, 72, 4), "large": (256, 192, 2)}
+_SIZES = {"images": (256, 192, 2), "images_2": (128, 96, 4), "images_4": (96, 72, 4)}
 _SUN = np.array([0.45, -0.35, 0.82]) / np.linalg.norm([0.45, -0.35, 0.82])
 
 
-def embedded_scene(size: Size = "small", seed: int = 0) -> Scene:
+def embedded_scene(size: Size = "images_4", seed: int = 0, held_out: int | None = None) -> Scene:
     """Make the scene: 24 train and 4 test views around a garden of patterned toys.
 
     Everything follows from `seed`; the same seed gives the same bits on one machine. The world is
     a sky of radius 10 around toys of about 3 units, z is up, the cameras orbit at 4.2 to 5 units.
 
     Args:
-        size: "small" is 96x72 pixels, "large" 256x192, from the same cameras.
+        size: "images" is 256x192 pixels, "images_2" 128x96, "images_4" 96x72, from the same
+            cameras.
         seed: of the patterns and of the points.
+        held_out: the test views are those whose index is this modulo 7; by default 3.
     """
     if size not in _SIZES:
         raise ValueError(f"embedded_scene: size={size!r}, allowed are {tuple(_SIZES)}")
@@ -38,8 +40,9 @@ def embedded_scene(size: Size = "small", seed: int = 0) -> Scene:
         View(f"view_{index:02d}", camera, _photo(solids, camera, rays_a_side))
         for index, camera in enumerate(cameras)
     ]
-    train = [view for i, view in enumerate(views) if i % _TEST_EVERY != _FIRST_TEST]
-    test = [view for i, view in enumerate(views) if i % _TEST_EVERY == _FIRST_TEST]
+    first = _FIRST_TEST if held_out is None else held_out % _TEST_EVERY
+    train = [view for i, view in enumerate(views) if i % _TEST_EVERY != first]
+    test = [view for i, view in enumerate(views) if i % _TEST_EVERY == first]
     points, colors = _sparse_points(solids, [view.camera for view in train], rng)
     extent = scene_extent([view.camera for view in train])
     return Scene("embedded", train, test, points, colors, extent)

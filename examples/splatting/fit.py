@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from opt3dgs_optim import Phase, PhaseScheduler
-from opt3dgs_optim.noise import CovarianceNoise
-from opt3dgs_optim.runlog import RunLog
+from opt3dgs_optim import EnergyHistogram, Phase, PhaseScheduler, PositionNoise
+from opt3dgs_optim.runs import RunLog
 from splatting.arms import NOISE_LR, Arm
 from splatting.density import MCMCDensityControl, regularisers
 from splatting.gaussians import (
@@ -25,7 +24,7 @@ from splatting.gaussians import (
     stock_learning_rates,
 )
 from splatting.metrics import photometric_loss, psnr, ssim
-from splatting.rasterizer import render
+from splatting.rasterizer import Rendering, render
 from splatting.scenes import Scene, View
 from splatting.stopping import StopRequest
 
@@ -45,9 +44,10 @@ class FitOptions:
     sh_degree: int = 0
     switch: float = 29 / 30
     evaluations: int = 20
+    sh_degree_interval: int = 1000  # iterations until one degree more is used, as trainers do
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "points", "evaluations"):
+        for name in ("iterations", "points", "evaluations", "sh_degree_interval"):
             if getattr(self, name) < 1:
                 raise ValueError(f"FitOptions: {name}={getattr(self, name)}, must be at least 1")
         if self.init not in ("sfm", "random"):
@@ -78,19 +78,19 @@ class Fit:
         self.density_draws = torch.Generator().manual_seed(options.seed + 2)
         self.gaussians = self._initial_gaussians()
         self.rates = stock_learning_rates(scene.extent)
-        self.optimizers: dict[str, torch.optim.Optimizer] = {
+        self.optimizers = {
             name: torch.optim.Adam(
                 [{"params": param, "lr": self.rates[name], "name": name}], eps=1e-15
             )
             for name, param in self.gaussians.items()
         }
         self.phases: PhaseScheduler | None = None
-        self.noise: CovarianceNoise | None = None
-        if arm.make is not None:
-            self.phases = arm.make(options.iterations, options.switch, mean_nu)
-            self.optimizers = self.phases.upgrade(self.optimizers, self.gaussians)
+        self.noise: PositionNoise | None = None  # where the trainer itself adds it
+        if arm.parts is not None:
+            self.phases = arm.make(options.iterations, options.switch, mean_nu, self.gaussians)
+            self.phases.upgrade(self.optimizers)
         elif arm.mcmc:
-            self.noise = CovarianceNoise(self.gaussians, NOISE_LR)
+            self.noise = PositionNoise(self.gaussians, NOISE_LR)
         self.density = self._density_control() if arm.mcmc else None
         self.iteration = 0
         self.views: list[int] = []  # what is left of this epoch
@@ -122,16 +122,15 @@ class Fit:
 
     def step(self) -> Tensor:
         """One iteration; returns the detached loss."""
-        index = self._next_view()
-        view = self.scene.train[index]
-        image = render(self.gaussians, view.camera, sh_degree=self.options.sh_degree).image
+        view = self.scene.train[self._next_view()]
+        image = self._render(view).image
         pixel_loss = None if self.phases is None else self.phases.pixel_loss
         loss = photometric_loss(image, view.image, pixel_loss)
         if self.arm.mcmc:
             loss = loss + self._regularisers()
         loss.backward()
         if self.phases is not None:
-            self.phases.observe(loss, view=index)
+            self.phases.observe(loss, iteration=self.iteration)
         self._step_optimizers()
         self._inject_noise()
         if self.density is not None:
@@ -169,17 +168,24 @@ class Fit:
     @property
     def mean_nu(self) -> float | None:
         """Mean of nu since the warm-up, or None where nu is off."""
-        multiplier = None if self.phases is None else self.phases.multiplier
-        return None if multiplier is None else float(multiplier.mean_multiplier)
+        histogram = None if self.phases is None else self.phases.part(EnergyHistogram)
+        return None if histogram is None else float(histogram.mean_multiplier)
 
     # -- looking at it -------------------------------------------------------------------------
 
     @torch.no_grad()
     def image(self, view: View) -> Tensor:
         """The render of a view, [H, W, 3] in 0..1."""
-        return render(self.gaussians, view.camera, sh_degree=self.options.sh_degree).image.clamp(
-            0, 1
-        )
+        return self._render(view).image.clamp(0, 1)
+
+    def _render(self, view: View) -> Rendering:
+        degree, background = self.active_sh_degree, self.scene.background
+        return render(self.gaussians, view.camera, sh_degree=degree, background=background)
+
+    @property
+    def active_sh_degree(self) -> int:
+        """The degree of spherical harmonics in use: one more each `sh_degree_interval`."""
+        return min(self.iteration // self.options.sh_degree_interval, self.options.sh_degree)
 
     def compile_kernels(self) -> None:
         """Have the rasterizer compiled, or loaded from its cache, before the run's clock starts."""
@@ -233,7 +239,8 @@ class Fit:
         state = torch.load(path, weights_only=True)
         arm = trunk or self.arm.name
         mine = (self.scene.name, arm, asdict(self.options), CHECKPOINT_FORMAT)
-        its = (state["scene"], state["arm"], state["options"], state["format"])
+        options = asdict(FitOptions()) | state["options"]  # older files lack newer options
+        its = (state["scene"], state["arm"], options, state["format"])
         if mine != its:
             raise ValueError(
                 f"{path}: a checkpoint of {its}, but this run is {mine}; choose another folder"
@@ -247,9 +254,8 @@ class Fit:
         torch.set_rng_state(state["random"][0])
         self.order.set_state(state["random"][1])
         self.density_draws.set_state(state["random"][2])
-        if trunk is not None and self.phases is not None:
-            done = {"iteration": self.iteration, "num_observed": self.iteration}
-            self.phases.load_state_dict({**done, "multiplier": None})
+        if self.phases is not None:  # a trunk may be stock, whose checkpoint has no clock
+            self.phases.current = self.iteration - 1
 
 
 def run(
@@ -300,7 +306,7 @@ def _open_log(fit: Fit, path: Path, metadata: dict[str, Any]) -> RunLog:
 def _log_step(fit: Fit, log: RunLog, phase: Phase, loss: Tensor) -> None:
     values: dict[str, Any] = {"loss": loss}
     if fit.phases is not None:
-        values.update(fit.phases.log_values())
+        values.update(fit.phases.numbers())
     log.step(fit.iteration, phase=phase.value, **values)
 
 

@@ -116,6 +116,9 @@ def photometric_loss(
 ) -> Tensor:
     """0.8 * pixel loss + 0.2 * (1 - SSIM), the loss of 3DGS (Kerbl et al. 2023, eq. 7).
 
+    Differentiable once in the render where that is one float32 image on the CPU and the target
+    is a constant (a compiled SSIM, see `fast/similarity.py`), and otherwise as often as one likes.
+
     Args:
         render: `[..., H, W, C]`, 0..1.
         target: the same shape.
@@ -134,4 +137,15 @@ def photometric_loss(
             raise ValueError(
                 f"photometric_loss: pixel_loss_fn must return a scalar, got {tuple(pixel.shape)}"
             )
-    return 0.8 * pixel + 0.2 * (1.0 - ssim_map(render, target).mean())
+    return 0.8 * pixel + 0.2 * (1.0 - _mean_ssim(render, target))
+
+
+def _mean_ssim(render: Tensor, target: Tensor) -> Tensor:
+    """The mean of `ssim_map`, compiled where that can be: one float32 image on the CPU."""
+    compiled = render.dim() == 3 and render.device.type == target.device.type == "cpu"
+    compiled = compiled and render.dtype == target.dtype == torch.float32
+    if not compiled or target.requires_grad:
+        return ssim_map(render, target).mean()
+    from splatting.fast.similarity import MeanSimilarity  # numba stays optional
+
+    return MeanSimilarity.apply(render, target, _HALF_WINDOW, (_C1, _C2))  # pyright: ignore

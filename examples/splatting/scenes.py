@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -15,10 +15,10 @@ from splatting.camera import Camera
 from splatting.colmap import PosedImage, SparseModel, read_colmap
 from splatting.transforms import read_json_object, read_transforms
 
-Size = Literal["small", "large"]
+Size = Literal["images", "images_2", "images_4"]  # the folder of the photos
 Layout = Literal["auto", "colmap", "transforms"]
+Background = Literal["black", "white"]
 
-_IMAGE_FOLDERS = {"small": "images_4", "large": "images"}
 _TEST_EVERY = 8  # the convention of Mip-NeRF 360 and of every 3DGS paper since
 
 
@@ -41,39 +41,57 @@ class Scene:
     points: Tensor  # [P, 3] float32, world units
     colors: Tensor  # [P, 3] float32, 0..1
     extent: float  # world units; see `scene_extent`
+    background: Tensor = field(default_factory=lambda: torch.zeros(3))  # [3] float32, 0..1
 
 
-def load_scene(source: str | Path, size: Size = "small", layout: Layout = "auto") -> Scene:
+def load_scene(
+    source: str | Path,
+    size: Size = "images_4",
+    layout: Layout = "auto",
+    *,
+    background: Background = "black",
+    held_out: int | None = None,
+) -> Scene:
     """Load a scene from a folder, or make the embedded one.
 
-    A folder holds `images/` and `images_4/` and either a COLMAP model in `sparse/0/` (or
-    `sparse/`), or `transforms.json` with its .ply. Test views are those of `split.json` where
-    there is one, and otherwise every 8th of the sorted names.
+    A folder holds `images/`, its halves `images_2/` and quarters `images_4/`, and either a COLMAP
+    model in `sparse/0/` (or `sparse/`), or `transforms.json` with its .ply. Test views are those
+    of `split.json` where there is one, and otherwise every 8th of the sorted names.
 
     Args:
         source: "embedded" (procedural, nothing to download; see `embedded.py`) or a folder.
-        size: "small" reads `images_4`, "large" `images`; intrinsics follow the actual image size.
+        size: the folder of the photos; intrinsics follow the actual image size.
         layout: "auto" prefers COLMAP where both layouts are present.
+        background: what is behind the Gaussians; "white" for NeRF-synthetic scenes.
+        held_out: the test views are those whose index among the sorted names is this modulo 8
+            (7 in the embedded scene); by default those of `split.json`, or 0.
 
     Raises:
         FileNotFoundError: a file or folder of the scene is missing.
         ValueError: a file is malformed, or an option is not one of those above.
     """
-    for option, value, allowed in (("size", size, Size), ("layout", layout, Layout)):
+    for option, value, allowed in (
+        ("size", size, Size),
+        ("layout", layout, Layout),
+        ("background", background, Background),
+    ):
         if value not in get_args(allowed):
             raise ValueError(f"load_scene: {option}={value!r}, allowed are {get_args(allowed)}")
+    if held_out is not None and held_out not in range(_TEST_EVERY):
+        raise ValueError(f"load_scene: held_out={held_out!r}, must be from 0 to {_TEST_EVERY - 1}")
     if str(source) == "embedded":
         from splatting.embedded import embedded_scene  # it imports Scene from here
 
-        return embedded_scene(size)
+        return embedded_scene(size, held_out=held_out)
     folder = Path(source)
     if not folder.is_dir():
         raise FileNotFoundError(f"load_scene: {folder} is no folder; expected one, or 'embedded'")
     model = _read_model(folder, layout)
     if len(model.points) == 0 or not np.isfinite(model.points).all():
         raise ValueError(f"{folder}: expected finite sparse points, got {len(model.points)} points")
-    train_names, test_names = _split(folder, sorted(image.name for image in model.images))
-    images = folder / _IMAGE_FOLDERS[size]
+    names = sorted(image.name for image in model.images)
+    train_names, test_names = _split(folder, names, held_out)
+    images = folder / size
     if not images.is_dir():
         raise FileNotFoundError(f"{images}: missing, expected the photos of size={size!r}")
     views = {posed.name: _load_view(images, posed) for posed in model.images}
@@ -85,6 +103,7 @@ def load_scene(source: str | Path, size: Size = "small", layout: Layout = "auto"
         torch.from_numpy(model.points).float(),
         torch.from_numpy(model.colors).float(),
         scene_extent([view.camera for view in train]),
+        torch.full((3,), float(background == "white")),
     )
 
 
@@ -112,15 +131,15 @@ def _read_model(folder: Path, layout: Layout) -> SparseModel:
     raise FileNotFoundError(f"{folder}: expected sparse/0/ (COLMAP) or transforms.json, found none")
 
 
-def _split(folder: Path, names: list[str]) -> tuple[list[str], list[str]]:
+def _split(folder: Path, names: list[str], held_out: int | None) -> tuple[list[str], list[str]]:
     if len(set(names)) != len(names):
         doubled = sorted({name for name in names if names.count(name) > 1})
         raise ValueError(f"{folder}: images listed more than once: {doubled}")
     path = folder / "split.json"
-    if path.is_file():
+    if path.is_file() and held_out is None:
         train, test = _read_split(path, names)
     else:
-        test = names[::_TEST_EVERY]
+        test = names[held_out or 0 :: _TEST_EVERY]
         train = [name for name in names if name not in test]
     if len(train) < 2:
         raise ValueError(

@@ -1,31 +1,49 @@
-"""Opt3DGS optimizers for existing 3D Gaussian Splatting trainers.
+"""Optimizers for 3D Gaussian Splatting trainers: Opt3DGS (AAAI 2026), annealing and fading."""
 
-`AWSGLD` explores, `LQNAdam` exploits, `PhaseScheduler` puts both into a trainer's optimizers and
-switches between them. Paper: Huang, Chen, Liu, Ji, "Opt3DGS", AAAI 2026, arXiv 2511.13571.
-"""
-
-from opt3dgs_optim._version import __version__
-from opt3dgs_optim.annealing import Annealing
 from opt3dgs_optim.awsgld import AWSGLD
-from opt3dgs_optim.backend import BackendInfo, backend_info
-from opt3dgs_optim.curvature import two_loop
-from opt3dgs_optim.energy import EnergyHistogram
-from opt3dgs_optim.fading import Fading
+from opt3dgs_optim.backend import backend_info
+from opt3dgs_optim.course import Course
+from opt3dgs_optim.lbfgs import two_loop
 from opt3dgs_optim.lqnadam import LQNAdam
-from opt3dgs_optim.phases import Phase, PhaseScheduler
-from opt3dgs_optim.pooling import Pooling
+from opt3dgs_optim.part import Part, Phase
+from opt3dgs_optim.parts.annealing import Annealing
+from opt3dgs_optim.parts.constant import ConstantMultiplier
+from opt3dgs_optim.parts.curvature import Curvature
+from opt3dgs_optim.parts.fading import Fading
+from opt3dgs_optim.parts.histogram import EnergyHistogram
+from opt3dgs_optim.parts.last_phase import FreshMoments, SquaredLoss
+from opt3dgs_optim.parts.noise import IsotropicNoise, PositionNoise
+from opt3dgs_optim.parts.pooling import Pooling
+from opt3dgs_optim.phases import PhaseScheduler
+from opt3dgs_optim.presets import DEFAULTS, paper_parts
+from opt3dgs_optim.rows import reset_points
+from opt3dgs_optim.runs import RunLog
+from opt3dgs_optim.stepadam import StepAdam
+from opt3dgs_optim.version import __version__
 
 __all__ = [
     "AWSGLD",
+    "DEFAULTS",
     "Annealing",
-    "BackendInfo",
+    "ConstantMultiplier",
+    "Course",
+    "Curvature",
     "EnergyHistogram",
     "Fading",
+    "FreshMoments",
+    "IsotropicNoise",
     "LQNAdam",
+    "Part",
     "Phase",
     "PhaseScheduler",
     "Pooling",
+    "PositionNoise",
+    "RunLog",
+    "SquaredLoss",
+    "StepAdam",
     "__version__",
     "backend_info",
+    "paper_parts",
+    "reset_points",
     "two_loop",
 ]

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import torch
 from torch import Tensor
 
-from opt3dgs_optim._adam import HookedAdam, fused_on_cuda
-from opt3dgs_optim._checks import check_choice, check_part
-from opt3dgs_optim._groups import is_positions
-from opt3dgs_optim._mistakes import EnergyWatch
-from opt3dgs_optim._repr import block, group_lines, noise_line, nu_line, skipped_lines
-from opt3dgs_optim._visible import shaped
-from opt3dgs_optim.energy import EnergyHistogram
-from opt3dgs_optim.noise import CovarianceNoise, IsotropicNoise
+from opt3dgs_optim.checks import check_choice, warn_user
+from opt3dgs_optim.course import Course
+from opt3dgs_optim.lending import AdamOptions
+from opt3dgs_optim.names import slot
+from opt3dgs_optim.part import Group, Part
+from opt3dgs_optim.parts.histogram import EnergyHistogram
+from opt3dgs_optim.parts.noise import IsotropicNoise, PositionNoise
+from opt3dgs_optim.stepadam import StepAdam
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+PLAIN_EPS = 1e15  # beside it Adam's root of the second moment vanishes
+STALE = 200  # steps without a new energy before it is said
 
 
-class AWSGLD(HookedAdam):
+class AWSGLD(StepAdam):
     """Adaptively weighted stochastic gradient Langevin dynamics, driven by Adam (eq. 15).
 
         x <- x - lr * nu * Adam(grad) + noise
@@ -29,16 +33,15 @@ class AWSGLD(HookedAdam):
 
     Args:
         params, lr, betas, eps, weight_decay, amsgrad: as in `torch.optim.Adam`.
-        foreach, maximize, capturable, differentiable, fused: as in `torch.optim.Adam`. With CUDA
-            parameters and no path asked for, the fused one is used: it alone takes nu from the
-            device without a synchronisation.
         histogram: where nu comes from; several optimizers may share one. None: nu is off.
-        noise: `IsotropicNoise` for any parameters, `CovarianceNoise` for the positions of
-            Gaussians (the group named `means` or `xyz`, or the only group), or None.
+        noise: `IsotropicNoise` for any parameters, `PositionNoise` for the positions of Gaussians
+            (the group named `means` or `xyz`, or the only group), or None.
         preconditioner: `"adam"`, or `"none"` for the plain SGLD drift `lr * nu * grad`, which
             samples exp(-energy / temperature) together with `IsotropicNoise(temperature=...)`.
-        skip_nonfinite: rows with a non-finite gradient keep parameters and moments for a step
-            (those rows of `.grad` are set to zero).
+            It is Adam's own with betas (0, b2) and an eps so large that nothing else counts.
+        adam: `foreach, maximize, capturable, differentiable, fused, decoupled_weight_decay`, as in
+            `torch.optim.Adam`. With CUDA parameters and no path asked for, the fused one is used:
+            it alone takes nu from the device without a synchronisation.
 
     The energy is the closure's value, or comes from `histogram.observe(loss)`, called once per
     iteration before `step()`. A non-finite energy skips the step. The histogram's state travels
@@ -64,9 +67,10 @@ class AWSGLD(HookedAdam):
 
     Raises:
         ValueError: an option is outside what is allowed.
+        TypeError: `params` is a tensor, or an option is none of Adam's.
     """
 
-    _own = (*HookedAdam._own, "histogram", "noise", "preconditioner", "_energy_watch")
+    any_group = True
 
     def __init__(
         self,
@@ -78,105 +82,74 @@ class AWSGLD(HookedAdam):
         amsgrad: bool = False,
         *,
         histogram: EnergyHistogram | None = None,
-        noise: IsotropicNoise | CovarianceNoise | None = None,
+        noise: IsotropicNoise | PositionNoise | None = None,
         preconditioner: Literal["adam", "none"] = "adam",
-        skip_nonfinite: bool = True,
-        foreach: bool | None = None,
-        maximize: bool = False,
-        capturable: bool = False,
-        differentiable: bool = False,
-        fused: bool | None = None,
+        **adam: Unpack[AdamOptions],
     ) -> None:
         check_choice("AWSGLD", "preconditioner", preconditioner, ("adam", "none"))
-        check_part("AWSGLD", "histogram", histogram, "an EnergyHistogram", "observe", "multiplier")
-        check_part("AWSGLD", "noise", noise, "IsotropicNoise or CovarianceNoise", "add_to")
-        params = list(params)
-        if histogram is not None:
-            fused = fused_on_cuda(params, fused, foreach, capturable)
-        super().__init__(
-            params,
-            lr,
-            betas,
-            eps,
-            weight_decay,
-            amsgrad,
-            skip_nonfinite=skip_nonfinite,
-            foreach=foreach,
-            maximize=maximize,
-            capturable=capturable,
-            differentiable=differentiable,
-            fused=fused,
-        )
-        self.histogram = histogram
-        self.noise = noise
-        self.preconditioner = preconditioner
-        self._energy_watch = EnergyWatch("AWSGLD")
+        _check_kind("histogram", histogram, EnergyHistogram)
+        _check_kind("noise", noise, IsotropicNoise, PositionNoise)
+        parts: list[Part] = [part for part in (histogram, noise) if part is not None]
+        if preconditioner == "none":
+            betas, eps = (0.0, betas[1]), PLAIN_EPS
+            parts.append(_PlainDrift())
+        super().__init__(params, lr, betas, eps, weight_decay, amsgrad, **adam)
+        self.histogram, self.noise = histogram, noise
+        self.follow(_ObservedCourse(parts, histogram))
+
+    def acts_on(self, part: Part, group: Group) -> bool:
+        """All parts on all groups, but the positions' noise on positions."""
+        if isinstance(part, PositionNoise):
+            return slot(group) == "means" or (len(self.param_groups) == 1 and slot(group) is None)
+        return True
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "histogram": self.histogram, "noise": self.noise}
+
+
+class _ObservedCourse(Course):
+    """A course without a clock whose energies a histogram is told."""
+
+    def __init__(self, parts: list[Part], histogram: EnergyHistogram | None) -> None:
+        super().__init__(parts)
+        self._histogram = histogram
+        self._seen, self._stale = -1, 0
+
+    def stepping(self, closure_value: Any) -> bool:
+        self.steps += 1
+        histogram = self._histogram
+        if histogram is None:
+            return True
+        if closure_value is not None:
+            histogram.observe(closure_value)
+        self._stale = self._stale + 1 if histogram.num_observed == self._seen else 0
+        self._seen = histogram.num_observed
+        if (histogram.num_observed == 0 and self.steps == 1) or self._stale == STALE:
+            since = f"for {STALE} steps" if histogram.num_observed else "yet"
+            warn_user(
+                f"AWSGLD: step() was called but no energy has been observed {since}, so the "
+                "multiplier is not being adapted. Call histogram.observe(loss) once per "
+                "iteration, before step(), or pass step() a closure that returns the loss."
+            )
+        valid = histogram.last_finite
+        on_host = not isinstance(valid, Tensor) or valid.device.type == "cpu"
+        self.valid = bool(valid) if on_host else valid
+        return True
+
+
+class _PlainDrift(Part):
+    """Undoes the division by Adam's eps."""
+
+    names = None
+
+    def factor(self, group: Group, course: Course) -> float:
+        return group["eps"]
 
     def __repr__(self) -> str:
-        lines = [nu_line(self.histogram), noise_line(self.noise)]
-        lines += skipped_lines(self.skipped_rows) + group_lines(self.param_groups)
-        return block(type(self).__name__, lines)
+        return "preconditioner='none'"
 
-    def _shared_state(self) -> dict[str, Any] | None:
-        return None if self.histogram is None else {"histogram": self.histogram.state_dict()}
 
-    def _load_shared_state(self, shared: Mapping[str, Any]) -> None:
-        if self.histogram is not None and "histogram" in shared:
-            self.histogram.load_state_dict(shared["histogram"])
-
-    def _begin_step(self, loss: Any) -> None:
-        if self.histogram is None:
-            return
-        if loss is not None:
-            self.histogram.observe(loss)
-        self._energy_watch.check(self.histogram)
-
-    def _bad_step(self) -> Tensor | None:
-        return None if self.histogram is None else ~self.histogram.last_finite
-
-    def _factor(self, group: dict[str, Any]) -> Tensor | float | None:
-        if self.histogram is None or self.histogram.num_observed == 0:
-            return None
-        return self.histogram.multiplier
-
-    def _update(
-        self,
-        group: dict[str, Any],
-        params: list[Tensor],
-        grads: list[Tensor],
-        moments: tuple[list[Tensor], ...],
-        found_inf: Tensor | None,
-        has_complex: bool,
-    ) -> None:
-        if self.preconditioner == "adam":
-            super()._update(group, params, grads, moments, found_inf, has_complex)
-            return
-        for param, grad in zip(params, grads, strict=True):
-            self._drift(group, param, grad, None if found_inf is None else found_inf <= 0)
-
-    def _update_rows(
-        self, group: dict[str, Any], param: Tensor, grad: Tensor, rows: Tensor
-    ) -> None:
-        if self.preconditioner == "adam":
-            super()._update_rows(group, param, grad, rows)
-        else:
-            self._drift(group, param, grad, shaped(rows, param))
-
-    def _drift(
-        self, group: dict[str, Any], param: Tensor, grad: Tensor, moving: Tensor | None
-    ) -> None:
-        drift = grad + group["weight_decay"] * param if group["weight_decay"] else grad
-        if moving is not None:
-            drift = torch.where(moving, drift, 0.0)
-        sign = 1.0 if group["maximize"] else -1.0
-        param.add_(drift * (sign * self._scaled_lr(group, param.device)))
-
-    def _after_group(self, group: dict[str, Any], params: list[Tensor]) -> None:
-        if self.noise is None:
-            return
-        if isinstance(self.noise, CovarianceNoise) and not self._holds_positions(group):
-            return
-        self._add_noise(self.noise, group, params)
-
-    def _holds_positions(self, group: dict[str, Any]) -> bool:
-        return is_positions(group) or (len(self.param_groups) == 1 and "name" not in group)
+def _check_kind(name: str, value: Any, *kinds: type) -> None:
+    if value is not None and not isinstance(value, kinds):
+        wanted = " or ".join(kind.__name__ for kind in kinds)
+        raise ValueError(f"AWSGLD: {name}={value!r}, but {wanted} or None is needed")

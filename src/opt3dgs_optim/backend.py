@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 
 from opt3dgs_optim import cuda
-from opt3dgs_optim._checks import check_choice
+from opt3dgs_optim.checks import check_choice
 
 Backend = Literal["auto", "cuda", "torch"]
 BACKENDS = ("auto", "cuda", "torch")
@@ -53,9 +53,8 @@ def backend_info(
         backend: `"auto"` takes the CUDA kernels where they can run, pure torch otherwise;
             `"cuda"` and `"torch"` insist.
 
-    The kernels are for points of three coordinates and consecutive curvature pairs; whatever else
-    `LQNAdam` can do is pure torch. A kernel that fails to compile or to launch raises: nothing is
-    replaced after an error.
+    The kernels are for points of three coordinates; parameters of another shape are stepped by pure
+    torch. A kernel that fails to compile or to launch raises: nothing is replaced after an error.
 
     Raises:
         ValueError: `backend` is none of these.
@@ -83,10 +82,19 @@ def backend_info(
     return BackendInfo(str(place), dtype, "torch", obstacle)
 
 
-def uses_kernel(backend: str, device: torch.device, dtype: torch.dtype) -> bool:
-    """Whether the kernels run; RuntimeError if they were asked for and cannot."""
-    if backend == "torch" or (backend == "auto" and device.type != "cuda"):
+def uses_kernel(backend: str, device: torch.device, dtype: torch.dtype, dim: int = 3) -> bool:
+    """Whether the kernels run for points of `dim` coordinates.
+
+    Raises:
+        RuntimeError: they were asked for and cannot.
+    """
+    if backend == "torch" or (backend == "auto" and (device.type != "cuda" or dim != 3)):
         return False
+    if dim != 3:
+        raise RuntimeError(
+            f"backend='cuda' was asked for with points of {dim} coordinates, but the kernels are "
+            "for 3; backend='auto' takes pure torch then"
+        )
     return backend_info(device, dtype, backend=backend).backend == "cuda"  # pyright: ignore
 
 

@@ -1,7 +1,7 @@
-"""Is everything in order here? `python -m opt3dgs_optim doctor`.
+"""Is everything in order here? `opt3dgs doctor`.
 
-Prints versions, which backend runs and why, a self-test of this installation, and what a step costs
-on this machine. Ends with 0, or 1 if a check of the self-test failed; `--json` for programs.
+Prints versions, which backend runs and why, and a self-test of this installation. Ends with 0, or 1
+if a check of the self-test failed; `--json` for programs.
 """
 
 from __future__ import annotations
@@ -20,40 +20,27 @@ from typing import Any
 import numpy as np
 import torch
 
-from opt3dgs_optim._status import StatusLine
-from opt3dgs_optim._version import __version__
 from opt3dgs_optim.backend import backend_info
 from opt3dgs_optim.doctor_checks import Check, run_checks
-from opt3dgs_optim.doctor_costs import Cost, measure
+from opt3dgs_optim.version import __version__
 
 __all__ = ["examine", "main"]
 
-POINTS = {"cuda": 1_000_000, "cpu": 100_000}
 MARKS = {"ok": "ok", "failed": "FAILED", "skipped": "--"}
 
 
-def examine(
-    device: torch.device, points: int | None, status: StatusLine | None = None
-) -> dict[str, Any]:
-    """Everything the doctor finds, as JSON holds it; `points` 0 leaves the costs out."""
-    line = StatusLine() if status is None else status
+def examine(device: torch.device) -> dict[str, Any]:
+    """Everything the doctor finds, as JSON holds it."""
     info = backend_info(device)
     begin = time.perf_counter()
-    checks = run_checks(device, lambda name: line.show(f"self-test: {name}"))
+    checks = run_checks(device)
     seconds = time.perf_counter() - begin
-    points = POINTS.get(device.type, POINTS["cpu"]) if points is None else points
-    costs: list[Cost] = []
-    if points:
-        costs = measure(device, points, lambda name: line.show(f"measuring: {name}"))
-    line.clear()
     return {
         "versions": versions(),
         "device": device_name(device),
         "backend": {"in_use": info.backend, "reason": info.reason, "advice": advice(device)},
         "self_test_seconds": round(seconds, 3),
         "checks": [asdict(check) for check in checks],
-        "points": points,
-        "costs": [asdict(cost) for cost in costs],
         "passed": all(check.outcome != "failed" for check in checks),
     }
 
@@ -102,10 +89,7 @@ def advice(device: torch.device) -> str | None:
 def as_text(found: dict[str, Any]) -> str:
     """What `examine` found, for people."""
     checks = [Check(**check) for check in found["checks"]]
-    costs = [Cost(**cost) for cost in found["costs"]]
     parts = [_versions_text(found), _checks_text(checks, found["self_test_seconds"])]
-    if costs:
-        parts.append(_costs_text(costs, found["points"]))
     failed = sum(check.outcome == "failed" for check in checks)
     skipped = sum(check.outcome == "skipped" for check in checks)
     parts.append(
@@ -140,40 +124,12 @@ def _checks_text(checks: Sequence[Check], seconds: float) -> str:
     return "\n".join([f"Self-test ({seconds:.1f} s)", *rows])
 
 
-def _costs_text(costs: Sequence[Cost], points: int) -> str:
-    title = f"Cost per million Gaussians (59 numbers each; measured with {points:,})"
-    head = f"  {'':<21}{'time':>10}{'kept per point':>17}{'moved per point':>18}{'rate':>11}"
-    rows = []
-    for cost in costs:
-        kept = "" if cost.bytes_kept is None else f"{cost.bytes_kept:,.0f} B"
-        moved = f"{cost.bytes_moved:,.0f} B"
-        rate = f"{cost.bytes_moved / cost.ns_per_point:,.1f} GB/s"
-        time = (
-            f"{cost.ns_per_point:,.1f} ms"
-            if cost.ns_per_point < 1e3
-            else (f"{cost.ns_per_point / 1e3:,.2f} s")
-        )
-        rows.append(f"  {cost.name:<21}{time:>10}{kept:>17}{moved:>18}{rate:>11}")
-    note = (
-        "  time: median; 1 ms per million is 1 ns per Gaussian. kept: optimizer state between\n"
-        "  steps. moved: the least to be read and written. The steps are without the gradients."
-    )
-    return "\n".join([title, head, *rows, note])
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m opt3dgs_optim doctor",
-        description="Versions, backend, self-test and costs of opt3dgs_optim on this machine.",
+        prog="opt3dgs doctor",
+        description="Versions, backend and self-test of opt3dgs_optim on this machine.",
     )
     parser.add_argument("--device", help="where to look (default: the GPU, if torch sees one)")
-    parser.add_argument(
-        "--points",
-        type=int,
-        metavar="N",
-        help="Gaussians to measure with (default: 1,000,000 on a GPU, 100,000 on a CPU); "
-        "0 for no measurement",
-    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     return parser
 
@@ -182,13 +138,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; 0, 1 if a check failed, 2 after one line that says what is wrong."""
     options = _parser().parse_args(arguments)
     try:
-        if options.points is not None and options.points < 0:
-            raise ValueError(f"--points {options.points}: must be 0 or more")
         device = _device(options.device)
     except ValueError as error:
         print(f"doctor: {error}", file=sys.stderr)
         return 2
-    found = examine(device, options.points)
+    found = examine(device)
     print(json.dumps(found, indent=2) if options.json else as_text(found))
     return 0 if found["passed"] else 1
 

@@ -15,12 +15,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from opt3dgs_optim import cuda, curvature, ops
+from opt3dgs_optim import cuda
 from opt3dgs_optim.awsgld import AWSGLD
-from opt3dgs_optim.backend import backend_info
-from opt3dgs_optim.energy import EnergyHistogram
+from opt3dgs_optim.backend import Backend, backend_info
+from opt3dgs_optim.covariance import add_covariance_noise, covariance_noise
+from opt3dgs_optim.lbfgs import history_from_pairs, laid_out, lqn_direction, two_loop
 from opt3dgs_optim.lqnadam import LQNAdam
-from opt3dgs_optim.noise import covariance_noise
+from opt3dgs_optim.parts.histogram import EnergyHistogram
 
 HISTORY_SIZE = 5
 ROWS = 1000
@@ -42,11 +43,10 @@ class CannotCheckError(Exception):
     """A check cannot be made here."""
 
 
-def run_checks(device: torch.device, show: Callable[[str], None]) -> list[Check]:
-    """All checks on `device`, `show`ing the name of each before it starts."""
+def run_checks(device: torch.device) -> list[Check]:
+    """All checks on `device`."""
     done = []
     for name, check in CHECKS.items():
-        show(name)
         try:
             done.append(Check(name, "ok", check(device)))
         except CannotCheckError as reason:
@@ -94,7 +94,7 @@ def dense_bfgs(s: Tensor, y: Tensor) -> Tensor:
 def two_loop_against_dense_matrices(device: torch.device) -> str:
     """The recursion equals the product with the dense matrix."""
     (s, y), grad = _pairs(device), _draw(ROWS, 3, device=device, seed=3)
-    found = curvature.two_loop(grad, curvature.history_from_pairs(s, y), HISTORY_SIZE)
+    found = two_loop(grad, history_from_pairs(s, y), HISTORY_SIZE)
     expected = torch.einsum("nij,nj->ni", dense_bfgs(s, y), grad)
     return _within(found, expected, EXACT, "dense BFGS matrices, float64")
 
@@ -102,7 +102,7 @@ def two_loop_against_dense_matrices(device: torch.device) -> str:
 def two_loop_secant_equation(device: torch.device) -> str:
     """H y = s for the newest pair, whatever the older ones are."""
     s, y = _pairs(device)
-    found = curvature.two_loop(y[-1], curvature.history_from_pairs(s, y), HISTORY_SIZE)
+    found = two_loop(y[-1], history_from_pairs(s, y), HISTORY_SIZE)
     return _within(found, s[-1], EXACT, "H y = s, float64")
 
 
@@ -180,7 +180,7 @@ def _compiled(obstacle: str) -> str:
         return f"not compiled, not launched: {obstacle}, and cuda.core is not installed"
     try:
         begin = time.perf_counter()
-        for name in cuda.KERNELS:
+        for name in set(cuda.KERNELS.values()):
             size = HISTORY_SIZE if name == "lqn.cu" else None
             cuda.compile_cubin(name, torch.float32, PROBE, history_size=size)
     except Exception as error:  # an incomplete NVRTC: no harm where there is no device
@@ -201,15 +201,22 @@ def _kernel_pair(device: torch.device, dtype: torch.dtype, limit: float) -> str:
     position, grad = (_draw(ROWS, 3, device=device, seed=i).to(dtype) for i in (5, 6))
     directions, moved = [], []
     scales, quats, opacities, eta = (tensor.to(dtype) for tensor in _gaussians(device))
-    for backend in ("cuda", "torch"):
-        history = curvature.laid_out(curvature.history_from_pairs(s, y), contiguous=True)
-        options = {"min_cosine": 1e-6, "powell": False, "graft": True, "gamma_clamp": None}
-        directions.append(
-            ops.lqn_direction(position, grad, history, HISTORY_SIZE, backend=backend, **options)[0]
+    backends: tuple[Backend, ...] = ("cuda", "torch")
+    for backend in backends:
+        history = laid_out(history_from_pairs(s, y), contiguous=True)
+        fed, *_ = lqn_direction(
+            position,
+            grad,
+            history,
+            HISTORY_SIZE,
+            min_cosine=1e-6,
+            graft=True,
+            backend=backend,
         )
+        directions.append(fed)
         means = torch.zeros_like(position)
         lr = torch.ones((), device=device)
-        ops.add_covariance_noise(
+        add_covariance_noise(
             means, scales, quats, opacities, eta=eta, lr=lr, noise_scale=1.0, backend=backend
         )
         moved.append(means)

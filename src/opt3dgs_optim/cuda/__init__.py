@@ -18,28 +18,28 @@ import torch
 from torch import Tensor
 
 BLOCK = 128  # threads; the .cu files promise it to the compiler
-HEADERS = ("two_loop.cuh", "packed.cuh")  # the second for the curvature only
-KERNELS = {"lqn.cu": "lqn_direction", "noise.cu": "add_covariance_noise"}
+HEADER = "two_loop.cuh"
+KERNELS = {  # the kernel: its file
+    "lqn_direction": "lqn.cu",
+    "two_loop": "lqn.cu",
+    "add_covariance_noise": "noise.cu",
+}
 
 
 def source(name: str) -> str:
-    """The text of a kernel file with the headers in front.
+    """The text of a kernel file with the header in front.
 
     cuda.core's disk cache refuses include paths, because it cannot see a header change.
     """
     folder = files(__name__)
-    needed = HEADERS if name == "lqn.cu" else HEADERS[:1]
-    headers = "".join((folder / header).read_text() for header in needed)
-    return headers.replace("#pragma once\n", "") + (folder / name).read_text()
+    header = (folder / HEADER).read_text().replace("#pragma once\n", "")
+    return header + (folder / name).read_text()
 
 
-def macros(
-    dtype: torch.dtype, history_size: int | None = None, packed: bool = False
-) -> list[tuple[str, str]]:
-    """What a kernel file is compiled with; `packed` is for half-size pairs."""
+def macros(dtype: torch.dtype, history_size: int | None = None) -> list[tuple[str, str]]:
+    """What a kernel file is compiled with."""
     size = [] if history_size is None else [("HISTORY_SIZE", str(history_size))]
-    half = [("PACKED_PAIRS", "1")] if packed else []
-    return size + half + ([("IN_FLOAT64", "1")] if dtype == torch.float64 else [])
+    return size + ([("IN_FLOAT64", "1")] if dtype == torch.float64 else [])
 
 
 def compile_cubin(
@@ -48,7 +48,6 @@ def compile_cubin(
     arch: str,
     *,
     history_size: int | None = None,
-    packed: bool = False,
     cache: Any = None,
     logs: Any = None,
     ptxas_options: list[str] | None = None,
@@ -56,11 +55,10 @@ def compile_cubin(
     """Compile a kernel file for an architecture such as "sm_90"; no GPU is needed.
 
     Args:
-        name: a key of `KERNELS`.
+        name: a file of `KERNELS`.
         dtype: torch.float32 or torch.float64.
         arch: without one, cuda.core would ask the driver.
         history_size: K; of "lqn.cu" only.
-        packed: whether for half-size pairs; of "lqn.cu" only.
         cache: a cuda.core program cache.
         logs: an object with `write`, for what the compiler says.
         ptxas_options: for the assembler, such as "-v".
@@ -69,17 +67,13 @@ def compile_cubin(
         cuda.core's ObjectCode.
     """
     core = importlib.import_module("cuda.core")
-    program = core.Program(
-        source(name),
-        "c++",
-        core.ProgramOptions(
-            arch=arch,
-            std="c++17",
-            define_macro=macros(dtype, history_size, packed) or None,
-            ptxas_options=ptxas_options,
-        ),
+    options = core.ProgramOptions(
+        arch=arch,
+        std="c++17",
+        define_macro=macros(dtype, history_size) or None,
+        ptxas_options=ptxas_options,
     )
-    return program.compile("cubin", logs=logs, cache=cache)
+    return core.Program(source(name), "c++", options).compile("cubin", logs=logs, cache=cache)
 
 
 @functools.cache
@@ -91,24 +85,12 @@ def _disk_cache() -> Any:
 
 
 @functools.cache
-def _kernel(
-    name: str,
-    device: int,
-    dtype: torch.dtype,
-    history_size: int | None = None,
-    packed: bool = False,
-) -> Any:
+def _kernel(kernel: str, device: int, dtype: torch.dtype, history_size: int | None) -> Any:
     major, minor = torch.cuda.get_device_capability(device)
     importlib.import_module("cuda.core").Device(device).set_current()
-    code = compile_cubin(
-        name,
-        dtype,
-        f"sm_{major}{minor}",
-        history_size=history_size,
-        packed=packed,
-        cache=_disk_cache(),
-    )
-    return code.get_kernel(KERNELS[name])
+    arch, cache = f"sm_{major}{minor}", _disk_cache()
+    code = compile_cubin(KERNELS[kernel], dtype, arch, history_size=history_size, cache=cache)
+    return code.get_kernel(kernel)
 
 
 class _TorchStream:
@@ -121,10 +103,30 @@ class _TorchStream:
         return 0, self._handle
 
 
-def _launch(kernel: Any, device: torch.device, rows: int, *arguments: Any) -> None:
-    core = importlib.import_module("cuda.core")
-    config = core.LaunchConfig(grid=(rows + BLOCK - 1) // BLOCK, block=BLOCK)
-    core.launch(_TorchStream(device), config, kernel, *arguments)
+def launch(
+    kernel: str,
+    like: Tensor,
+    threads: int,
+    *arguments: Tensor | np.generic | int,
+    history_size: int | None = None,
+) -> None:
+    """Run a kernel on the device and current stream of `like`, compiled for its dtype.
+
+    Args:
+        kernel: a key of `KERNELS`.
+        like: float32 or float64.
+        threads: at least as many are started; none for 0.
+        arguments: contiguous tensors, as their addresses, and numpy numbers of C's size.
+        history_size: K, of the kernels that are compiled for it.
+    """
+    if threads == 0:
+        return
+    core, device = importlib.import_module("cuda.core"), like.device
+    values = (a.data_ptr() if isinstance(a, Tensor) else a for a in arguments)
+    with torch.cuda.device(device):
+        function = _kernel(kernel, like.get_device(), like.dtype, history_size)
+        config = core.LaunchConfig(grid=(threads + BLOCK - 1) // BLOCK, block=BLOCK)
+        core.launch(_TorchStream(device), config, function, *values)
 
 
 def _real(dtype: torch.dtype) -> Any:
@@ -137,32 +139,29 @@ def lqn_direction(
     history: Tensor,
     history_size: int,
     min_cosine: float,
-    powell: bool,
     graft: bool,
-    gamma_clamp: tuple[float, float] | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """`curvature.step` on the GPU, for points of three coordinates. Never synchronises."""
-    direction = torch.empty_like(grad, memory_format=torch.contiguous_format)
-    accepted = torch.empty(grad.shape[0], dtype=torch.bool, device=grad.device)
+    """`lbfgs.lqn_direction` on the GPU, for points of three coordinates. Never synchronises."""
+    rows, real = grad.shape[0], _real(grad.dtype)
+    fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
+    accepted = torch.empty(rows, dtype=torch.bool, device=grad.device)
     candidates = torch.empty_like(accepted)
-    if grad.shape[0] == 0:
-        return direction, accepted, candidates
-    position, grad, cells = position.contiguous(), grad.contiguous(), history.contiguous()
-    real = _real(grad.dtype)
-    low, high = gamma_clamp or (0.0, 0.0)
-    with torch.cuda.device(grad.device):
-        _launch(
-            _kernel("lqn.cu", grad.get_device(), grad.dtype, history_size, history.dim() == 2),
-            grad.device,
-            grad.shape[0],
-            *(t.data_ptr() for t in (position, grad, cells, direction, accepted, candidates)),
-            np.int64(grad.shape[0]),
-            *(real(value) for value in (min_cosine, low, high)),
-            *(np.int32(flag) for flag in (powell, graft, gamma_clamp is not None)),
-        )
+    cells = history.contiguous()
+    tensors = (position.contiguous(), grad.contiguous(), cells, fed, accepted, candidates)
+    numbers = (np.int64(rows), real(min_cosine), np.int32(graft))
+    launch("lqn_direction", grad, rows, *tensors, *numbers, history_size=history_size)
     if cells is not history:  # laid out for torch, e.g. loaded from a checkpoint of a CPU run
         history.copy_(cells)
-    return direction, accepted, candidates
+    return fed, accepted, candidates
+
+
+def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
+    """`lbfgs.two_loop` on the GPU, for points of three coordinates. Never synchronises."""
+    rows = grad.shape[0]
+    result = torch.empty_like(grad, memory_format=torch.contiguous_format)
+    tensors = (grad.contiguous(), history.contiguous(), result)
+    launch("two_loop", grad, rows, *tensors, np.int64(rows), history_size=history_size)
+    return result
 
 
 def add_covariance_noise(
@@ -171,34 +170,23 @@ def add_covariance_noise(
     quats: Tensor,
     opacities: Tensor,
     eta: Tensor,
-    lr: Tensor,
+    lr: float | Tensor,
     noise_scale: float,
     sharpness: float,
     threshold: float,
 ) -> None:
-    """Add the noise of `noise.covariance_noise`, times lr * noise_scale, to `means` in place.
+    """Add `covariance.covariance_noise`, times lr * noise_scale, to `means` in place.
 
     A learning rate on the GPU is read there, when the kernel runs; one on the CPU is passed on.
     """
-    if means.shape[0] == 0:
-        return
-    on_device = lr.is_cuda
-    rate = lr.to(torch.float32) if on_device else None
+    rows, real = means.shape[0], _real(means.dtype)
+    on_device = isinstance(lr, Tensor) and lr.is_cuda
+    rate = lr.to(torch.float32) if on_device else 0  # a null pointer
     factor = noise_scale if on_device else noise_scale * float(lr)
     target = means.contiguous()
-    tensors = [tensor.contiguous() for tensor in (scales, quats, opacities, eta)]
-    real = _real(means.dtype)
-    with torch.cuda.device(means.device):
-        _launch(
-            _kernel("noise.cu", means.get_device(), means.dtype),
-            means.device,
-            means.shape[0],
-            target.data_ptr(),
-            *(tensor.data_ptr() for tensor in tensors),
-            0 if rate is None else rate.data_ptr(),
-            *(real(value) for value in (factor, sharpness, threshold)),
-            np.int64(means.shape[0]),
-        )
+    tensors = (tensor.contiguous() for tensor in (scales, quats, opacities, eta))
+    numbers = (real(value) for value in (factor, sharpness, threshold))
+    launch("add_covariance_noise", means, rows, target, *tensors, rate, *numbers, np.int64(rows))
     if target is not means:
         means.copy_(target)
 

@@ -28,33 +28,19 @@ POINT Vec3<T> covariance_noise(Vec3<T> scales, Lanes<T> quat, T opacity, Vec3<T>
   return times(rotated(real, axis, v), gate);
 }
 
-template <typename T>
-POINT void noise_row(T* means, const T* scales, const T* quats, const T* opacities, const T* eta, const float* lr,
-                     T noise_scale, T sharpness, T threshold, long long rows) {
+extern "C" __global__ void __launch_bounds__(128)
+    add_covariance_noise(Real* __restrict__ means, const Real* __restrict__ scales,
+                         const Real* __restrict__ quats, const Real* __restrict__ opacities,
+                         const Real* __restrict__ eta, const float* __restrict__ lr, Real noise_scale,
+                         Real sharpness, Real threshold, long long rows) {
   const long long row = static_cast<long long>(blockIdx.x) * blockDim.x + threadIdx.x;
   if (row >= rows) return;
-  const T* s = scales + 3 * row;
-  const T* e = eta + 3 * row;
-  const Vec3<T> noise = covariance_noise<T>({s[0], s[1], s[2]}, load(quats + 4 * row), opacities[row],
-                                            {e[0], e[1], e[2]}, sharpness, threshold);
+  const Vec3<Real> noise =
+      covariance_noise(read_row(scales, row), load(quats + 4 * row), opacities[row], read_row(eta, row), sharpness, threshold);
   // The learning rate is read here and now: a captured graph sees what the scheduler has written.
-  const T factor = lr ? static_cast<T>(*lr) * noise_scale : noise_scale;
-  T* m = means + 3 * row;
+  const Real factor = lr ? static_cast<Real>(*lr) * noise_scale : noise_scale;
+  Real* m = means + 3 * row;
   m[0] += noise.x * factor;
   m[1] += noise.y * factor;
   m[2] += noise.z * factor;
 }
-
-#define NOISE_KERNEL(NAME, T)                                                                            \
-  extern "C" __global__ void __launch_bounds__(128)                                                      \
-      NAME(T* __restrict__ means, const T* __restrict__ scales, const T* __restrict__ quats,             \
-           const T* __restrict__ opacities, const T* __restrict__ eta, const float* __restrict__ lr,     \
-           T noise_scale, T sharpness, T threshold, long long rows) {                                    \
-    noise_row<T>(means, scales, quats, opacities, eta, lr, noise_scale, sharpness, threshold, rows);     \
-  }
-
-#ifdef IN_FLOAT64
-NOISE_KERNEL(add_covariance_noise, double)
-#else
-NOISE_KERNEL(add_covariance_noise, float)
-#endif

@@ -1,9 +1,15 @@
-// The arithmetic of one point, for the GPU and, through tests/cuda_host_shim.h, for a host compiler.
+// The arithmetic of one point, for the GPU and, through tests/cuda/cuda_host_shim.h, for a host compiler.
 // No includes, no barriers, no shared memory, no atomics: one thread, one point.
-// The same formulas in the same order as opt3dgs_optim/_pairs.py and curvature.py.
+// The same formulas in the same order as in opt3dgs_optim/lbfgs.
 #pragma once
 
 #define POINT __host__ __device__ __forceinline__
+
+#ifdef IN_FLOAT64
+typedef double Real;  // what the kernels are compiled for
+#else
+typedef float Real;
+#endif
 
 template <typename T> struct Vec3 { T x, y, z; };
 
@@ -60,6 +66,18 @@ POINT void store(double* at, Lanes<double> lanes) {
   q[1] = {lanes.v.z, lanes.spare};
 }
 
+// Row `row` of [N, 3].
+template <typename T> POINT Vec3<T> read_row(const T* rows, long long row) {
+  const T* at = rows + 3 * row;
+  return {at[0], at[1], at[2]};
+}
+template <typename T> POINT void write_row(T* rows, long long row, Vec3<T> v) {
+  T* at = rows + 3 * row;
+  at[0] = v.x;
+  at[1] = v.y;
+  at[2] = v.z;
+}
+
 template <typename T> struct Pair { Vec3<T> s, y; T cosine; };
 
 // Divide a pair by |y|.
@@ -70,22 +88,11 @@ template <typename T> POINT Pair<T> normalised(Vec3<T> s, Vec3<T> y) {
   return {s, y, dot(over(s, length(s)), y)};
 }
 
-// Powell's damping with B = 1 / gamma; gamma is 0 where there is no pair yet.
-template <typename T> POINT Pair<T> damped(Pair<T> pair, T gamma) {
-  const T sy = dot(pair.s, pair.y);
-  const T known = gamma > T(0) ? gamma : T(1);
-  const T s_bs = dot(pair.s, pair.s) / known;
-  if (!(gamma > T(0) && sy < T(0.2) * s_bs)) return pair;
-  const T theta = T(0.8) * s_bs / (s_bs - sy);
-  const Vec3<T> bs = over(pair.s, known);
-  return normalised(pair.s, along(times(pair.y, theta), T(1) - theta, bs));
-}
-
 // Makes the compiler forget what memory holds. Without it, a long history that is read twice would
 // be kept in registers between the two readings: 158 of them, or spills.
 POINT void read_again() { asm volatile("" ::: "memory"); }
 
-// The history of one point, [slots][8]: see opt3dgs_optim/curvature.py for the layout.
+// The history of one point, [slots][8]: see opt3dgs_optim/lbfgs/history.py for the layout.
 // K is known to the compiler, so that a short history lives in registers from load to store.
 template <typename T, int K> struct History {
   static constexpr bool kept = K <= 5;  // more pairs than that are read again in the second loop
@@ -135,8 +142,6 @@ template <typename T, int K> struct History {
     if constexpr (kept) return y[j].v;
     return load(row + 8 * j + 4).v;
   }
-
-  static POINT Pair<T> as_stored(Pair<T> pair) { return pair; }
 
   // The spare lane of half `half` of slot `slot`, as the header has it now.
   POINT T spare(int slot, int half, T unused) const {
@@ -190,12 +195,11 @@ template <typename T, int K> struct History {
 template <typename T> POINT T inverse(T sy) { return sy <= T(0) ? T(0) : T(1) / sy; }
 
 // Nocedal and Wright (2006), algorithm 7.4, for pairs with |y| = 1; an empty slot is zero.
-template <int K, typename T, typename Pairs>
-POINT Vec3<T> two_loop(Vec3<T> q, const Pairs& history, bool clamp, T low, T high) {
+template <int K, typename T> POINT Vec3<T> recursion(Vec3<T> q, const History<T, K>& history) {
   T alpha[K];
 #pragma unroll
   for (int j = 0; j < K; ++j) {
-    if constexpr (!Pairs::kept) read_again();
+    if constexpr (!History<T, K>::kept) read_again();
     const Vec3<T> s = history.pair_s(j), y = history.pair_y(j);
     alpha[j] = dot(s, q) * inverse(dot(s, y));
     q = along(q, -alpha[j], y);
@@ -203,11 +207,10 @@ POINT Vec3<T> two_loop(Vec3<T> q, const Pairs& history, bool clamp, T low, T hig
   // |y| = 1, hence gamma = s.y / y.y = s.y of the newest pair. No pair: r stays the gradient.
   T gamma = dot(history.pair_s(0), history.pair_y(0));
   if (gamma <= T(0)) gamma = T(1);
-  else if (clamp) gamma = gamma < low ? low : gamma > high ? high : gamma;
   Vec3<T> r = times(q, gamma);
 #pragma unroll
   for (int j = K - 1; j >= 0; --j) {
-    if constexpr (!Pairs::kept) read_again();
+    if constexpr (!History<T, K>::kept) read_again();
     const Vec3<T> s = history.pair_s(j), y = history.pair_y(j);
     const T beta = dot(y, r) * inverse(dot(s, y));
     r = along(r, alpha[j] - beta, s);
@@ -215,26 +218,18 @@ POINT Vec3<T> two_loop(Vec3<T> q, const Pairs& history, bool clamp, T low, T hig
   return r;
 }
 
-template <typename T> struct Options {
-  T min_cosine, gamma_low, gamma_high;
-  bool powell, graft, clamp;
-};
-
 struct Flags { bool accepted, candidate; };
 
 // One step of one point: accept a pair, update the header, and say what Adam is fed.
-// Pairs is how they are stored: History, or PackedHistory of packed.cuh.
-template <typename T, int K, typename Pairs>
-POINT Flags lqn_point(Vec3<T> position, Vec3<T> grad, T* row, const Options<T>& options, Vec3<T>* fed) {
+template <int K, typename T>
+POINT Flags lqn_point(Vec3<T> position, Vec3<T> grad, T* row, T min_cosine, bool graft, Vec3<T>* fed) {
   *fed = grad;  // what every point without a usable result keeps, bit for bit
   const T scale = largest(grad);
   if (!finite(grad) || scale == T(0)) return {false, false};  // not visible: nothing changes
-  Pairs history(row);
-  Pair<T> pair = normalised(along(position, T(-1), history.position), along(grad, T(-1), history.gradient));
+  History<T, K> history(row);
+  const Pair<T> pair = normalised(along(position, T(-1), history.position), along(grad, T(-1), history.gradient));
   const bool candidate = history.counter > T(0);
-  if (options.powell) pair = damped(pair, dot(history.pair_s(0), history.pair_y(0)));
-  pair = Pairs::as_stored(pair);
-  const bool accepted = candidate && pair.cosine > options.min_cosine;  // false where not finite
+  const bool accepted = candidate && pair.cosine > min_cosine;  // false where not finite
   history.position = position;
   history.gradient = grad;
   if (!candidate) history.counter = T(1);
@@ -243,11 +238,18 @@ POINT Flags lqn_point(Vec3<T> position, Vec3<T> grad, T* row, const Options<T>& 
   if (history.counter <= T(1)) return {accepted, candidate};
 
   const Vec3<T> unit = over(grad, scale);
-  Vec3<T> r = two_loop<K>(unit, history, options.clamp, options.gamma_low, options.gamma_high);
+  Vec3<T> r = recursion(unit, history);
   const T size = length(r);
   const bool descent = dot(unit, over(r, size)) > T(0);  // false where not finite
-  if (options.graft) r = times(r, sqrt(dot(unit, unit)) / size);
+  if (graft) r = times(r, sqrt(dot(unit, unit)) / size);
   r = times(r, scale);
   if (descent && finite(r)) *fed = r;
   return {accepted, candidate};
+}
+
+// H g of one point; its gradient where it has no pair.
+template <int K, typename T> POINT Vec3<T> two_loop_point(Vec3<T> grad, T* row) {
+  const T scale = largest(grad);
+  if (scale == T(0)) return grad;
+  return times(recursion(over(grad, scale), History<T, K>(row)), scale);
 }

@@ -20,8 +20,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from opt3dgs_optim._groups import canonical_name
-from opt3dgs_optim.phases import PAPER_SWITCH, Phase, PhaseScheduler
+from opt3dgs_optim.names import canonical_name
+from opt3dgs_optim.phases import PhaseScheduler
+from opt3dgs_optim.presets import PAPER_SWITCH
 
 try:
     from nerfstudio.models.splatfacto import (  # pyright: ignore
@@ -99,7 +100,7 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
         losses = super().get_loss_dict(outputs, batch, metrics_dict)
         if not self.training or not self._phases:
             return losses
-        if self.phases.squared_loss and self.phases.phase is Phase.EXPLOITATION:
+        if self.phases.pixel_part() is not None:
             render, target = self._images(outputs, batch)
             change = self.phases.pixel_loss(render, target) - (render - target).abs().mean()
             losses["main_loss"] = losses["main_loss"] + (1 - self.config.ssim_lambda) * change

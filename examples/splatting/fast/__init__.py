@@ -1,0 +1,1 @@
+"""The compiled float32 twin of the reference rasterizer and of the photometric loss."""

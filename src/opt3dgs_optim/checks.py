@@ -1,0 +1,91 @@
+"""Option checks whose messages name the call, the value and what is allowed."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+
+
+def check_number(
+    call: str,
+    name: str,
+    value: Any,
+    low: float = -math.inf,
+    high: float = math.inf,
+    *,
+    open_low: bool = False,
+    open_high: bool = False,
+) -> float:
+    """Return `value` as a float, or raise ValueError if it lies outside the interval."""
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    inside = (
+        number
+        and (value > low if open_low else value >= low)
+        and (value < high if open_high else value <= high)
+    )
+    if not inside or not math.isfinite(value):
+        left, right = ("(" if open_low else "["), (")" if open_high else "]")
+        raise ValueError(
+            f"{call}: {name}={value!r}, but a finite number in {left}{low}, {high}{right} is needed"
+        )
+    return float(value)
+
+
+def check_count(call: str, name: str, value: Any, low: int, high: int | None = None) -> int:
+    """Return `value` as an int, or raise ValueError unless it is an integer in low..high."""
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    if not whole or value < low or (high is not None and value > high):
+        allowed = f"at least {low}" if high is None else f"in {low}..{high}"
+        raise ValueError(f"{call}: {name}={value!r}, but an integer {allowed} is needed")
+    return value
+
+
+def check_choice(call: str, name: str, value: Any, allowed: Sequence[str]) -> str:
+    """Return `value`, or raise ValueError unless it is one of `allowed`."""
+    if not isinstance(value, str) or value not in allowed:
+        listed = ", ".join(repr(item) for item in allowed)
+        raise ValueError(f"{call}: {name}={value!r}, but one of {listed} is needed")
+    return value
+
+
+def check_flag(call: str, name: str, value: Any) -> bool:
+    """Return `value`, or raise ValueError unless it is True or False."""
+    if not isinstance(value, bool):
+        raise ValueError(f"{call}: {name}={value!r}, but True or False is needed")
+    return value
+
+
+def check_interval(call: str, name: str, value: Any) -> tuple[float, float]:
+    """Return `value` as (low, high) floats, or raise ValueError unless low < high, finite."""
+    pair = isinstance(value, (tuple, list)) and len(value) == 2
+    if not pair:
+        raise ValueError(f"{call}: {name}={value!r}, but a pair (low, high) is needed")
+    low = check_number(call, f"{name}[0]", value[0])
+    high = check_number(call, f"{name}[1]", value[1])
+    if low >= high:
+        raise ValueError(f"{call}: {name}={value!r}, but low < high is needed")
+    return low, high
+
+
+def warn_user(message: str) -> None:
+    """Warn at the line outside of this package and torch from which the call came."""
+    inside = tuple(os.path.dirname(each) + os.sep for each in (__file__, torch.__file__))
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(inside):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level)
+
+
+def check_keys(call: str, state: Any, needed: tuple[str, ...]) -> None:
+    """ValueError unless `state` is a mapping with at least the keys `needed`."""
+    if not isinstance(state, Mapping):
+        raise ValueError(f"{call}: {state!r}, but a dict is needed")
+    missing = sorted(set(needed) - set(state))
+    if missing:
+        raise ValueError(f"{call}: keys {missing} are missing")

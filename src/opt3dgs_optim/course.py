@@ -1,0 +1,240 @@
+"""The course of a training: its clock, its parts, and the energy observed last."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim.checks import check_keys
+from opt3dgs_optim.part import Part, Phase, overrides
+
+HOOKS = ("observe", "pixel_loss", "factor", "before", "after")
+CHECK_STEPS = 100  # iterations between two looks at the parts' evidence
+FORMAT = 2  # of a checkpoint
+LOGGER = logging.getLogger("opt3dgs_optim")
+P = TypeVar("P", bound=Part)
+
+
+class Course:
+    """The clock, the parts and the energy of one training; several optimizers may follow one.
+
+    Args:
+        parts: what the steps have, in the order in which it is applied.
+        total_steps: iterations of the training.
+        switch_step: the first iteration of exploitation; None: no phases, all parts always act.
+        adaptive: whether parts are switched off that this training shows no need of.
+
+    Raises:
+        TypeError: one of the parts is none.
+    """
+
+    def __init__(
+        self,
+        parts: Iterable[Part] = (),
+        *,
+        total_steps: int = 1,
+        switch_step: int | None = None,
+        adaptive: bool = False,
+    ) -> None:
+        self.parts = list(parts)
+        for part in self.parts:
+            if not isinstance(part, Part):
+                raise TypeError(f"{type(self).__name__}: parts has {part!r}, but a Part is needed")
+        self.total_steps, self.switch_step = total_steps, switch_step or 0
+        self._has_phases = switch_step is not None
+        self.adaptive = adaptive
+        self.switched_off: dict[str, str] = {}  # part's name -> why
+        self.current = -1  # the iteration observed last, whose step comes next
+        self.num_observed = 0
+        self.steps = 0  # of all optimizers
+        self.valid: Tensor | bool = True  # whether the last energy was finite
+        self._plan()
+
+    def _plan(self) -> None:
+        """Which parts have which hooks in which phase; a hook that nobody has is never called."""
+        acting = []
+        for name, part in zip(self.part_names(), self.parts, strict=True):
+            standing = part.instead() if name in self.switched_off else part
+            acting += [] if standing is None else [standing]
+        self._acting: dict[Phase | None, list[Part]] = {None: acting}
+        for phase in Phase:
+            self._acting[phase] = [part for part in acting if part.during in (None, phase)]
+        self._hooks = {
+            (phase, hook): [part for part in parts if overrides(part, hook)]
+            for phase, parts in self._acting.items()
+            for hook in HOOKS
+        }
+        self.keys = tuple({key: None for part in self.parts for key in part.keys})
+
+    # -- where the training is -----------------------------------------------------------------
+
+    @property
+    def iteration(self) -> int:
+        """The iteration whose loss comes next, from 0."""
+        return self.current + 1
+
+    @property
+    def keeps_state(self) -> bool:
+        """Whether a checkpoint must hold anything of it."""
+        return self._has_phases or bool(self.parts)
+
+    @property
+    def progress(self) -> float:
+        """Share of the run before the iteration observed last, from 0."""
+        return max(self.current, 0) / self.total_steps
+
+    @property
+    def exploiting(self) -> bool:
+        """Whether the iteration observed last, whose step comes next, is exploitation."""
+        return self._has_phases and self.current >= self.switch_step
+
+    def phase_of(self, iteration: int) -> Phase | None:
+        """The phase of an iteration; None where there are no phases."""
+        if not self._has_phases:
+            return None
+        return Phase.EXPLOITATION if iteration >= self.switch_step else Phase.EXPLORATION
+
+    def hooks(self, name: str) -> list[Part]:
+        """The parts that have this hook and act in the step that comes next."""
+        return self._hooks[self.phase_of(self.current), name]
+
+    def part(self, kind: type[P]) -> P | None:
+        """The first part of a class, or None."""
+        return next((part for part in self.parts if isinstance(part, kind)), None)
+
+    def part_names(self) -> list[str]:
+        """The parts' names in `switched_off` and in checkpoints: their classes', with a number
+        from the second of a class on.
+        """
+        names: list[str] = []
+        for part in self.parts:
+            name = type(part).__name__
+            again = sum(other.split("#")[0] == name for other in names)
+            names.append(f"{name}#{again + 1}" if again else name)
+        return names
+
+    # -- one iteration -------------------------------------------------------------------------
+
+    def take(self, energy: Tensor) -> None:
+        """Tell the parts that act of the energy of the iteration `current`, 0-d, detached."""
+        self.num_observed += 1
+        if energy.device.type == "cpu":
+            self.valid = math.isfinite(energy)
+        else:
+            self.valid = torch.isfinite(energy)
+        for part in self.hooks("observe"):
+            part.observe(energy, self.valid, self)
+
+    def stepping(self, closure_value: Any) -> bool:
+        """Called at the begin of every step of every optimizer.
+
+        Args:
+            closure_value: the loss that a closure has returned, or None.
+
+        Returns:
+            Whether the parts act; without, the step is plain Adam's.
+        """
+        self.steps += 1
+        if closure_value is not None:
+            loss = torch.as_tensor(closure_value).detach().reshape(())
+            self.current += 1
+            self.take(loss)
+        return True
+
+    def expect(self, steps: int) -> None:
+        """Called where Adam's moments come without our state: they have made so many steps."""
+
+    def numbers(self) -> dict[str, float | Tensor]:
+        """What the parts that act say of themselves: columns of the run log."""
+        columns: dict[str, float | Tensor] = {}
+        for part in self._acting[self.phase_of(self.current)]:
+            columns.update(part.numbers(self))
+        return columns
+
+    def judge(self, over_ranks: Any = None) -> list[tuple[str, str, str]]:
+        """Switch parts off and on by their evidence: one transfer from the device.
+
+        Args:
+            over_ranks: averages a tensor over the ranks, so that all decide alike; or None.
+
+        Returns:
+            (event, part's name, reason) of each change.
+        """
+        named = zip(self.part_names(), self.parts, strict=True)
+        shown = [(name, part, part.evidence(self)) for name, part in named]
+        known = [(name, part, seen) for name, part, seen in shown if seen is not None]
+        if not known:
+            return []
+        device = known[-1][2].device
+        widest = torch.float32 if device.type == "mps" else torch.float64
+        packed = torch.cat([seen.detach().to(device, widest) for _, _, seen in known])
+        numbers = (packed if over_ranks is None else over_ranks(packed)).tolist()
+        changes = []
+        for name, part, seen in known:
+            own, numbers = numbers[: seen.numel()], numbers[seen.numel() :]
+            why, before = part.useless(own, self), self.switched_off.pop(name, None)
+            if why is not None:
+                self.switched_off[name] = before or why
+            if why is not None and before is None:
+                changes.append(("switched_off", name, why))
+            elif why is None and before is not None:
+                changes.append(("switched_on", name, "it is of use again"))
+        if changes:
+            self._plan()
+        for event, name, why in changes:
+            LOGGER.info("iteration %d: %s %s: %s", self.current, name, event.replace("_", " "), why)
+        return changes
+
+    # -- state -----------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Any]:
+        """Clock, parts and what is switched off, as plain numbers, strings, lists and dicts."""
+        return {
+            "format": FORMAT,
+            "iteration": self.iteration,
+            "num_observed": self.num_observed,
+            "switched_off": dict(self.switched_off),
+            "parts": {
+                name: state
+                for name, part in zip(self.part_names(), self.parts, strict=True)
+                if (state := part.state_dict())
+            },
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore `state_dict()`; parts that it does not know begin anew.
+
+        Raises:
+            ValueError: it is damaged, or of another format; then nothing is changed.
+        """
+        call = f"{type(self).__name__}.load_state_dict"
+        check_keys(call, state, ("iteration", "num_observed", "switched_off", "parts"))
+        if state.get("format") != FORMAT:
+            raise ValueError(f"{call}: format={state.get('format')!r}, but {FORMAT} is needed")
+        for name in ("iteration", "num_observed"):
+            value = state[name]
+            if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+                raise ValueError(f"{call}: {name}={value!r}, but a whole number is needed")
+        check_keys(f"{call}: parts", state["parts"], ())
+        old = {name: part.state_dict() for name, part in self._named()}
+        try:
+            for name, part in self._named():
+                if name in state["parts"]:
+                    part.load_state_dict(state["parts"][name])
+        except (ValueError, KeyError, TypeError) as error:
+            for name, part in self._named():
+                if old[name]:
+                    part.load_state_dict(old[name])
+            raise ValueError(f"{call}: {error}") from None
+        self.current, self.num_observed = state["iteration"] - 1, state["num_observed"]
+        known = dict(self._named())
+        self.switched_off = {k: str(v) for k, v in state["switched_off"].items() if k in known}
+        self._plan()
+
+    def _named(self) -> list[tuple[str, Part]]:
+        return list(zip(self.part_names(), self.parts, strict=True))

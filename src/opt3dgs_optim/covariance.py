@@ -1,0 +1,151 @@
+"""3DGS-MCMC's covariance-shaped position noise (eq. 2)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim import cuda
+from opt3dgs_optim.backend import uses_kernel
+from opt3dgs_optim.lbfgs.pairs import columns, row_chunks
+
+GATE_SHARPNESS = 100.0  # k of eq. 2's gate
+GATE_OPACITY = 0.005  # t of eq. 2's gate: the opacity under which a Gaussian counts as dead
+
+
+def covariance_noise(
+    scales: Tensor,
+    quats: Tensor,
+    opacities: Tensor,
+    eta: Tensor,
+    *,
+    sharpness: float = GATE_SHARPNESS,
+    threshold: float = GATE_OPACITY,
+) -> Tensor:
+    """Noise shaped by each Gaussian's covariance and gated by its opacity (eq. 2).
+
+        sigmoid(-k (o - t)) * Sigma @ eta,   Sigma = R diag(s)^2 R^T
+
+    Nearly transparent Gaussians wander along their own shape, opaque ones stand still.
+
+    Args:
+        scales: [N, 3] log of the standard deviations, world units.
+        quats: [N, 4] rotations, wxyz, need not be normalised.
+        opacities: [N] or [N, 1] logits.
+        eta: [N, 3] standard normal.
+        sharpness: k, per unit of opacity.
+        threshold: t, opacity in 0..1.
+
+    Returns:
+        [N, 3] in squared world units; the caller multiplies by noise scale and learning rate.
+    """
+    noise = torch.empty_like(eta)
+    for rows in row_chunks(eta):
+        part = (scales[rows], quats[rows], opacities[rows], eta[rows])
+        noise[rows] = _noise(*part, sharpness, threshold).T
+    return noise
+
+
+def add_covariance_noise(
+    means: Tensor,
+    scales: Tensor,
+    quats: Tensor,
+    opacities: Tensor,
+    eta: Tensor,
+    lr: float | Tensor,
+    *,
+    noise_scale: float,
+    backend: str = "auto",
+) -> None:
+    """Add eq. 2's noise, `lr * noise_scale * covariance_noise(...)`, to `means` in place.
+
+    Args:
+        means: [N, 3] world units, changed in place.
+        scales: [N, 3] log of the standard deviations.
+        quats: [N, 4] wxyz, need not be normalised.
+        opacities: [N] or [N, 1] logits.
+        eta: [N, 3] standard normal.
+        lr: a number, or 0-d; on a GPU it is read there, when the step runs.
+        noise_scale: noise_lr of 3DGS-MCMC.
+        backend: "auto", "cuda" or "torch".
+
+    Raises:
+        RuntimeError: `backend="cuda"` where the kernel cannot run.
+        ValueError: the shapes or dtypes do not fit (the kernel's; torch has its own words).
+    """
+    compiling = torch.compiler.is_compiling()
+    if not compiling and uses_kernel(backend, means.device, means.dtype, means.shape[1]):
+        tensors = {"scales": scales, "quats": quats, "opacities": opacities, "eta": eta}
+        _check_gaussians(means, **tensors)
+        constants = (GATE_SHARPNESS, GATE_OPACITY)
+        cuda.add_covariance_noise(means, *tensors.values(), lr, noise_scale, *constants)
+        return
+    factor = lr * noise_scale
+    for rows in row_chunks(means):
+        part = (scales[rows], quats[rows], opacities[rows], eta[rows])
+        means[rows] += (_noise(*part, GATE_SHARPNESS, GATE_OPACITY) * factor).T
+
+
+def _check_gaussians(means: Tensor, **others: Tensor) -> None:
+    """The kernel reads memory by these shapes: be sure of them."""
+    rows = means.shape[0]
+    needed = {"scales": (rows, 3), "quats": (rows, 4), "eta": (rows, 3), "opacities": (rows,)}
+    for name, tensor in others.items():
+        shape = (tensor.numel(),) if name == "opacities" else tuple(tensor.shape)
+        alike = tensor.dtype == means.dtype and tensor.device == means.device
+        if shape != needed[name] or not alike:
+            raise ValueError(
+                f"add_covariance_noise: {name} is {tuple(tensor.shape)} {tensor.dtype} on "
+                f"{tensor.device}, but {needed[name]} {means.dtype} on {means.device} is needed"
+            )
+
+
+def largest_noise(scales: Tensor, opacities: Tensor, noise_scale: float) -> Tensor:
+    """The largest noise of any Gaussian, in learning rates of the positions, 0-d.
+
+    Noise is lr * noise_scale * gate * Sigma eta (eq. 2), so its deviation along the longest axis is
+    lr * noise_scale * gate * s^2; an Adam step is about lr.
+
+    Args:
+        scales: [N, 3] log of the standard deviations.
+        opacities: [N] or [N, 1] logits.
+        noise_scale: noise_lr of 3DGS-MCMC.
+    """
+    if scales.numel() == 0:
+        return scales.new_zeros(())
+    gate = torch.sigmoid(-GATE_SHARPNESS * (torch.sigmoid(opacities.reshape(-1)) - GATE_OPACITY))
+    return noise_scale * (gate * (2 * scales.amax(1)).exp()).amax()
+
+
+def _noise(
+    scales: Tensor,
+    quats: Tensor,
+    opacities: Tensor,
+    eta: Tensor,
+    sharpness: float,
+    threshold: float,
+) -> Tensor:
+    """`covariance_noise` as [3, N]."""
+    gate = torch.sigmoid(-sharpness * (torch.sigmoid(opacities.reshape(-1)) - threshold))
+    q = columns(quats, quats.dtype)
+    # clamp: as torch.nn.functional.normalize
+    w, *axis = (q / (q * q).sum(0).sqrt().clamp(min=1e-12)).unbind()
+    # R^T eta: rotation by the conjugate quaternion; then the variances; then R.
+    local = _rotate(w, [-a for a in axis], list(columns(eta, eta.dtype).unbind()))
+    variance = (2 * columns(scales, scales.dtype)).exp().unbind()
+    shaped = [a * b for a, b in zip(variance, local, strict=True)]
+    return torch.stack([v * gate for v in _rotate(w, axis, shaped)])
+
+
+def _rotate(w: Tensor, q: list[Tensor], v: list[Tensor]) -> list[Tensor]:
+    """Rotate v by the unit quaternion (w, q): v + w t + q x t with t = 2 q x v."""
+    t = [2 * component for component in _cross(q, v)]
+    return [a + w * b + c for a, b, c in zip(v, t, _cross(q, t), strict=True)]
+
+
+def _cross(a: list[Tensor], b: list[Tensor]) -> list[Tensor]:
+    return [
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    ]

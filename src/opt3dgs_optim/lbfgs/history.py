@@ -1,0 +1,126 @@
+"""The history of every point: how curvature pairs lie in memory.
+
+One point is one row. Its history is a row of a single float tensor, because density control
+edits optimizer state by rows (gathers, zeroes, appends zero rows): all zero means "no history".
+
+Layout, [N, slots, 2 (D + 1)] for points of D coordinates and a history of K pairs:
+
+    slot j, lanes 0 .. D-1        s, the parameter difference   } of the j-th newest pair, both
+    slot j, lanes D+1 .. 2D       y, the gradient difference    } divided by |y|
+    lanes D and 2D + 1            spare; the header below lives in them
+
+The header holds the point's last visible position and gradient and a counter. With K > D it fits
+into the spare lanes of slots 0 .. D (slots = K: no further memory, 160 bytes per point in float32
+for K = 5, D = 3); otherwise it gets a slot of its own (slots = K + 1).
+
+A new pair moves the older ones down a slot. A ring would write less, but every reader would have
+to gather by row, which costs torch more than all the arithmetic; and the header dirties the same
+memory sectors anyway. In memory, a history that torch computes on is transposed (strides of a
+[slots, lanes, N] tensor), one that the CUDA kernel computes on is contiguous; every function here
+takes both.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim.lbfgs.pairs import Pair, columns, normalised_pair
+
+MAX_HISTORY = 16
+
+
+def history_shape(points: Tensor, history_size: int) -> tuple[int, int, int]:
+    """Shape of the history of `points` [N, D] for `history_size` pairs of each."""
+    rows, dim = points.shape
+    return rows, history_size + (history_size <= dim), 2 * (dim + 1)
+
+
+def new_history(points: Tensor, history_size: int, *, contiguous: bool = False) -> Tensor:
+    """An empty history for `points` [N, D]; float32, or float64 for float64 points.
+
+    `contiguous` is for the CUDA kernel; otherwise the memory is laid out for torch.
+    """
+    dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
+    rows, *cells = history_shape(points, history_size)
+    if contiguous:
+        return torch.zeros(rows, *cells, dtype=dtype, device=points.device)
+    return torch.zeros(*cells, rows, dtype=dtype, device=points.device).movedim(-1, 0)
+
+
+def laid_out(history: Tensor, *, contiguous: bool) -> Tensor:
+    """`history` itself, or a copy of it if its memory is laid out for the other backend."""
+    if contiguous:
+        return history.contiguous()
+    cells = history.movedim(0, -1)
+    return history if cells.is_contiguous() else cells.contiguous().movedim(-1, 0)
+
+
+class Header(NamedTuple):
+    """Views into a history tensor: what the next pair is taken against."""
+
+    position: Tensor  # [N, D] at the last visible step
+    gradient: Tensor  # [N, D] at the last visible step
+    counter: Tensor  # [N] 0: never visible; c: holds c - 1 pairs
+
+
+def header(history: Tensor, history_size: int) -> Header:
+    """The header's views into `history` [N, slots, 2 (D + 1)]."""
+    dim = history.shape[2] // 2 - 1
+    if history_size > dim:
+        position, gradient = history[:, :dim, dim], history[:, :dim, 2 * dim + 1]
+        return Header(position, gradient, history[:, dim, dim])
+    lanes = history[:, history_size]
+    return Header(lanes[:, :dim], lanes[:, dim + 1 : 2 * dim + 1], lanes[:, dim])
+
+
+def check_history(call: str, grad: Tensor, history: Tensor, history_size: int) -> None:
+    """ValueError unless `history` has the shape that `grad` [N, D] and `history_size` need."""
+    needed = history_shape(grad, history_size)
+    if history.shape != needed:
+        raise ValueError(
+            f"{call}: history has shape {tuple(history.shape)}, but {list(needed)} is needed for a "
+            f"gradient of shape {tuple(grad.shape)} and history_size={history_size}"
+        )
+
+
+def stored_pairs(history: Tensor, history_size: int) -> tuple[Tensor, Tensor]:
+    """s and y of the stored pairs, [K, D, N] each, newest first."""
+    dim = history.shape[2] // 2 - 1
+    cells = history[:, :history_size].permute(1, 2, 0)
+    if cells.stride(2) != 1:
+        cells = cells.contiguous()
+    return cells[:, :dim], cells[:, dim + 1 : 2 * dim + 1]
+
+
+def push(history: Tensor, history_size: int, pair: Pair, accept: Tensor) -> None:
+    """Put a pair in front of the others, in the rows of `accept` [N] (bool), in place."""
+    dim = pair.s.shape[0]
+    halves = history[:, :history_size].permute(1, 2, 0).unflatten(1, (2, dim + 1))
+    slots = halves[:, :, :dim].unbind()  # s and y of each pair, [2, D, N]
+    for slot in range(history_size - 1, 0, -1):
+        torch.where(accept, slots[slot - 1], slots[slot], out=slots[slot])
+    for new, old in zip((pair.s, pair.y), slots[0].unbind(), strict=True):
+        torch.where(accept, new, old, out=old)
+
+
+def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:
+    """A history tensor of K given pairs per point, oldest first.
+
+    Args:
+        s: [K, N, D] parameter differences.
+        y: [K, N, D] gradient differences, with s.y > 0.
+
+    Returns:
+        A history for `two_loop(grad, history, history_size=K)`.
+    """
+    size = s.shape[0]
+    history = new_history(s[0], size)
+    everywhere = torch.ones(s.shape[1], dtype=torch.bool, device=s.device)
+    for k in range(size):
+        pair = normalised_pair(columns(s[k], history.dtype), columns(y[k], history.dtype))
+        push(history, size, pair, everywhere)
+    header(history, size).counter.fill_(size + 1)
+    return history

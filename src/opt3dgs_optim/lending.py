@@ -1,0 +1,111 @@
+"""What a step lends to torch's Adam, and takes back whatever happens."""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import Any, TypedDict
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim.course import Course
+from opt3dgs_optim.part import Group
+
+LOGGER = logging.getLogger("opt3dgs_optim")
+
+
+class AdamOptions(TypedDict, total=False):
+    """torch.optim.Adam's keyword-only options."""
+
+    foreach: bool | None
+    maximize: bool
+    capturable: bool
+    differentiable: bool
+    fused: bool | None
+    decoupled_weight_decay: bool
+
+
+class Lent:
+    """Learning rates, gradients and flags that stand in place of others for one step."""
+
+    def __init__(self) -> None:
+        self._items: list[tuple[dict[str, Any], str, Any]] = []
+        self._attributes: list[tuple[Any, str, Any]] = []
+
+    def item(self, owner: dict[str, Any], key: str, value: Any) -> None:
+        """Put `value` in place of `owner[key]`."""
+        self._items.append((owner, key, owner[key]))
+        owner[key] = value
+
+    def attribute(self, owner: Any, name: str, value: Any) -> None:
+        """Put `value` in place of `owner.name`; None where there is none."""
+        self._attributes.append((owner, name, getattr(owner, name, None)))
+        setattr(owner, name, value)
+
+    def take_back(self) -> None:
+        """Put everything back."""
+        for owner, key, value in self._items:
+            owner[key] = value
+        for owner, name, value in self._attributes:
+            setattr(owner, name, value)
+
+    def rate(self, group: Group, factor: float | Tensor, valid: Tensor | bool) -> None:
+        """lr times the factor, never left in the group: schedulers would compound it.
+
+        Args:
+            group: the group to be stepped.
+            factor: on Adam's step, not on decoupled weight decay, which would grow weights where
+                it is negative.
+            valid: 0-d, whether the step will be made, where only the device knows.
+        """
+        rate = group["lr"]
+        if isinstance(factor, Tensor):
+            if factor.device.type == "cpu":
+                factor = factor.item()
+            else:  # fused Adam reads a float32 learning rate from the device
+                device = group["params"][0].device
+                factor = factor.to(device=device, dtype=torch.float32, non_blocking=True)
+        if group.get("decoupled_weight_decay") and group["weight_decay"]:
+            kept = 1 - rate * group["weight_decay"]
+            kept = torch.where(valid, kept, 1.0) if isinstance(valid, Tensor) else kept
+            for param in group["params"]:
+                if param.grad is not None:
+                    param.mul_(kept)
+            self.item(group, "weight_decay", 0.0)
+        self.item(group, "lr", rate * factor)
+
+    def flag(self, optimizer: Any, valid: Tensor) -> None:
+        """Merge "the loss is not finite" with the GradScaler's flag, on the device."""
+        flag, theirs = (~valid).to(torch.float32), getattr(optimizer, "found_inf", None)
+        if theirs is not None:
+            flag = torch.maximum(flag, theirs.reshape(()).to(flag.device))
+        self.attribute(optimizer, "found_inf", flag)
+
+
+def guard(grad: Tensor, course: Course, told: bool) -> bool:
+    """Take a gradient that is not finite as zero, number by number, in place.
+
+    Returns:
+        Whether there was such a number; False where only the device knows.
+    """
+    on_host = grad.device.type == "cpu"
+    # The sum is finite unless a summand is not, or it overflows.
+    if on_host and math.isfinite(abs(grad.sum().item())):
+        return False
+    grad.nan_to_num_(0.0, 0.0, 0.0)
+    if on_host and not told:
+        LOGGER.warning(
+            "iteration %d: a gradient of shape %s is not finite; such numbers are taken as zero, "
+            "here and later",
+            course.current,
+            tuple(grad.shape),
+        )
+    return on_host
+
+
+def times(factor: float | Tensor | None, other: float | Tensor | None) -> float | Tensor | None:
+    """The product of two factors on a step, of which None is 1."""
+    if factor is None or other is None:
+        return other if factor is None else factor
+    return factor * other

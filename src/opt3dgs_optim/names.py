@@ -1,0 +1,43 @@
+"""Which parameter group is which Gaussian parameter, in the names trainers use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+# gsplat | INRIA and 3dgs-mcmc | nerfstudio
+GAUSSIAN_NAMES: Mapping[str, tuple[str, ...]] = {
+    "means": ("means", "xyz"),
+    "scales": ("scales", "scaling"),
+    "quats": ("quats", "rotation"),
+    "opacities": ("opacities", "opacity"),
+    "sh0": ("sh0", "f_dc", "features_dc", "colors"),
+    "shN": ("shN", "f_rest", "features_rest", "features"),
+}
+GAUSSIAN = tuple(GAUSSIAN_NAMES)
+SLOT = "gaussian"  # of a parameter group: gsplat's name of what it holds, written by `upgrade`
+_CANONICAL = {alias: name for name, aliases in GAUSSIAN_NAMES.items() for alias in aliases}
+
+
+def canonical_name(name: Any) -> str | None:
+    """gsplat's name of a Gaussian parameter group, or None for any other group."""
+    return _CANONICAL.get(name) if isinstance(name, str) else None
+
+
+def slot(group: Mapping[str, Any]) -> str | None:
+    """gsplat's name of the Gaussian parameter in a group: what `upgrade` said, or its own; None."""
+    return group[SLOT] if SLOT in group else canonical_name(group.get("name"))
+
+
+def check_names(call: str, names: Any) -> tuple[str, ...]:
+    """gsplat's names of these Gaussian parameters; ValueError for another name, or none at all."""
+    known: tuple[str | None, ...] = ()
+    if isinstance(names, (tuple, list)):
+        known = tuple(canonical_name(name) for name in names)
+    found = tuple(name for name in known if name is not None)
+    if not found or len(found) < len(known):
+        raise ValueError(
+            f"{call}: names={names!r}, but a tuple of Gaussian parameters' names is needed: "
+            f"{', '.join(GAUSSIAN_NAMES)}"
+        )
+    return found

@@ -1,0 +1,129 @@
+"""The protocol of a part: one thing that a training's steps can have."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from torch import Tensor
+
+from opt3dgs_optim.names import GAUSSIAN
+
+if TYPE_CHECKING:
+    from opt3dgs_optim.course import Course
+
+Group = dict[str, Any]  # a parameter group of an optimizer
+
+
+class Phase(enum.Enum):
+    """What a training is doing."""
+
+    EXPLORATION = "exploration"
+    EXPLOITATION = "exploitation"
+
+
+class Part:
+    """One thing that a training's steps can have: a factor, another gradient, noise, ...
+
+    A part overrides the hooks that it needs; one that is not overridden is never called. What it
+    keeps per row lives in `optimizer.state[param]` under its `keys`, as float32 tensors with the
+    points first, where an all-zero row means "nothing": a trainer's density control edits them
+    with the moments. What it keeps per parameter lives in the group, as plain numbers. Both travel
+    in the optimizers' `state_dict()`, and so does `state_dict()` of the part.
+
+    Parts know nothing of masks, of GradScaler or of `maximize`: they get the gradient of what is
+    minimised, unscaled, zero in rows that are not to move.
+
+    Attributes:
+        during: the phase in which the part acts; None: in both.
+        names: the Gaussian parameters that it acts on, gsplat's names; None: every group.
+        keys: what it keeps per row in `optimizer.state[param]`.
+
+    Examples:
+        A coordinate whose gradient disagrees with the mean of the last ones is not stepped:
+
+        >>> import torch
+        >>> from opt3dgs_optim import Part, PhaseScheduler
+        >>> class SignAgreement(Part):
+        ...     def before(self, group, param, grad, state, course):
+        ...         return torch.where(grad * state["exp_avg"] < 0, 0.0, grad)
+        >>> phases = PhaseScheduler(total_steps=30_000, parts=[SignAgreement()])
+    """
+
+    during: ClassVar[Phase | None] = None
+    keys: ClassVar[tuple[str, ...]] = ()
+    names: Any = GAUSSIAN  # tuple[str, ...] | None
+
+    def __repr__(self) -> str:
+        """The options, without those of all Gaussian parameters."""
+        options = [f.name for f in fields(self)] if is_dataclass(self) else []
+        shown = [name for name in options if name != "names" or self.names != GAUSSIAN]
+        return f"{type(self).__name__}({', '.join(f'{n}={getattr(self, n)!r}' for n in shown)})"
+
+    # -- once per iteration; nothing here may read a GPU's number back --------------------------
+
+    def observe(self, energy: Tensor, valid: Tensor | bool, course: Course) -> None:
+        """Take the loss of an iteration in which the part acts.
+
+        Args:
+            energy: 0-d, finite where `valid`.
+            valid: whether it is finite; a 0-d bool tensor where the loss lives on a GPU.
+            course: the training.
+        """
+
+    def pixel_loss(self, error: Tensor) -> Tensor:
+        """The photometric term, 0-d, of `render - target`; the last part that has one wins."""
+        raise NotImplementedError
+
+    # -- in the step of a group ---------------------------------------------------------------
+
+    def factor(self, group: Group, course: Course) -> float | Tensor | None:
+        """The factor on the group's step, 0-d; None is 1. The factors of all parts multiply."""
+
+    def before(
+        self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
+    ) -> Tensor:
+        """The gradient that Adam is fed instead of `grad` (of its shape); may edit the moments.
+
+        `state` holds Adam's moments already. `course.valid` as a tensor: a step that will be
+        dropped is still prepared, and must leave no trace.
+        """
+        raise NotImplementedError
+
+    def after(self, group: Group, param: Tensor, state: dict[str, Any], course: Course) -> None:
+        """After the parameter has moved. The group's learning rate is the trainer's own again."""
+
+    # -- what it says and keeps ---------------------------------------------------------------
+
+    def numbers(self, course: Course) -> Mapping[str, float | Tensor]:
+        """Columns of the run log for the iteration observed last: numbers or 0-d tensors."""
+        return {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a checkpoint must hold, as plain floats, lists and dicts."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore `state_dict()`; ValueError where it is damaged, and then nothing is changed."""
+
+    # -- leaving out, with `adaptive=True` ------------------------------------------------------
+
+    def evidence(self, course: Course) -> Tensor | None:
+        """What it did to this training, [k] numbers on the device; None: nothing to judge by.
+
+        The evidence of all parts is read in one transfer every 100 iterations, and averaged over
+        the ranks.
+        """
+
+    def useless(self, evidence: list[float], course: Course) -> str | None:
+        """Why this training does not need the part, or None; asked while it is off, too."""
+
+    def instead(self) -> Part | None:
+        """What takes its place where it is useless; None: nothing."""
+
+
+def overrides(part: Part, hook: str) -> bool:
+    """Whether a part has a hook of its own."""
+    return getattr(type(part), hook) is not getattr(Part, hook)

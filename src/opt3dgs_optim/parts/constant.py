@@ -1,0 +1,44 @@
+"""A constant multiplier: the control that every claim for the flat histogram needs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from opt3dgs_optim.checks import check_count, check_number
+from opt3dgs_optim.course import Course
+from opt3dgs_optim.part import Group, Part, Phase
+
+
+@dataclass(frozen=True, repr=False)
+class ConstantMultiplier(Part):
+    """nu = `value`, whatever the energy: a plain change of all learning rates while exploring.
+
+    While the loss falls, the flat histogram's nu is above 1 on average; part of any gain is then
+    just a larger step. Compare with a constant of the same mean
+    (`EnergyHistogram.mean_multiplier`) before crediting the histogram.
+
+    Args:
+        value: the multiplier, any finite number.
+        warmup: number of energies during which it is 1, as in `EnergyHistogram`.
+
+    Raises:
+        ValueError: an option is outside what is allowed.
+    """
+
+    value: float
+    warmup: int = 0
+
+    during = Phase.EXPLORATION
+
+    def __post_init__(self) -> None:
+        check_number("ConstantMultiplier", "value", self.value)
+        check_count("ConstantMultiplier", "warmup", self.warmup, 0)
+
+    def factor(self, group: Group, course: Course) -> float:
+        """The multiplier of the next step."""
+        return 1.0 if course.num_observed <= self.warmup else self.value
+
+    def numbers(self, course: Course) -> Mapping[str, float]:
+        """`nu`, after the warm-up."""
+        return {"nu": self.value} if course.num_observed > self.warmup else {}

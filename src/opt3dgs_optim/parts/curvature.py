@@ -1,0 +1,175 @@
+"""Curvature: a per-point L-BFGS direction as the gradient that Adam is fed (eq. 17)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim.backend import BACKENDS, Backend, uses_kernel
+from opt3dgs_optim.checks import check_choice, check_count, check_flag, check_number
+from opt3dgs_optim.course import Course
+from opt3dgs_optim.lbfgs import (
+    MAX_HISTORY,
+    foresight,
+    history_shape,
+    laid_out,
+    lqn_direction,
+    new_history,
+)
+from opt3dgs_optim.names import check_names
+from opt3dgs_optim.part import Group, Part, Phase
+
+HISTORY = "history"
+PROBE_STEPS = 10  # exploitation steps between two looks at what the pairs foretell
+MIN_PROBES = 5
+MIN_ACCEPTED = 0.1  # share of the candidate pairs
+# Pairs that are mostly the difference between views reach 0.03 to 0.07, exact ones of a quadratic
+# with condition 100 reach 0.2.
+MIN_FORESIGHT = 0.1
+
+
+class Curvature(Part):
+    """Feed Adam the local quasi-Newton direction of every point while exploiting (eq. 17).
+
+    Dimension 0 of a parameter is points; the rest of it (3 coordinates, for positions) is one
+    small optimization problem per point. Each keeps its last `history_size` curvature pairs, taken
+    between two consecutive steps in which it was visible, and the L-BFGS two-loop recursion turns
+    its gradient into a pseudo-gradient. There is no line search: Adam takes the step. A point
+    without a usable pair is stepped by plain Adam, bit for bit.
+
+    A point whose gradient is exactly zero is taken as not visible: no pair is stored for it. The
+    history is dropped where the parameter object, or its number of rows, is not the one of the
+    last step: a trainer's density control has moved the rows (`reset_points` tells more). A row
+    that it sets to zero starts anew.
+
+    Memory: 32 K bytes per point beyond Adam's (K > 3, D = 3, float32), from the switch on.
+
+    Args:
+        history_size: K, number of pairs, 1 to 16 (the paper: 5).
+        min_cosine: a pair is accepted if s.y > min_cosine |s| |y|.
+        graft: give the pseudo-gradient of each point the length of its gradient.
+        names: the Gaussian parameters, under gsplat's or INRIA's names.
+        backend: `"auto"` runs points in three dimensions as a CUDA kernel where it can, and all
+            else as pure torch; `"cuda"` and `"torch"` insist. See `backend_info`.
+
+    Raises:
+        ValueError: an option is outside what is allowed; in a step, a parameter is complex.
+        RuntimeError: in a step, `backend="cuda"`, and the kernel cannot run.
+    """
+
+    during = Phase.EXPLOITATION
+    keys = (HISTORY,)
+
+    def __init__(
+        self,
+        history_size: int = 5,
+        *,
+        min_cosine: float = 1e-6,
+        graft: bool = True,
+        names: tuple[str, ...] | None = ("means",),
+        backend: Backend = "auto",
+    ) -> None:
+        call = type(self).__name__
+        self.history_size = check_count(call, "history_size", history_size, 1, MAX_HISTORY)
+        self.min_cosine = check_number(call, "min_cosine", min_cosine, 0.0, 1.0, open_high=True)
+        self.graft = check_flag(call, "graft", graft)
+        self.names = None if names is None else check_names(call, names)
+        self.backend: Backend = check_choice(call, "backend", backend, BACKENDS)  # pyright: ignore
+        self._step = -1  # of the tally
+        self._tally = torch.zeros(2)  # [accepted, candidates] of the last step
+        self._seen = torch.zeros(4)  # those and [foresight, points looked at], of all steps
+        self._probes = 0
+
+    def __repr__(self) -> str:
+        share = self.accepted_share
+        accepted = "" if share is None else f", accepted share {float(share):.3g}"
+        names = "all" if self.names is None else " ".join(self.names)
+        return f"Curvature({self.history_size} pairs per point of {names}{accepted})"
+
+    @property
+    def accepted_share(self) -> Tensor | None:
+        """Share of the last step's candidate pairs that were accepted, 0-d; None before any."""
+        return None if self._step < 0 else self._tally[0] / self._tally[1].clamp(min=1)
+
+    def before(
+        self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
+    ) -> Tensor:
+        """Store the pairs that this step completes; return the pseudo-gradient."""
+        if param.is_complex():
+            raise ValueError("Curvature: complex parameters have no real curvature pairs")
+        if param.numel() == 0:
+            return grad
+        position = param.detach().reshape(param.shape[0] if param.dim() else 1, -1)
+        gradient = grad.reshape(position.shape)
+        history = self._history(state, position)
+        if course.adaptive and course.num_observed % PROBE_STEPS == 0:
+            self._look(foresight(history, self.history_size, position, gradient))
+        fed, accepted, candidates = lqn_direction(
+            position,
+            gradient,
+            history,
+            self.history_size,
+            min_cosine=self.min_cosine,
+            graft=self.graft,
+            backend=self.backend,
+        )
+        self._count(torch.stack([accepted.count_nonzero(), candidates.count_nonzero()]), course)
+        return fed.reshape(grad.shape)
+
+    def _history(self, state: dict[str, Any], position: Tensor) -> Tensor:
+        shape = history_shape(position, self.history_size)
+        kernel = position.is_cuda and uses_kernel(
+            self.backend, position.device, position.dtype, position.shape[1]
+        )
+        if HISTORY not in state or tuple(state[HISTORY].shape) != shape:
+            state.pop(HISTORY, None)  # before the new one, or both would be in memory
+            state[HISTORY] = new_history(position, self.history_size, contiguous=kernel)
+        state[HISTORY] = laid_out(state[HISTORY], contiguous=kernel)
+        return state[HISTORY]
+
+    def _count(self, tally: Tensor, course: Course) -> None:
+        self._tally = tally if course.steps != self._step else self._tally + tally
+        self._step = course.steps
+        if course.adaptive:
+            self._seen = self._seen.to(tally.device)
+            self._seen[:2] += tally
+
+    def _look(self, foretold: Tensor) -> None:
+        self._seen = self._seen.to(foretold.device)
+        self._seen[2:] += foretold
+        self._probes += 1
+
+    def numbers(self, course: Course) -> Mapping[str, float | Tensor]:
+        """`accepted`: the share of the candidate pairs that the last step accepted."""
+        share = self.accepted_share
+        return {} if share is None else {"accepted": share}
+
+    def state_dict(self) -> dict[str, Any]:
+        """What `adaptive` judges by; the pairs are in the optimizers' state."""
+        return {"seen": self._seen.tolist(), "probes": self._probes}
+
+    def load_state_dict(self, state: Any) -> None:
+        """Restore `state_dict()`."""
+        self._seen, self._probes = torch.tensor(state["seen"]), int(state["probes"])
+
+    def evidence(self, course: Course) -> Tensor:
+        """[4]: pairs accepted, candidates, sum of their foresight, points looked at."""
+        return self._seen
+
+    def useless(self, evidence: list[float], course: Course) -> str | None:
+        """Where few pairs are accepted, or those that are know no more than the gradient does."""
+        accepted, candidates, foretold, points = evidence
+        if candidates == 0 or self._probes < MIN_PROBES:
+            return None
+        share, mean = accepted / candidates, foretold / max(points, 1.0)
+        if share < MIN_ACCEPTED:
+            return f"{share:.3f} of the candidate pairs were accepted (threshold {MIN_ACCEPTED})"
+        if mean < MIN_FORESIGHT:
+            return (
+                f"the pairs foretell the next ones by a cosine of only {mean:.3f} more than the "
+                f"gradient does (threshold {MIN_FORESIGHT}; accepted share {share:.2f})"
+            )
+        return None

@@ -1,0 +1,110 @@
+"""Fading: Adam's moments of random points are shrunk, so that their next steps are longer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim.checks import check_count, check_number
+from opt3dgs_optim.course import Course
+from opt3dgs_optim.names import GAUSSIAN, check_names
+from opt3dgs_optim.part import Group, Part
+
+CALL = "Fading"
+DONE = "faded"  # of a group: events that its parameter has had
+MOST = 32  # events made up for at once, where a trainer's iteration count jumps
+
+
+@dataclass(frozen=True, repr=False)
+class Fading(Part):
+    """Shrink Adam's state of a random share of the points, again and again (after AdamW-GS).
+
+    A point's step is lr * exp_avg / sqrt(exp_avg_sq). With the default factors it keeps its
+    length at first (0.2 / sqrt(0.04) = 1); within ten iterations exp_avg is that of new gradients,
+    while exp_avg_sq needs a thousand to recover: until then the point's steps are up to five times
+    longer. So fading is a larger learning rate for single points, for a while.
+
+    The same points are faded in all these parameters. Which ones depends on `seed`, the event
+    and the number of points alone: a resumed run repeats them. It costs no memory.
+
+    Args:
+        share: of the points in each event, chance per point in (0, 1].
+        exp_avg, exp_avg_sq: factors on the moments, in [0, 1]. exp_avg^2 <= exp_avg_sq keeps the
+            next step from being longer than the last.
+        events: how many over the run.
+        start, stop: where the first and the last event are, as shares of the run.
+        seed: of the choice of points.
+        names: the Gaussian parameters, under gsplat's or INRIA's names.
+
+    Raises:
+        ValueError: an option is outside what is allowed, or a name is no Gaussian parameter's.
+    """
+
+    share: float = 0.2
+    exp_avg: float = 0.2
+    exp_avg_sq: float = 0.04
+    events: int = 300
+    start: float = 0.03
+    stop: float = 0.5
+    seed: int = 0
+    names: tuple[str, ...] = GAUSSIAN
+
+    def __post_init__(self) -> None:
+        check_number(CALL, "share", self.share, 0.0, 1.0, open_low=True)
+        check_number(CALL, "exp_avg", self.exp_avg, 0.0, 1.0)
+        check_number(CALL, "exp_avg_sq", self.exp_avg_sq, 0.0, 1.0)
+        check_count(CALL, "events", self.events, 1)
+        check_number(CALL, "start", self.start, 0.0, 1.0)
+        check_number(CALL, "stop", self.stop, self.start, 1.0, open_low=True)
+        check_count(CALL, "seed", self.seed, 0)
+        object.__setattr__(self, "names", check_names(CALL, self.names))
+
+    def events_before(self, iteration: int, total_steps: int) -> int:
+        """Number of events before the step of this iteration (from 0)."""
+        share = (iteration / total_steps - self.start) / (self.stop - self.start)
+        return int(min(max(share, 0.0), 1.0) * self.events)
+
+    def chosen(self, event: int, num_points: int, device: torch.device) -> Tensor:
+        """Which points an event fades, [num_points] bool: the same in every parameter."""
+        # A CPU's generator reads 32 bits; consecutive seeds are far apart in them.
+        seed = (event + self.seed * 0x9E3779B1) % 2**32
+        generator = torch.Generator(device).manual_seed(seed)
+        return torch.rand(num_points, generator=generator, device=device) < self.share
+
+    def before(
+        self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
+    ) -> Tensor:
+        """Fade the moments by the events since this parameter's last step."""
+        # The step of iteration i comes after i + 1 observations.
+        now = self.events_before(course.iteration, course.total_steps)
+        done = group.get(DONE)
+        if done is None:
+            done = self.events_before(course.iteration - 1, course.total_steps)
+        group[DONE] = now
+        if now > done and param.dim() > 0:
+            self._fade(param, state, range(max(done, now - MOST), now), course.valid)
+        return grad
+
+    def _fade(
+        self, param: Tensor, state: dict[str, Any], events: range, valid: Tensor | bool
+    ) -> None:
+        shape = (-1, *[1] * (param.dim() - 1))
+        for event in events:
+            chosen = self.chosen(event, param.shape[0], param.device)
+            if isinstance(valid, Tensor):
+                chosen = chosen & valid
+            state["exp_avg"].mul_(torch.where(chosen, self.exp_avg, 1.0).view(shape))
+            second = torch.where(chosen, self.exp_avg_sq, 1.0).view(shape)
+            for key in ("exp_avg_sq", "max_exp_avg_sq"):
+                if key in state:
+                    state[key].mul_(second)
+
+    def numbers(self, course: Course) -> Mapping[str, float]:
+        """`faded`: the share of the points that the present iteration's events fade."""
+        now, total = course.iteration, course.total_steps
+        events = self.events_before(now, total) - self.events_before(now - 1, total)
+        return {"faded": 1.0 - (1.0 - self.share) ** events}

@@ -1,0 +1,384 @@
+"""The flat histogram: the multiplier nu of every step, from the density of the visited energies."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim.checks import check_count, check_interval, check_keys, check_number
+from opt3dgs_optim.course import Course
+from opt3dgs_optim.part import Group, Part, Phase
+from opt3dgs_optim.partitions import REACH, FixedPartitions, MovingPartitions
+from opt3dgs_optim.parts.constant import ConstantMultiplier
+
+PAPER_RANGE = (0.0, 0.2)
+PAPER_TEMPERATURE = 2e-3  # not given in the paper; zeta * tau / du = 1.5 at its zeta and du
+PAPER_CLAMP = (-5.0, 5.0)  # not given in the paper; the only published one of its family
+CALL = "EnergyHistogram"
+CLAMP = (-1.0, 3.0)  # twice as far from 1 as nu is two deviations out
+LOGGER = logging.getLogger("opt3dgs_optim")
+CONSTANT = 1e-9  # smallest deviation of an energy that varies, as a share of its size
+TINY = 1e-100  # smallest deviation of an energy around zero that varies
+# Where a constant would do as well: nu's deviation over so many energies, or share of the run.
+WINDOW, WINDOW_SHARE = 300, 1 / 30
+EFFECT = 0.1  # relative: learning rates that differ by less are taken as the same
+TOP_SHARE = 0.5  # of Theta, in the open partition above the range: the loss may yet fall into it
+
+
+class EnergyHistogram(Part):
+    """Steps are longer at energies below the mean, shorter above it: the flat histogram's nu.
+
+        nu = 1 + zeta * tau * dlog Theta / du                                        (eq. 14)
+
+    Theta is the weight of the energy's partition, by how often the training has been there.
+
+    By default (`energy_range="auto"`, `temperature="auto"`) the partitions follow the energy's
+    recent mean and deviation, tau is (1 - zeta) / (2 zeta) deviations, and the slope of log Theta
+    is that of a smoothed density: an energy two deviations from the mean gets |nu - 1| = 1 at all
+    times, nu's mean is 1 and its deviation 1/2, whatever zeta and however far the energy falls.
+    `MovingPartitions` has the formulas. With a range and a temperature it is the paper's update,
+    to the letter (`FixedPartitions`); `EnergyHistogram.paper()` has its numbers.
+
+    The state lives on the device of the energies, and `observe` does not wait for a GPU.
+
+    Args:
+        num_partitions: number of partitions; None for 48 that follow the energy, 200 of a range.
+        energy_range: (low, high) in units of the loss, cut uniformly; the first and the last
+            partition are open (eq. 7). `"auto"`: see above.
+        zeta: flattening exponent, 0 to 1; with an automatic temperature neither of the two.
+        temperature: tau, in units of the loss; automatic where the range is, and only there.
+        warmup: number of energies during which nu is 1 while Theta is being estimated.
+        clamp: (low, high) bounds of nu, or None; `"auto"` is (-1, 3) for partitions that follow
+            the energy, where nu seldom leaves 0 to 2, and (-5, 5) for those of a range.
+
+    Raises:
+        ValueError: an option is outside what is allowed.
+
+    Examples:
+        >>> import torch
+        >>> from opt3dgs_optim import EnergyHistogram
+        >>> histogram = EnergyHistogram(warmup=100)
+        >>> draw = torch.Generator().manual_seed(0)
+        >>> for _ in range(2_000):
+        ...     _ = histogram.observe(0.1 + 0.01 * torch.randn((), generator=draw))
+        >>> 0.9 < float(histogram.mean_multiplier) < 1.1
+        True
+        >>> 0.4 < float(histogram.multiplier_std) < 0.6
+        True
+    """
+
+    during = Phase.EXPLORATION
+
+    def __init__(
+        self,
+        num_partitions: int | None = None,
+        energy_range: tuple[float, float] | Literal["auto"] = "auto",
+        *,
+        zeta: float = 0.75,
+        temperature: float | Literal["auto"] = "auto",
+        warmup: int = 250,
+        clamp: tuple[float, float] | Literal["auto"] | None = "auto",
+    ) -> None:
+        automatic = _are_automatic(energy_range, temperature)
+        fewest = 24 if automatic else 3  # at most half a deviation wide
+        wanted = (48 if automatic else 200) if num_partitions is None else num_partitions
+        self.num_partitions = check_count(CALL, "num_partitions", wanted, fewest)
+        self.zeta = check_number(
+            CALL, "zeta", zeta, 0.0, 1.0, open_low=automatic, open_high=automatic
+        )
+        self.warmup = check_count(CALL, "warmup", warmup, 4 if automatic else 0)
+        if clamp == "auto":
+            clamp = CLAMP if automatic else PAPER_CLAMP
+        self.clamp = None if clamp is None else check_interval(CALL, "clamp", clamp)
+        self.energy_range, self.temperature = energy_range, temperature
+        self._law: FixedPartitions | MovingPartitions
+        if automatic:
+            self._law = MovingPartitions(self.num_partitions, self.zeta, self.clamp)
+        else:
+            self.energy_range = check_interval(CALL, "energy_range", energy_range)
+            self.temperature = check_number(CALL, "temperature", temperature, 0.0)
+            self._law = FixedPartitions(
+                self.num_partitions,
+                self.energy_range,
+                self.zeta,
+                self.temperature,
+                self.warmup,
+                self.clamp,
+            )
+        self._allocate(torch.device("cpu"))
+
+    @classmethod
+    def paper(cls, **overrides: Any) -> EnergyHistogram:
+        """The paper's update with its settings: range [0, 0.2], zeta .75, warm-up 2,500.
+
+        The temperature (2e-3), the clamp (-5 to 5) and lambda's schedule are not in the paper.
+        """
+        settings: dict[str, Any] = {
+            "energy_range": PAPER_RANGE,
+            "temperature": PAPER_TEMPERATURE,
+            "warmup": 2500,
+            **overrides,
+        }
+        return cls(**settings)
+
+    def _allocate(self, device: torch.device) -> None:
+        self._device = device
+        self._law.allocate(device)
+        self.num_observed = 0  # calls of observe(): says whether anybody calls
+        self._taken = 0  # of them, those that count: on a GPU all, on a CPU the finite ones
+        self.last_finite: Tensor | bool = True  # whether the last energy was
+        # Powers 0, 1 and 2 of nu, summed over the energies after the warm-up.
+        self._powers = torch.arange(3, dtype=self._law.nu.dtype, device=device)
+        self._sums = torch.zeros_like(self._powers)
+        self._host_sums = [0.0, 0.0, 0.0]  # the same, of energies on a CPU
+        self._factor: float | Tensor = 1.0
+        self._windows: list[list[float]] = []
+        self._constant: ConstantMultiplier | None = None
+        self._verdict: str | None = None
+
+    # -- one energy ----------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def observe(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self,
+        energy: Tensor | float,
+        valid: Tensor | bool | None = None,
+        course: Course | None = None,
+    ) -> Tensor:
+        """Take one energy: nu from the weights as they are, then the weights' update.
+
+        Args:
+            energy: the training loss of this iteration, 0-d (or one element). One that is not
+                finite changes nothing.
+            valid: whether it is finite, where that is known already.
+            course: not used.
+
+        Returns:
+            nu, 0-d, on the energy's device.
+
+        Raises:
+            ValueError: the energy has several elements.
+        """
+        value = self._on_device(energy)
+        if valid is None:
+            valid = torch.isfinite(value)
+        on_host = value.device.type == "cpu"
+        if on_host:
+            valid = bool(valid)
+        self.num_observed += 1
+        self.last_finite = valid
+        if valid is not False:
+            self._take(value, valid, on_host)
+        return self.multiplier if course is not None else self.multiplier.clone()
+
+    def _take(self, value: Tensor, valid: Tensor | Literal[True], on_host: bool) -> None:
+        law = self._law
+        self._taken += 1
+        if isinstance(law, FixedPartitions):
+            law.take(value, valid)
+        else:
+            law.take(value, valid, self._taken)
+        warm = self._taken > self.warmup
+        if not warm:
+            law.nu.fill_(1.0)
+        if on_host:
+            self._factor = nu = law.nu.item()
+            if warm:
+                powers = (1.0, nu, nu * nu)
+                self._host_sums = [a + b for a, b in zip(self._host_sums, powers, strict=True)]
+            elif self._taken == self.warmup and isinstance(law, MovingPartitions):
+                self._say_if_constant(law)
+        else:
+            self._factor = law.nu
+            if warm:
+                self._sums.addcmul_(torch.pow(law.nu, self._powers), torch.as_tensor(valid))
+
+    def _on_device(self, energy: Tensor | float) -> Tensor:
+        if not isinstance(energy, Tensor):
+            energy = torch.tensor(float(energy), dtype=torch.float64)
+        elif energy.numel() != 1:
+            raise ValueError(
+                f"{CALL}.observe: energy has shape {tuple(energy.shape)}, but one number is needed"
+            )
+        if energy.device != self._device:  # e.g. resumed from a checkpoint
+            state = self.state_dict()
+            self._allocate(energy.device)
+            self._restore(state)
+        if energy.dim():
+            energy = energy.reshape(())
+        return energy.detach() if energy.requires_grad else energy
+
+    def _say_if_constant(self, law: MovingPartitions) -> None:
+        low, high, _ = law.coordinates()
+        if high - low <= max(CONSTANT * REACH * abs(high + low), TINY):
+            LOGGER.warning(
+                "%s: the first %d energies are all %g, so nu is 1 until they vary; is it the "
+                "loss that is observed?", CALL, self._taken, (high + low) / 2
+            )  # fmt: skip
+
+    def factor(self, group: Group, course: Course | None = None) -> float | Tensor | None:
+        """Nu, a number where the energies live on a CPU."""
+        return self._factor if self.num_observed else None
+
+    # -- reading -------------------------------------------------------------------------------
+
+    @property
+    def multiplier(self) -> Tensor:
+        """Nu after the last finite energy, 0-d, on the energies' device."""
+        return self._law.nu
+
+    @property
+    def weights(self) -> Tensor:
+        """Theta, [num_partitions], positive, sum 1 (eq. 9)."""
+        return self._law.weights.clone()
+
+    def _moments(self) -> Tensor:
+        if self._device.type == "cpu":
+            return torch.tensor(self._host_sums, dtype=torch.float64)
+        return self._sums
+
+    @property
+    def mean_multiplier(self) -> Tensor:
+        """Mean of nu over all energies after the warm-up (1 before it), 0-d.
+
+        It is what an honest control uses: a constant multiplier of this size.
+        """
+        count, total, _ = self._moments()
+        return torch.where(count > 0, total / count, 1.0)
+
+    @property
+    def multiplier_std(self) -> Tensor:
+        """Standard deviation of nu over all energies after the warm-up, 0-d."""
+        count, total, squares = self._moments()
+        return (squares / count - (total / count) ** 2).nan_to_num(0.0).clamp(min=0).sqrt()
+
+    @property
+    def calibrated_range(self) -> tuple[float, float]:
+        """(low, high) of the partitions now, in units of the loss. Synchronises."""
+        return self._law.coordinates()[:2]
+
+    @property
+    def calibrated_temperature(self) -> float:
+        """Tau now, in units of the loss. Synchronises."""
+        return self._law.coordinates()[2]
+
+    def numbers(self, course: Course | None = None) -> dict[str, float | Tensor]:
+        """`nu`, after the warm-up; and the energy's recent mean and deviation, where they count."""
+        if self._taken <= self.warmup:
+            return {}
+        columns: dict[str, float | Tensor] = {"nu": self._law.nu.clone()}
+        if isinstance(self._law, MovingPartitions):
+            mean, deviation = self._law.recent()
+            columns |= {"energy_mean": mean, "energy_deviation": deviation}
+        return columns
+
+    # -- leaving it out ------------------------------------------------------------------------
+
+    def evidence(self, course: Course) -> Tensor | None:
+        """[4]: energies after the warm-up, their sum of nu and of its square; and Theta's share in
+        the open partition above the range.
+        """
+        moments = self._moments()
+        return torch.cat([moments, self._law.weights[-1:].to(moments.dtype)])
+
+    def useless(self, evidence: list[float], course: Course) -> str | None:
+        """Where nu has been nearly constant for 300 energies, or for a thirtieth of the run."""
+        *now, above = evidence
+        if self._verdict is not None or now[0] <= 0:
+            return self._verdict
+        window = max(WINDOW, WINDOW_SHARE * course.total_steps)
+        self._windows.append(now)
+        old = [each for each in self._windows if now[0] - each[0] >= window]
+        if not old:
+            return None
+        self._windows = self._windows[len(old) - 1 :]
+        count, total, squares = (new - before for new, before in zip(now, old[-1], strict=True))
+        mean = total / count
+        deviation = math.sqrt(max(squares / count - mean * mean, 0.0))
+        if above > TOP_SHARE or deviation > EFFECT * abs(mean):
+            return None
+        # Its mean is a learning rate that this training has been running with: leaving it would be
+        # a change of its own. A mean of 0 or less would never come down again.
+        near_one = mean <= 0 or abs(mean - 1) <= EFFECT
+        self._constant = None if near_one else ConstantMultiplier(mean)
+        follow = "off" if near_one else f"a constant {mean:.3g} from now on"
+        self._verdict = (
+            f"nu was {mean:.3f} with a deviation of {deviation:.3f} over {count:.0f} energies: "
+            f"{follow}"
+        )
+        return self._verdict
+
+    def instead(self) -> Part | None:
+        """A constant of nu's mean, unless that is 1."""
+        return self._constant
+
+    # -- state ---------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that `observe` has learnt, as plain numbers and lists. Synchronises."""
+        return {
+            "num_observed": self.num_observed,
+            "num_taken": self._taken,
+            "sums": self._moments().tolist(),
+            **self._law.state(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore `state_dict()`.
+
+        Raises:
+            ValueError: it is damaged, or of other partitions; nothing is changed then.
+        """
+        call = f"{CALL}.load_state_dict"
+        check_keys(call, state, tuple(self.state_dict()))
+        for name, here in self.state_dict().items():
+            saved = state[name]
+            rows = saved if isinstance(here, list) else [saved]
+            if not isinstance(rows, list) or (isinstance(here, list) and len(rows) != len(here)):
+                found = len(rows) if isinstance(rows, list) else repr(saved)
+                raise ValueError(
+                    f"{call}: {name} has {found} numbers, but a histogram with "
+                    f"num_partitions={self.num_partitions} has {len(here)}"
+                )
+            if not all(isinstance(v, (int, float)) and math.isfinite(v) for v in rows):
+                raise ValueError(f"{call}: {name}={saved!r}, but finite numbers are needed")
+        self._law.check(call, state)
+        self._allocate(self._device)
+        self._restore(state)
+
+    def _restore(self, state: Mapping[str, Any]) -> None:
+        self._law.load(state)
+        if self._device.type == "cpu":
+            self._host_sums = list(state["sums"])
+        else:
+            self._sums.copy_(torch.tensor(state["sums"], dtype=self._sums.dtype))
+        self.num_observed, self._taken = int(state["num_observed"]), int(state["num_taken"])
+        self._factor = self._law.nu.item() if self._device.type == "cpu" else self._law.nu
+
+    def __repr__(self) -> str:
+        where = f"energy_range={self.energy_range!r}, temperature={self.temperature!r}, "
+        if self.energy_range == "auto":
+            where = ""
+        line = f"{CALL}({where}zeta={self.zeta:g}, clamp={self.clamp}): "
+        if self._taken == 0:
+            return f"{line}nu 1, no energy observed yet"
+        if self._taken <= self.warmup:
+            return f"{line}nu 1, warm-up: {self._taken} of {self.warmup} energies"
+        mean, deviation = float(self.mean_multiplier), float(self.multiplier_std)
+        return f"{line}nu {float(self.multiplier):.4g}, mean {mean:.4g} +- {deviation:.2g}"
+
+
+def _are_automatic(energy_range: Any, temperature: Any) -> bool:
+    """Whether both are; ValueError if only one of the two is."""
+    words = [each for each in (energy_range, temperature) if isinstance(each, str)]
+    if any(word != "auto" for word in words) or len(words) == 1:
+        raise ValueError(
+            f"{CALL}: energy_range={energy_range!r} and temperature={temperature!r}, but either "
+            "both are 'auto', or both are numbers"
+        )
+    return bool(words)

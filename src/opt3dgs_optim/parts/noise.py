@@ -1,0 +1,180 @@
+"""Langevin noise: covariance-shaped for Gaussians, isotropic for anything else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim.backend import BACKENDS, Backend
+from opt3dgs_optim.checks import check_choice, check_number, warn_user
+from opt3dgs_optim.course import Course
+from opt3dgs_optim.covariance import add_covariance_noise, largest_noise
+from opt3dgs_optim.part import Group, Part, Phase
+
+GaussianTensors = Mapping[str, Tensor]
+TWICE = 5  # steps in a row with positions changed by somebody else before it is said
+EFFECT = 1e-3  # of the noise's deviation along a Gaussian's longest axis, in learning rates
+
+
+class PositionNoise(Part):
+    """3DGS-MCMC's position noise: `scale * lr * covariance_noise(...)` after each step (eq. 2).
+
+    For trainers that do not inject it themselves; gsplat's MCMCStrategy and 3dgs-mcmc do, and
+    then this part must be left out (or their noise_lr be 0). lr is the trainer's own present
+    learning rate of the positions, without any factor.
+
+    Args:
+        gaussians: the trainer's dict with `scales` [N, 3] log, `quats` [N, 4] wxyz and
+            `opacities` [N] or [N, 1] logits, or a function that returns it. It is read anew in
+            every step, because density control replaces the tensors in it.
+        scale: noise_lr of 3DGS-MCMC.
+        during: the phase in which it is added; None: both.
+        generator: random generator of the parameters' device, or None for torch's own.
+        backend: `"auto"`, `"cuda"` or `"torch"`; see `backend_info`.
+
+    Raises:
+        ValueError: an option is outside what is allowed; in a step, a tensor is missing among the
+            Gaussians or has another number of rows.
+    """
+
+    names = ("means",)
+
+    def __init__(
+        self,
+        gaussians: GaussianTensors | Callable[[], GaussianTensors],
+        scale: float = 5e5,
+        *,
+        during: Phase | None = None,
+        generator: torch.Generator | None = None,
+        backend: Backend = "auto",
+    ) -> None:
+        self.gaussians = gaussians
+        self.scale = check_number("PositionNoise", "scale", scale, 0.0)
+        self.during = during  # pyright: ignore[reportAttributeAccessIssue]
+        self.generator = generator
+        self.backend: Backend = check_choice(  # pyright: ignore[reportAttributeAccessIssue]
+            "PositionNoise", "backend", backend, BACKENDS
+        )
+        self._left = (0, 0)  # where the positions lay after the last step, and how often written
+        self._moved = 0
+
+    def __repr__(self) -> str:
+        during = "" if self.during is None else f", during={self.during.value}"
+        return f"PositionNoise(scale={self.scale:g}{during})"
+
+    def tensors(self, rows: int | None = None) -> GaussianTensors:
+        """The Gaussians' present tensors; ValueError unless they are those of `rows` points."""
+        source = self.gaussians() if callable(self.gaussians) else self.gaussians
+        missing = [name for name in ("scales", "quats", "opacities") if name not in source]
+        if missing:
+            raise ValueError(
+                f"PositionNoise: {missing} are not among the Gaussians' tensors {sorted(source)}"
+            )
+        if rows is not None and source["scales"].shape[0] != rows:
+            raise ValueError(
+                f"PositionNoise: {source['scales'].shape[0]} scales for {rows} means; the dict "
+                "must hold the tensors that belong to the means being stepped"
+            )
+        return source
+
+    def before(
+        self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
+    ) -> Tensor:
+        """Say once that somebody else moves the positions too, as a trainer's own noise does."""
+        # Density control puts another tensor in place; noise writes into this one, every time.
+        written = self._left[0] == param.data_ptr() and self._left[1] != param._version
+        if self._moved <= TWICE:
+            self._moved = self._moved + 1 if written else 0
+            if self._moved > TWICE:
+                warn_user(
+                    f"PositionNoise: the positions were changed in place between {TWICE} steps in "
+                    "a row, while this part adds noise in every step; if the trainer injects its "
+                    "own noise, set its noise_lr to 0, or leave this part out"
+                )
+        return grad
+
+    def after(self, group: Group, param: Tensor, state: dict[str, Any], course: Course) -> None:
+        """Add the noise to the positions [N, 3] in place."""
+        self.add_to(param, group["lr"], course.valid)
+        self._left = (param.data_ptr(), param._version)
+
+    @torch.no_grad()
+    def add_to(self, means: Tensor, lr: float | Tensor, valid: Tensor | bool = True) -> None:
+        """Add the noise to `means` [N, 3] in place; lr is their present learning rate."""
+        source = self.tensors(means.shape[0])
+        rate = torch.where(valid, lr, 0.0) if isinstance(valid, Tensor) else lr
+        add_covariance_noise(
+            means,
+            *(source[name].detach() for name in ("scales", "quats", "opacities")),
+            eta=_normal_like(means, self.generator),
+            lr=rate,
+            noise_scale=self.scale,
+            backend=self.backend,
+        )
+
+    def evidence(self, course: Course) -> Tensor:
+        """[1]: the largest noise of any Gaussian, in learning rates of the positions."""
+        source = self.tensors()
+        scales, opacities = source["scales"].detach(), source["opacities"].detach()
+        return largest_noise(scales, opacities, self.scale).reshape(1)
+
+    def useless(self, evidence: list[float], course: Course) -> str | None:
+        """Where no Gaussian is near the opacity gate; looked at again at every check."""
+        if evidence[0] >= EFFECT:
+            return None
+        return (
+            "no Gaussian is near the opacity gate: the largest noise is "
+            f"{evidence[0]:.1g} learning rates (threshold {EFFECT:g})"
+        )
+
+
+class IsotropicNoise(Part):
+    """Langevin noise of a landscape: `sqrt(2 lr temperature)`, or a fixed deviation, times eta.
+
+    Args:
+        temperature: that of the law exp(-energy / temperature) which plain SGLD drift
+            (`AWSGLD(preconditioner="none")`) then samples, in units of the energy.
+        std: a fixed deviation per step, in units of the parameters, instead of a temperature.
+        generator: random generator of the parameters' device, or None for torch's own.
+
+    Raises:
+        ValueError: not exactly one of temperature and std, or it is below 0.
+    """
+
+    names = None
+
+    def __init__(
+        self,
+        temperature: float | None = None,
+        std: float | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        if (temperature is None) == (std is None):
+            raise ValueError(
+                f"IsotropicNoise: temperature={temperature!r} and std={std!r}, but exactly one of "
+                "the two is needed"
+            )
+        name = "std" if temperature is None else "temperature"
+        check_number("IsotropicNoise", name, std if temperature is None else temperature, 0.0)
+        self.temperature, self.std, self.generator = temperature, std, generator
+
+    def __repr__(self) -> str:
+        size = f"std={self.std:g}" if self.std is not None else f"temperature={self.temperature:g}"
+        return f"IsotropicNoise({size})"
+
+    def after(self, group: Group, param: Tensor, state: dict[str, Any], course: Course) -> None:
+        """Add the noise to the parameter (any shape) in place."""
+        deviation: Any = self.std
+        if self.temperature is not None:
+            deviation = (2 * group["lr"] * self.temperature) ** 0.5
+        if isinstance(course.valid, Tensor):
+            deviation = deviation * course.valid
+        param.add_(_normal_like(param, self.generator) * deviation)
+
+
+def _normal_like(tensor: Tensor, generator: torch.Generator | None) -> Tensor:
+    # randn_like takes no generator.
+    return torch.randn(tensor.shape, dtype=tensor.dtype, device=tensor.device, generator=generator)

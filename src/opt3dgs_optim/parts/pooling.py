@@ -1,0 +1,51 @@
+"""Pooling: one second moment for all coordinates of a point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from opt3dgs_optim.course import Course
+from opt3dgs_optim.names import check_names
+from opt3dgs_optim.part import Group, Part
+
+
+@dataclass(frozen=True, repr=False)
+class Pooling(Part):
+    """Replace Adam's second moments of a point's coordinates by their mean (after VectorAdam).
+
+        v_ij <- mean_j v_ij,    point i, coordinate j of one parameter
+
+    Adam divides every coordinate's gradient by the size of that coordinate's own gradients, so
+    that it makes a full step along an axis that the images hardly constrain: a Gaussian's extent
+    along the line of sight, which few views see and the scale regulariser pulls at. With one
+    second moment the step has the direction of `exp_avg`, whatever the axes: short along such an
+    axis, up to the root of the number of coordinates longer along one with large gradients.
+
+    Applied after every step, so that the first step of a point is Adam's own. The state keeps its
+    shapes, [N, ..] with equal coordinates, because trainers edit it by rows. It costs no memory.
+
+    VectorAdam: Ling, Sharp and Jacobson, NeurIPS 2022. It sums over the coordinates; the mean
+    keeps the length of steps whose coordinates are alike, and so the trainer's learning rates.
+
+    Args:
+        names: the Gaussian parameters, under gsplat's or INRIA's names.
+
+    Raises:
+        ValueError: a name is no Gaussian parameter's, or there is none.
+    """
+
+    names: tuple[str, ...] = ("means", "scales", "quats")
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "names", check_names("Pooling", self.names))
+
+    def after(self, group: Group, param: Tensor, state: dict[str, Any], course: Course) -> None:
+        """Pool the second moments of a parameter [N, ..], in place."""
+        for key in ("exp_avg_sq", "max_exp_avg_sq"):
+            moment = state.get(key)
+            if moment is not None and moment.dim() > 1 and moment.numel() > 0:
+                coordinates = tuple(range(1, moment.dim()))
+                moment.copy_(moment.mean(coordinates, keepdim=True).expand_as(moment))

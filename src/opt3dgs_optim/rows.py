@@ -1,0 +1,201 @@
+"""Whose rows they are: what parts keep per row, against trainers that add, drop and move rows."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.weak import WeakIdKeyDictionary
+
+from opt3dgs_optim.checks import warn_user
+
+
+class _Seen(NamedTuple):
+    """What belonged together after a parameter's last step: an edit of one alone shows."""
+
+    param: weakref.ref[Tensor]
+    rows: int
+    moment: weakref.ref[Tensor]  # exp_avg
+
+
+class Ledger:
+    """Remembers to which rows of which parameter the tensors under the parts' keys belong.
+
+    Some trainers edit every tensor of the state by rows, others (INRIA, 3dgs-mcmc) the two moments
+    only. The rule that is safe with all: what was not seen with this parameter object, at this
+    number of rows, is dropped. The number alone is not enough: pruning and splitting between two
+    steps can bring it back to what it was.
+    """
+
+    def __init__(self) -> None:
+        self._seen: Any = WeakIdKeyDictionary()  # a part's tensor -> _Seen
+
+    def drop_strangers(self, param: Tensor, state: dict[str, Any], keys: Iterable[str]) -> None:
+        """Remove the tensors under `keys` that are of other rows than the parameter's present."""
+        for key in keys:
+            if key in state and not self._knows(param, state[key]):
+                del state[key]
+
+    def remember(self, param: Tensor, state: dict[str, Any], keys: Iterable[str]) -> None:
+        """Take the tensors under `keys` as those of the parameter's present rows."""
+        for key in keys:
+            if key in state:
+                seen = _Seen(weakref.ref(param), rows_of(param), weakref.ref(state["exp_avg"]))
+                self._seen[state[key]] = seen
+
+    def forget(
+        self,
+        call: str,
+        states: list[tuple[Tensor, dict[str, Any]]],
+        keys: Iterable[str],
+        rows: Tensor,
+        moments: bool,
+    ) -> None:
+        """Zero these rows under `keys`, and of the moments too if asked; see `reset_points`."""
+        is_mask = rows.dtype == torch.bool
+        fitting = [
+            (param, state)
+            for param, state in states
+            if param.dim() > 0 and (not is_mask or rows.shape == param.shape[:1])
+        ]
+        if states and not fitting:
+            raise ValueError(
+                f"{call}: rows has shape {tuple(rows.shape)}, but a mask of the first dimension "
+                f"of {[tuple(param.shape) for param, _ in states]} is needed"
+            )
+        for param, state in fitting:
+            for key in [key for key in keys if key in state]:
+                seen = self._seen.get(state[key])
+                # Edited by rows with the moments: not where they alone were.
+                left_behind = seen is not None and seen.moment() is not state["exp_avg"]
+                if left_behind or state[key].shape[0] != rows_of(param):
+                    del state[key]
+                else:
+                    state[key][rows.to(param.device)] = 0
+                    self.remember(param, state, (key,))
+            for key in ("exp_avg", "exp_avg_sq", "max_exp_avg_sq") if moments else ():
+                if key in state and state[key].shape[0] == param.shape[0]:
+                    state[key][rows.to(param.device)] = 0
+
+    def _knows(self, param: Tensor, tensor: Tensor) -> bool:
+        seen = self._seen.get(tensor)
+        return seen is not None and seen.param() is param and seen.rows == rows_of(param)
+
+
+class Frozen:
+    """Rows of a parameter that a step is to leave as they are: saved before, put back after.
+
+    Args:
+        moving: the other rows, [N] bool, or 0-d: all or none.
+        param: the parameter, [N, ..].
+        state: its state in the optimizer; every tensor in it is saved but `step`, unless nothing
+            moves.
+    """
+
+    def __init__(self, moving: Tensor, param: Tensor, state: dict[str, Any]) -> None:
+        self._state = state
+        tensors = {key: value for key, value in state.items() if isinstance(value, Tensor)}
+        if moving.dim() > 0:
+            tensors.pop("step", None)
+        # .data: putting back is no write that a part should notice by the version counter.
+        kept = [param.data, *tensors.values()]
+        self._kept = [(each, each.clone(), shaped(moving, each)) for each in kept]
+
+    @torch.no_grad()
+    def put_back(self) -> None:
+        """Give the rows that were not to move what they had."""
+        for tensor, saved, moving in self._kept:
+            tensor.copy_(torch.where(moving, tensor, saved))
+
+
+def rows_of(param: Tensor) -> int:
+    """The number of points of a parameter; a number alone is one."""
+    return param.shape[0] if param.dim() else 1
+
+
+def shaped(rows: Tensor, like: Tensor) -> Tensor:
+    """[N] as [N, 1, ..] for broadcasting over `like` [N, ..]; 0-d as it is."""
+    return rows.reshape(-1, *[1] * (like.dim() - 1)) if rows.dim() else rows
+
+
+def check_mask(call: str, masks: list[Any], num_points: int | None) -> Tensor:
+    """The only mask as a flat bool tensor [N]; ValueError where there is another number of them."""
+    if len(masks) != 1:
+        raise ValueError(f"{call}.step: {len(masks)} masks, but one is needed")
+    mask = masks[0]
+    if not isinstance(mask, Tensor) or mask.dim() == 0 or mask.is_complex():
+        raise ValueError(f"{call}.step: visible={mask!r}, but a mask of shape [N] is needed")
+    mask = mask.detach().reshape(-1)
+    if num_points is not None and num_points != mask.numel():
+        raise ValueError(
+            f"{call}.step: num_points={num_points}, but the mask has {mask.numel()} rows"
+        )
+    return mask if mask.dtype == torch.bool else mask != 0
+
+
+def check_mask_rows(call: str, rows: int, params: list[tuple[bool, Tensor]]) -> None:
+    """ValueError unless a mask of `rows` fits the parameters that it is about, and there are any.
+
+    Only against those with a gradient: a mask may be older than the others' rows, as where a
+    trainer adds points between rendering and step; such parameters are not stepped.
+    """
+    present = [(takes, param) for takes, param in params if param.grad is not None]
+    shapes = [tuple(param.shape) for takes, param in present if takes]
+    if present and (not shapes or any(shape[:1] != (rows,) for shape in shapes)):
+        shapes = shapes or [tuple(param.shape) for _, param in present]
+        raise ValueError(
+            f"{call}: the mask has {rows} rows, but the parameters have shapes {shapes}; a mask of "
+            "their first dimension is needed"
+        )
+
+
+def check_rows(call: str, params: list[Tensor], keys: Iterable[str], state: Any) -> None:
+    """ValueError unless loaded moments fit the parameters; what parts kept of other rows goes.
+
+    The number of rows may differ: some trainers load the optimizer first, the points afterwards.
+    """
+    for param in params:
+        own = state.get(param)
+        if not own:
+            continue
+        for key in ("exp_avg", "exp_avg_sq"):
+            value = own.get(key)
+            if not isinstance(value, Tensor) or value.shape[1:] != param.shape[1:]:
+                shape = tuple(value.shape) if isinstance(value, Tensor) else value
+                raise ValueError(
+                    f"{call}: {key} has shape {shape}, but the parameter has {tuple(param.shape)}"
+                )
+        if "step" not in own:
+            raise ValueError(f"{call}: no 'step' among {list(own)}; an Adam's state is needed")
+        for key in keys:
+            if key in own and own[key].shape[0] != rows_of(param):
+                warn_user(
+                    f"{call}: {key} of {own[key].shape[0]} rows for a parameter of "
+                    f"{rows_of(param)}: dropped, and collected anew"
+                )
+                del own[key]
+
+
+def reset_points(optimizers: Any, rows: Tensor, *, moments: bool = False) -> None:
+    """Say which points have moved by other means than the optimizers: what parts kept of them goes.
+
+    For a trainer that knows what its density control did. Call it after each edit of the
+    parameters: curvature pairs of all other points stay in use, where they would otherwise be
+    dropped with the exchanged Parameter object. The state's rows must have been edited along
+    (gsplat does; INRIA's edits leave the pairs behind, and they are dropped).
+
+    Args:
+        optimizers: an upgraded optimizer, or a dict of them (others in it are left alone).
+        rows: [N] bool mask or a vector of indices, of the points as they are now.
+        moments: whether to start their Adam moments anew too.
+
+    Raises:
+        ValueError: a mask fits no parameter.
+    """
+    every = optimizers.values() if isinstance(optimizers, Mapping) else [optimizers]
+    for optimizer in every:
+        if hasattr(optimizer, "reset_points"):
+            optimizer.reset_points(rows, moments=moments)

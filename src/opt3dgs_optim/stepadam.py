@@ -1,0 +1,332 @@
+"""The only Adam: torch's own step, with the parts of a course before, in and after it."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+from torch._compile import _disable_dynamo
+from torch.optim import Adam
+
+from opt3dgs_optim.course import Course
+from opt3dgs_optim.describe import block, group_lines
+from opt3dgs_optim.lending import Lent, guard, times
+from opt3dgs_optim.names import SLOT, canonical_name
+from opt3dgs_optim.part import Group, Part
+from opt3dgs_optim.rows import (
+    Frozen,
+    Ledger,
+    check_mask,
+    check_mask_rows,
+    check_rows,
+    shaped,
+)
+
+# Unwrapped: torch's step hooks and its profiler are around our step already.
+ADAM_STEP = inspect.unwrap(Adam.step)
+STATE_KEY = "opt3dgs"  # in param_groups[0] of a state_dict: the course's state
+
+
+class StepAdam(Adam):
+    """`torch.optim.Adam` whose steps have the parts of a `Course`.
+
+    The arithmetic is torch's own `Adam.step`, bit for bit, on every path (single tensor, foreach,
+    fused, capturable): a step lends it scaled learning rates and other gradients, and takes them
+    back, whatever happens. Made by `PhaseScheduler.upgrade`, `AWSGLD` and `LQNAdam`.
+    """
+
+    course: Course
+    any_group = False  # whether the parts act on groups that are no Gaussian parameter's, too
+    _base: type[Adam] = Adam  # whose step it is that the parts surround
+    _ledger: Ledger
+    _told = False  # of a gradient that is not finite
+
+    def follow(self, course: Course, base: type[Adam] = Adam) -> None:
+        """Have the parts of `course` from now on.
+
+        Args:
+            course: the training's.
+            base: the class whose step the parts surround: torch's Adam, or one with arithmetic of
+                its own, whose step then gets the mask.
+        """
+        self.course, self._base, self._ledger = course, base, Ledger()
+        self._patch_step_function()  # torch's, for a class that was given to a made optimizer
+        groups = self.param_groups
+        own_path = any(g[k] is not None for g in groups for k in ("fused", "foreach"))
+        own_path = own_path or any(g["capturable"] for g in groups)
+        tensors = [p for group in groups for p in group["params"]]
+        if base is Adam and not own_path and tensors and all(p.is_cuda for p in tensors):
+            self._use_fused()
+        self._trust_rows()
+
+    def _use_fused(self) -> None:
+        """Only torch's fused path takes a factor, and drops a step, on the device."""
+        self.defaults["fused"] = True
+        self._step_supports_amp_scaling = True
+        for group in self.param_groups:
+            group["fused"] = True
+            for param in group["params"]:
+                state = self.state.get(param)
+                if state:
+                    state["step"] = state["step"].to(param.device, torch.float32)
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """As torch's; notes which Gaussian parameter the group's name says that it holds."""
+        super().add_param_group(param_group)
+        group = self.param_groups[-1]
+        group.setdefault(SLOT, canonical_name(group.get("name")))
+
+    def acts_on(self, part: Part, group: Group) -> bool:
+        """Whether a part acts on a group."""
+        name = group.get(SLOT)
+        return part.names is None or name in part.names or (name is None and self.any_group)
+
+    # -- the step ------------------------------------------------------------------------------
+
+    # Under torch.compile a step runs as it is, like those of torch's own optimizers.
+    @_disable_dynamo
+    def step(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self,
+        closure: Callable[[], Any] | Tensor | None = None,
+        num_points: int | None = None,
+        *,
+        visible: Tensor | None = None,
+        visibility: Tensor | None = None,
+    ) -> Any:
+        """One step: of all rows, or only of those that a camera saw.
+
+        With a mask, the other rows keep parameters and state, whatever the parts do; the bias
+        correction is that of the whole parameter. It costs a copy of both. Parameters without a
+        gradient are left alone, whatever the mask, as in INRIA's and gsplat's own masked steps.
+
+        Args:
+            closure: evaluates the model and returns the loss; or the mask, as gsplat
+                (`step(mask)`) and INRIA (`step(mask, N)`) pass it.
+            num_points: number of rows, which must be the mask's.
+            visible: [N] mask; anything but 0 is visible.
+            visibility: another name of `visible`, gsplat's.
+
+        Returns:
+            The closure's value, or None.
+
+        Raises:
+            ValueError: several masks, or one that fits no parameter with a gradient.
+        """
+        self._opt_called = True  # what learning-rate schedulers would note by wrapping this method
+        masks: list[Any] = [each for each in (visible, visibility) if each is not None]
+        if isinstance(closure, Tensor):
+            masks, closure = [closure, *masks], None
+        mask = check_mask(type(self).__name__, masks, num_points) if masks else None
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        with torch.set_grad_enabled(self.defaults["differentiable"]):
+            acting = self.course.stepping(loss)
+            if self.course.valid is not False:
+                self._step(mask, acting)
+        return loss
+
+    # Learning-rate schedulers, which would wrap `step` on the instance, need not: `step` tells.
+    step._wrapped_by_lr_sched = True  # pyright: ignore[reportFunctionMemberAccess]
+
+    def _step(self, mask: Tensor | None, acting: bool) -> None:
+        course, lent, frozen, moved = self.course, Lent(), [], []
+        names = ("before", "factor", "after")
+        hooks = [course.hooks(name) if acting else [] for name in names]
+        if mask is not None:
+            self._check_mask(mask)
+        try:
+            for group in self.param_groups:
+                before, factor, after = (
+                    [part for part in parts if self.acts_on(part, group)] for parts in hooks
+                )
+                moved += self._prepare(group, mask, before, factor, after, lent, frozen)
+            if isinstance(course.valid, Tensor) and self._drops_on_device():
+                lent.flag(self, course.valid)
+            self._step_base(mask)
+        finally:
+            lent.take_back()
+        for group, param, parts in moved:
+            for part in parts:
+                part.after(group, param, self.state[param], course)
+            if course.keys:
+                self._ledger.remember(param, self.state[param], course.keys)
+        for rows in frozen:
+            rows.put_back()
+
+    def _prepare(
+        self,
+        group: Group,
+        mask: Tensor | None,
+        befores: list[Part],
+        factors: list[Part],
+        afters: list[Part],
+        lent: Lent,
+        frozen: list[Frozen],
+    ) -> list[tuple[Group, Tensor, list[Part]]]:
+        """Lend the group what its step needs; return what is to come after it."""
+        moved, with_parts = [], bool(befores or afters)
+        for param in group["params"]:
+            if param.grad is None or param.grad.is_sparse:
+                continue
+            self._told |= guard(param.grad, self.course, self._told)
+            moving = self._moving(group, param, mask, with_parts)
+            if moving is not None or befores:
+                self._lend_gradient(group, param, moving, befores, lent, frozen)
+            moved.append((group, param, afters))
+        factor = None
+        for part in factors:
+            factor = times(factor, part.factor(group, self.course))
+        if factor is not None:
+            lent.rate(group, factor, self.course.valid)
+        return moved
+
+    def _step_base(self, mask: Tensor | None) -> None:
+        if self._base is Adam:
+            ADAM_STEP(self)
+            return
+        step = inspect.unwrap(self._base.step)
+        if mask is None:
+            step(self)
+            return
+        if isinstance(self.course.valid, Tensor):
+            mask = mask & self.course.valid.to(mask.device)
+        takes_number = len(inspect.signature(step).parameters) > 2  # INRIA's: step(mask, N)
+        step(self, mask, mask.numel()) if takes_number else step(self, mask)
+
+    def _lend_gradient(
+        self,
+        group: Group,
+        param: Tensor,
+        moving: Tensor | None,
+        parts: list[Part],
+        lent: Lent,
+        frozen: list[Frozen],
+    ) -> None:
+        """Put what Adam is to be fed into `param.grad`."""
+        fed, state = cast(Tensor, param.grad), self.state[param]
+        if not state:  # torch makes its moments only where there is nothing else yet
+            self._init_group({**group, "params": [param]}, [], [], [], [], [], [])
+        if moving is not None:
+            frozen.append(Frozen(moving, param, state))
+            fed = torch.where(shaped(moving, fed), fed, 0.0)
+        self._ledger.drop_strangers(param, state, self.course.keys)
+        # Parts get the gradient of what is minimised, in unscaled units.
+        scale = getattr(self, "grad_scale", None)
+        unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
+        plain = not parts or (scale is None and unit == 1.0)
+        fed = fed if plain else fed / unit
+        for part in parts:
+            fed = part.before(group, param, fed, state, self.course)
+        fed = fed if plain else fed * unit
+        if fed is not param.grad:
+            lent.attribute(param, "grad", fed)
+
+    def _moving(
+        self, group: Group, param: Tensor, mask: Tensor | None, with_parts: bool
+    ) -> Tensor | None:
+        """The rows that may move, [N] or 0-d bool; None: all, or the base's own step knows."""
+        valid = self.course.valid
+        if mask is not None and self._takes_mask(group, mask.numel()):
+            if self._base is not Adam and not with_parts:
+                return None
+            rows = mask.to(param.device)
+            return rows & valid if isinstance(valid, Tensor) else rows
+        return valid if isinstance(valid, Tensor) and not self._drops_on_device() else None
+
+    def _drops_on_device(self) -> bool:
+        """Whether torch's own step can be told on the device not to be made."""
+        return self._base is Adam and all(group["fused"] for group in self.param_groups)
+
+    # -- masks ---------------------------------------------------------------------------------
+
+    def _takes_mask(self, group: Group, rows: int) -> bool:
+        """Whether a mask of so many rows is about this group."""
+        if group.get(SLOT) is not None:
+            return True
+        return self.any_group and any(p.shape[:1] == (rows,) for p in group["params"])
+
+    def _check_mask(self, mask: Tensor) -> None:
+        call, rows = f"{type(self).__name__}.step", mask.numel()
+        taking = [self._takes_mask(group, rows) for group in self.param_groups]
+        every = list(zip(taking, self.param_groups, strict=True))
+        check_mask_rows(call, rows, [(takes, p) for takes, g in every for p in g["params"]])
+        if self.defaults["differentiable"]:
+            raise ValueError(f"{call}: a mask with differentiable=True is not possible")
+
+    def reset_points(self, rows: Tensor, *, moments: bool = False) -> None:
+        """Say which points have moved by other means than `step()`; see `reset_points`."""
+        groups = [g for g in self.param_groups if self.any_group or g.get(SLOT) is not None]
+        states = [(p, self.state.get(p, {})) for group in groups for p in group["params"]]
+        call = f"{type(self).__name__}.reset_points"
+        self._ledger.forget(call, states, self.course.keys, rows, moments)
+
+    # -- copies and checkpoints ----------------------------------------------------------------
+
+    def _trust_rows(self) -> None:
+        """Take what the parts have kept as that of the parameters' present rows."""
+        for param, state in self.state.items():
+            self._ledger.remember(param, state, self.course.keys)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "course": self.course, "_base": self._base}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        if "course" in state:  # a copy: the parameters are other objects, the rows the same
+            self._ledger = Ledger()
+            self._trust_rows()
+
+    def state_dict(self) -> dict[str, Any]:
+        """torch's, with the course's inside `param_groups[0]`, and nothing of strangers' rows."""
+        for param, state in self.state.items():
+            self._ledger.drop_strangers(param, state, self.course.keys)
+        if not self.course.keeps_state:
+            return super().state_dict()
+        group = self.param_groups[0]
+        group[STATE_KEY] = self.course.state_dict()
+        try:
+            return super().state_dict()
+        finally:
+            del group[STATE_KEY]
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """As torch's; also takes the `state_dict()` of a plain Adam.
+
+        Raises:
+            ValueError: it does not fit; then nothing has been loaded.
+        """
+        call = f"{type(self).__name__}.load_state_dict"
+        before = self.state, self.param_groups
+        names = [group.get(SLOT) for group in self.param_groups]
+        super().load_state_dict(state_dict)
+        try:
+            params = [p for group in self.param_groups for p in group["params"]]
+            check_rows(call, params, self.course.keys, self.state)
+            self.take_loaded()
+        except ValueError:
+            self.state, self.param_groups = before
+            raise
+        for group, name in zip(self.param_groups, names, strict=True):
+            if name is not None:
+                group[SLOT] = name
+        if self._base is Adam and self.defaults["fused"]:
+            self._use_fused()
+        self._trust_rows()
+
+    def take_loaded(self) -> None:
+        """Take the course's state out of the groups, where a checkpoint has put it."""
+        shared = self.param_groups[0].pop(STATE_KEY, None)
+        if shared is not None:
+            self.course.load_state_dict(shared)
+        else:
+            steps = [float(state["step"]) for state in self.state.values() if "step" in state]
+            self.course.expect(int(max(steps, default=0)))
+
+    def __repr__(self) -> str:
+        lines = [str(part) for part in self.course.parts] + group_lines(self.param_groups)
+        return block(type(self).__name__, lines)

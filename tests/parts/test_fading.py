@@ -1,0 +1,205 @@
+"""Fading: which points, how often, and what happens to them."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from trainers import edit_rows, gsplat_optimizers, inria_optimizer, make_splats, only, state_of, train
+
+from opt3dgs_optim import Fading, PhaseScheduler
+
+TOTAL = 60
+CPU = torch.device("cpu")
+
+
+
+def test_events_are_spread_evenly_and_each_happens_once() -> None:
+    fading = Fading(events=300, start=0.03, stop=0.5)
+    counts = [fading.events_before(i, 30_000) for i in range(30_001)]
+    assert counts[900] == 0
+    assert counts[-1] == counts[15_000] == 300
+    steps = [b - a for a, b in itertools.pairwise(counts)]
+    assert set(steps) == {0, 1}
+    assert Fading(events=300).events_before(100, 100) == 300  # a short run has several at once
+
+
+def test_the_same_points_fade_in_all_parameters_and_the_share_is_right() -> None:
+    splats = make_splats(400)
+    fading = Fading(share=0.25, events=1, start=0.0, stop=0.5)
+    phases = only(TOTAL, fading)
+    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    train(splats, optimizers, phases, 0, 29)
+    before = {
+        name: {key: value.clone() for key, value in opt.state[splats[name]].items()}
+        for name, opt in optimizers.items()
+    }
+    phases.observe(0.1)  # iteration 29: the event is before its step
+    chosen = []
+    for name, optimizer in optimizers.items():
+        group, param = optimizer.param_groups[0], splats[name]
+        fading.before(group, param, torch.zeros_like(param), optimizer.state[param], phases)
+        state = optimizer.state[splats[name]]
+        faded = _ratio(state, before[name], "exp_avg") < 0.5
+        chosen.append(faded)
+        for key, factor in (("exp_avg", 0.2), ("exp_avg_sq", 0.04)):
+            expected = torch.where(faded, factor, 1.0)
+            torch.testing.assert_close(_ratio(state, before[name], key), expected)
+    assert all(torch.equal(rows, chosen[0]) for rows in chosen)
+    assert 60 <= int(chosen[0].sum()) <= 140  # 100 expected, deviation 8.7
+
+
+def _ratio(after: dict[str, Any], before: dict[str, Any], key: str) -> torch.Tensor:
+    """By what each point's moments were multiplied, [N]."""
+    old = before[key].reshape(len(before[key]), -1)
+    return (after[key].reshape(old.shape) * old).sum(1) / (old * old).sum(1)
+
+
+@pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
+def test_only_the_named_parameters_fade(make: Any) -> None:
+    after: list[dict[str, torch.Tensor]] = []
+    every_parameter = Fading(1.0, events=1, start=0.0)
+    named_ones = replace(every_parameter, names=("opacities", "scaling"))  # INRIA's: the scales
+    for fading in ([], [named_ones], [every_parameter]):
+        splats = make_splats(40)
+        phases = only(TOTAL, *fading)
+        optimizers = phases.upgrade(make(splats))
+        train(splats, optimizers, phases, 0, 31)
+        after.append(
+            {name: state_of(optimizers, p)["exp_avg_sq"].clone() for name, p in splats.items()}
+        )
+    plain, some, every = after
+    for name in plain:
+        assert not torch.equal(plain[name], every[name]), name
+        named = name in ("opacities", "scales")
+        assert torch.equal(some[name], every[name] if named else plain[name]), name
+
+
+def test_a_step_after_fading_is_no_longer_than_before() -> None:
+    """0.2 / sqrt(0.04) = 1: what the defaults are chosen for."""
+    param = torch.nn.Parameter(torch.zeros(500, 3))
+    adam = torch.optim.Adam([param], lr=1.0)
+    for i in range(200):
+        param.grad = torch.randn(500, 3, generator=torch.Generator().manual_seed(i))
+        adam.step()
+    state = adam.state[param]
+    length = (state["exp_avg"] / state["exp_avg_sq"].sqrt()).abs()
+    group = {"faded": 0}
+    phases = PhaseScheduler(TOTAL, parts=[])
+    phases.observe(0.1, iteration=TOTAL // 2)
+    Fading(share=1.0, events=1).before(group, param, param, state, phases)
+    faded = (state["exp_avg"] / state["exp_avg_sq"].sqrt()).abs()
+    torch.testing.assert_close(faded, length)
+
+
+def test_fading_survives_density_control() -> None:
+    splats = make_splats()
+    phases = only(TOTAL, Fading(share=1.0, events=60, start=0.0, stop=1.0))
+    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    for i in range(0, TOTAL, 10):
+        train(splats, optimizers, phases, i, i + 10)
+        edit_rows(splats, optimizers, torch.arange(len(splats["means"])) % 4 != 1, 2)  # pyright: ignore[reportArgumentType]
+    assert all(bool(p.isfinite().all()) for p in splats.values())
+
+
+# -- each event once, whatever the iterations do --------------------------------------------------
+
+
+def trained(fading: Fading, iterations: Any, steps: int = 1) -> torch.Tensor:
+    """Second moments of points that have the same gradient in each of `steps` per iteration."""
+    x = torch.nn.Parameter(torch.ones(500, 3))
+    phases = only(100, fading)
+    means = phases.upgrade({"means": torch.optim.Adam([x], lr=0.0, betas=(0.9, 0.0))})["means"]
+    means.defaults["betas"] = means.param_groups[0]["betas"] = (0.9, 1 - 1e-12)
+    phases.observe(0.1, iteration=0)
+    x.grad = torch.ones(500, 3)
+    means.step()
+    means.state[x]["exp_avg_sq"].fill_(1.0)
+    for iteration in iterations:
+        phases.observe(0.1, iteration=iteration)
+        for _ in range(steps):
+            x.grad = torch.zeros(500, 3)
+            means.step()
+    return means.state[x]["exp_avg_sq"][:, 0].log() / torch.tensor(0.04).log()
+
+
+EVENTS = Fading(share=0.5, events=10, start=0.0, stop=1.0)
+
+
+def test_an_iteration_that_jumps_loses_no_event() -> None:
+    """A trainer that accumulates gradients, or one that resumes: the events in between come."""
+    one_by_one = trained(EVENTS, range(1, 100))
+    assert float(one_by_one.mean()) == pytest.approx(5, abs=0.3)
+    for jumps in (range(4, 101, 5), [60, 99], [99]):
+        assert torch.allclose(trained(EVENTS, jumps), one_by_one, atol=1e-3), jumps
+
+
+def test_several_steps_per_iteration_fade_once() -> None:
+    assert torch.allclose(trained(EVENTS, range(1, 100), 3), trained(EVENTS, range(1, 100)), atol=1e-3)
+
+
+def test_a_rewound_training_does_not_fade_what_is_over() -> None:
+    """Back to an earlier iteration without its checkpoint: nothing is faded for going back."""
+    before, after = trained(EVENTS, [55]), trained(EVENTS, [55, 12])
+    assert torch.allclose(before, after, atol=1e-3)
+
+
+def test_many_events_at_once_are_not_all_made_up_for() -> None:
+    every = Fading(share=1.0, events=300, start=0.0, stop=1.0)
+    assert float(trained(every, [99]).max()) < 32.5  # 0.04^32 is denormal
+
+
+def test_a_dropped_step_fades_nothing_and_its_event_comes_with_the_next() -> None:
+    x = torch.nn.Parameter(torch.ones(50, 3))
+    phases = only(100, Fading(share=1.0, events=1, start=0.0, stop=0.5))
+    means = phases.upgrade({"means": torch.optim.Adam([x], lr=0.0)})["means"]
+    for iteration, loss in ((0, 0.1), (49, float("nan")), (50, 0.1)):
+        phases.observe(loss, iteration=iteration)
+        x.grad = torch.zeros(50, 3) if iteration else torch.ones(50, 3)
+        before = means.state[x]["exp_avg"].clone() if iteration else x.grad
+        means.step()
+        ratio = float((means.state[x]["exp_avg"] / before).mean())
+        assert ratio == pytest.approx({0: 0.1, 49: 1.0, 50: 0.2 * 0.9}[iteration])
+
+
+# -- the choice of points --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2**31, 2**32, 2**40 + 7])
+def test_every_seed_chooses_other_points(seed: int) -> None:
+    """A CPU's generator reads 32 bits, all of which the event took."""
+    chosen = [Fading(seed=seed).chosen(event, 4000, CPU) for event in range(3)]
+    others = [Fading(seed=other).chosen(0, 4000, CPU) for other in (3, 5) if other != seed]
+    for one, other in itertools.combinations([*chosen, *others], 2):
+        # independent choices of 20 % have 4 % in common: 160, deviation 12
+        assert 100 < int((one & other).sum()) < 220
+    assert torch.equal(chosen[1], Fading(seed=seed).chosen(1, 4000, CPU))
+
+
+def test_the_log_gets_the_share_of_this_iteration() -> None:
+    phases = only(100, Fading(share=0.25, events=10, start=0.0, stop=1.0))
+    phases.observe(0.1, iteration=4)
+    assert phases.numbers()["faded"] == pytest.approx(0.0)
+    phases.observe(0.1, iteration=9)
+    assert phases.numbers()["faded"] == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: Fading(share=0.0), r"Fading: share=0.0"),
+        (lambda: Fading(exp_avg=1.5), r"Fading: exp_avg=1.5"),
+        (lambda: Fading(exp_avg_sq=-0.1), r"Fading: exp_avg_sq=-0.1"),
+        (lambda: Fading(events=0), r"Fading: events=0"),
+        (lambda: Fading(start=0.6, stop=0.5), r"Fading: stop=0.5.*\(0.6, 1.0\]"),
+        (lambda: Fading(seed=-1), r"Fading: seed=-1"),
+        (lambda: Fading(names=("pose",)), r"Fading: names=\('pose',\).*means, scales"),
+        (lambda: Fading(names=()), r"Fading: names=\(\)"),
+    ],
+)
+def test_bad_options_are_named(call: Any, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        call()

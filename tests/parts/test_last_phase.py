@@ -1,0 +1,90 @@
+"""What changes at the switch: the loss and the moments."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from trainers import (
+    edit_rows,
+    gsplat_optimizers,
+    inria_optimizer,
+    make_splats,
+    only,
+    state_of,
+    train,
+)
+
+from opt3dgs_optim import FreshMoments, PhaseScheduler, SquaredLoss
+
+TOTAL, SWITCH = 60, 40
+
+
+def test_the_loss_is_squared_while_exploiting() -> None:
+    phases = only(18, SquaredLoss(), switch=12)
+    render, target = torch.full((2, 2, 3), 0.5), torch.zeros(2, 2, 3)
+    for iteration in range(18):
+        expected = 0.25 if iteration >= 12 else 0.5
+        assert float(phases.pixel_loss(render, target)) == expected
+        phases.observe(0.1)
+
+
+@pytest.mark.parametrize("settling", [0, TOTAL - SWITCH, TOTAL - SWITCH + 1])
+@pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
+def test_moments_start_anew_at_the_switch_where_there_is_time(make, settling: int) -> None:
+    splats = make_splats()
+    phases = only(TOTAL, FreshMoments(settling), switch=SWITCH)
+    optimizers = phases.upgrade(make(splats))
+    train(splats, optimizers, phases, 0, SWITCH + 1)
+    fresh = settling <= TOTAL - SWITCH
+    for param in splats.values():
+        state = state_of(optimizers, param)
+        assert float(state["step"]) == (1.0 if fresh else SWITCH + 1.0)
+    train(splats, optimizers, phases, SWITCH + 1, TOTAL)
+    steps = TOTAL - SWITCH if fresh else TOTAL
+    assert {float(state_of(optimizers, p)["step"]) for p in splats.values()} == {steps}
+
+
+def test_the_first_step_after_the_switch_is_that_of_a_new_adam() -> None:
+    ours, theirs = make_splats(), make_splats()
+    phases = only(TOTAL, FreshMoments(), switch=SWITCH)
+    optimizers = phases.upgrade(gsplat_optimizers(ours, amsgrad=True))
+    train(ours, optimizers, phases, 0, SWITCH)
+    for name, param in ours.items():
+        theirs[name].data.copy_(param.data)
+    train(ours, optimizers, phases, SWITCH, TOTAL)
+    train(theirs, gsplat_optimizers(theirs, amsgrad=True), None, SWITCH, TOTAL)
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+
+
+def test_points_that_come_after_the_switch_do_not_start_the_others_anew() -> None:
+    splats = make_splats()
+    phases = only(TOTAL, FreshMoments(), switch=SWITCH)
+    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    train(splats, optimizers, phases, 0, SWITCH + 5)
+    edit_rows(splats, optimizers, torch.arange(12), 3)
+    train(splats, optimizers, phases, SWITCH + 5, SWITCH + 6)
+    assert float(state_of(optimizers, splats["means"])["step"]) == 6.0
+
+
+def test_a_step_that_is_dropped_at_the_switch_does_not_lose_the_fresh_start() -> None:
+    splats = make_splats()
+    phases = only(TOTAL, FreshMoments(), switch=SWITCH)
+    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    train(splats, optimizers, phases, 0, SWITCH)
+    phases.observe(float("nan"))
+    for optimizer in optimizers.values():
+        optimizer.step()
+    train(splats, optimizers, phases, SWITCH + 1, SWITCH + 2)
+    assert {float(state_of(optimizers, p)["step"]) for p in splats.values()} == {1.0}
+
+
+@pytest.mark.parametrize("settling", [-1, 1.5, None, "many", True])
+def test_settling_is_a_number_of_iterations(settling) -> None:
+    with pytest.raises(ValueError, match="FreshMoments: settling="):
+        FreshMoments(settling)
+
+
+def test_the_paper_has_both() -> None:
+    phases = PhaseScheduler.paper(300)
+    assert phases.part(SquaredLoss) is not None
+    assert phases.part(FreshMoments) == FreshMoments()

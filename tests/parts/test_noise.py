@@ -1,0 +1,186 @@
+"""The noise's law against an oracle of matrices."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+import pytest
+import torch
+from oracles import covariance
+
+from opt3dgs_optim import Course, IsotropicNoise, PositionNoise
+from opt3dgs_optim.covariance import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
+
+
+def gaussians(n: int, seed: int = 0) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    draw = {
+        "scales": torch.randn(n, 3, generator=generator, dtype=torch.float64),
+        "quats": 3 * torch.randn(n, 4, generator=generator, dtype=torch.float64),
+        "opacities": 6 * torch.randn(n, generator=generator, dtype=torch.float64) - 4,
+    }
+    return draw
+
+
+def test_is_gate_times_covariance_times_eta() -> None:
+    g = gaussians(40)
+    eta = torch.randn(40, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
+    noise = covariance_noise(g["scales"], g["quats"], g["opacities"], eta).numpy()
+    for i in range(40):
+        opacity = 1 / (1 + np.exp(-g["opacities"][i].item()))
+        gate = 1 / (1 + np.exp(100 * (opacity - 0.005)))
+        sigma = covariance(g["scales"][i].numpy(), g["quats"][i].numpy())
+        np.testing.assert_allclose(noise[i], gate * sigma @ eta[i].numpy(), rtol=1e-9, atol=1e-13)
+
+
+def test_gate_is_the_trainers_op_sigmoid() -> None:
+    """op_sigmoid(1 - o, k=100, x0=0.995) of 3dgs-mcmc."""
+    opacity = torch.tensor([0.0005, 0.005, 0.05, 0.9], dtype=torch.float64)
+    ones = torch.ones(4, 3, dtype=torch.float64)
+    quats = torch.tensor([[1.0, 0, 0, 0]] * 4, dtype=torch.float64)
+    noise = covariance_noise(0 * ones, quats, opacity.logit(), ones)[:, 0]
+    expected = 1 / (1 + torch.exp(-100 * ((1 - opacity) - 0.995)))
+    torch.testing.assert_close(noise, expected, rtol=1e-9, atol=1e-15)
+
+
+def test_nerfstudio_opacities_have_a_second_dimension() -> None:
+    g = gaussians(5)
+    eta = torch.ones(5, 3, dtype=torch.float64)
+    flat = covariance_noise(g["scales"], g["quats"], g["opacities"], eta)
+    column = covariance_noise(g["scales"], g["quats"], g["opacities"].unsqueeze(1), eta)
+    assert torch.equal(flat, column)
+
+
+def test_added_noise_has_the_covariance_squared() -> None:
+    """Cov(gate Sigma eta) = gate^2 Sigma^2, times (lr scale)^2."""
+    n = 40_000
+    one = {key: value[:1].expand(n, *value.shape[1:]) for key, value in gaussians(1, 3).items()}
+    one["opacities"] = torch.full((n,), -12.0, dtype=torch.float64)
+    means = torch.zeros(n, 3, dtype=torch.float64)
+    torch.manual_seed(0)
+    PositionNoise(one, scale=20.0).add_to(means, 0.05)
+    sigma = covariance(one["scales"][0].numpy(), one["quats"][0].numpy())
+    gate = 1 / (1 + np.exp(100 * (1 / (1 + np.exp(12.0)) - 0.005)))
+    expected = gate**2 * sigma @ sigma
+    # relative standard error of a second moment from 40,000 draws: 0.7 %
+    np.testing.assert_allclose(np.cov(means.numpy().T), expected, atol=0.04 * expected.max())
+
+
+def test_host_dict_is_read_anew() -> None:
+    g = gaussians(4)
+    noise = PositionNoise(g, scale=1.0)
+    more = gaussians(6)
+    g.update(more)
+    means = torch.zeros(6, 3, dtype=torch.float64)
+    noise.add_to(means, 1.0)
+    assert bool(means.any())
+
+
+def test_function_as_source() -> None:
+    means = torch.zeros(4, 3, dtype=torch.float64)
+    PositionNoise(lambda: gaussians(4), scale=1.0).add_to(means, 1.0)
+    assert bool(means.any())
+
+
+def test_generator_makes_it_reproducible() -> None:
+    draws = []
+    for _ in "ab":
+        means = torch.zeros(4, 3, dtype=torch.float64)
+        generator = torch.Generator().manual_seed(5)
+        PositionNoise(gaussians(4), scale=1.0, generator=generator).add_to(means, 1.0)
+        draws.append(means)
+    assert torch.equal(*draws)
+
+
+def test_mistakes_are_named() -> None:
+    means = torch.zeros(4, 3, dtype=torch.float64)
+    with pytest.raises(ValueError, match=re.escape("['quats', 'opacities']")):
+        PositionNoise({"scales": means}).add_to(means, 1.0)
+    with pytest.raises(ValueError, match="5 scales for 4 means"):
+        PositionNoise(gaussians(5)).add_to(means, 1.0)
+
+
+def test_the_constants_are_the_trainers() -> None:
+    """noise_lr, k and 1 - x0 of 3dgs-mcmc."""
+    assert PositionNoise({}).scale == 5e5
+    assert (GATE_SHARPNESS, GATE_OPACITY) == (100.0, 0.005)
+
+
+def test_quaternions_of_any_length_and_of_none() -> None:
+    """As torch.nn.functional.normalize: below 1e-12 there is no direction, and no NaN."""
+    g = gaussians(5)
+    eta = torch.ones(5, 3, dtype=torch.float64)
+    sizes = torch.tensor([1e-6, 0.1, 1.0, 1e6, 1.0], dtype=torch.float64)[:, None]
+    unit = torch.nn.functional.normalize(g["quats"])
+    found = covariance_noise(g["scales"], unit * sizes, g["opacities"], eta)
+    expected = covariance_noise(g["scales"], unit, g["opacities"], eta)
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)
+    none = covariance_noise(g["scales"], 0 * unit, g["opacities"], eta)
+    # R = 1 where there is no quaternion: the variances along the axes
+    upright = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(5, 4)
+    assert torch.equal(none, covariance_noise(g["scales"], upright, g["opacities"], eta))
+
+
+@pytest.mark.parametrize(
+    "lr", [0.05, torch.tensor(0.05, dtype=torch.float64)], ids=["float", "0-d"]
+)
+def test_added_noise_is_scale_times_learning_rate_times_the_draw(lr: float | torch.Tensor) -> None:
+    g = gaussians(7)
+    start = torch.randn(7, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    means = start.clone()
+    noise = PositionNoise(g, scale=0.25, generator=torch.Generator().manual_seed(5))
+    noise.add_to(means, lr)
+    eta = torch.randn(7, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    drawn = covariance_noise(g["scales"], g["quats"], g["opacities"], eta)
+    torch.testing.assert_close(means, start + 0.25 * 0.05 * drawn, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("options", "deviation"),
+    [
+        ({"temperature": 0.5}, math.sqrt(2 * 0.02 * 0.5)),
+        ({"std": 0.3}, 0.3),
+        ({"temperature": 0.0}, 0.0),
+        ({"std": 0.0}, 0.0),
+    ],
+    ids=str,
+)
+def test_isotropic_noise_is_the_deviation_times_the_draw(options: dict, deviation: float) -> None:
+    start = torch.randn(6, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    point = start.clone()
+    noise = IsotropicNoise(**options, generator=torch.Generator().manual_seed(5))
+    noise.after({"lr": 0.02}, point, {}, Course())
+    eta = torch.randn(6, 2, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    torch.testing.assert_close(point, start + deviation * eta, rtol=1e-14, atol=0)
+
+
+def test_isotropic_noise_is_given_in_one_way() -> None:
+    options: dict
+    for options in ({}, {"temperature": 1.0, "std": 1.0}):
+        with pytest.raises(ValueError, match="exactly one of the two"):
+            IsotropicNoise(**options)
+    for name in ("temperature", "std"):
+        options = {name: -0.5}
+        with pytest.raises(ValueError, match=rf"IsotropicNoise: {name}=-0\.5"):
+            IsotropicNoise(**options)
+
+
+def test_a_scale_of_a_half_or_none() -> None:
+    for scale in (0.5, 0.0):
+        assert PositionNoise({}, scale=scale).scale == scale
+    with pytest.raises(ValueError, match=r"scale=-0\.5"):
+        PositionNoise({}, scale=-0.5)
+    with pytest.raises(ValueError, match="backend='fast'"):
+        PositionNoise({}, backend="fast")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("rows", [3, 5])
+def test_gaussians_of_another_scene(rows: int) -> None:
+    """Also where the number of points is that of the coordinates."""
+    means = torch.zeros(rows, 3, dtype=torch.float64)
+    with pytest.raises(ValueError, match=f"6 scales for {rows} means"):
+        PositionNoise(gaussians(6)).add_to(means, 1.0)
+    PositionNoise(gaussians(rows)).add_to(means, 1.0)
+    assert bool(means.any())
