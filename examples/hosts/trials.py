@@ -95,6 +95,7 @@ def _inria(trainer: str, *options: str, script: str = "train.py") -> Trial:
 _MINI = "--densify_until_iter 40 --simp_iteration1 40 --simp_iteration2 70 --imp_metric indoor"
 # taming cannot clone none or split none: a budget for few refinements, and points of both kinds.
 _TAMING = "--mode final_count --budget 6000 --cams 2 --densify_until_iter 60 --percent_dense 0.03"
+_TAMING += " --opacity_reset_interval 1000"  # afterwards no gradient is large enough to split
 _NO_FUSED = "unexpected keyword argument 'fused'"
 TRIALS = (
     _gsplat("gsplat-1.4.0", "mcmc"),

@@ -20,9 +20,6 @@ BESIDE = Path(__file__).resolve().parents[3] / "shared" / "scenes" / "banana"
 SCENE = Path(os.environ.get("OPT3DGS_SCENE", BESIDE))
 NEEDED = ("torchmetrics", "tyro", "cv2", "sklearn", "yaml", "imageio")
 OURS = 1.5  # dB that an edited run of 100 iterations may be worse than the stock one
-SPARSE = "a mask made before the densification stops the sparse Adam (issue 17, 1)"
-SECOND = "an optimizer without positions cannot be upgraded second (issue 17, 4)"
-TODAY = {("gaussian-splatting", "sparse_adam"): SPARSE, ("taming-3dgs", "--mode"): SECOND}
 
 pytestmark = pytest.mark.hosts
 
@@ -40,14 +37,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def of_trials(trials: tuple[Trial, ...]) -> list:
-    made = []
-    for trial in trials:
-        reason = next(
-            (TODAY[k] for k in TODAY if k[0] == trial.trainer and k[1] in trial.options), None
-        )
-        marks = [pytest.mark.xfail(strict=True, reason=reason)] if reason else []
-        made.append(pytest.param(trial, id=trial.name, marks=marks))
-    return made
+    return [pytest.param(trial, id=trial.name) for trial in trials]
 
 
 def need(trial: Trial) -> None:
@@ -111,7 +101,6 @@ def test_resume(trial: Trial, first: str, scene: Path, work: Path, tmp_path: Pat
     assert done.psnr > begun.psnr - OURS
 
 
-@pytest.mark.xfail(strict=True, reason="nothing shows that the package is active (issue 17, 6)")
 def test_a_sign_of_life(scene: Path, work: Path, tmp_path: Path) -> None:
     trial = next(t for t in TRIALS if t.trainer == "3dgs-mcmc")
     need(trial)
