@@ -201,7 +201,8 @@ def missing() -> str | None:
     except ModuleNotFoundError:
         found = False
     if not found:
-        return "cuda.core is not installed (pip install 'opt3dgs_optim[cuda]')"
+        extra = "cuda12" if (torch.version.cuda or "").startswith("12") else "cuda"
+        return f"cuda.core is not installed (pip install 'opt3dgs_optim[{extra}]')"
     if not torch.cuda.is_available():
         return "torch sees no CUDA device: no NVIDIA driver, or a build of torch without CUDA"
     try:
