@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import subprocess
 import sys
 import tarfile
@@ -142,9 +141,7 @@ def test_wheel_trains_in_an_empty_environment(installed: Path, tmp_path: Path) -
 
 
 def test_doctor_finds_the_wheel_in_order(installed: Path, tmp_path: Path) -> None:
-    words = ("-m", "opt3dgs_optim", "doctor", "--json", "--points", "500", "--device", "cpu")
-    done = run(installed, tmp_path, *words)
+    done = run(installed, tmp_path, "-m", "opt3dgs_optim", "doctor", "--device", "cpu")
     assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert found["passed"] is True
-    assert found["versions"]["opt3dgs_optim"] == opt3dgs_optim.__version__
+    assert "In order: " in done.stdout
+    assert opt3dgs_optim.__version__ in done.stdout

@@ -13,23 +13,15 @@ COMMANDS = {
     "report": "compare runs from their logs: error against run time",
     "hosts": "the lines to change in your trainer, as a diff or applied",
 }
+MODULES = {"report": "runs.report", "hosts": "hosts.__main__"}
 
 
 def usage() -> str:
     """The list of commands."""
     width = max(map(len, COMMANDS))
-    rows = [f"  {name:<{width}}  {what}" for name, what in COMMANDS.items()]
-    return "\n".join(
-        [
-            f"opt3dgs_optim {__version__}",
-            "",
-            "opt3dgs COMMAND ...",
-            "",
-            *rows,
-            "",
-            "opt3dgs COMMAND --help says more.",
-        ]
-    )
+    rows = "\n".join(f"  {name:<{width}}  {what}" for name, what in COMMANDS.items())
+    head = f"opt3dgs_optim {__version__}\n\nopt3dgs COMMAND ..."
+    return f"{head}\n\n{rows}\n\nopt3dgs COMMAND --help says more."
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -45,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"opt3dgs_optim: no command {words[0]!r}\n\n{usage()}", file=sys.stderr)
         return 2
     try:
-        module = "runs.report" if words[0] == "report" else words[0]
+        module = MODULES.get(words[0], words[0])
         return importlib.import_module(f"opt3dgs_optim.{module}").main(words[1:])
     except KeyboardInterrupt:
         return 130

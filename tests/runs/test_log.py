@@ -155,9 +155,8 @@ def test_first_line_describes_the_run_without_host_or_folders(tmp_path, monkeypa
     assert run.name == "run"
     assert run.metadata == {"arm": "mcmc", "seed": 0}
     assert run.origin["command"] == "train.py --data=plush --arm mcmc"
-    assert run.origin["machine"]["cpus"] == os.cpu_count()
+    assert f", {os.cpu_count()} CPUs" in run.origin["machine"]
     assert "phase" in run.steps
-    assert run.evaluations["peak_host_bytes"][0] > 1e6
     assert not torch.cuda.is_initialized()
 
 
@@ -427,7 +426,6 @@ def test_cuda_steps_do_not_synchronize(tmp_path):
         log.evaluation(99, psnr=energy)
     run = read_run(tmp_path / "run.jsonl")
     assert run.steps["count"].tolist() == list(range(100))
-    assert run.evaluations["peak_cuda_bytes"][0] > 0
 
 
 def test_wrong_arguments_name_call_value_and_what_is_allowed(tmp_path):
@@ -494,19 +492,16 @@ def test_a_log_on_a_system_without_locks(tmp_path, monkeypatch):
     assert kinds.count("start") == 3
 
 
-def test_a_log_says_how_much_memory_a_gpu_has_given(tmp_path, monkeypatch):
+def test_a_log_names_the_gpu_and_a_pause_waits_for_it(tmp_path, monkeypatch):
     waited = []
     monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "a GPU")
-    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda: 12345)
     monkeypatch.setattr(torch.cuda, "synchronize", lambda: waited.append(True))
     with RunLog(tmp_path / "log.jsonl") as log:
         log.step(0, phase="exploration", loss=0.5)
         with log.paused():
             log.evaluation(1, psnr=20.0)
-    said = (tmp_path / "log.jsonl").read_text()
-    assert '"gpu":"a GPU"' in said
-    assert "12345" in said
+    assert ", a GPU, " in (tmp_path / "log.jsonl").read_text()
     assert waited == [True, True]  # before the pause and after it
 
 
@@ -535,7 +530,6 @@ class Wandb:
 
 def test_a_mirror_gets_the_numbers_of_steps_and_evaluations(tmp_path, monkeypatch):
     monkeypatch.setattr("time.perf_counter", lambda: 0.0)
-    monkeypatch.setattr(log_module, "peak_memory", dict)
     board, wandb = Board(), Wandb()
     with RunLog(tmp_path / "run.jsonl", every=2) as log:
         log.step(0, loss=7.0)  # before there is a mirror

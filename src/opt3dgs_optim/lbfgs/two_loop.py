@@ -35,8 +35,6 @@ def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
     with gamma = s.y / y.y of the newest pair. H does not change when s and y of a pair are scaled
     together, so pairs are stored with |y| = 1 and no product leaves the floating-point range.
 
-    Points of three coordinates on a GPU are a CUDA kernel's, where it can run (`backend_info`).
-
     Args:
         grad: [N, D] gradients, any finite size.
         history: [N, slots, 2 (D + 1)], as `history_from_pairs` makes one.
@@ -67,16 +65,9 @@ def scaled(grad: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def recursion(grad: Tensor, s: Tensor, y: Tensor) -> Tensor:
-    """`two_loop` for gradients of moderate size, coordinates first.
+    """`two_loop` for gradients [D, N] of moderate size; pairs [K, D, N], newest first.
 
-    Args:
-        grad: [D, N].
-        s: [K, D, N], newest first, zero where there is no pair.
-        y: [K, D, N], unit length where there is a pair.
-
-    Returns:
-        The pseudo-gradient H g [D, N], in the parameters' units; the gradient where there is no
-        pair.
+    |y| = 1 where there is a pair, and s = y = 0 where there is none.
     """
     sy = dot(s, y)
     inverses = torch.threshold(sy, 0.0, torch.inf).reciprocal()  # no pair: 1 / inf = 0
@@ -152,7 +143,7 @@ def step(
     check_history("lqn_direction", grad, history, history_size)
     asked = grad.is_cuda or backend == "cuda"
     if asked and uses_kernel(backend, grad.device, grad.dtype, grad.shape[1]):
-        check_alike(grad, position=position, history=history)
+        check_alike(grad, position, history)
         return cuda.lqn_direction(position, grad, history, history_size, min_cosine, graft)
     fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
     accepted = torch.empty(grad.shape[0], dtype=torch.bool, device=grad.device)
@@ -169,18 +160,18 @@ def step(
     return fed, accepted, candidates
 
 
-def check_alike(like: Tensor, **others: Tensor) -> None:
-    """A kernel reads memory by the dtype of `like` [N, 3]: be sure of the others'."""
-    for name, tensor in others.items():
-        if tensor.dtype != like.dtype or tensor.device != like.device:
+def check_alike(grad: Tensor, position: Tensor, history: Tensor) -> None:
+    """A kernel reads memory by the shape and dtype of `grad` [N, 3]: be sure of the others'."""
+    for name, tensor in (("position", position), ("history", history)):
+        if tensor.dtype != grad.dtype or tensor.device != grad.device:
             raise ValueError(
-                f"lqn_direction: {name} is {tensor.dtype} on {tensor.device}, but {like.dtype} on "
-                f"{like.device}, as the gradient, is needed"
+                f"lqn_direction: {name} is {tensor.dtype} on {tensor.device}, but {grad.dtype} on "
+                f"{grad.device}, as the gradient, is needed"
             )
-    if others["position"].shape != like.shape:
+    if position.shape != grad.shape:
         raise ValueError(
-            f"lqn_direction: position has shape {tuple(others['position'].shape)}, but "
-            f"{tuple(like.shape)} is needed"
+            f"lqn_direction: position has shape {tuple(position.shape)}, but "
+            f"{tuple(grad.shape)} is needed"
         )
 
 
@@ -199,13 +190,9 @@ def take_pairs(
     while it is not visible leaves its history as it is.
 
     Args:
-        history: [N, slots, 2 (D + 1)], changed in place.
-        head: the views of its header.
-        history_size: K.
-        position: [D, N] before the step.
-        gradient: [D, N] there.
+        history: [N, slots, 2 (D + 1)], changed in place; `head` are the views of its header.
+        position, gradient: [D, N] before the step.
         visible: [N] bool.
-        min_cosine: see `lqn_direction`.
 
     Returns:
         (accepted, candidates), [N] bool each.

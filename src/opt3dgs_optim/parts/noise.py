@@ -28,8 +28,8 @@ class PositionNoise(Part):
 
     Args:
         gaussians: the trainer's dict with `scales` [N, 3] log, `quats` [N, 4] wxyz and
-            `opacities` [N] or [N, 1] logits, or a function that returns it. It is read anew in
-            every step, because density control replaces the tensors in it.
+            `opacities` [N] or [N, 1] logits, or a function that returns it; read in every step,
+            because density control replaces the tensors in it.
         scale: noise_lr of 3DGS-MCMC.
         during: the phase in which it is added; None: both.
         generator: random generator of the parameters' device, or None for torch's own.

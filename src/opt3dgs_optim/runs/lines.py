@@ -25,7 +25,7 @@ NO_TEXT = re.compile("[\0\ud800-\udfff]")  # what no file name, page or terminal
 
 
 class LineFile:
-    """An append-only file of lines, locked against a second writer.
+    """An append-only file of lines, locked against a second writer where files can be locked.
 
     Raises:
         BlockingIOError: the file is open in another LineFile, here or in another process.
@@ -37,10 +37,16 @@ class LineFile:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = open(path, "ab", buffering=0)  # noqa: SIM115 - closed by close()
         try:
-            self._lock()
-        except BaseException:
+            if fcntl is not None:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
             self._file.close()
-            raise
+            raise BlockingIOError(
+                f"RunLog({str(self.path)!r}): another RunLog is writing this file; close that one "
+                "or give each run its own path"
+            ) from None
+        except OSError:  # a file system without locks: nothing to check with
+            pass
 
     @property
     def closed(self) -> bool:
@@ -49,8 +55,8 @@ class LineFile:
     def append(self, line: Mapping[str, Any]) -> None:
         """Write one JSON line in one system call (more only if the kernel cuts it short)."""
         data = json.dumps(line, separators=(",", ":"), allow_nan=False).encode() + b"\n"
-        if data.startswith(START) and self._is_torn():
-            data = b"\n" + data
+        if data.startswith(START) and self.path.read_bytes()[-1:] not in (b"", b"\n"):
+            data = b"\n" + data  # the last session was killed within a line
         rest = memoryview(data)
         while rest:
             rest = rest[self._file.write(rest) or 0 :]
@@ -65,24 +71,6 @@ class LineFile:
             with contextlib.suppress(OSError):
                 fcntl.flock(self._file, fcntl.LOCK_UN)
         self._file.close()
-
-    def _lock(self) -> None:
-        try:
-            if fcntl is not None:
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise BlockingIOError(
-                f"RunLog({str(self.path)!r}): another RunLog is writing this file; close that one "
-                "or give each run its own path"
-            ) from None
-        except OSError:  # a file system without locks: nothing to check with
-            pass
-
-    def _is_torn(self) -> bool:
-        with open(self.path, "rb") as file:
-            size = file.seek(0, os.SEEK_END)
-            file.seek(max(size - 1, 0))
-            return file.read(1) not in (b"", b"\n")
 
 
 def index(call: str, iteration: int) -> int:

@@ -10,10 +10,14 @@ from __future__ import annotations
 
 import logging
 import os
+import platform
+import re
+import sys
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from datetime import datetime, timezone
 from enum import Enum
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,13 +26,10 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.runs.lines import LineFile, index, number, plain, text
-from opt3dgs_optim.runs.machine import origin, peak_memory, synchronize
 from opt3dgs_optim.runs.read import read_run
 
 LOGGER = logging.getLogger("opt3dgs_optim")
-RESERVED = frozenset(
-    {"kind", "iteration", "seconds", "phase", "event", "peak_cuda_bytes", "peak_host_bytes"}
-)
+RESERVED = ("kind", "iteration", "seconds", "phase", "event")
 
 
 class _Pending(NamedTuple):
@@ -43,14 +44,13 @@ class _Pending(NamedTuple):
 class RunLog:
     """Append the course of one training run to the JSON-lines file `path`.
 
-    Every line goes out in one unbuffered write: a killed process loses at most the line it was
-    writing and, on a GPU, the few step lines whose numbers were still on their way. An existing
-    log is continued, its clock too; to go on from a checkpoint use `resume`.
+    A killed process loses at most the line it was writing and, on a GPU, the few step lines whose
+    numbers were still on their way. An existing log is continued, its clock too; to go on from a
+    checkpoint use `resume`.
 
-    A step line costs no host synchronisation: 0-d CUDA tensors are copied to pinned memory in
-    stream order and written at a later call, once the copy has completed. CPU tensors and floats
-    are written at once; tensors of other devices are read with `item()`. No autograd graph is
-    kept. Evaluations, events, `paused`, `flush` and `close` do wait for the GPU.
+    A step line costs no host synchronisation: CUDA scalars are copied to pinned memory in stream
+    order and written at a later call. Evaluations, events, `paused`, `flush` and `close` do wait
+    for the GPU. No autograd graph is kept.
 
     Args:
         path: the log file; missing parent folders are made.
@@ -97,7 +97,7 @@ class RunLog:
             self._base: float = last[0]["seconds"] if last else 0.0
             self._since: float | None = time.perf_counter()
             start = self._line("start", last[0]["iteration"] if last else 0)
-            self._file.append(start | origin() | {"metadata": described})
+            self._file.append(start | _origin() | {"metadata": described})
         except BaseException:
             self._file.close()
             raise
@@ -132,11 +132,8 @@ class RunLog:
 
         `log.mirror(SummaryWriter("runs/garden"))`, of `torch.utils.tensorboard`; in gsplat's
         trainer, which has one, `log.mirror(self.writer)`; `log.mirror(wandb.init(project="3dgs"))`.
-        Tags are `step/NAME` and `evaluation/NAME`, run seconds among them.
-
-        Numbers go out with their line: nothing waits for a GPU, and `every` holds. A writer that
-        raises gets nothing more; the logger `opt3dgs_optim` says so, training and log go on. W&B
-        drops what comes with a smaller step than something before it.
+        Tags are `step/NAME` and `evaluation/NAME`, run seconds among them. Numbers go out with
+        their line. A writer that raises gets nothing more, and the logger `opt3dgs_optim` says so.
 
         Args:
             writer: has `add_scalar(tag, value, step)`, or `log({tag: value}, step=step)`.
@@ -175,12 +172,8 @@ class RunLog:
         self._drain(wait=False)
 
     def evaluation(self, iteration: int, **metrics: float | Tensor) -> None:
-        """Log metrics (`psnr` in dB, `ssim`, `train_psnr`, `num_points`, ...), one number each.
-
-        Adds torch's `peak_cuda_bytes` if CUDA is in use, else the process's `peak_host_bytes`.
-        Errors as in `step`.
-        """
-        line = self._line("evaluation", index("RunLog.evaluation", iteration)) | peak_memory()
+        """Log metrics (`psnr` in dB, `ssim`, `points`, ...), a number each; raises as `step`."""
+        line = self._line("evaluation", index("RunLog.evaluation", iteration))
         self._pending.append(_pack("RunLog.evaluation", line, metrics))
         self._drain(wait=True)
 
@@ -202,7 +195,7 @@ class RunLog:
         inside does not.
         """
         if self._pauses == 0:
-            synchronize()
+            _synchronize()
             self._base, self._since = self.seconds, None
         self._pauses += 1
         try:
@@ -210,7 +203,7 @@ class RunLog:
         finally:
             self._pauses -= 1
             if self._pauses == 0:
-                synchronize()
+                _synchronize()
                 self._since = time.perf_counter()
 
     def flush(self) -> None:
@@ -268,6 +261,26 @@ class RunLog:
                 LOGGER.warning("RunLog.mirror: %r failed and gets no more: %r", writer, error)
 
 
+def _origin() -> dict[str, Any]:
+    """What runs, where and since when; no host name, no folders."""
+    machine = f"{platform.platform()}, {os.cpu_count()} CPUs"
+    if torch.cuda.is_initialized():
+        machine += f", {torch.cuda.get_device_name()}"
+    # "--data=/home/me/plush" becomes "--data=plush".
+    words = [re.sub(r"[^=]*[/\\](?=[^=]*$)", "", word.rstrip("/\\")) for word in sys.argv]
+    return {
+        "time": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "command": text(" ".join(words)),
+        "machine": f"{machine}, Python {platform.python_version()}, torch {torch.__version__}",
+    }
+
+
+def _synchronize() -> None:
+    """Wait for the GPU, where one is in use; asking it anything else would start CUDA."""
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+
+
 def _pack(call: str, line: dict[str, Any], values: Mapping[str, Any]) -> _Pending:
     """Put host numbers into `line` and send CUDA ones on their way to pinned memory."""
     _check_names(call, values)
@@ -296,5 +309,5 @@ def _check_names(call: str, values: Mapping[str, Any]) -> None:
     for name in values:
         if name in RESERVED or not name.isprintable():
             raise ValueError(
-                f"{call}({name!a}=...): reserved; choose a printable name not in {sorted(RESERVED)}"
+                f"{call}({name!a}=...): reserved; choose a printable name not in {RESERVED}"
             )

@@ -44,10 +44,8 @@ class Run:
     def series(self, name: str, kind: str = "evaluation") -> tuple[np.ndarray, ...]:
         """(iteration, seconds, value) at the lines of `kind` that log the number `name`."""
         lines = [r for r in self.records if r["kind"] == kind and name in r]
-        return tuple(
-            np.array([r[key] for r in lines], dtype=dtype)
-            for key, dtype in (("iteration", np.int64), ("seconds", float), (name, float))
-        )
+        columns = _columns(lines)
+        return tuple(columns.get(key, np.array([])) for key in ("iteration", "seconds", name))
 
 
 def read_run(path: str | os.PathLike[str]) -> Run:
@@ -129,28 +127,25 @@ def _decode(value: Any, depth: int = 0) -> Any:
     if depth > DEEPEST + 1:  # the line itself, and what `plain` allows in it
         raise ValueError(f"nested deeper than {DEEPEST}")
     if isinstance(value, str):
-        return NON_FINITE.get(value, _whole(value))
+        if NO_TEXT.search(value):
+            raise ValueError("text with NUL or with a lone surrogate")
+        return NON_FINITE.get(value, value)
     if isinstance(value, int) and abs(value) >= 2**1023:
         raise ValueError("an integer that is no float64")
     if isinstance(value, list):
         return [_decode(item, depth + 1) for item in value]
     if isinstance(value, dict):
-        return {_whole(key): _decode(item, depth + 1) for key, item in value.items()}
+        _decode(list(value), depth)  # the keys
+        return {key: _decode(item, depth + 1) for key, item in value.items()}
     return value
-
-
-def _whole(text: str) -> str:
-    if NO_TEXT.search(text):
-        raise ValueError("text with NUL or with a lone surrogate")
-    return text
 
 
 def _columns(lines: list[dict[str, Any]]) -> Columns:
     names = dict.fromkeys(key for line in lines for key in line if key not in ("kind", "phase"))
+    names = dict.fromkeys(("iteration", "seconds", *names))
     nan = float("nan")
     columns = {name: np.array([line.get(name, nan) for line in lines], float) for name in names}
-    columns["iteration"] = np.array([line["iteration"] for line in lines], np.int64)
-    columns["seconds"] = np.array([line["seconds"] for line in lines], float)
+    columns["iteration"] = columns["iteration"].astype(np.int64)  # below 2**53: exact
     if any("phase" in line for line in lines):
         columns["phase"] = np.array([str(line.get("phase", "")) for line in lines], str)
     return columns

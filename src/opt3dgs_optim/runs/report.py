@@ -16,7 +16,7 @@ from pathlib import Path
 from opt3dgs_optim.runs.plot import draw
 from opt3dgs_optim.runs.read import Run, read_run
 from opt3dgs_optim.runs.stats import compare
-from opt3dgs_optim.runs.table import as_json, as_markdown, origin_lines
+from opt3dgs_optim.runs.table import as_json, as_markdown, origin
 
 NO_PICTURE = (
     "report: no picture, since matplotlib is not installed: pip install 'opt3dgs_optim[report]'"
@@ -71,7 +71,7 @@ def write_report(
     out = _writable(out)
     try:
         for comparison, name in zip(comparisons, names, strict=True):
-            draw(comparison, out / name, "   ".join(origin_lines(runs)))
+            draw(comparison, out / name, origin(runs))
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] != "matplotlib":
             raise

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,6 @@ import numpy as np
 from opt3dgs_optim.runs.read import Run
 
 KNOWN = ("psnr", "ssim", "train_psnr", "lpips")  # listed first
-MEMORY = ("peak_cuda_bytes", "peak_host_bytes")
-NO_NUMBERS = ("iteration", "seconds", "phase", *MEMORY)  # of the columns, not of interest
 LOWER_IS_BETTER = ("lpips", "loss", "error", "mse", "mae", "l1", "l2", "energy", "flip")
 
 
@@ -36,16 +34,12 @@ class Stat:
 
 @dataclass
 class Arm:
-    """The runs of one arm on one scene, and what they come to."""
+    """The runs of one arm on one scene, and what they come to, by the heading in the table."""
 
     name: str
     runs: list[Run]
     colour: int  # the same on every scene; 0 is the baseline's
-    finals: dict[str, Stat | None] = field(default_factory=dict)  # last value of every metric
-    numbers: dict[str, Stat | None] = field(default_factory=dict)  # seconds, iterations, ...
-    to_baseline: Stat | None = None  # seconds to the baseline's final metric; n runs got there
-    gain: Stat | None = None  # over the baseline at equal seconds, positive is better
-    paired: bool = False  # whether `gain` pairs equal seeds
+    numbers: dict[str, Stat | None]
 
 
 @dataclass
@@ -87,41 +81,51 @@ def compare(
         baseline = "mcmc" if "mcmc" in names else names[0]
     elif baseline not in names:
         raise ValueError(f"--baseline {baseline!r}: no such arm; there are {', '.join(names)}")
-    colours = {name: i for i, name in enumerate(dict.fromkeys([baseline, *names]))}
-    return [
-        _compare_scene(scene, [Arm(n, arms[n], colours[n]) for n in colours if n in arms], metric)
-        for scene, arms in scenes.items()
-    ]
+    order = list(dict.fromkeys([baseline, *names]))
+    return [_compare_scene(scene, arms, order, metric) for scene, arms in scenes.items()]
 
 
-def _compare_scene(scene: str | None, arms: list[Arm], metric: str) -> Comparison:
-    reference = arms[0] if arms[0].colour == 0 else None
-    names = metric_names([run for arm in arms for run in arm.runs])
-    for arm in arms:
-        arm.finals = {name: _stat(arm.runs, name, lambda values: values[-1]) for name in names}
-        arm.numbers = _numbers(arm.runs)
-    final = reference.finals.get(metric) if reference else None
+def _compare_scene(
+    scene: str | None, runs: dict[str, list[Run]], order: list[str], metric: str
+) -> Comparison:
+    everything = [run for arm in runs.values() for run in arm]
+    metrics, columns = metric_names(everything), step_names(everything)
+    references = runs.get(order[0], [])
+    final = _stat(references, metric, lambda values: values[-1])
     target = final.mean if final and np.isfinite(final.mean) else None
-    for arm in arms:
-        if target is not None:
-            reached = [_first_time(run, metric, target) for run in arm.runs]
-            arm.to_baseline = Stat.of([seconds for seconds in reached if seconds is not None])
-        if reference and arm is not reference:
-            arm.gain, arm.paired = _gain(arm.runs, reference.runs, metric)
-    baseline = reference.name if reference else None
-    return Comparison(scene, metric, baseline, target, arms, _notes(arms, metric))
+    arms = []
+    for colour, name in enumerate(order):
+        if name not in runs:
+            continue
+        own = runs[name]
+        numbers = {f"final {m}": _stat(own, m, lambda values: values[-1]) for m in metrics}
+        seconds = [max((r["seconds"] for r in run.records), default=0.0) for run in own]
+        iterations = [max((r["iteration"] for r in run.records), default=0) for run in own]
+        rates = [i / s for i, s in zip(iterations, seconds, strict=True) if s > 0]
+        numbers |= {"seconds": Stat.of(seconds), "iterations": Stat.of(iterations)}
+        numbers |= {"iterations/s": Stat.of(rates)}
+        numbers |= {f"mean {c}": _stat(own, c, _finite_mean, "step") for c in columns}
+        reached = [_first_time(run, metric, target) for run in own]
+        known = [seconds for seconds in reached if seconds is not None]
+        numbers[f"seconds to baseline {metric}"] = Stat.of(known)
+        gains = [] if name == order[0] else _gains(own, references, metric)
+        numbers[f"{metric} gain at equal seconds"] = Stat.of(gains)
+        arms.append(Arm(name, own, colour, numbers))
+    notes = [note for arm in arms for run in arm.runs if (note := _note(run, arm.name, metric))]
+    return Comparison(scene, metric, order[0] if references else None, target, arms, notes)
 
 
 def metric_names(runs: Sequence[Run]) -> list[str]:
     """Every metric the runs evaluated, PSNR, SSIM and training PSNR first."""
-    found = dict.fromkeys(key for run in runs for key in run.evaluations if key not in NO_NUMBERS)
-    return [name for name in KNOWN if name in found] + [n for n in found if n not in KNOWN]
+    found = dict.fromkeys(name for run in runs for name in run.evaluations)
+    named = [*(name for name in KNOWN if name in found), *found]
+    return [name for name in dict.fromkeys(named) if name not in ("iteration", "seconds")]
 
 
 def step_names(runs: Sequence[Run]) -> list[str]:
     """The columns of the step lines that are no loss: what the parts say of themselves."""
-    found = dict.fromkeys(key for run in runs for key in run.steps if key not in NO_NUMBERS)
-    return [name for name in found if higher_is_better(name)]
+    found = dict.fromkeys(name for run in runs for name in run.steps if higher_is_better(name))
+    return [name for name in found if name not in ("iteration", "seconds", "phase")]
 
 
 def higher_is_better(metric: str) -> bool:
@@ -129,23 +133,17 @@ def higher_is_better(metric: str) -> bool:
     return not any(word in metric.lower() for word in LOWER_IS_BETTER)
 
 
-def _numbers(runs: list[Run]) -> dict[str, Stat | None]:
-    seconds = [max((r["seconds"] for r in run.records), default=0.0) for run in runs]
-    iterations = [max((r["iteration"] for r in run.records), default=0) for run in runs]
-    rates = [i / s for i, s in zip(iterations, seconds, strict=True) if s > 0]
-    numbers = {"seconds": Stat.of(seconds), "iterations": Stat.of(iterations)}
-    numbers |= {"iterations_per_second": Stat.of(rates)}
-    numbers |= {name: _stat(runs, name, np.max) for name in MEMORY}
-    return numbers | {f"mean_{n}": _stat(runs, n, np.mean, "step") for n in step_names(runs)}
-
-
 def _stat(runs: list[Run], name: str, of: Any, kind: str = "evaluation") -> Stat | None:
-    """Over the runs that log a number: `of` its values, in steps of the finite ones."""
+    """Of the values of `name` in every run that logs it: `of` them, None to leave a run out."""
     series = [run.series(name, kind)[2] for run in runs]
-    if kind == "step":
-        series = [values[np.isfinite(values)] for values in series]
+    values = [of(values) for values in series if len(values)]
+    return Stat.of([float(value) for value in values if value is not None])
+
+
+def _finite_mean(values: np.ndarray) -> float | None:
+    values = values[np.isfinite(values)]
     with np.errstate(over="ignore"):
-        return Stat.of([float(of(values)) for values in series if len(values)])
+        return float(values.mean()) if len(values) else None
 
 
 def _curve(run: Run, metric: str) -> tuple[np.ndarray, np.ndarray]:
@@ -154,8 +152,10 @@ def _curve(run: Run, metric: str) -> tuple[np.ndarray, np.ndarray]:
     return seconds, values if higher_is_better(metric) else -values
 
 
-def _first_time(run: Run, metric: str, target: float) -> float | None:
+def _first_time(run: Run, metric: str, target: float | None) -> float | None:
     """Seconds until the metric first reaches `target`, linear between evaluations."""
+    if target is None:
+        return None
     seconds, values = _curve(run, metric)
     goal = target if higher_is_better(metric) else -target
     reached = np.flatnonzero(values >= goal)
@@ -167,49 +167,32 @@ def _first_time(run: Run, metric: str, target: float) -> float | None:
     return float(np.interp(goal, values[i - 1 : i + 1], seconds[i - 1 : i + 1]))
 
 
-def _gain(runs: list[Run], references: list[Run], metric: str) -> tuple[Stat | None, bool]:
-    """Gain at the smaller of the final times; paired by seed where every run has its partner."""
-    by_seed = {repr(r.metadata["seed"]): r for r in references if "seed" in r.metadata}
-    seeds = [repr(run.metadata["seed"]) for run in runs if "seed" in run.metadata]
-    if len(set(seeds)) == len(runs) and all(seed in by_seed for seed in seeds):
-        pairs = [(run, by_seed[seed]) for run, seed in zip(runs, seeds, strict=True)]
-        gains = [_difference([run], [partner], metric) for run, partner in pairs]
-        return Stat.of([gain.mean for gain in gains if gain]), True
-    return _difference(runs, references, metric), False
+def _gains(runs: list[Run], references: list[Run], metric: str) -> list[float]:
+    """For every seed that both have: the gain at the smaller of the two final times."""
+    by_seed = {repr(run.metadata.get("seed")): _curve(run, metric) for run in references}
+    gains = []
+    for run in runs:
+        ours, theirs = _curve(run, metric), by_seed.get(repr(run.metadata.get("seed")))
+        if theirs is None or len(ours[0]) == 0 or len(theirs[0]) == 0:
+            continue
+        time = min(ours[0][-1], theirs[0][-1])
+        if time >= max(ours[0][0], theirs[0][0]):
+            gains.append(float(np.interp(time, *ours) - np.interp(time, *theirs)))
+    return gains
 
 
-def _difference(runs: list[Run], references: list[Run], metric: str) -> Stat | None:
-    """Difference of the means at the last second that all runs share; None before some begins."""
-    curves = [_curve(run, metric) for run in (*runs, *references)]
-    if any(len(seconds) == 0 for seconds, _ in curves):
+def _note(run: Run, arm: str, metric: str) -> str | None:
+    """What a reader must know of a run before trusting the table."""
+    values = run.series(metric)[2]
+    odd = int((~np.isfinite(values)).sum())
+    if all(record["kind"] == "start" for record in run.records):
+        note = "empty run, nothing logged"
+    elif len(values) == 0:
+        note = f"no evaluation of {metric}"
+    elif odd:
+        note = f"{metric} not finite in {odd} evaluations"
+    elif len(values) == 1:
+        note = f"a single evaluation of {metric}"
+    else:
         return None
-    time = min(seconds[-1] for seconds, _ in curves)
-    if any(time < seconds[0] for seconds, _ in curves):
-        return None
-    values = [float(np.interp(time, *curve)) for curve in curves]
-    a, b = Stat.of(values[: len(runs)]), Stat.of(values[len(runs) :])
-    assert a is not None
-    assert b is not None
-    std = None if a.std is None or b.std is None else float(np.hypot(a.std, b.std))
-    return Stat(a.mean - b.mean, std, a.n)
-
-
-def _notes(arms: list[Arm], metric: str) -> list[str]:
-    """What a reader must know before trusting the table."""
-    notes = []
-    for arm in arms:
-        for run in arm.runs:
-            values = run.series(metric)[2]
-            odd = int((~np.isfinite(values)).sum())
-            if all(r["kind"] == "start" for r in run.records):
-                note = "empty run, nothing logged"
-            elif len(values) == 0:
-                note = f"no evaluation of {metric}"
-            elif odd:
-                note = f"{metric} not finite in {odd} evaluations"
-            elif len(values) == 1:
-                note = f"a single evaluation of {metric}"
-            else:
-                continue
-            notes.append(f"{run.name} ({arm.name}): {note}")
-    return notes
+    return f"{run.name} ({arm}): {note}"
