@@ -33,12 +33,14 @@ def test_the_main_classes_have_one(name: str) -> None:
 
 API = (Path(__file__).resolve().parents[1] / "docs" / "api.md").read_text(encoding="utf-8")
 # Their arguments stand in one sentence.
-SENTENCES = ("read_run", "find_logs", "diff", "write", "PhaseScheduler.follow_scene", "Run.series")
+SENTENCES = ("read_run", "find_logs", "diff", "write", "paper_parts", "Run.series")
 SENTENCES += ("RunLog.resume", "RunLog.step", "RunLog.evaluation", "RunLog.event")
-SENTENCES += tuple(f"{noise}.add_to" for noise in ("CovarianceNoise", "IsotropicNoise"))
-STATES = ("PhaseScheduler", "LQNAdam", "EnergyHistogram")
-SENTENCES += tuple(f"{name}.load_state_dict" for name in STATES)
-ELSEWHERE = ("CurvatureOptions", "Phase")  # LQNAdam says what the options are; an enumeration
+SENTENCES += ("PositionNoise.add_to", "Fading.chosen", "Course.phase_of", "Course.part")
+SENTENCES += ("StepAdam.acts_on", "StepAdam.reset_points", "PhaseScheduler.part")
+SENTENCES += tuple(f"{name}.load_state_dict" for name in ("StepAdam", "EnergyHistogram"))
+HOOKS = ("factor", "before", "after", "pixel_loss", "numbers", "load_state_dict")
+SENTENCES += tuple(f"Part.{hook}" for hook in (*HOOKS, "evidence", "useless"))
+ELSEWHERE = ("Phase",)  # an enumeration
 
 
 def of_the_reference() -> dict[str, Callable[..., Any]]:
@@ -50,7 +52,8 @@ def of_the_reference() -> dict[str, Callable[..., Any]]:
         if module == "opt3dgs_optim.hosts.nerfstudio":
             continue
         item = getattr(importlib.import_module(module), name)
-        found[name] = item
+        if callable(item):
+            found[name] = item
         for names in re.findall(r"members: \[(.*)\]", block):
             for member in filter(None, names.split(", ")):
                 value = inspect.getattr_static(item, member)
