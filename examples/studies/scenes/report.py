@@ -90,9 +90,7 @@ def tables(study: Study) -> dict[str, str]:
         "few-views": scenes_table(study, few, FEW_VIEWS_ARMS),
         "full-scenes": scenes_table(study, long["30,000 iterations"], LONG_ARMS),
         "decisions": _decisions_table(study),
-        "front": front_table(
-            study, {n: study.settings(n) for n in (SHORT, 7_500, 30_000)}, FRONT
-        ),
+        "front": front_table(study, {n: study.settings(n) for n in (SHORT, 7_500, 30_000)}, FRONT),
     }
     for stage, settings in (
         ("random", study.settings(SHORT, "random")),
