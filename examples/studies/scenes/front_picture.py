@@ -129,10 +129,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     seconds = args.share * stock.seconds[-1]
     draw(scene, courses, seconds, args.out)
     reached = next(s for s, p in zip(ours.seconds, ours.psnr, strict=True) if p >= stock.psnr[-1])
+    machine = f"{platform.system()} {platform.machine()}, one thread, torch {torch.__version__}"
     record = {
         "command": "python examples/studies/scenes/front_picture.py",
         "date": f"{date.today()}",
-        "machine": f"{platform.system()} {platform.machine()}, one thread, torch {torch.__version__}",
+        "machine": machine,
         "iterations": args.iterations,
         "points": options.points,
         "pictures_after_seconds": round(seconds, 2),
