@@ -40,7 +40,8 @@ SENTENCES += ("StepAdam.acts_on", "StepAdam.reset_points", "PhaseScheduler.part"
 SENTENCES += tuple(f"{name}.load_state_dict" for name in ("StepAdam", "EnergyHistogram"))
 HOOKS = ("factor", "before", "after", "pixel_loss", "numbers", "load_state_dict")
 SENTENCES += tuple(f"Part.{hook}" for hook in (*HOOKS, "evidence", "useless"))
-ELSEWHERE = ("Phase",)  # an enumeration
+SENTENCES += ("PhaseScheduler.paper",)  # the class's
+ELSEWHERE = ("Phase", "StepAdam")  # an enumeration; torch's own arguments
 
 
 def of_the_reference() -> dict[str, Callable[..., Any]]:
@@ -95,7 +96,11 @@ def test_every_tensor_has_a_shape(name: str) -> None:
     texts = explained(inspect.getdoc(REFERENCE[name]) or "")
     for each in arguments(REFERENCE[name]) if name not in ELSEWHERE else ():
         tensor = re.search(r"(?<!Gaussian)Tensor\b(?! \| None = None)", str(each.annotation))
-        if tensor and each.name in texts and each.name not in ("lr", "closure", "visibility"):
+        if (
+            tensor
+            and each.name in texts
+            and each.name not in ("lr", "closure", "visibility", "valid")
+        ):
             assert re.search(r"\[|0-d|shape", texts[each.name]), f"{name}: {each.name}"
 
 
@@ -105,7 +110,7 @@ def test_every_error_is_announced(name: str) -> None:
     source = inspect.getsource(inspect.unwrap(REFERENCE[name]))
     doc = inspect.getdoc(REFERENCE[name]) or ""
     raises = re.findall(r"raise (\w+Error)", source) if not inspect.isclass(REFERENCE[name]) else []
-    for error in raises:
+    for error in set(raises) - {"NotImplementedError"}:  # a hook that nobody has is never called
         assert error in doc, f"{name} raises {error}"
 
 
