@@ -93,12 +93,12 @@ def draw(scene: Scene, courses: dict[str, Course], seconds: float, path: Path) -
         axis.plot(course.seconds, course.psnr, color=colour, lw=3)
         at = course.at(seconds * 2)
         below = colour == COLOURS[0]
-        place = (course.seconds[at], course.psnr[at] + (-0.7 if below else 0.35))
+        place = (course.seconds[at], course.psnr[at] + (-0.7 if below else 0.5))
         align = "top" if below else "bottom"
         axis.annotate(name, place, color=colour, fontsize=14, va=align)
     axis.axvline(seconds, color="#999999", lw=1.2, ls="--")
     low = 11.5
-    axis.annotate("the pictures above ", (seconds, low + 0.3), fontsize=12, ha="right")
+    axis.annotate(" the pictures above", (seconds, low + 0.4), fontsize=12)
     end = min(course.seconds[-1] for course in courses.values())
     axis.set_xlim(0, end)
     axis.set_ylim(low, max(course.psnr[-1] for course in courses.values()) + 1.4)
