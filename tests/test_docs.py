@@ -130,6 +130,8 @@ def test_commands_exist_with_their_options(page: Path) -> None:
     "line",
     [
         "python -m opt3dgs_optim.no_such_module",
+        "opt3dgs hosts diff PATH --no-such-option",
+        "opt3dgs report runs --no-such-option",
         "python -m opt3dgs_optim.hosts diff PATH --no-such-option",
         "python examples/no_such_file.py",
         "python examples/train.py --no-such-option",
@@ -212,22 +214,12 @@ def build_hooks() -> Any:
 
 
 def test_what_the_pages_ask_the_build_for_is_there() -> None:
-    asked = 0
+    included = []
     for page in PAGES:
-        text = page.read_text(encoding="utf-8")
-        for heading in re.findall(r"<!-- readme: (.+?) -->", text):
-            assert len(build_hooks().readme_section(heading).splitlines()) > 10
-            asked += 1
-        for included in re.findall(r'^--8<-- "(.+)"$', text, re.M):
-            assert (ROOT / included).is_file()
-            asked += 1
-    assert asked >= 3
+        included += re.findall(r'^--8<-- "(.+)"$', page.read_text(encoding="utf-8"), re.M)
+    assert len(included) >= 2
+    assert all((ROOT / path).is_file() for path in included)
     assert "exploitation step" in build_hooks().step_costs()
-
-
-def test_a_section_that_is_gone_is_an_error() -> None:
-    with pytest.raises(ValueError, match="0 sections '## No such heading'"):
-        build_hooks().readme_section("No such heading")
 
 
 @pytest.mark.parametrize(

@@ -132,12 +132,13 @@ def main(arguments: list[str] | None = None) -> int:
         print("\ninterrupted; the same command goes on with the unfinished experiments")
         return 130
     sections = tables.sections(results)
-    write(options.output / "tables.md", "\n\n".join(sections.values()) + "\n")
     from studies.landscapes import plots  # matplotlib is needed from here on only
 
     plots.all_plots(results, options.output)
-    if options.output.resolve() == RESULTS and PAGE.exists():
+    if options.output.resolve() == RESULTS:
         write(PAGE, tables.renewed(PAGE.read_text(encoding="utf-8"), sections))
+    else:
+        write(options.output / "tables.md", "\n\n".join(sections.values()) + "\n")
     print(f"wrote {options.output}")
     return 0
 

@@ -2,7 +2,7 @@
 
 With `--runs`, first adds the finished trainings to docs/results/study/records.json. Then
 everything is made from that file alone: the plots beside it, `decisions.json`, and the tables
-between the markers of docs/evidence.md and the README.
+between the markers of docs/evidence.md, docs/results/study/tables.md and the README.
 """
 
 from __future__ import annotations
@@ -29,12 +29,25 @@ from studies.scenes.arms import (
 from studies.scenes.decisions import decide
 from studies.scenes.plots import plot_curves, plot_gains
 from studies.scenes.records import gather, merge, read, write
-from studies.scenes.tables import gains_table, goals_table, machines_line, nu_table, scenes_table
+from studies.scenes.tables import (
+    front_table,
+    gains_table,
+    goals_table,
+    machines_line,
+    nu_table,
+    scenes_table,
+)
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 FOLDER = REPOSITORY / "docs" / "results" / "study"
 PAGE = REPOSITORY / "docs" / "evidence.md"
-PAGES = (PAGE, REPOSITORY / "README.md")  # that have tables
+PAGES = (PAGE, FOLDER / "tables.md", REPOSITORY / "README.md")  # that have tables
+FRONT = (  # what it is, arm, control
+    ("**the defaults**", DEFAULTS, BASELINE),
+    ("the paper's preset, all parts", "paper", BASELINE),
+    ("AW-SGLD against a constant multiplier of its mean", "awsgld", "constant"),
+    ("L-BFGS against the same last phase without", "l2+reset+lqn@1/30", "l2+reset@1/30"),
+)
 SHORT = 3_000
 ALONE = ("mcmc", "faded", "annealed-4-0.4", "annealed-8-0.4")
 LONG_ARMS = (*ALONE, ALL_ANNEALED, DEFAULTS, UNFADED_OPACITIES, POOLED)
@@ -77,6 +90,7 @@ def tables(study: Study) -> dict[str, str]:
         "few-views": scenes_table(study, few, FEW_VIEWS_ARMS),
         "full-scenes": scenes_table(study, long["30,000 iterations"], LONG_ARMS),
         "decisions": _decisions_table(study),
+        "front": front_table(study, {n: study.settings(n) for n in (SHORT, 7_500, 30_000)}, FRONT),
     }
     for stage, settings in (
         ("random", study.settings(SHORT, "random")),

@@ -84,6 +84,33 @@ def goals_table(study: Study, kinds: dict[str, list[Setting]], arm: str, control
     return "\n".join(lines)
 
 
+def front_table(
+    study: Study, kinds: dict[int, list[Setting]], rows: Sequence[tuple[str, str, str]]
+) -> str:
+    """The README's: gains at equal seconds by length of the training, and scenes below the control.
+
+    Args:
+        kinds: the settings of each length, by its iterations.
+        rows: (what it is, arm, control); the first one's scenes are counted.
+    """
+    lines = [
+        f"| iterations | {' | '.join(f'{n:,}' for n in kinds)} |",
+        f"|---|{'---:|' * len(kinds)}",
+    ]
+    for what, arm, control in rows:
+        gains = [study.gain(settings, arm, control) for settings in kinds.values()]
+        cells = ["-" if gain is None else f"{_gain_and_spread(gain)} dB" for gain in gains]
+        lines.append(f"| {what} | {' | '.join(cells)} |")
+    what, arm, control = rows[0]
+    shares = [[study.gain([s], arm, control) for s in settings] for settings in kinds.values()]
+    behind = [
+        f"{sum(g.equal_seconds < 0 for g in found if g)} of {sum(g is not None for g in found)}"
+        for found in shares
+    ]
+    lines.insert(3, f"| scenes on which they end below stock | {' | '.join(behind)} |")
+    return "\n".join(lines)
+
+
 def nu_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) -> str:
     """Mean of nu by scene, of the arms that have one."""
     lines = [

@@ -314,7 +314,7 @@ def write_json(path: Path, results: dict[str, Any], indent: int | None = None) -
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs/results/stability")
-    parser.add_argument("--page", type=Path, default=ROOT / "docs/stability.md")
+    parser.add_argument("--page", type=Path, default=ROOT / "docs/results/stability/stability.md")
     parser.add_argument("--rows", type=int, default=50)
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--tables", action="store_true", help="measure nothing")
@@ -339,7 +339,6 @@ def main() -> None:
         plot(results["problems"], 0, "iterations", folder / "iterations.png")
         plot(results["problems"], 1, "seconds", folder / "seconds.png")
         plot(results["quadratics"], 0, "iterations", folder / "conditions.png")
-    (folder / "stability.md").write_text(report(results))
     options.page.write_text(filled(options.page.read_text(), folder, report(results)))
     print(f"wrote {folder} and {options.page}")
 

@@ -1,4 +1,4 @@
-"""The figures of docs/stability.md: read from docs/results/stability/, written between its markers.
+"""The figures of docs/results/stability/stability.md: from the JSON beside it, between its markers.
 
 `stability.py` calls this; nothing is measured here.
 """

@@ -1,4 +1,4 @@
-"""docs/stability.md says what its committed measurements say, and they say enough."""
+"""docs/results/stability/stability.md says what its committed measurements say, and they say enough."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def result(name: str) -> dict[str, Any]:
 
 
 def test_tables_are_those_of_the_measurements() -> None:
-    assert (FOLDER / "stability.md").read_text() == stability.report(result("stability"))
+    assert stability.report(result("stability")) in (FOLDER / "stability.md").read_text()
 
 
 def filled(page: str) -> str:
@@ -28,12 +28,12 @@ def filled(page: str) -> str:
 
 
 def test_page_is_that_of_the_measurements() -> None:
-    page = (DOCS / "stability.md").read_text()
+    page = (FOLDER / "stability.md").read_text()
     assert filled(page) == page
 
 
 def test_a_changed_figure_shows() -> None:
-    page = (DOCS / "stability.md").read_text()
+    page = (FOLDER / "stability.md").read_text()
     coverage = stability_page.coverage_block(result("coverage"))
     assert coverage in page
     assert filled(page.replace(coverage, "99.9 %")) == page
