@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 import torch
-
-from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam, PhaseScheduler
 from opt3dgs_optim._checks import check_interval
 from opt3dgs_optim._running import ViewMeans
 from opt3dgs_optim.multiplier import ConstantMultiplier
+
+from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam, PhaseScheduler
 
 
 def point() -> torch.nn.Parameter:

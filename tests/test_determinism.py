@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 import torch
+from opt3dgs_optim.curvature import direction, history_from_pairs, two_loop
+from opt3dgs_optim.noise import CovarianceNoise, IsotropicNoise
 from torch import Tensor
 
 from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam
-from opt3dgs_optim.curvature import direction, history_from_pairs, two_loop
-from opt3dgs_optim.noise import CovarianceNoise, IsotropicNoise
 
 KINDS = ["awsgld", "isotropic noise", "covariance noise", "lqnadam", "powell", "epoch"]
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from opt3dgs_optim.curvature import header
 from problems import MULTIMODAL, SMOOTH, gradient, hessians, quadratic
 from torch import Tensor
 from trainers import (
@@ -17,7 +18,6 @@ from trainers import (
 )
 
 from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam
-from opt3dgs_optim.curvature import header
 from opt3dgs_optim.lqnadam import CurvatureOptions
 
 BOTH = [AWSGLD, LQNAdam]

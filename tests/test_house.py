@@ -11,12 +11,12 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-
-import opt3dgs_optim
-from opt3dgs_optim import EnergyHistogram, LQNAdam, Phase, PhaseScheduler, two_loop
 from opt3dgs_optim._groups import GAUSSIAN_NAMES
 from opt3dgs_optim.multiplier import ConstantMultiplier
 from opt3dgs_optim.noise import CovarianceNoise, IsotropicNoise, covariance_noise
+
+import opt3dgs_optim
+from opt3dgs_optim import EnergyHistogram, LQNAdam, Phase, PhaseScheduler, two_loop
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "opt3dgs_optim"

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from opt3dgs_optim._mistakes import FROZEN_STEPS
 from torch.optim.lr_scheduler import ExponentialLR
 from trainers import (
     edit_rows,
@@ -20,8 +21,6 @@ from trainers import (
     train,
     view_loss,
 )
-
-from opt3dgs_optim._mistakes import FROZEN_STEPS
 
 
 @pytest.mark.parametrize("theirs", [5e5, Namespace(noise_lr=5e5), {"noise_lr": 5e5}], ids=str)

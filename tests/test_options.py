@@ -12,6 +12,9 @@ from typing import Any
 
 import pytest
 import torch
+from opt3dgs_optim.curvature import history_from_pairs
+from opt3dgs_optim.multiplier import ConstantMultiplier
+from opt3dgs_optim.noise import CovarianceNoise, IsotropicNoise
 
 from opt3dgs_optim import (
     AWSGLD,
@@ -24,10 +27,7 @@ from opt3dgs_optim import (
     backend_info,
     two_loop,
 )
-from opt3dgs_optim.curvature import history_from_pairs
 from opt3dgs_optim.lqnadam import CurvatureOptions
-from opt3dgs_optim.multiplier import ConstantMultiplier
-from opt3dgs_optim.noise import CovarianceNoise, IsotropicNoise
 
 TORCH = "checked, or taken as truth values, by torch.optim.Adam"
 FREE = "any value is meaningful, or torch raises where it is used"

@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
-from trainers import everything, gsplat_optimizers, make_splats, train
-
-from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam, PhaseScheduler, cuda, ops
 from opt3dgs_optim._evidence import largest_noise
 from opt3dgs_optim._nonfinite import CAPACITY, FrozenRows
 from opt3dgs_optim._ranks import RankMean
 from opt3dgs_optim._visible import masked_adam
+from torch import Tensor
+from trainers import everything, gsplat_optimizers, make_splats, train
+
+from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam, PhaseScheduler, cuda, ops
 
 
 class OnGpu(Tensor):

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 import torch
+from opt3dgs_optim.noise import CovarianceNoise, IsotropicNoise
 from torch.optim import Optimizer
 from trainers import everything
 
 from opt3dgs_optim import AWSGLD, EnergyHistogram, Fading, LQNAdam, PhaseScheduler
-from opt3dgs_optim.noise import CovarianceNoise, IsotropicNoise
 
 
 def points(rows: int = 4) -> torch.nn.Parameter:

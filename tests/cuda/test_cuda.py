@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from kernel_host import OPTIONS, Problem, free_run, noise_case, relative_difference
+from opt3dgs_optim.noise import CovarianceNoise
 from torch import Tensor
 from trainers import everything
 
@@ -15,7 +16,6 @@ from opt3dgs_optim import AWSGLD, Annealing, Fading, LQNAdam, Pooling, backend_i
 from opt3dgs_optim.covariance import add_covariance_noise
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
 from opt3dgs_optim.lqnadam import CurvatureOptions
-from opt3dgs_optim.noise import CovarianceNoise
 
 REASON = "torch sees no CUDA device"
 if torch.cuda.is_available():

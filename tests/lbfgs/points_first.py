@@ -20,9 +20,9 @@ def record(
     min_cosine: float,
 ) -> tuple[Tensor, Tensor]:
     """(accepted, candidates); `visible` [N] is the caller's, whatever the gradients are."""
-    moved = (columns(each, history.dtype) for each in (position, gradient))
+    x, g = (columns(each, history.dtype) for each in (position, gradient))
     head = header(history, history_size)
-    return take_pairs(history, head, history_size, *moved, visible, min_cosine)
+    return take_pairs(history, head, history_size, x, g, visible, min_cosine)
 
 
 def direction(grad: Tensor, history: Tensor, history_size: int, *, graft: bool) -> Tensor:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from opt3dgs_optim.lbfgs import pairs as columns_of
 from opt3dgs_optim.lbfgs import foresight, history_from_pairs, lqn_direction, new_history
+from opt3dgs_optim.lbfgs import pairs as columns_of
 from opt3dgs_optim.lbfgs.history import header
 
 POINTS, VIEWS, STEPS = 300, 30, 150

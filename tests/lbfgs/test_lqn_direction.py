@@ -16,8 +16,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import opt3dgs_optim
 from opt3dgs_optim import cuda
-from opt3dgs_optim.lbfgs import pairs as columns_of
 from opt3dgs_optim.lbfgs import foresight, laid_out, lqn_direction, new_history, two_loop
+from opt3dgs_optim.lbfgs import pairs as columns_of
 from opt3dgs_optim.lbfgs.two_loop import step
 
 OPERATOR = torch.ops.opt3dgs_optim.lqn_direction.default

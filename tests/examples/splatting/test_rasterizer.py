@@ -483,7 +483,11 @@ def test_wrong_dtype_and_camera_are_refused():
 
 def test_auto_takes_the_fast_twin_where_it_can():
     camera = look_at_origin()
-    for dtype, backend in ((torch.float32, "fast"), (torch.float64, "reference")):
+    cases: tuple[tuple[torch.dtype, Backend], ...] = (
+        (torch.float32, "fast"),
+        (torch.float64, "reference"),
+    )
+    for dtype, backend in cases:
         gaussians = {name: value.to(dtype) for name, value in scene(30, 1).items()}
         expected = render(gaussians, camera, backend=backend).image
         assert torch.equal(render(gaussians, camera).image, expected)
