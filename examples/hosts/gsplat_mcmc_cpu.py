@@ -46,8 +46,9 @@ class Result(NamedTuple):
 
 
 def install(optimizers: Any) -> Any:
-    """The documented line."""
-    return PhaseScheduler.install(optimizers, ITERATIONS)
+    """The documented lines."""
+    phases = PhaseScheduler(ITERATIONS)
+    return phases, phases.upgrade(optimizers)
 
 
 ARMS = {"adam": None, "opt3dgs": install}

@@ -134,8 +134,8 @@ class Done:
 
     @property
     def psnr(self) -> float | None:
-        """The last one that the trainer printed, dB."""
-        found = re.findall(r"PSNR:? ([\d.]+)", self.output)
+        """That of the test views, which the trainer printed last, dB."""
+        found = re.findall(r"(?:Evaluating test: .*?PSNR|PSNR:) ([\d.]+)", self.output)
         return float(found[-1]) if found else None
 
     @property

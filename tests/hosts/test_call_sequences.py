@@ -179,13 +179,14 @@ def test_a_second_optimizer_of_gaussians() -> None:
     plain, *adams = model()
     assert not torch.equal(whole["shN"], start)
     nothing = PhaseScheduler(TOTAL, parts=[])
-    run(plain, nothing, *map(nothing.upgrade, adams), 1, 32)
+    one, two = map(nothing.upgrade, adams)
+    run(plain, nothing, one, two, 1, 32)
     assert not torch.equal(whole["shN"], plain["shN"])  # annealed: not plain Adam's
 
     half, *adams = model()
     before = PhaseScheduler(TOTAL)
     saved = [before.upgrade(o) for o in adams]
-    run(half, before, *saved, 1, 16)
+    run(half, before, saved[0], saved[1], 1, 16)
     again = [type(a)(a.param_groups, lr=0.0, eps=1e-15) for a in model()[1:]]
     for optimizer, old in zip(again, saved, strict=True):
         for group, there in zip(optimizer.param_groups, old.param_groups, strict=True):
@@ -194,7 +195,7 @@ def test_a_second_optimizer_of_gaussians() -> None:
     resumed = PhaseScheduler(TOTAL)
     again = [resumed.upgrade(o) for o in again]
     assert resumed.iteration == 16
-    run(half, resumed, *again, 17, 32)
+    run(half, resumed, again[0], again[1], 17, 32)
     assert torch.equal(half["means"], whole["means"])
     assert torch.equal(half["shN"], whole["shN"])
 
