@@ -123,7 +123,8 @@ class Curvature(Part):
 
     def _history(self, state: dict[str, Any], position: Tensor) -> Tensor:
         shape = history_shape(position, self.history_size)
-        kernel = position.is_cuda and uses_kernel(
+        asked = position.is_cuda or self.backend == "cuda"
+        kernel = asked and uses_kernel(
             self.backend, position.device, position.dtype, position.shape[1]
         )
         if HISTORY not in state or tuple(state[HISTORY].shape) != shape:
