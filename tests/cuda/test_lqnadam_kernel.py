@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -19,8 +21,8 @@ needs_compiler = pytest.mark.skipif(compiler() is None, reason="g++ is not insta
 BACKENDS = ["torch", pytest.param("kernel", marks=needs_compiler, id="kernel on the host")]
 
 
-def put_into_optimizers(patch: pytest.MonkeyPatch) -> None:
-    """Let LQNAdam take the host's kernels for the CUDA kernels, as it would on a GPU."""
+def on_the_host(patch: pytest.MonkeyPatch) -> Callable[..., LQNAdam]:
+    """LQNAdam with the host's kernels in the place of the CUDA kernels, as on a GPU."""
 
     def kernel(
         x: Tensor, g: Tensor, history: Tensor, size: int, min_cosine: float, graft: bool
@@ -32,18 +34,21 @@ def put_into_optimizers(patch: pytest.MonkeyPatch) -> None:
     for name, module in list(sys.modules.items()):
         if name.startswith("opt3dgs_optim.") and hasattr(module, "uses_kernel"):
             patch.setattr(module, "uses_kernel", lambda *_: True)
+    return partial(LQNAdam, backend="cuda")
 
 
 @pytest.fixture(params=BACKENDS)
-def optimizer_of(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> type[LQNAdam]:
+def optimizer_of(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., LQNAdam]:
     """LQNAdam on either backend."""
-    if request.param == "kernel":
-        put_into_optimizers(monkeypatch)
-    return LQNAdam
+    return on_the_host(monkeypatch) if request.param == "kernel" else LQNAdam
 
 
 @pytest.mark.parametrize(("condition", "left"), [(1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-7)])
-def test_lqnadam_converges(optimizer_of: type[LQNAdam], condition: float, left: float) -> None:
+def test_lqnadam_converges(
+    optimizer_of: Callable[..., LQNAdam], condition: float, left: float
+) -> None:
     """1,000 steps, the learning rate decayed to 1e-6 of a tenth of the distance."""
     hessian = hessians(300, condition)
     x = torch.nn.Parameter(torch.ones(300, 3, dtype=torch.float64))
@@ -57,7 +62,9 @@ def test_lqnadam_converges(optimizer_of: type[LQNAdam], condition: float, left: 
 
 
 @pytest.mark.parametrize("condition", CONDITIONS)
-def test_lqnadam_survives_any_condition(optimizer_of: type[LQNAdam], condition: float) -> None:
+def test_lqnadam_survives_any_condition(
+    optimizer_of: Callable[..., LQNAdam], condition: float
+) -> None:
     """Float32, losses in units of 1e-8 to 1e8 in one batch: finite, and never far off."""
     unit = log_uniform(ROWS, 1e-8, 1e8).float()[:, None]
     hessian = hessians(ROWS, condition).float()
@@ -80,10 +87,9 @@ def test_both_backends_take_the_same_path(
     """100 steps of LQNAdam at condition 1e3, by either: the same points, to rounding."""
     hessian, ends = hessians(200, 1e3), []
     for patched in (False, True):
-        if patched:
-            put_into_optimizers(monkeypatch)
+        make = on_the_host(monkeypatch) if patched else LQNAdam
         x = torch.nn.Parameter(torch.ones(200, 3, dtype=torch.float64))
-        optimizer = LQNAdam([x], lr=0.01)
+        optimizer = make([x], lr=0.01)
         for _ in range(100):
             x.grad = gradient(quadratic(hessian), x)
             optimizer.step()

@@ -339,16 +339,6 @@ def test_no_autograd_graph_is_kept(tmp_path):
         assert alive() is None
 
 
-def test_thinning_keeps_multiples_only_of_steps(tmp_path):
-    with RunLog(tmp_path / "run.jsonl", every=3) as log:
-        for i in range(10):
-            log.step(i, phase="exploration", energy=1)
-            log.evaluation(i, psnr=1)
-    run = read_run(tmp_path / "run.jsonl")
-    assert run.steps["iteration"].tolist() == [0, 3, 6, 9]
-    assert len(run.evaluations["psnr"]) == 10
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="no fcntl on this system, so no lock")
 def test_a_second_writer_is_refused(tmp_path):
     path = tmp_path / "run.jsonl"
@@ -402,8 +392,8 @@ def test_lines_wait_for_the_gpu_in_order_without_waiting_for_it(tmp_path, gpu):
         gpu[0].done = True
         log.step(5, phase="exploration", energy=scalar)
         assert len(strict_lines(path)) == 4
-        log.flush()
-        assert len(strict_lines(path)) == 6
+        log.event("waited", 5)
+        assert len(strict_lines(path)) == 7
         log.step(6, phase="exploration", energy=scalar)
     assert read_run(path).steps["energy"].tolist() == [1, 2, 3, 3, 4, 5]
     assert read_run(path).steps["iteration"].tolist() == [1, 2, 3, 4, 5, 6]
@@ -429,9 +419,6 @@ def test_cuda_steps_do_not_synchronize(tmp_path):
 
 
 def test_wrong_arguments_name_call_value_and_what_is_allowed(tmp_path):
-    for every in (0, 1.5):
-        with pytest.raises(ValueError, match=r"RunLog\(every=.*>= 1"):
-            RunLog(tmp_path / "run.jsonl", every=every)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match=r"metadata.*no string"):
         RunLog(tmp_path / "run.jsonl", metadata={"x": object()})
     assert not (tmp_path / "run.jsonl").exists()
@@ -463,9 +450,6 @@ def test_real_clock_runs(tmp_path):
 @pytest.mark.parametrize(
     ("options", "error"),
     [
-        ({"every": 0}, ValueError),
-        ({"every": 1.5}, ValueError),
-        ({"every": None}, ValueError),
         ({"metadata": {"a": object()}}, TypeError),
         ({"path": None}, TypeError),
     ],
@@ -474,7 +458,7 @@ def test_real_clock_runs(tmp_path):
 def test_a_wrong_option_is_refused(options, error, tmp_path):
     with pytest.raises(error):
         RunLog(**{"path": tmp_path / "run.jsonl", **options})
-    assert set(inspect.signature(RunLog).parameters) == {"path", "metadata", "every"}
+    assert set(inspect.signature(RunLog).parameters) == {"path", "metadata"}
 
 
 def test_a_log_on_a_system_without_locks(tmp_path, monkeypatch):
@@ -531,11 +515,10 @@ class Wandb:
 def test_a_mirror_gets_the_numbers_of_steps_and_evaluations(tmp_path, monkeypatch):
     monkeypatch.setattr("time.perf_counter", lambda: 0.0)
     board, wandb = Board(), Wandb()
-    with RunLog(tmp_path / "run.jsonl", every=2) as log:
+    with RunLog(tmp_path / "run.jsonl") as log:
         log.step(0, loss=7.0)  # before there is a mirror
         log.mirror(board)
         log.mirror(wandb)
-        log.step(1, loss=8.0)  # not a multiple of two
         log.step(2, phase="exploration", loss=torch.tensor(0.5), nu=math.inf)
         log.event("switch", 2, reason=3.0)
         log.evaluation(3, psnr=20.0)

@@ -40,10 +40,8 @@ class Curvature(Part):
     its gradient into a pseudo-gradient. There is no line search: Adam takes the step. A point
     without a usable pair is stepped by plain Adam, bit for bit.
 
-    A point whose gradient is exactly zero is taken as not visible: no pair is stored for it. The
-    history is dropped where the parameter object, or its number of rows, is not the one of the
-    last step: a trainer's density control has moved the rows (`reset_points` tells more). A row
-    that it sets to zero starts anew.
+    A point whose gradient is exactly zero is taken as not visible: no pair is stored for it. What
+    density control's edits of rows do to the history: see `reset_points`.
 
     Memory: 32 K bytes per point beyond Adam's (K > 3, D = 3, float32), from the switch on.
 
@@ -108,22 +106,21 @@ class Curvature(Part):
             gradient = torch.where(course.valid, gradient, 0.0)
         history = self._history(state, position)
         if course.adaptive and course.num_observed % PROBE_STEPS == 0:
-            self._look(foresight(history, self.history_size, position, gradient))
+            foretold = foresight(history, self.history_size, position, gradient)
+            self._seen = self._seen.to(foretold.device)
+            self._seen[2:] += foretold
+            self._probes += 1
+        options = {"min_cosine": self.min_cosine, "graft": self.graft, "backend": self.backend}
         fed, accepted, candidates = lqn_direction(
-            position,
-            gradient,
-            history,
-            self.history_size,
-            min_cosine=self.min_cosine,
-            graft=self.graft,
-            backend=self.backend,
+            position, gradient, history, self.history_size, **options
         )
         self._count(torch.stack([accepted.count_nonzero(), candidates.count_nonzero()]), course)
         return fed.reshape(grad.shape)
 
     def _history(self, state: dict[str, Any], position: Tensor) -> Tensor:
         shape = history_shape(position, self.history_size)
-        kernel = position.is_cuda and uses_kernel(
+        asked = position.is_cuda or self.backend == "cuda"
+        kernel = asked and uses_kernel(
             self.backend, position.device, position.dtype, position.shape[1]
         )
         if HISTORY not in state or tuple(state[HISTORY].shape) != shape:
@@ -138,11 +135,6 @@ class Curvature(Part):
         if course.adaptive:
             self._seen = self._seen.to(tally.device)
             self._seen[:2] += tally
-
-    def _look(self, foretold: Tensor) -> None:
-        self._seen = self._seen.to(foretold.device)
-        self._seen[2:] += foretold
-        self._probes += 1
 
     def numbers(self, course: Course) -> Mapping[str, float | Tensor]:
         """`accepted`: the share of the candidate pairs that the last step accepted."""

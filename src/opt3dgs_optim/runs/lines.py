@@ -61,10 +61,6 @@ class LineFile:
         while rest:
             rest = rest[self._file.write(rest) or 0 :]
 
-    def sync(self) -> None:
-        """Force what was written to the disk."""
-        os.fsync(self._file.fileno())
-
     def close(self) -> None:
         if fcntl and not self._file.closed and os.getpid() == self._owner:
             # A forked data loader shares the lock: release it for both, but only from the owner.

@@ -49,7 +49,7 @@ class RunLog:
     checkpoint use `resume`.
 
     A step line costs no host synchronisation: CUDA scalars are copied to pinned memory in stream
-    order and written at a later call. Evaluations, events, `paused`, `flush` and `close` do wait
+    order and written at a later call. Evaluations, events, `paused` and `close` do wait
     for the GPU. No autograd graph is kept.
 
     Args:
@@ -57,10 +57,9 @@ class RunLog:
         metadata: what describes the run (`arm`, `seed`, `scene`, options): strings, numbers,
             booleans, None, lists and mappings of these. The report groups by `arm` and pairs
             by `seed`. `command` replaces the command line recorded otherwise (base names only).
-        every: write step lines only at iterations that are multiples of `every`.
 
     Raises:
-        ValueError: `every` < 1, metadata nested too deep, or `path` is no run log.
+        ValueError: metadata nested too deep, or `path` is no run log.
         TypeError: metadata that JSON cannot hold.
         BlockingIOError: another RunLog has the file open (noticed where files can be locked).
 
@@ -81,13 +80,9 @@ class RunLog:
         path: str | os.PathLike[str],
         *,
         metadata: Mapping[str, Any] | None = None,
-        every: int = 1,
     ) -> None:
-        if not isinstance(every, int) or every < 1:
-            raise ValueError(f"RunLog(every={every!r}): must be an integer >= 1")
         described = plain("RunLog(metadata)", dict(metadata or {}))
         self.path = Path(path)
-        self.every = every
         self._pending: deque[_Pending] = deque()
         self._mirrors: list[Any] = []
         self._pauses = 0
@@ -109,7 +104,6 @@ class RunLog:
         *,
         iteration: int,
         metadata: Mapping[str, Any] | None = None,
-        every: int = 1,
     ) -> RunLog:
         """Continue the log of a run that goes on from a checkpoint taken at `iteration`.
 
@@ -120,7 +114,7 @@ class RunLog:
         iteration = index("RunLog.resume", iteration)
         if not Path(path).is_file():
             raise FileNotFoundError(f"RunLog.resume: no run log at {os.fspath(path)!r}")
-        log = cls(path, metadata=metadata, every=every)
+        log = cls(path, metadata=metadata)
         records = [r for r in read_run(path).records[:-1] if r["iteration"] <= iteration]
         log._base = records[-1]["seconds"] if records else 0.0
         log._since = time.perf_counter()
@@ -163,12 +157,10 @@ class RunLog:
             ValueError: a negative iteration, a reserved name or a tensor of several elements.
             TypeError: a value that is no number.
         """
-        iteration = index("RunLog.step", iteration)
-        if iteration % self.every == 0:
-            line = self._line("step", iteration)
-            if phase is not None:
-                line["phase"] = text(str(phase.value if isinstance(phase, Enum) else phase))
-            self._pending.append(_pack("RunLog.step", line, columns))
+        line = self._line("step", index("RunLog.step", iteration))
+        if phase is not None:
+            line["phase"] = text(str(phase.value if isinstance(phase, Enum) else phase))
+        self._pending.append(_pack("RunLog.step", line, columns))
         self._drain(wait=False)
 
     def evaluation(self, iteration: int, **metrics: float | Tensor) -> None:
@@ -205,11 +197,6 @@ class RunLog:
             if self._pauses == 0:
                 _synchronize()
                 self._since = time.perf_counter()
-
-    def flush(self) -> None:
-        """Wait for numbers still on the GPU, write their lines, and force the file to the disk."""
-        self._drain(wait=True)
-        self._file.sync()
 
     def close(self) -> None:
         """Write what is pending and release the file; a second call does nothing."""

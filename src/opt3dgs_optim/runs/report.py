@@ -1,7 +1,7 @@
 """Compare runs from their logs: `python -m opt3dgs_optim report RUN... -o DIR`.
 
-Writes `report.md`, `report.json` and, with matplotlib (the extra
-`opt3dgs_optim[report]`), `report.png`, or `report-SCENE.png` for each of several scenes.
+Writes `report.md` and, with matplotlib (the extra `opt3dgs_optim[report]`), `report.png`, or
+`report-SCENE.png` for each of several scenes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 from opt3dgs_optim.runs.plot import draw
 from opt3dgs_optim.runs.read import Run, read_run
 from opt3dgs_optim.runs.stats import compare
-from opt3dgs_optim.runs.table import as_json, as_markdown, origin
+from opt3dgs_optim.runs.table import as_markdown, origin
 
 NO_PICTURE = (
     "report: no picture, since matplotlib is not installed: pip install 'opt3dgs_optim[report]'"
@@ -76,13 +76,8 @@ def write_report(
         if (error.name or "").partition(".")[0] != "matplotlib":
             raise
         names = []
-    texts = {
-        "report.md": as_markdown(comparisons, runs, names),
-        "report.json": as_json(comparisons, runs),
-    }
-    for name, text in texts.items():
-        (out / name).write_text(text, encoding="utf-8")
-    return [out / name for name in (*texts, *names)]
+    (out / "report.md").write_text(as_markdown(comparisons, runs, names), encoding="utf-8")
+    return [out / name for name in ("report.md", *names)]
 
 
 def _picture_names(scenes: list[str | None]) -> list[str]:
@@ -99,27 +94,22 @@ def _picture_names(scenes: list[str | None]) -> list[str]:
 
 def _writable(out: str | Path) -> Path:
     """The folder `out`, made if it is missing; OSError if nothing can be written into it."""
-    out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
+    Path(out).mkdir(parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=out).close()
-    return out
+    return Path(out)
 
 
-def _parser() -> argparse.ArgumentParser:
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line: 0, or 2 after one line that says what is wrong."""
     parser = argparse.ArgumentParser(
-        prog="opt3dgs_optim report", description="Compare runs from their run logs."
+        prog="opt3dgs report", description="Compare runs from their run logs."
     )
     add = parser.add_argument
     add("runs", nargs="+", metavar="RUN", help="run log, or folder of *.jsonl")
     add("-o", "--out", default="report", metavar="DIR", help="to write into (default: report)")
     add("--metric", help="to compare by (default: psnr if logged, else the first)")
     add("--baseline", metavar="ARM", help="reference arm (default: mcmc if there, else the first)")
-    return parser
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line: 0, or 2 after one line that says what is wrong."""
-    options = _parser().parse_args(arguments)
+    options = parser.parse_args(arguments)
     try:
         logs = find_logs(options.runs)
         _writable(options.out)

@@ -1,14 +1,11 @@
-"""A report as text: Markdown for people, JSON for programs."""
+"""A report as text, in Markdown."""
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import asdict
 
-from opt3dgs_optim.runs.lines import plain
 from opt3dgs_optim.runs.read import Run
 from opt3dgs_optim.runs.stats import Comparison, Stat
 
@@ -18,21 +15,6 @@ READING = (
     "*gain*: difference to the baseline's run of the same seed at the smaller of the two final "
     "times, positive is better. Both interpolate linearly between evaluations."
 )
-
-
-def as_json(comparisons: Sequence[Comparison], runs: Sequence[Run]) -> str:
-    """The whole report; statistics are {mean, std, n} or null, NaN is the string "nan"."""
-    scenes = []
-    for c in comparisons:
-        arms = [
-            {"arm": arm.name, "runs": [run.name for run in arm.runs]}
-            | {name: stat and asdict(stat) for name, stat in arm.numbers.items()}
-            for arm in c.arms
-        ]
-        about = {"scene": c.scene, "metric": c.metric, "baseline": c.baseline}
-        scenes.append(about | {"notes": c.notes, "arms": arms})
-    report = {"format": 2, "origin": origin(runs), "scenes": scenes}
-    return json.dumps(plain("report", report), indent=2, allow_nan=False) + "\n"
 
 
 def as_markdown(
