@@ -1,4 +1,4 @@
-"""Compare runs from their logs: `python -m opt3dgs_optim report RUN... -o DIR`.
+"""Compare runs from their logs: `opt3dgs report RUN... -o DIR`.
 
 Writes `report.md`, `report.json` and, with matplotlib (the extra
 `opt3dgs_optim[report]`), `report.png`, or `report-SCENE.png` for each of several scenes.
@@ -107,7 +107,7 @@ def _writable(out: str | Path) -> Path:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="opt3dgs_optim report", description="Compare runs from their run logs."
+        prog="opt3dgs report", description="Compare runs from their run logs."
     )
     add = parser.add_argument
     add("runs", nargs="+", metavar="RUN", help="run log, or folder of *.jsonl")
