@@ -1,8 +1,8 @@
 """What mkdocs does to these pages besides Markdown; see `hooks` in mkdocs.yml.
 
 Formulas become MathML (no script, no font), `<!-- step costs -->` becomes a table of the committed
-JSON, tables get a frame to scroll in. A built page that would fetch anything from the net fails the
-build.
+JSON, the cells of tables get their column's name, so that a phone can show a row as a card. A built
+page that would fetch anything from the net fails the build.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 DOCS = Path(__file__).resolve().parent
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.+?)\\[)\]]</\1>', re.S)
 PRINTED = '<div class="highlight"><span class="filename">prints</span>'
+TABLE = re.compile(r"<table>\n<thead>.*?</table>", re.S)
 PICTURE = re.compile(r'<img [^>]*\bsrc="([^":]+)"[^>]*>')
 FETCHES = (
     re.compile(r"<(?:script|img|iframe|source|video|embed)\b[^>]*\bsrc=[\"']?(?:https?:)?//", re.I),
@@ -33,8 +34,23 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 def on_page_content(html: str, **_: Any) -> str:
     """Turn the formulas into MathML, mark what is printed, let a picture open by itself."""
     html = FORMULA.sub(lambda m: mathml(m[2], block=m[1] == "div"), html)
+    html = TABLE.sub(lambda m: labelled(m[0]), html)
     html = html.replace(PRINTED, PRINTED.replace('"highlight"', '"highlight printed"'))
     return PICTURE.sub(r'<a class="picture" href="\1">\g<0></a>', html)
+
+
+def labelled(table: str) -> str:
+    """A table whose cells name their column, for a screen that is too narrow for its header."""
+    head, body = table.split("</thead>")
+    names = [re.sub(r"<[^>]+>", "", name) for name in re.findall(r"<th[^>]*>(.*?)</th>", head)]
+
+    def row(match: re.Match[str]) -> str:
+        left = iter(names)
+        cell = r"<td([^>]*)>(.*?)</td>"
+        put = r'<td data-label="{}"\1><span>\2</span></td>'
+        return re.sub(cell, lambda m: m.expand(put.format(next(left, ""))), match[0], flags=re.S)
+
+    return f"{head}</thead>{re.sub(r'<tr>.*?</tr>', row, body, flags=re.S)}"
 
 
 def on_post_build(config: Any, **_: Any) -> None:

@@ -245,3 +245,11 @@ def test_formulas_become_mathml() -> None:
     made = build_hooks().on_page_content('<p><span class="arithmatex">\\(a &lt; b\\)</span></p>')
     assert made.startswith("<p><math")
     assert "<mo><</mo>" in html.unescape(made)
+
+
+def test_cells_of_tables_name_their_column() -> None:
+    head = "<table>\n<thead>\n<tr>\n<th>part</th>\n<th><code>dB</code></th>\n</tr>\n</thead>\n"
+    rows = "<tbody>\n<tr>\n<td>a</td>\n<td style='x'>1</td>\n</tr>\n</tbody>\n</table>"
+    made = build_hooks().on_page_content(head + rows)
+    assert '<td data-label="part"><span>a</span></td>' in made
+    assert "<td data-label=\"dB\" style='x'><span>1</span>" in made

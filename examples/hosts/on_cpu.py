@@ -7,7 +7,7 @@ Everything after the script's path is the script's own. CUDA is mapped to the CP
 rasterizers are replaced by the examples' own (`pip install "opt3dgs_optim[examples]"`), viewers and
 loggers that are not installed by ones that do nothing; the script itself is not touched. With a
 hundred iterations on photos of 160 x 106 pixels, a minute or two show whether the lines of
-`python -m opt3dgs_optim.hosts diff` work in your trainer: not how good the result gets.
+`opt3dgs hosts diff` work in your trainer: not how good the result gets.
 
 What is not as on a GPU: pinhole cameras without distortion only; no antialiased mode, no 2DGS, no
 depth supervision in INRIA's trainer; the absolute gradients of `absgrad` and the importances of

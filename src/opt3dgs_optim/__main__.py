@@ -13,7 +13,7 @@ COMMANDS = {
     "report": "compare runs from their logs: error against run time",
     "hosts": "the lines to change in your trainer, as a diff or applied",
 }
-MODULES = {"report": "runs.report", "hosts": "hosts.__main__"}
+MODULES = {"report": "runs.report", "hosts": "hosts.cli"}  # of a command, where not its name
 
 
 def usage() -> str:
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(__version__)
         return 0
     if words[0] not in COMMANDS:
-        print(f"opt3dgs_optim: no command {words[0]!r}\n\n{usage()}", file=sys.stderr)
+        print(f"opt3dgs: no command {words[0]!r}\n\n{usage()}", file=sys.stderr)
         return 2
     try:
         module = MODULES.get(words[0], words[0])

@@ -1,4 +1,4 @@
-"""The package in other people's trainers: `python -m opt3dgs_optim.hosts diff PATH_TO_TRAINER`.
+"""The package in other people's trainers: `opt3dgs hosts diff PATH_TO_TRAINER`.
 
 `edits` writes the lines that a training script needs, `nerfstudio` adds methods to nerfstudio.
 """

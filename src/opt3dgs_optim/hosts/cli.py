@@ -1,4 +1,4 @@
-"""The command line: `python -m opt3dgs_optim.hosts diff PATH [--write]`."""
+"""The command `opt3dgs hosts diff PATH [--write]`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ them. A file whose names cannot be read with certainty is refused, with the line
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; 0 where the file was edited, else 1."""
-    parser = argparse.ArgumentParser("python -m opt3dgs_optim.hosts", description=DESCRIPTION)
+    parser = argparse.ArgumentParser("opt3dgs hosts", description=DESCRIPTION)
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser("diff", help="print the changed lines for a trainer's file")
     command.add_argument("path", type=Path, help="simple_trainer.py or train.py")
@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         done = diff(options.path)
         backup = write(options.path) if options.write else None
     except ValueError as error:
-        print(f"opt3dgs_optim.hosts: {options.path}: {error}", file=sys.stderr)
+        print(f"opt3dgs hosts: {options.path}: {error}", file=sys.stderr)
         print("\n".join(["The lines to add by hand:", *LINES_BY_HAND]), file=sys.stderr)
         return 1
     print(done.diff, end="")

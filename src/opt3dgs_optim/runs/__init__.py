@@ -1,6 +1,6 @@
 """Error against run time, of any trainer: a log while it trains, a report on the logs.
 
-Nothing here needs the optimizers. `python -m opt3dgs_optim report` is `runs.report`.
+Nothing here needs the optimizers. `opt3dgs report` is `runs.report`.
 """
 
 from opt3dgs_optim.runs.log import RunLog

@@ -1,4 +1,4 @@
-"""Compare runs from their logs: `python -m opt3dgs_optim report RUN... -o DIR`.
+"""Compare runs from their logs: `opt3dgs report RUN... -o DIR`.
 
 Writes `report.md` and, with matplotlib (the extra `opt3dgs_optim[report]`), `report.png`, or
 `report-SCENE.png` for each of several scenes.
