@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -44,7 +44,7 @@ class Arm:
     noise_during: Phase | None = None  # None: in both phases
 
     def make(
-        self, iterations: int, switch: float, nu: float | None, gaussians: dict[str, Tensor]
+        self, iterations: int, switch: float, nu: float | None, gaussians: Mapping[str, Tensor]
     ) -> PhaseScheduler:
         """The scheduler of one training: the arm's parts, and the noise of 3DGS-MCMC.
 
