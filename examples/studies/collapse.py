@@ -72,18 +72,15 @@ class Frozen(Part):
 
 def train(folder: Path, arm: str, seed: int, iterations: int, points: int) -> dict[str, Any]:
     """Train; return what is recorded, the curve and the trace included."""
-    from splatting.arms import NOISE_LR, Arm
+    from splatting.arms import Arm
     from splatting.fit import Fit, FitOptions
     from splatting.scenes import load_scene
-
-    from opt3dgs_optim import PhaseScheduler, PositionNoise
 
     torch.set_num_threads(1)
     warmup = round(iterations * WARMUP)
     part = {"stock": None, "frozen": Frozen(warmup), "default": EnergyHistogram(warmup=warmup)}[arm]
-    parts: list[Part] = [PositionNoise(lambda: fit.gaussians, NOISE_LR)]
-    parts += [] if part is None else [part]
-    made = Arm(arm, arm, make=lambda *_: PhaseScheduler(iterations, iterations, parts=parts))
+    parts: list[Part] = [] if part is None else [part]
+    made = Arm(arm, arm, lambda *_: parts)
     fit = Fit(load_scene(folder), made, FitOptions(iterations, points, seed, switch=1.0))
     histogram = part.histogram if isinstance(part, Frozen) else part
     curve, trace = [], []

@@ -29,6 +29,7 @@ BASELINE = "mcmc"
 ALL_ANNEALED = "annealed-4-0.4+faded"
 DEFAULTS = "annealed-4-opacities-1+faded"  # what `PhaseScheduler(total_steps)` is
 POOLED = f"{DEFAULTS}+pooled"
+STABLE = "awsgld-stable"  # its histogram follows the energy; that of the arms before it did not
 UNFADED_OPACITIES = f"{DEFAULTS}-opacities-unfaded"
 V_ONLY = f"{DEFAULTS}-v-only"
 EVENT_STEPS = 10  # iterations for one event of fading in a run of 3,000, where it was chosen
@@ -86,8 +87,12 @@ def core() -> list[StudyArm]:
     paper = "a constant multiplier, the paper's mean nu"
     return [
         StudyArm(BASELINE, "stock 3DGS-MCMC, torch's Adam"),
-        StudyArm("awsgld", "with the flat-histogram multiplier", histogram),
-        StudyArm("constant", "a constant multiplier, its mean nu", constant, needs="awsgld"),
+        StudyArm("awsgld", "with the flat-histogram multiplier", retired=True),
+        StudyArm("constant", "a constant multiplier, its mean nu", retired=True),
+        StudyArm(STABLE, "with the flat-histogram multiplier that follows the energy", histogram),
+        StudyArm(
+            f"{STABLE}-constant", "a constant multiplier, its mean nu", constant, needs=STABLE
+        ),
         *rates,
         *annealed,
         StudyArm("faded", "moments of random points faded", of(FADING)),
@@ -112,25 +117,16 @@ def core() -> list[StudyArm]:
 
 
 def with_nu() -> list[StudyArm]:
-    """The multiplier on top of annealing and fading, beside a constant of its mean."""
+    """The multiplier on top of annealing and fading, beside a constant of its mean; retired."""
     words = ", with a constant multiplier: the next arm's mean nu"
+    awsgld = ", with the flat-histogram multiplier"
+    pairs = [(f"{trunk}+constant", f"{trunk}+awsgld", trunk) for trunk in list(TRUNKS)[:3]]
     return [
         arm
-        for trunk in ("annealed-8-0.4", "faded", DEFAULTS)
+        for plain, own, trunk in pairs
         for arm in (
-            StudyArm(
-                f"{trunk}+constant",
-                WORDS[trunk] + words,
-                _on(trunk, constant),
-                needs=f"{trunk}+awsgld",
-                control=trunk,
-            ),
-            StudyArm(
-                f"{trunk}+awsgld",
-                f"{WORDS[trunk]}, with the flat-histogram multiplier",
-                _on(trunk, histogram),
-                control=f"{trunk}+constant",
-            ),
+            StudyArm(plain, WORDS[trunk] + words, control=trunk, retired=True),
+            StudyArm(own, WORDS[trunk] + awsgld, control=plain, retired=True),
         )
     ]
 

@@ -12,6 +12,7 @@ from studies.scenes.arms import (
     DEFAULTS,
     GROUPS,
     POOLED,
+    STABLE,
     STUDY_ARMS,
     UNFADED_OPACITIES,
     V_ONLY,
@@ -26,13 +27,14 @@ ROTATED_SCENES = (*MANY_VIEWS_SCENES, "embedded", "banana", "lund_door", "bright
 ROTATED_ARMS = (
     *("mcmc", DEFAULTS, "defaults-3000", "faded", "paper", "paper-constant"),
     *("faded-3000", "rates-x2", POOLED, "annealed-2", "own-step"),
+    *(STABLE, f"{STABLE}-constant"),
 )
 LONG_ARMS = tuple(arm.name for arm in long_runs())
 FULL_PARTS_SCENES = ("brighton_beach", "lund_door")  # where the defaults lose
 POINTS = 4_000
 NUM_POINTS = {"embedded": 2_000, "bonsai": 10_000, "lego": 10_000}
 CONFIRMED = ("faded-v-only", V_ONLY)  # what gained most among the other leads
-FIRST_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "annealed-8-0.4", "faded")
+FIRST_ARMS = ("mcmc", "rates-x2", "annealed-8-0.4", "faded")
 
 
 @dataclass(frozen=True)
@@ -53,8 +55,6 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
     }
     later = [name for name in arms["core"] if name not in FIRST_ARMS]
     tails = [*arms["tails"], *arms["on-top"]]
-    on_defaults = [name for name in arms["with-nu"] if name.startswith(DEFAULTS)]
-    later += [name for name in arms["with-nu"] if name not in on_defaults]
     beyond = [name for name in arms["leads"] if name not in LONG_ARMS]
 
     def cross(
@@ -91,7 +91,6 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
             if spec.seed == seed
         ],
         "full-parts": cross(FULL_PARTS_SCENES, [UNFADED_OPACITIES], 1, 30_000),
-        "with-nu": cross(SCENES, on_defaults, seeds, 3_000),
         "rest": cross(QUICK_SCENES, later, seeds, 3_000),
         "leads": cross(QUICK_SCENES, beyond, seeds, 3_000),
         "confirmed": cross(SCENES, CONFIRMED, seeds, 3_000),

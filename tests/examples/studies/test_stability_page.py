@@ -1,4 +1,4 @@
-"""docs/results/stability/stability.md says what its committed measurements say, and they say enough."""
+"""The stability study's page says what its measurements say, and they say enough."""
 
 from __future__ import annotations
 
