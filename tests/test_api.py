@@ -16,8 +16,9 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_what_a_page_imports_from_the_top_is_there(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
-    named = re.findall(r"from opt3dgs_optim import \(?([\w, \n]+)", text)
-    names = {name for found in named for name in re.split(r"[,\s]+", found) if name}
+    named = re.findall(r"from opt3dgs_optim import (\([^)]*\)|[^\n(]+)", text)
+    plain = [re.sub(r"#[^\n]*|[()`]", "", each) for each in named]
+    names = {name for each in plain for name in re.findall(r"\w+", each)}
     assert {name for name in names if not hasattr(opt3dgs_optim, name)} == set()
 
 
