@@ -1,8 +1,8 @@
 """What mkdocs does to these pages besides Markdown; see `hooks` in mkdocs.yml.
 
 Formulas become MathML (no script, no font), `<!-- step costs -->` becomes a table of the committed
-JSON, `<!-- readme: HEADING -->` that section of the README. A built page that would fetch anything
-from the net fails the build.
+JSON, tables get a frame to scroll in. A built page that would fetch anything from the net fails the
+build.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 DOCS = Path(__file__).resolve().parent
-README = DOCS.parent / "README.md"
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.+?)\\[)\]]</\1>', re.S)
 PRINTED = '<div class="highlight"><span class="filename">prints</span>'
 PICTURE = re.compile(r'<img [^>]*\bsrc="([^":]+)"[^>]*>')
@@ -26,12 +25,9 @@ FETCHES = (
 )  # fmt: skip
 
 
-def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Fill in the table and the README's sections."""
-    folder = Path(page.file.src_uri).parent
-    markdown = markdown.replace("<!-- step costs -->", step_costs())
-    up = "../" * len(folder.parts)
-    return re.sub(r"<!-- readme: (.+?) -->", lambda m: readme_section(m[1], up), markdown)
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Fill in the table."""
+    return markdown.replace("<!-- step costs -->", step_costs())
 
 
 def on_page_content(html: str, **_: Any) -> str:
@@ -61,31 +57,6 @@ def mathml(latex: str, *, block: bool) -> str:
 
     formula = convert(html.unescape(latex).strip(), display="block" if block else "inline")
     return f'<div class="formula">{formula}</div>' if block else formula
-
-
-def readme_section(heading: str, up: str = "") -> str:
-    """The README's section of that heading, without it, its links as seen from docs/.
-
-    Args:
-        heading: how the heading begins.
-        up: the way from the page that includes it to docs/.
-
-    Raises:
-        ValueError: no such section, or it links to a file that the site does not have.
-    """
-    sections = re.split(r"^## ", README.read_text(encoding="utf-8"), flags=re.M)[1:]
-    bodies = [body for body in sections if body.startswith(heading)]
-    if len(bodies) != 1:
-        raise ValueError(f"README.md has {len(bodies)} sections '## {heading}', but one is needed")
-    text = bodies[0].partition("\n")[2].strip() + "\n"
-
-    def moved(match: re.Match[str]) -> str:
-        label, target = match[1], match[2]
-        if target.startswith("docs/"):
-            return f"[{label}]({up}{target.removeprefix('docs/')})"
-        return match[0] if re.match(r"https?:|#", target) else f"{label} (`{target}`)"
-
-    return re.sub(r"\[([^\]]+)\]\(([^)\s]+)\)", moved, text)
 
 
 STEPS = ("six Adams", "six Adams + gsplat's noise", "exploration step", "exploitation step")

@@ -33,7 +33,7 @@ PROGRESS = re.compile(r"\[\s*(\d+)%\]")
 COUNTS = re.compile(r"(\d+) (passed|failed|skipped|errors?)\b")
 # In a process of its own: what torch 2.4 compiles makes the whole process flush denormal numbers
 # to zero, and hypothesis refuses to draw numbers then.
-ALONE = "test_runlog.py"
+ALONE = "test_log.py"
 # (first torch that has it, test, what it needs)
 NEWER = (
     (
@@ -93,7 +93,7 @@ def suitable_tests() -> list[Path]:
 
     That of the documentation starts the examples' commands, which need the extras.
     """
-    found = sorted(TESTS.glob("test_*.py"))
+    found = sorted(TESTS.rglob("test_*.py"))
     return [path for path in found if path.name != "test_docs.py" and needs_only_torch(path)]
 
 

@@ -11,25 +11,26 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
-from splatting.arms import HISTOGRAM_ARM, Arm, in_order
+from splatting.arms import ARMS, Arm, in_order
 from splatting.gallery import draw_gallery
 from splatting.scenes import load_scene
 from splatting.stopping import stop_at_once
+from splatting.writable import check_folder
 from tqdm import tqdm
-from train import SHARED_OPTIONS, add_fit_options, recorded_command
+from train import SHARED_OPTIONS, add_fit_options, fit_options, recorded_command
 
-from opt3dgs_optim.report import write_report
-from opt3dgs_optim.runlog import Run, read_run
+from opt3dgs_optim.runs import Run, read_run
+from opt3dgs_optim.runs.report import write_report
 
 DEFAULT_ARMS = "adam,mcmc,mcmc+awsgld,mcmc+constant-multiplier,mcmc+l2+reset,opt3dgs,annealed+faded"
 POLL_SECONDS = 0.2
@@ -87,17 +88,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     try:
         arms = in_order([name.strip() for name in args.arms.split(",") if name.strip()])
+        if not arms:
+            raise ValueError(f"--arms {args.arms!r}: names no arm; there are {', '.join(ARMS)}")
+        options = asdict(fit_options(args))
         for name in ("seeds", "jobs"):
             if getattr(args, name) < 1:
                 raise ValueError(f"--{name} {getattr(args, name)}: must be at least 1")
+        if args.out is not None:
+            check_folder(args.out)  # before the scene is read
         scene = load_scene(args.scene, args.size, background=args.background)
         out = args.out or Path("runs") / f"{scene.name}-{args.size}"
+        check_folder(out)
         trainings = [
             Training(arm, seed, out / arm.name / f"seed-{seed}")
             for seed in range(args.seeds)
             for arm in arms
         ]
-        _refuse_other_options(trainings, args, scene.name)
+        del options["seed"]
+        about = {"scene": scene.name, "size": args.size, "background": args.background}
+        _refuse_other_options(trainings, options | about)
         command = recorded_command("error_vs_time.py", parser, args)
         stop_at_once()
         _train_all(trainings, args, command)
@@ -117,30 +126,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _refuse_other_options(
-    trainings: list[Training], args: argparse.Namespace, scene_name: str
-) -> None:
+def _refuse_other_options(trainings: list[Training], asked: dict[str, Any]) -> None:
     """A folder that holds runs with other options would mix what is not comparable."""
-    asked = {
-        "scene": scene_name,
-        "size": args.size,
-        "iterations": args.iterations,
-        "points": args.points,
-        "init": args.init,
-        "sh_degree": args.sh_degree,
-        "sh_degree_interval": args.sh_degree_interval,
-        "background": args.background,
-    }
     for training in trainings:
-        if not training.log.exists():
-            continue
-        its = read_run(training.log).metadata
+        its = read_run(training.log).metadata if training.log.exists() else asked
         differing = {key: its.get(key) for key in asked if its.get(key) != asked[key]}
-        differing.update({} if math.isclose(its.get("switch", 0), args.switch) else {"switch": 0})
         if differing:
             raise ValueError(
                 f"{training.folder}: holds a run with {differing}, asked for are "
-                f"{ {key: asked.get(key, args.switch) for key in differing} }; use another -o"
+                f"{ {key: asked[key] for key in differing} }; use another -o"
             )
 
 
@@ -174,7 +168,7 @@ def _may_start(training: Training, trainings: list[Training]) -> bool:
 
 def _source(training: Training, trainings: list[Training]) -> Training:
     """The run whose mean nu a control takes: same seed, the arm that it is the control of."""
-    return next(t for t in trainings if t.arm.name == HISTOGRAM_ARM and t.seed == training.seed)
+    return next(t for t in trainings if (t.arm.name, t.seed) == (training.arm.needs, training.seed))
 
 
 def _start(

@@ -1,4 +1,4 @@
-"""Fit one scene with one arm: python examples/train.py --scene embedded --arm opt3dgs -o runs/one.
+"""Fit one scene with one arm: python examples/train.py --scene embedded --arm mcmc -o runs/one
 
 A second start with the same folder goes on from the checkpoint of the first.
 """
@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import get_args
 
 import torch
-from splatting.arms import ARMS, find_arm
+from splatting.arms import ARMS, DEFAULT_ARM, find_arm
 from splatting.fit import Fit, FitOptions, Progress, run
 from splatting.gaussians import save_ply
 from splatting.scenes import Background, Size, load_scene
+from splatting.writable import check_folder
 from tqdm import tqdm
 
 SHARED_OPTIONS = (
@@ -40,6 +41,19 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
     add("--switch", type=float, default=defaults.switch, help="where exploitation starts, 0..1")
 
 
+def fit_options(args: argparse.Namespace, seed: int = 0) -> FitOptions:
+    """Of the command line; ValueError where one is outside what is allowed."""
+    return FitOptions(
+        args.iterations,
+        args.points,
+        seed,
+        args.init,
+        args.sh_degree,
+        args.switch,
+        sh_degree_interval=args.sh_degree_interval,
+    )
+
+
 def recorded_command(
     program: str, parser: argparse.ArgumentParser, args: argparse.Namespace
 ) -> str:
@@ -58,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     add_fit_options(parser)
     arms = "; ".join(f"{arm.name}: {arm.what}" for arm in ARMS.values())
-    parser.add_argument("--arm", default="opt3dgs", choices=ARMS, metavar="ARM", help=arms)
+    parser.add_argument("--arm", default=DEFAULT_ARM, choices=ARMS, metavar="ARM", help=arms)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--mean-nu", type=float, help="for mcmc+constant-multiplier")
     parser.add_argument("-o", "--out", type=Path, default=Path("runs/train"), metavar="DIR")
@@ -72,15 +86,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(arguments)
     torch.set_num_threads(1)
     try:
-        options = FitOptions(
-            args.iterations,
-            args.points,
-            args.seed,
-            args.init,
-            args.sh_degree,
-            args.switch,
-            sh_degree_interval=args.sh_degree_interval,
-        )
+        options = fit_options(args, args.seed)
+        check_folder(args.out)
         scene = load_scene(args.scene, args.size, background=args.background)
         fit = Fit(scene, find_arm(args.arm), options, args.mean_nu)
     except (OSError, ValueError) as error:

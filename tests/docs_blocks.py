@@ -83,8 +83,13 @@ def trainer_names() -> dict[str, Any]:
         "torch": torch,
         "self": SimpleNamespace(optimizers=adams({"means": 3, "scales": 3, "quats": 4})),
         "cfg": SimpleNamespace(max_steps=100),
+        "max_steps": 100,
         "world_size": 1,
-        "gaussians": SimpleNamespace(optimizer=torch.optim.Adam(groups, lr=0.0, eps=1e-15)),
+        "masks": torch.ones(3, 8, 8, dtype=torch.bool),
+        "iteration": 1,
+        "gaussians": SimpleNamespace(
+            optimizer=torch.optim.Adam(groups, lr=0.0, eps=1e-15), shoptimizer=None
+        ),
         "opt": SimpleNamespace(iterations=100),
         "colors": image,
         "pixels": torch.rand(3, 8, 8),

@@ -68,7 +68,7 @@ def check_python(words: list[str]) -> None:
     else:
         start, rest = words[:1], words[1:]
         assert (ROOT / words[0]).is_file(), words
-    if rest and re.fullmatch(r"[a-z]+", rest[0]) and rest[0] in help_of(*start):
+    while rest and re.fullmatch(r"[a-z]+", rest[0]) and rest[0] in help_of(*start):
         start, rest = [*start, rest[0]], rest[1:]  # a subcommand
     known = set(re.findall(r"(?<![\w-])--?[\w-]+", help_of(*start)))
     for word in rest:
@@ -84,7 +84,7 @@ def check_install(words: list[str]) -> None:
         if extras:
             extra = set(filter(None, (extras[1] or "").split(",")))
             assert extra <= set(PROJECT["optional-dependencies"]), word
-        elif not word.startswith("-"):
+        elif not word.startswith(("-", "git+")):
             assert (ROOT / word).is_file(), f"{words}: {word} is neither this package nor a file"
 
 
@@ -92,6 +92,9 @@ def check_command(words: list[str]) -> None:
     program, rest = words[0].removeprefix(".venv/bin/"), words[1:]
     if program in ("python", "python3"):
         check_python(rest)
+    elif program in PROJECT["scripts"]:
+        module = PROJECT["scripts"][program].partition(":")[0]
+        check_python(["-m", module.removesuffix(".__main__"), *rest])
     elif program == "pip":
         check_install(rest)
     elif program == "ns-train":  # nerfstudio's, with our methods

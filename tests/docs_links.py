@@ -14,7 +14,11 @@ def makes(maker: str, picture: Path) -> bool:
     The name may be composed: its words must occur, as in f"step_{device}.png".
     """
     folder = (ROOT / maker).parent
-    sources = [*folder.glob("*.py"), *folder.glob("*/*.py"), *(ROOT / "src").rglob("report*.py")]
+    sources = [
+        *folder.glob("*.py"),
+        *folder.glob("*/*.py"),
+        *(ROOT / "src").glob("*/runs/report.py"),
+    ]
     text = "\n".join(path.read_text(encoding="utf-8") for path in sources)
     return all(word in text for word in re.split(r"[_-]", picture.stem)) and picture.suffix in text
 

@@ -9,7 +9,7 @@ import torch
 from problems import gradient
 from torch import Tensor
 
-from opt3dgs_optim import curvature
+from opt3dgs_optim.lbfgs import lqn_direction, new_history
 
 Function = Callable[[Tensor], Tensor]  # [N, D] -> [N]
 
@@ -21,7 +21,7 @@ def minimise(
     *,
     history_size: int = 5,
     first: float = 0.1,
-    step: Callable[..., Any] = curvature.step,
+    step: Callable[..., Any] = lqn_direction,
 ) -> list[Tensor]:
     """L-BFGS on every row of `x` [N, D]; the points after each iteration.
 
@@ -34,10 +34,10 @@ def minimise(
         history_size: K.
         first: length of the first step, as a share of the start's own length: rows may be in any
             units, and the method has to go the same way in all of them.
-        step: the recursion, `curvature.step` or another backend's.
+        step: the recursion, `lqn_direction` or another backend's.
     """
-    history = curvature.new_history(x, history_size)
-    options = {"min_cosine": 1e-14, "powell": False, "graft": False, "gamma_clamp": None}
+    history = new_history(x, history_size)
+    options = {"min_cosine": 1e-14, "graft": False}
     length = x.norm(dim=1, keepdim=True) * first
     course = []
     for _ in range(iterations):

@@ -8,12 +8,9 @@ import re
 
 import pytest
 import torch
-from trainers import everything
 
-from opt3dgs_optim import LQNAdam, backend_info, cuda
+from opt3dgs_optim import Curvature, LQNAdam, PositionNoise, backend_info, cuda
 from opt3dgs_optim.backend import uses_kernel
-from opt3dgs_optim.lqnadam import CurvatureOptions
-from opt3dgs_optim.noise import CovarianceNoise
 
 
 @pytest.fixture
@@ -95,11 +92,11 @@ def test_torch_can_be_insisted_on(machine) -> None:
     "call",
     [
         lambda: backend_info("cpu", backend="triton"),  # pyright: ignore
-        lambda: CurvatureOptions(backend="triton"),  # pyright: ignore
-        lambda: CovarianceNoise({}, backend="triton"),  # pyright: ignore
+        lambda: Curvature(backend="triton"),  # pyright: ignore
+        lambda: PositionNoise({}, backend="triton"),  # pyright: ignore
         lambda: LQNAdam([torch.zeros(1, 3)], backend="triton"),  # pyright: ignore
     ],
-    ids=["backend_info", "CurvatureOptions", "CovarianceNoise", "LQNAdam"],
+    ids=["backend_info", "Curvature", "PositionNoise", "LQNAdam"],
 )
 def test_unknown_backend_is_a_value_error(call) -> None:
     with pytest.raises(ValueError, match="backend='triton', but one of 'auto', 'cuda', 'torch'"):
@@ -116,13 +113,5 @@ def test_cuda_on_a_cpu_is_one_clear_error() -> None:
 def test_cuda_is_refused_where_there_is_no_kernel() -> None:
     x = torch.nn.Parameter(torch.ones(4, 2))
     x.grad = torch.ones_like(x)
-    with pytest.raises(RuntimeError, match=r"the kernel is for consecutive pairs and \[N, 3\]"):
+    with pytest.raises(RuntimeError, match="points of 2 coordinates"):
         LQNAdam([x], backend="cuda").step()
-
-
-def test_scheduler_hands_the_backend_to_the_noise() -> None:
-    phases = everything(10, curvature=CurvatureOptions(backend="torch"), noise_scale=1.0)
-    adam = torch.optim.Adam([{"params": [torch.nn.Parameter(torch.ones(4, 3))], "name": "means"}])
-    phases.upgrade({"means": adam}, {"scales": torch.ones(4, 3)})
-    assert phases.noise is not None
-    assert phases.noise.backend == "torch"

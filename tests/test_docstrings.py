@@ -20,7 +20,7 @@ MODULES = [name for _, name, _ in pkgutil.walk_packages(opt3dgs_optim.__path__, 
 
 @pytest.mark.parametrize("name", [name for name in MODULES if not name.endswith("__main__")])
 def test_examples_run(name: str) -> None:
-    if name == "opt3dgs_optim.nerfstudio":
+    if name == "opt3dgs_optim.hosts.nerfstudio":
         pytest.importorskip("nerfstudio", reason="nerfstudio is not installed: its users' module")
     result = doctest.testmod(importlib.import_module(name))
     assert result.failed == 0
@@ -33,12 +33,15 @@ def test_the_main_classes_have_one(name: str) -> None:
 
 API = (Path(__file__).resolve().parents[1] / "docs" / "api.md").read_text(encoding="utf-8")
 # Their arguments stand in one sentence.
-SENTENCES = ("read_run", "find_logs", "diff", "write", "PhaseScheduler.follow_scene", "Run.series")
+SENTENCES = ("read_run", "find_logs", "diff", "write", "paper_parts", "Run.series")
 SENTENCES += ("RunLog.resume", "RunLog.step", "RunLog.evaluation", "RunLog.event")
-SENTENCES += tuple(f"{noise}.add_to" for noise in ("CovarianceNoise", "IsotropicNoise"))
-STATES = ("PhaseScheduler", "LQNAdam", "EnergyHistogram")
-SENTENCES += tuple(f"{name}.load_state_dict" for name in STATES)
-ELSEWHERE = ("CurvatureOptions", "Phase")  # LQNAdam says what the options are; an enumeration
+SENTENCES += ("PositionNoise.add_to", "Fading.chosen", "Course.phase_of", "Course.part")
+SENTENCES += ("StepAdam.acts_on", "StepAdam.reset_points", "PhaseScheduler.part")
+SENTENCES += tuple(f"{name}.load_state_dict" for name in ("StepAdam", "EnergyHistogram"))
+HOOKS = ("factor", "before", "after", "pixel_loss", "numbers", "load_state_dict")
+SENTENCES += tuple(f"Part.{hook}" for hook in (*HOOKS, "evidence", "useless"))
+SENTENCES += ("PhaseScheduler.paper",)  # the class's
+ELSEWHERE = ("Phase", "StepAdam")  # an enumeration; torch's own arguments
 
 
 def of_the_reference() -> dict[str, Callable[..., Any]]:
@@ -47,10 +50,11 @@ def of_the_reference() -> dict[str, Callable[..., Any]]:
     for block in re.split(r"^::: ", API, flags=re.M)[1:]:
         path = block.split()[0]
         module, _, name = path.rpartition(".")
-        if module == "opt3dgs_optim.nerfstudio":
+        if module == "opt3dgs_optim.hosts.nerfstudio":
             continue
         item = getattr(importlib.import_module(module), name)
-        found[name] = item
+        if callable(item):
+            found[name] = item
         for names in re.findall(r"members: \[(.*)\]", block):
             for member in filter(None, names.split(", ")):
                 value = inspect.getattr_static(item, member)
@@ -92,7 +96,11 @@ def test_every_tensor_has_a_shape(name: str) -> None:
     texts = explained(inspect.getdoc(REFERENCE[name]) or "")
     for each in arguments(REFERENCE[name]) if name not in ELSEWHERE else ():
         tensor = re.search(r"(?<!Gaussian)Tensor\b(?! \| None = None)", str(each.annotation))
-        if tensor and each.name in texts and each.name not in ("lr", "closure", "visibility"):
+        if (
+            tensor
+            and each.name in texts
+            and each.name not in ("lr", "closure", "visibility", "valid")
+        ):
             assert re.search(r"\[|0-d|shape", texts[each.name]), f"{name}: {each.name}"
 
 
@@ -102,7 +110,7 @@ def test_every_error_is_announced(name: str) -> None:
     source = inspect.getsource(inspect.unwrap(REFERENCE[name]))
     doc = inspect.getdoc(REFERENCE[name]) or ""
     raises = re.findall(r"raise (\w+Error)", source) if not inspect.isclass(REFERENCE[name]) else []
-    for error in raises:
+    for error in set(raises) - {"NotImplementedError"}:  # a hook that nobody has is never called
         assert error in doc, f"{name} raises {error}"
 
 

@@ -67,7 +67,7 @@ class SparseGaussianAdam(SelectiveAdam):
     @torch.no_grad()
     def step(self, visibility: Tensor, N: int) -> None:  # type: ignore[override]
         """As SelectiveAdam's."""
-        assert N == visibility.shape[0]
+        assert visibility.shape[0] == N
         SelectiveAdam.step.__wrapped__(self, visibility)  # type: ignore[attr-defined]
 
 
@@ -320,7 +320,9 @@ def test_an_optimizer_with_masked_steps_keeps_its_arithmetic(
 ) -> None:
     """No bias correction, as without us: its own steps, at the rate that the parts say."""
     ours, theirs = points(), points()
-    mine, stock = (cls([{"params": [p], "lr": 0.1, "name": "xyz"}], eps=1e-15) for p in (ours, theirs))
+    mine, stock = (
+        cls([{"params": [p], "lr": 0.1, "name": "xyz"}], eps=1e-15) for p in (ours, theirs)
+    )
     steps = list(enumerate(masks()))
     for step, mask in steps[:before]:
         ours.grad, theirs.grad = gradients(ours, step), gradients(theirs, step)

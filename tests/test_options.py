@@ -209,8 +209,8 @@ def test_a_backend_that_there_is_not() -> None:
             backend_info("cpu", backend=value)  # pyright: ignore[reportArgumentType]
 
 
-# Bases that nobody constructs, the enum, and the histogram, which has tests of its own.
-OTHERS = {"Course", "Part", "Phase", "StepAdam", "EnergyHistogram"}
+# Bases that nobody constructs, the enum, and those that have such tests of their own.
+OTHERS = {"Course", "Part", "Phase", "StepAdam", "EnergyHistogram", "RunLog"}
 
 
 def test_every_public_class_is_here() -> None:

@@ -507,7 +507,14 @@ def test_what_is_upgraded_and_what_is_not_is_said_once(
         phases.upgrade(optimizer)
     (record,) = caplog.records
     said = record.getMessage()
-    for words in ("opt3dgs_optim 0.", "total_steps=500", "Annealing(", "Fading(", "xyz", "rotation"):
+    for words in (
+        "opt3dgs_optim 0.",
+        "total_steps=500",
+        "Annealing(",
+        "Fading(",
+        "xyz",
+        "rotation",
+    ):
         assert words in said
     assert said.endswith("left alone: exposure")
     assert (record.name, record.levelname) == ("opt3dgs_optim", "INFO")
@@ -534,7 +541,9 @@ def test_an_energy_that_nobody_steps_after() -> None:
     phases.upgrade(gsplat_optimizers(make_splats()))
     for _ in range(20):
         phases.observe(0.1)
-    with pytest.warns(UserWarning, match=r"20 losses were observed and no upgraded.*Annealing, Fad"):
+    with pytest.warns(
+        UserWarning, match=r"20 losses were observed and no upgraded.*Annealing, Fad"
+    ):
         phases.observe(0.1)
     for _ in range(50):
         phases.observe(0.1)  # once
@@ -544,7 +553,9 @@ def test_optimizers_that_step_without_an_energy() -> None:
     splats = make_splats()
     optimizers = PhaseScheduler(500).upgrade(gsplat_optimizers(splats))
     train(splats, optimizers, None, 0, 20)
-    with pytest.warns(UserWarning, match=r"20 times without an energy at all.*Annealing, Fad") as told:
+    with pytest.warns(
+        UserWarning, match=r"20 times without an energy at all.*Annealing, Fad"
+    ) as told:
         train(splats, optimizers, None, 20, 21)
     (warning,) = told
     assert warning.filename.endswith("trainers.py")  # the user's line, not ours or torch's
@@ -561,7 +572,9 @@ def test_an_energy_that_stops_coming() -> None:
 
 def test_steps_before_the_first_energy_are_plain_adams() -> None:
     ours, theirs = make_splats(), make_splats()
-    optimizers = PhaseScheduler(500, parts=[Annealing(), Pooling()]).upgrade(gsplat_optimizers(ours))
+    optimizers = PhaseScheduler(500, parts=[Annealing(), Pooling()]).upgrade(
+        gsplat_optimizers(ours)
+    )
     train(ours, optimizers, None, 0, 15)
     train(theirs, gsplat_optimizers(theirs), None, 0, 15)
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)

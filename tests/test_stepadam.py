@@ -321,7 +321,9 @@ def test_a_broken_loss_is_dropped_on_a_device_too(
     splats["opacities"].data.fill_(-9.0)
     noise = PositionNoise(splats, scale=1.0)
     fading = Fading(share=1.0, events=TOTAL, start=0.0, stop=1.0)
-    phases = everything(TOTAL, 20, Annealing(), fading, Pooling(), noise, nu=ConstantMultiplier(2.0))
+    phases = everything(
+        TOTAL, 20, Annealing(), fading, Pooling(), noise, nu=ConstantMultiplier(2.0)
+    )
     options: dict[str, Any] = {"decoupled_weight_decay": True, "weight_decay": 0.1, **path}
     optimizers = phases.upgrade(gsplat_optimizers(splats, **options))
     for at in (10, 25):
@@ -458,9 +460,6 @@ def test_a_gradient_that_overflows_at_a_finite_loss_is_skipped(
     """And nothing fades: the scaler drops the step, of which the loss knows nothing."""
     if device:
         on_a_device(monkeypatch)
-        from opt3dgs_optim import StepAdam
-
-        monkeypatch.setattr(StepAdam, "_overflowed_on_host", lambda self: False)
     scaler, splats, optimizers, phases, _ = scaled(fused)
     for _ in range(5):
         scaled_step(scaler, splats, optimizers, phases)

@@ -22,7 +22,7 @@ SMOKE = """
 import sys, torch
 before = set(sys.modules)  # torch itself imports tqdm where there is one
 import opt3dgs_optim
-from opt3dgs_optim import LQNAdam, PhaseScheduler, backend_info, cuda
+from opt3dgs_optim import DEFAULTS, LQNAdam, PhaseScheduler, backend_info, cuda, paper_parts
 assert {place!r} in opt3dgs_optim.__file__, opt3dgs_optim.__file__
 x = torch.nn.Parameter(torch.ones(300, 3))
 optimizer = LQNAdam([x], lr=0.1)
@@ -34,7 +34,8 @@ assert "HISTORY_SIZE" in cuda.source("lqn.cu")
 
 splats = {{name: torch.nn.Parameter(torch.ones(50, 3)) for name in ("means", "scales")}}
 adams = {{k: torch.optim.Adam([dict(params=[p], lr=0.01, name=k)]) for k, p in splats.items()}}
-phases, optimizers = PhaseScheduler.install(adams, 10, switch=6)
+phases = PhaseScheduler(10, switch=6, parts=[*DEFAULTS, *paper_parts(10)])
+optimizers = phases.upgrade(adams)
 losses = []
 for _ in range(10):
     loss = phases.pixel_loss(splats["means"] * splats["scales"].exp(), torch.zeros(50, 3))
@@ -102,9 +103,9 @@ def test_wheel_is_small_and_holds_the_package_alone(wheel: Path) -> None:
     assert wheel.name == f"opt3dgs_optim-{opt3dgs_optim.__version__}-py3-none-any.whl"
     assert wheel.stat().st_size < MOST_BYTES
     names = set(contents(wheel))
-    for name in ("two_loop.cuh", "packed.cuh", "lqn.cu", "noise.cu", "__init__.py"):
+    for name in ("two_loop.cuh", "lqn.cu", "noise.cu", "__init__.py"):
         assert f"opt3dgs_optim/cuda/{name}" in names
-    for name in ("py.typed", "__main__.py", "doctor.py", "follow.py"):
+    for name in ("py.typed", "__main__.py", "doctor.py", "runs/report.py"):
         assert f"opt3dgs_optim/{name}" in names
     tops = {name.split("/")[0] for name in names}
     assert tops == {"opt3dgs_optim", f"opt3dgs_optim-{opt3dgs_optim.__version__}.dist-info"}
@@ -120,6 +121,15 @@ def test_wheel_needs_torch_and_numpy_alone(wheel: Path) -> None:
     extras = {line.split()[1] for line in lines if line.startswith("Provides-Extra:")}
     assert {"cuda", "cuda12", "report", "examples", "test"} <= extras
     assert f"Version: {opt3dgs_optim.__version__}" in lines
+    for field in ("Author:", "License-Expression:", "Requires-Python:", "Classifier: Environment"):
+        assert any(line.startswith(field) for line in lines), field
+
+
+def test_the_command_is_installed(installed: Path, tmp_path: Path) -> None:
+    (entry,) = site_of(installed.parent.parent).glob("*.dist-info/entry_points.txt")
+    assert "[console_scripts]\nopt3dgs = opt3dgs_optim.__main__:main\n" in entry.read_text()
+    command = "import sys; from opt3dgs_optim.__main__ import main; sys.exit(main(['--version']))"
+    assert run(installed, tmp_path, "-c", command).stdout.strip() == opt3dgs_optim.__version__
 
 
 def test_sdist_builds_the_same_wheel(wheel: Path, tmp_path: Path) -> None:
@@ -142,7 +152,7 @@ def test_wheel_trains_in_an_empty_environment(installed: Path, tmp_path: Path) -
 
 
 def test_doctor_finds_the_wheel_in_order(installed: Path, tmp_path: Path) -> None:
-    words = ("-m", "opt3dgs_optim", "doctor", "--json", "--points", "500", "--device", "cpu")
+    words = ("-m", "opt3dgs_optim", "doctor", "--json", "--device", "cpu")
     done = run(installed, tmp_path, *words)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)

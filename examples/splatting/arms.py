@@ -2,112 +2,119 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
-from opt3dgs_optim import EnergyHistogram, PhaseScheduler
-from opt3dgs_optim.lqnadam import CurvatureOptions
-from opt3dgs_optim.multiplier import ConstantMultiplier
+import torch
+from torch import Tensor
+
+from opt3dgs_optim import (
+    DEFAULTS,
+    ConstantMultiplier,
+    Curvature,
+    EnergyHistogram,
+    FreshMoments,
+    Part,
+    Phase,
+    PhaseScheduler,
+    PositionNoise,
+    SquaredLoss,
+    paper_parts,
+)
+from opt3dgs_optim.presets import PAPER_WARMUP
 
 NOISE_LR = 5e5  # 3DGS-MCMC
-PAPER_WARMUP = 2_500 / 30_000
+SETTLING = 100  # iterations after which restarted moments are of use
 HISTOGRAM_ARM = "mcmc+awsgld"
-CONSTANT_ARM = "mcmc+constant-multiplier"
+DEFAULT_ARM = "annealed+faded"
 
-# (iterations, switch, mean nu of the histogram arm or None) -> the scheduler
-MakeScheduler = Callable[[int, float, float | None], PhaseScheduler]
+# (iterations, mean nu of the arm in `needs` or None) -> what the steps have
+MakeParts = Callable[[int, float | None], list[Part]]
 
 
 @dataclass(frozen=True)
 class Arm:
-    """One way of training; `make` is None for torch's own Adam in the trainer."""
+    """One way of training."""
 
     name: str
     what: str
+    parts: MakeParts | None = None  # None: torch's own Adam in the trainer
     mcmc: bool = True  # relocation, growth, noise and regularisers of 3DGS-MCMC
-    make: MakeScheduler | None = None
     needs: str | None = None  # the arm whose mean nu it takes, seed by seed
+    noise_during: Phase | None = None  # None: in both phases
+
+    def make(
+        self, iterations: int, switch: float, nu: float | None, gaussians: Mapping[str, Tensor]
+    ) -> PhaseScheduler:
+        """The scheduler of one training: the arm's parts, and the noise of 3DGS-MCMC.
+
+        Args:
+            iterations: length of the training.
+            switch: where exploitation starts, as a share of it.
+            nu: mean nu of the arm in `needs`.
+            gaussians: the trainer's dict of parameters, which the noise reads in every step.
+        """
+        if self.needs is not None and nu is None:
+            raise ValueError(f"arm {self.name}: needs the mean nu of {self.needs}; run it first")
+        parts = [] if self.parts is None else self.parts(iterations, nu)
+        noise = PositionNoise(gaussians, NOISE_LR, during=self.noise_during)
+        return PhaseScheduler(iterations, switch, [*parts, noise])
 
 
-ALL_OFF: dict[str, Any] = {
-    "multiplier": None,
-    "curvature": None,
-    "squared_loss": False,
-    "reset_moments": False,
-    "annealing": None,
-    "fading": None,
-    "pooling": None,
-    "noise_scale": NOISE_LR,
-}
+def fixed(*parts: Callable[[], Part]) -> MakeParts:
+    """These parts, made anew for each training: some learn, and serve one."""
+    return lambda _iterations, _nu: [make() for make in parts]
 
 
-def _scheduler(**options: Any) -> MakeScheduler:
-    """A scheduler of which only the named parts are on; the noise is the package's."""
-
-    def make(iterations: int, switch: float, _nu: float | None) -> PhaseScheduler:
-        return PhaseScheduler(iterations, switch, **ALL_OFF | options)
-
-    return make
+def histogram(iterations: int, _nu: float | None = None) -> list[Part]:
+    """The flat-histogram multiplier, its settings measured on the run."""
+    return [EnergyHistogram(warmup=max(4, round(iterations * PAPER_WARMUP)))]
 
 
-def _histogram(iterations: int, switch: float, _nu: float | None) -> PhaseScheduler:
-    return _scheduler(multiplier="histogram")(iterations, switch, None)
+def constant(iterations: int, nu: float | None) -> list[Part]:
+    """Its control; float32, as the histogram's nu on the step is."""
+    value = float(torch.tensor(nu, dtype=torch.float32))
+    return [ConstantMultiplier(value, warmup=round(iterations * PAPER_WARMUP))]
 
 
-def _constant(iterations: int, switch: float, nu: float | None) -> PhaseScheduler:
-    if nu is None:
-        raise ValueError(f"arm {CONSTANT_ARM}: needs the mean nu of {HISTOGRAM_ARM}; run it first")
-    constant = ConstantMultiplier(nu, warmup=round(iterations * PAPER_WARMUP))
-    return _scheduler(multiplier=constant)(iterations, switch, None)
-
-
-def _defaults(iterations: int, switch: float, _nu: float | None) -> PhaseScheduler:
-    return PhaseScheduler(iterations, switch, noise_scale=NOISE_LR)
-
-
-def _opt3dgs(iterations: int, switch: float, _nu: float | None) -> PhaseScheduler:
-    parts = _scheduler(
-        multiplier="histogram",
-        curvature=CurvatureOptions(),
-        squared_loss=True,
-        reset_moments="auto",
-    )
-    return parts(iterations, switch, None)
-
-
-def paper_scheduler(iterations: int, switch: float, _nu: float | None) -> PhaseScheduler:
-    """Everything on, with the paper's settings."""
-    histogram = EnergyHistogram.paper(warmup=round(iterations * PAPER_WARMUP))
-    return PhaseScheduler.paper(
-        iterations, switch=switch, multiplier=histogram, noise_scale=NOISE_LR
-    )
+def opt3dgs(iterations: int, _nu: float | None = None) -> list[Part]:
+    """Every part of the paper, settings measured on the run."""
+    last = [FreshMoments(settling=SETTLING), SquaredLoss(), Curvature()]
+    return [*histogram(iterations), *last]
 
 
 _ARMS = (
     Arm("adam", "torch's Adam alone: no density control, no noise", mcmc=False),
     Arm("mcmc", "stock 3DGS-MCMC with torch's Adam: the baseline"),
-    Arm(HISTOGRAM_ARM, "with the flat-histogram multiplier", make=_histogram),
+    Arm(HISTOGRAM_ARM, "with the flat-histogram multiplier", histogram),
     Arm(
-        CONSTANT_ARM,
+        "mcmc+constant-multiplier",
         "its control: a constant multiplier, the mean nu of that arm and seed",
-        make=_constant,
+        constant,
         needs=HISTOGRAM_ARM,
     ),
-    Arm("mcmc+l2", "L2 in the last phase", make=_scheduler(squared_loss=True)),
+    Arm("mcmc+l2", "L2 in the last phase", fixed(SquaredLoss)),
     Arm(
         "mcmc+l2+reset",
         "L2 and fresh Adam moments in the last phase",
-        make=_scheduler(squared_loss=True, reset_moments=True),
+        fixed(FreshMoments, SquaredLoss),
     ),
     Arm(
         "mcmc+l2+reset+lqn",
         "the same with L-BFGS directions for the positions",
-        make=_scheduler(squared_loss=True, reset_moments=True, curvature=CurvatureOptions()),
+        fixed(FreshMoments, SquaredLoss, Curvature),
     ),
-    Arm("opt3dgs", "every part of the paper, settings measured on the run", make=_opt3dgs),
-    Arm("opt3dgs-paper", "every part of the paper, its settings", make=paper_scheduler),
-    Arm("annealed+faded", "annealed steps, faded moments: the package's defaults", make=_defaults),
+    Arm("opt3dgs", "every part of the paper, settings measured on the run", opt3dgs),
+    Arm(
+        "opt3dgs-paper",
+        "every part of the paper, its settings",
+        lambda iterations, _nu: paper_parts(iterations),
+    ),
+    Arm(
+        DEFAULT_ARM,
+        "annealed steps, faded moments: the package's defaults",
+        lambda _iterations, _nu: [*DEFAULTS],
+    ),
 )
 ARMS = {arm.name: arm for arm in _ARMS}
 

@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from opt3dgs_optim import Phase, PhaseScheduler
-from opt3dgs_optim.noise import CovarianceNoise
-from opt3dgs_optim.runlog import RunLog
+from opt3dgs_optim import EnergyHistogram, Phase, PhaseScheduler, PositionNoise
+from opt3dgs_optim.runs import RunLog
 from splatting.arms import NOISE_LR, Arm
 from splatting.density import MCMCDensityControl, regularisers
 from splatting.gaussians import (
@@ -79,19 +78,19 @@ class Fit:
         self.density_draws = torch.Generator().manual_seed(options.seed + 2)
         self.gaussians = self._initial_gaussians()
         self.rates = stock_learning_rates(scene.extent)
-        self.optimizers: dict[str, torch.optim.Optimizer] = {
+        self.optimizers = {
             name: torch.optim.Adam(
                 [{"params": param, "lr": self.rates[name], "name": name}], eps=1e-15
             )
             for name, param in self.gaussians.items()
         }
         self.phases: PhaseScheduler | None = None
-        self.noise: CovarianceNoise | None = None
-        if arm.make is not None:
-            self.phases = arm.make(options.iterations, options.switch, mean_nu)
-            self.optimizers = self.phases.upgrade(self.optimizers, self.gaussians)
+        self.noise: PositionNoise | None = None  # where the trainer itself adds it
+        if arm.parts is not None:
+            self.phases = arm.make(options.iterations, options.switch, mean_nu, self.gaussians)
+            self.phases.upgrade(self.optimizers)
         elif arm.mcmc:
-            self.noise = CovarianceNoise(self.gaussians, NOISE_LR)
+            self.noise = PositionNoise(self.gaussians, NOISE_LR)
         self.density = self._density_control() if arm.mcmc else None
         self.iteration = 0
         self.views: list[int] = []  # what is left of this epoch
@@ -123,8 +122,7 @@ class Fit:
 
     def step(self) -> Tensor:
         """One iteration; returns the detached loss."""
-        index = self._next_view()
-        view = self.scene.train[index]
+        view = self.scene.train[self._next_view()]
         image = self._render(view).image
         pixel_loss = None if self.phases is None else self.phases.pixel_loss
         loss = photometric_loss(image, view.image, pixel_loss)
@@ -132,7 +130,7 @@ class Fit:
             loss = loss + self._regularisers()
         loss.backward()
         if self.phases is not None:
-            self.phases.observe(loss, view=index)
+            self.phases.observe(loss, iteration=self.iteration)
         self._step_optimizers()
         self._inject_noise()
         if self.density is not None:
@@ -170,8 +168,8 @@ class Fit:
     @property
     def mean_nu(self) -> float | None:
         """Mean of nu since the warm-up, or None where nu is off."""
-        multiplier = None if self.phases is None else self.phases.multiplier
-        return None if multiplier is None else float(multiplier.mean_multiplier)
+        histogram = None if self.phases is None else self.phases.part(EnergyHistogram)
+        return None if histogram is None else float(histogram.mean_multiplier)
 
     # -- looking at it -------------------------------------------------------------------------
 
@@ -192,8 +190,9 @@ class Fit:
     def compile_kernels(self) -> None:
         """Have the rasterizer compiled, or loaded from its cache, before the run's clock starts."""
         copy = {name: param.detach().requires_grad_() for name, param in self.gaussians.items()}
-        camera = self.scene.train[0].camera
-        render(copy, camera, sh_degree=self.options.sh_degree).image.sum().backward()
+        view = self.scene.train[0]
+        image = render(copy, view.camera, sh_degree=self.options.sh_degree).image
+        photometric_loss(image, view.image).backward()
 
     def evaluate(self) -> dict[str, float]:
         """PSNR and SSIM of the test views, PSNR of a few train views, number of Gaussians."""
@@ -256,9 +255,8 @@ class Fit:
         torch.set_rng_state(state["random"][0])
         self.order.set_state(state["random"][1])
         self.density_draws.set_state(state["random"][2])
-        if trunk is not None and self.phases is not None:
-            done = {"iteration": self.iteration, "num_observed": self.iteration}
-            self.phases.load_state_dict({**done, "multiplier": None})
+        if self.phases is not None:  # a trunk may be stock, whose checkpoint has no clock
+            self.phases.current = self.iteration - 1
 
 
 def run(
@@ -309,7 +307,7 @@ def _open_log(fit: Fit, path: Path, metadata: dict[str, Any]) -> RunLog:
 def _log_step(fit: Fit, log: RunLog, phase: Phase, loss: Tensor) -> None:
     values: dict[str, Any] = {"loss": loss}
     if fit.phases is not None:
-        values.update(fit.phases.log_values())
+        values.update(fit.phases.numbers())
     log.step(fit.iteration, phase=phase.value, **values)
 
 

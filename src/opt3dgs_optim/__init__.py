@@ -16,7 +16,9 @@ from opt3dgs_optim.parts.noise import IsotropicNoise, PositionNoise
 from opt3dgs_optim.parts.pooling import Pooling
 from opt3dgs_optim.phases import PhaseScheduler
 from opt3dgs_optim.presets import DEFAULTS, paper_parts
-from opt3dgs_optim.stepadam import StepAdam, reset_points
+from opt3dgs_optim.rows import reset_points
+from opt3dgs_optim.runs import RunLog
+from opt3dgs_optim.stepadam import StepAdam
 from opt3dgs_optim.version import __version__
 
 __all__ = [
@@ -36,6 +38,7 @@ __all__ = [
     "PhaseScheduler",
     "Pooling",
     "PositionNoise",
+    "RunLog",
     "SquaredLoss",
     "StepAdam",
     "__version__",

@@ -1,4 +1,4 @@
-"""The commands: `python -m opt3dgs_optim`."""
+"""The commands: `opt3dgs`, or `python -m opt3dgs_optim`."""
 
 from __future__ import annotations
 
@@ -6,30 +6,22 @@ import importlib
 import sys
 from collections.abc import Sequence
 
-from opt3dgs_optim._version import __version__
+from opt3dgs_optim.version import __version__
 
 COMMANDS = {
-    "doctor": "versions, which backend runs and why, a self-test, and what a step costs here",
-    "report": "compare runs from their logs, or watch them while they train (--follow)",
+    "doctor": "versions, which backend runs and why, and a self-test",
+    "report": "compare runs from their logs: error against run time",
     "hosts": "the lines to change in your trainer, as a diff or applied",
 }
+MODULES = {"report": "runs.report", "hosts": "hosts.__main__"}
 
 
 def usage() -> str:
     """The list of commands."""
     width = max(map(len, COMMANDS))
-    rows = [f"  {name:<{width}}  {what}" for name, what in COMMANDS.items()]
-    return "\n".join(
-        [
-            f"opt3dgs_optim {__version__}",
-            "",
-            "python -m opt3dgs_optim COMMAND ...",
-            "",
-            *rows,
-            "",
-            "python -m opt3dgs_optim COMMAND --help says more.",
-        ]
-    )
+    rows = "\n".join(f"  {name:<{width}}  {what}" for name, what in COMMANDS.items())
+    head = f"opt3dgs_optim {__version__}\n\nopt3dgs COMMAND ..."
+    return f"{head}\n\n{rows}\n\nopt3dgs COMMAND --help says more."
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -45,7 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"opt3dgs_optim: no command {words[0]!r}\n\n{usage()}", file=sys.stderr)
         return 2
     try:
-        return importlib.import_module(f"opt3dgs_optim.{words[0]}").main(words[1:])
+        module = MODULES.get(words[0], words[0])
+        return importlib.import_module(f"opt3dgs_optim.{module}").main(words[1:])
     except KeyboardInterrupt:
         return 130
 

@@ -8,16 +8,17 @@ from torch import Tensor
 
 from opt3dgs_optim.checks import check_choice, warn_user
 from opt3dgs_optim.course import Course
+from opt3dgs_optim.lending import AdamOptions
 from opt3dgs_optim.names import slot
 from opt3dgs_optim.part import Group, Part
 from opt3dgs_optim.parts.histogram import EnergyHistogram
 from opt3dgs_optim.parts.noise import IsotropicNoise, PositionNoise
-from opt3dgs_optim.stepadam import AdamOptions, StepAdam
+from opt3dgs_optim.stepadam import StepAdam
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-PLAIN_EPS = 1e15  # beside it Adam's root of the second moment vanishes
+PLAIN_EPS = 1e15  # so large that Adam's root of the second moment vanishes beside it
 STALE = 200  # steps without a new energy before it is said
 
 
@@ -26,9 +27,8 @@ class AWSGLD(StepAdam):
 
         x <- x - lr * nu * Adam(grad) + noise
 
-    nu comes from a flat histogram over the training loss (`EnergyHistogram`): steps are longer
-    where the loss is being seen more often with rising energy, shorter or backwards beyond the
-    peak. With `histogram=None` and `noise=None` this is `torch.optim.Adam`, bit for bit.
+    nu comes from a flat histogram over the training loss (`EnergyHistogram`). With neither
+    histogram nor noise this is `torch.optim.Adam`, bit for bit.
 
     Args:
         params, lr, betas, eps, weight_decay, amsgrad: as in `torch.optim.Adam`.
@@ -37,7 +37,6 @@ class AWSGLD(StepAdam):
             (the group named `means` or `xyz`, or the only group), or None.
         preconditioner: `"adam"`, or `"none"` for the plain SGLD drift `lr * nu * grad`, which
             samples exp(-energy / temperature) together with `IsotropicNoise(temperature=...)`.
-            It is Adam's own with betas (0, b2) and an eps so large that nothing else counts.
         adam: `foreach, maximize, capturable, differentiable, fused, decoupled_weight_decay`, as in
             `torch.optim.Adam`. With CUDA parameters and no path asked for, the fused one is used:
             it alone takes nu from the device without a synchronisation.
@@ -45,9 +44,6 @@ class AWSGLD(StepAdam):
     The energy is the closure's value, or comes from `histogram.observe(loss)`, called once per
     iteration before `step()`. A non-finite energy skips the step. The histogram's state travels
     inside `state_dict()`.
-
-    Memory: Adam's; the histogram is a few hundred numbers, noise is drawn in 12 bytes per point
-    during the step.
 
     Examples:
         >>> import torch

@@ -17,15 +17,7 @@ KERNEL_DTYPES = (torch.float32, torch.float64)
 
 @dataclass(frozen=True)
 class BackendInfo:
-    """What runs for tensors of one kind; `reason` says why it is not the other.
-
-    The two give the same numbers, up to rounding.
-
-    Attributes:
-        device, dtype: of the tensors that it is about.
-        backend: what runs, "cuda" or "torch".
-        reason: why, in words.
-    """
+    """What runs for tensors of a device and dtype; `reason` says why it is not the other."""
 
     device: str
     dtype: torch.dtype
@@ -33,10 +25,8 @@ class BackendInfo:
     reason: str
 
     def __repr__(self) -> str:
-        return (
-            f"BackendInfo({self.backend!r} runs on {self.device} in "
-            f"{str(self.dtype).removeprefix('torch.')}: {self.reason})"
-        )
+        kind = str(self.dtype).removeprefix("torch.")
+        return f"BackendInfo({self.backend!r} runs on {self.device} in {kind}: {self.reason})"
 
 
 def backend_info(
@@ -48,13 +38,13 @@ def backend_info(
     """Which backend a `backend` option chooses for the curvature and the noise, and why.
 
     Args:
-        device: that of the parameters; None for the GPU, if torch sees one, else the CPU.
-        dtype: that of the parameters.
+        device, dtype: of the parameters; None for the GPU, if torch sees one, else the CPU.
         backend: `"auto"` takes the CUDA kernels where they can run, pure torch otherwise;
             `"cuda"` and `"torch"` insist.
 
-    The kernels are for points of three coordinates; parameters of another shape are stepped by pure
-    torch. A kernel that fails to compile or to launch raises: nothing is replaced after an error.
+    The two give the same numbers, up to rounding. The kernels are for points of three coordinates;
+    parameters of another shape are stepped by pure torch. A kernel that fails to compile or to
+    launch raises: nothing is replaced after an error.
 
     Raises:
         ValueError: `backend` is none of these.

@@ -93,6 +93,12 @@ class Course:
         """Whether the iteration observed last, whose step comes next, is exploitation."""
         return self._has_phases and self.current >= self.switch_step
 
+    @property
+    def check_steps(self) -> int:
+        """Iterations between looks at the evidence: a tenth of a short exploitation."""
+        left = self.total_steps - self.switch_step
+        return min(CHECK_STEPS, max(left // 10, 10)) if self.exploiting else CHECK_STEPS
+
     def phase_of(self, iteration: int) -> Phase | None:
         """The phase of an iteration; None where there are no phases."""
         if not self._has_phases:
@@ -170,8 +176,9 @@ class Course:
         known = [(name, part, seen) for name, part, seen in shown if seen is not None]
         if not known:
             return []
-        packed = torch.cat([seen.detach().to(known[-1][2].device, torch.float64)
-                            for _, _, seen in known])  # fmt: skip
+        device = known[-1][2].device
+        widest = torch.float32 if device.type == "mps" else torch.float64
+        packed = torch.cat([seen.detach().to(device, widest) for _, _, seen in known])
         numbers = (packed if over_ranks is None else over_ranks(packed)).tolist()
         changes = []
         for name, part, seen in known:

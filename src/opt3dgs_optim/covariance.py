@@ -7,24 +7,16 @@ from torch import Tensor
 
 from opt3dgs_optim import cuda
 from opt3dgs_optim.backend import uses_kernel
-from opt3dgs_optim.lbfgs.columns import columns, row_chunks
+from opt3dgs_optim.lbfgs.pairs import columns, row_chunks
 
 GATE_SHARPNESS = 100.0  # k of eq. 2's gate
 GATE_OPACITY = 0.005  # t of eq. 2's gate: the opacity under which a Gaussian counts as dead
 
 
-def covariance_noise(
-    scales: Tensor,
-    quats: Tensor,
-    opacities: Tensor,
-    eta: Tensor,
-    *,
-    sharpness: float = GATE_SHARPNESS,
-    threshold: float = GATE_OPACITY,
-) -> Tensor:
+def covariance_noise(scales: Tensor, quats: Tensor, opacities: Tensor, eta: Tensor) -> Tensor:
     """Noise shaped by each Gaussian's covariance and gated by its opacity (eq. 2).
 
-        sigmoid(-k (o - t)) * Sigma @ eta,   Sigma = R diag(s)^2 R^T
+        sigmoid(-k (o - t)) * Sigma @ eta,   Sigma = R diag(s)^2 R^T,   k = 100, t = 0.005
 
     Nearly transparent Gaussians wander along their own shape, opaque ones stand still.
 
@@ -33,16 +25,13 @@ def covariance_noise(
         quats: [N, 4] rotations, wxyz, need not be normalised.
         opacities: [N] or [N, 1] logits.
         eta: [N, 3] standard normal.
-        sharpness: k, per unit of opacity.
-        threshold: t, opacity in 0..1.
 
     Returns:
         [N, 3] in squared world units; the caller multiplies by noise scale and learning rate.
     """
     noise = torch.empty_like(eta)
     for rows in row_chunks(eta):
-        part = (scales[rows], quats[rows], opacities[rows], eta[rows])
-        noise[rows] = _noise(*part, sharpness, threshold).T
+        noise[rows] = _noise(scales[rows], quats[rows], opacities[rows], eta[rows]).T
     return noise
 
 
@@ -61,10 +50,7 @@ def add_covariance_noise(
 
     Args:
         means: [N, 3] world units, changed in place.
-        scales: [N, 3] log of the standard deviations.
-        quats: [N, 4] wxyz, need not be normalised.
-        opacities: [N] or [N, 1] logits.
-        eta: [N, 3] standard normal.
+        scales, quats, opacities, eta: as in `covariance_noise`.
         lr: a number, or 0-d; on a GPU it is read there, when the step runs.
         noise_scale: noise_lr of 3DGS-MCMC.
         backend: "auto", "cuda" or "torch".
@@ -75,15 +61,13 @@ def add_covariance_noise(
     """
     compiling = torch.compiler.is_compiling()
     if not compiling and uses_kernel(backend, means.device, means.dtype, means.shape[1]):
-        tensors = {"scales": scales, "quats": quats, "opacities": opacities, "eta": eta}
-        _check_gaussians(means, **tensors)
-        constants = (GATE_SHARPNESS, GATE_OPACITY)
-        cuda.add_covariance_noise(means, *tensors.values(), lr, noise_scale, *constants)
+        _check_gaussians(means, scales=scales, quats=quats, opacities=opacities, eta=eta)
+        gate = GATE_SHARPNESS, GATE_OPACITY
+        cuda.add_covariance_noise(means, scales, quats, opacities, eta, lr, noise_scale, *gate)
         return
     factor = lr * noise_scale
     for rows in row_chunks(means):
-        part = (scales[rows], quats[rows], opacities[rows], eta[rows])
-        means[rows] += (_noise(*part, GATE_SHARPNESS, GATE_OPACITY) * factor).T
+        means[rows] += (_noise(scales[rows], quats[rows], opacities[rows], eta[rows]) * factor).T
 
 
 def _check_gaussians(means: Tensor, **others: Tensor) -> None:
@@ -103,30 +87,21 @@ def _check_gaussians(means: Tensor, **others: Tensor) -> None:
 def largest_noise(scales: Tensor, opacities: Tensor, noise_scale: float) -> Tensor:
     """The largest noise of any Gaussian, in learning rates of the positions, 0-d.
 
-    Noise is lr * noise_scale * gate * Sigma eta (eq. 2), so its deviation along the longest axis is
-    lr * noise_scale * gate * s^2; an Adam step is about lr.
-
-    Args:
-        scales: [N, 3] log of the standard deviations.
-        opacities: [N] or [N, 1] logits.
-        noise_scale: noise_lr of 3DGS-MCMC.
+    Along a Gaussian's longest axis its deviation is lr * noise_scale * gate * s^2 (eq. 2), and an
+    Adam step is about lr. Arguments as in `add_covariance_noise`.
     """
     if scales.numel() == 0:
         return scales.new_zeros(())
-    gate = torch.sigmoid(-GATE_SHARPNESS * (torch.sigmoid(opacities.reshape(-1)) - GATE_OPACITY))
-    return noise_scale * (gate * (2 * scales.amax(1)).exp()).amax()
+    return noise_scale * (_gate(opacities) * (2 * scales.amax(1)).exp()).amax()
 
 
-def _noise(
-    scales: Tensor,
-    quats: Tensor,
-    opacities: Tensor,
-    eta: Tensor,
-    sharpness: float,
-    threshold: float,
-) -> Tensor:
+def _gate(opacities: Tensor) -> Tensor:
+    opacity = torch.sigmoid(opacities.reshape(-1))
+    return torch.sigmoid(-GATE_SHARPNESS * (opacity - GATE_OPACITY))
+
+
+def _noise(scales: Tensor, quats: Tensor, opacities: Tensor, eta: Tensor) -> Tensor:
     """`covariance_noise` as [3, N]."""
-    gate = torch.sigmoid(-sharpness * (torch.sigmoid(opacities.reshape(-1)) - threshold))
     q = columns(quats, quats.dtype)
     # clamp: as torch.nn.functional.normalize
     w, *axis = (q / (q * q).sum(0).sqrt().clamp(min=1e-12)).unbind()
@@ -134,6 +109,7 @@ def _noise(
     local = _rotate(w, [-a for a in axis], list(columns(eta, eta.dtype).unbind()))
     variance = (2 * columns(scales, scales.dtype)).exp().unbind()
     shaped = [a * b for a, b in zip(variance, local, strict=True)]
+    gate = _gate(opacities)
     return torch.stack([v * gate for v in _rotate(w, axis, shaped)])
 
 

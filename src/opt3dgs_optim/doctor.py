@@ -1,74 +1,36 @@
-"""Is everything in order here? `python -m opt3dgs_optim doctor`.
-
-Prints versions, which backend runs and why, a self-test of this installation, and what a step costs
-on this machine. Ends with 0, or 1 if a check of the self-test failed; `--json` for programs.
-"""
+"""Is everything in order here? `opt3dgs doctor`: versions, backend and why, a self-test."""
 
 from __future__ import annotations
 
 import argparse
 import importlib.metadata
-import json
 import platform
 import sys
-import time
 from collections.abc import Sequence
-from dataclasses import asdict
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
-from opt3dgs_optim._status import StatusLine
-from opt3dgs_optim._version import __version__
 from opt3dgs_optim.backend import backend_info
-from opt3dgs_optim.doctor_checks import Check, run_checks
-from opt3dgs_optim.doctor_costs import Cost, measure
+from opt3dgs_optim.doctor_checks import run_checks
+from opt3dgs_optim.version import __version__
 
-__all__ = ["examine", "main"]
-
-POINTS = {"cuda": 1_000_000, "cpu": 100_000}
 MARKS = {"ok": "ok", "failed": "FAILED", "skipped": "--"}
 
 
-def examine(
-    device: torch.device, points: int | None, status: StatusLine | None = None
-) -> dict[str, Any]:
-    """Everything the doctor finds, as JSON holds it; `points` 0 leaves the costs out."""
-    line = StatusLine() if status is None else status
-    info = backend_info(device)
-    begin = time.perf_counter()
-    checks = run_checks(device, lambda name: line.show(f"self-test: {name}"))
-    seconds = time.perf_counter() - begin
-    points = POINTS.get(device.type, POINTS["cpu"]) if points is None else points
-    costs: list[Cost] = []
-    if points:
-        costs = measure(device, points, lambda name: line.show(f"measuring: {name}"))
-    line.clear()
-    return {
-        "versions": versions(),
-        "device": device_name(device),
-        "backend": {"in_use": info.backend, "reason": info.reason, "advice": advice(device)},
-        "self_test_seconds": round(seconds, 3),
-        "checks": [asdict(check) for check in checks],
-        "points": points,
-        "costs": [asdict(cost) for cost in costs],
-        "passed": all(check.outcome != "failed" for check in checks),
-    }
-
-
-def versions() -> dict[str, str | None]:
-    """Versions of the package and of what it stands on; None for what is not installed."""
+def versions(device: torch.device) -> dict[str, str]:
+    """The package, what it stands on, and what runs on `device`."""
+    info, threads = backend_info(device), torch.get_num_threads()
+    gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else None
     return {
         "opt3dgs_optim": __version__,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "torch": torch.__version__,
-        "cuda_of_torch": torch.version.cuda,
+        "python": f"{platform.python_version()}, {platform.platform()}",
+        "torch": f"{torch.__version__}, CUDA {torch.version.cuda or 'is not built in'}",
         "numpy": np.__version__,
-        "cuda_core": _installed("cuda-core"),
-        "matplotlib": _installed("matplotlib"),
+        "cuda.core": _installed("cuda-core") or "not installed (only the kernels need it)",
+        "matplotlib": _installed("matplotlib") or "not installed (only pictures need it)",
+        "device": f"{device}: {gpu or f'{platform.machine()}, torch threads: {threads}'}",
+        "backend": f"{info.backend}: {info.reason}",
     }
 
 
@@ -79,129 +41,33 @@ def _installed(distribution: str) -> str | None:
         return None
 
 
-def device_name(device: torch.device) -> str:
-    """The GPU's name, or the processor's with the number of torch's threads."""
-    if device.type == "cuda":
-        return f"{device}: {torch.cuda.get_device_name(device)}"
-    path = Path("/proc/cpuinfo")
-    lines = path.read_text().splitlines() if path.exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    threads = torch.get_num_threads()
-    many = "1 thread" if threads == 1 else f"{threads} threads"
-    return f"{device}: {names[0] if names else platform.machine()}, {many}"
-
-
-def advice(device: torch.device) -> str | None:
-    """The command that would bring the kernels, where nothing else is in their way."""
-    if device.type != "cuda" or torch.version.cuda is None or _installed("cuda-core"):
-        return None
-    extra = "cuda12" if torch.version.cuda.startswith("12") else "cuda"
-    return f"pip install 'opt3dgs_optim[{extra}]'"
-
-
-def as_text(found: dict[str, Any]) -> str:
-    """What `examine` found, for people."""
-    checks = [Check(**check) for check in found["checks"]]
-    costs = [Cost(**cost) for cost in found["costs"]]
-    parts = [_versions_text(found), _checks_text(checks, found["self_test_seconds"])]
-    if costs:
-        parts.append(_costs_text(costs, found["points"]))
-    failed = sum(check.outcome == "failed" for check in checks)
-    skipped = sum(check.outcome == "skipped" for check in checks)
-    parts.append(
-        f"{failed} of {len(checks)} checks FAILED: this installation gives wrong numbers, or none."
-        if failed
-        else f"In order: {len(checks) - skipped} checks passed"
-        + (f", {skipped} could not be made here." if skipped else ".")
-    )
-    return "\n\n".join(parts)
-
-
-def _versions_text(found: dict[str, Any]) -> str:
-    version, backend = found["versions"], found["backend"]
-    cuda = version["cuda_of_torch"]
-    rows = {
-        "opt3dgs_optim": version["opt3dgs_optim"],
-        "python": f"{version['python']}, {version['platform']}",
-        "torch": f"{version['torch']}, " + (f"CUDA {cuda}" if cuda else "built without CUDA"),
-        "numpy": version["numpy"],
-        "cuda.core": version["cuda_core"] or "not installed (only the kernels need it)",
-        "matplotlib": version["matplotlib"] or "not installed (only pictures need it)",
-        "device": found["device"],
-        "backend": f"{backend['in_use']}: {backend['reason']}",
-    }
-    if backend["advice"]:
-        rows["advice"] = f"for the kernels: {backend['advice']}"
-    return "\n".join(f"{name:<14} {value}" for name, value in rows.items())
-
-
-def _checks_text(checks: Sequence[Check], seconds: float) -> str:
-    rows = [f"  {MARKS[check.outcome]:<7} {check.name}: {check.detail}" for check in checks]
-    return "\n".join([f"Self-test ({seconds:.1f} s)", *rows])
-
-
-def _costs_text(costs: Sequence[Cost], points: int) -> str:
-    title = f"Cost per million Gaussians (59 numbers each; measured with {points:,})"
-    head = f"  {'':<21}{'time':>10}{'kept per point':>17}{'moved per point':>18}{'rate':>11}"
-    rows = []
-    for cost in costs:
-        kept = "" if cost.bytes_kept is None else f"{cost.bytes_kept:,.0f} B"
-        moved = f"{cost.bytes_moved:,.0f} B"
-        rate = f"{cost.bytes_moved / cost.ns_per_point:,.1f} GB/s"
-        time = (
-            f"{cost.ns_per_point:,.1f} ms"
-            if cost.ns_per_point < 1e3
-            else (f"{cost.ns_per_point / 1e3:,.2f} s")
-        )
-        rows.append(f"  {cost.name:<21}{time:>10}{kept:>17}{moved:>18}{rate:>11}")
-    note = (
-        "  time: median; 1 ms per million is 1 ns per Gaussian. kept: optimizer state between\n"
-        "  steps. moved: the least to be read and written. The steps are without the gradients."
-    )
-    return "\n".join([title, head, *rows, note])
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m opt3dgs_optim doctor",
-        description="Versions, backend, self-test and costs of opt3dgs_optim on this machine.",
-    )
-    parser.add_argument("--device", help="where to look (default: the GPU, if torch sees one)")
-    parser.add_argument(
-        "--points",
-        type=int,
-        metavar="N",
-        help="Gaussians to measure with (default: 1,000,000 on a GPU, 100,000 on a CPU); "
-        "0 for no measurement",
-    )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    return parser
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; 0, 1 if a check failed, 2 after one line that says what is wrong."""
-    options = _parser().parse_args(arguments)
+    parser = argparse.ArgumentParser(
+        prog="opt3dgs doctor",
+        description="Versions, backend and self-test of opt3dgs_optim on this machine.",
+    )
+    parser.add_argument("--device", help="where to look (default: the GPU, if torch sees one)")
+    name = parser.parse_args(arguments).device or ("cuda" if torch.cuda.is_available() else "cpu")
     try:
-        if options.points is not None and options.points < 0:
-            raise ValueError(f"--points {options.points}: must be 0 or more")
-        device = _device(options.device)
-    except ValueError as error:
-        print(f"doctor: {error}", file=sys.stderr)
-        return 2
-    found = examine(device, options.points)
-    print(json.dumps(found, indent=2) if options.json else as_text(found))
-    return 0 if found["passed"] else 1
-
-
-def _device(name: str | None) -> torch.device:
-    """The device of that name, proved by a tensor on it; ValueError if it cannot be used."""
-    if name is None:
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        return torch.zeros(1, device=name).device
+        device = torch.zeros(1, device=name).device
     except (AssertionError, NotImplementedError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
-        raise ValueError(f"--device {name!r}: torch cannot use it here: {reason}") from None
+        print(f"doctor: --device {name!r}: torch cannot use it here: {reason}", file=sys.stderr)
+        return 2
+    for what, version in versions(device).items():
+        print(f"{what:<14} {version}")
+    checks = run_checks(device)
+    print("\nSelf-test")
+    for check in checks:
+        print(f"  {MARKS[check.outcome]:<7} {check.name}: {check.detail}")
+    outcomes = [check.outcome for check in checks]
+    if failed := outcomes.count("failed"):
+        print(f"\n{failed} of {len(checks)} checks FAILED: this installation gives wrong numbers.")
+        return 1
+    passed, skipped = outcomes.count("ok"), outcomes.count("skipped")
+    print(f"\nIn order: {passed} checks passed, {skipped} could not be made here.")
+    return 0
 
 
 if __name__ == "__main__":

@@ -6,8 +6,6 @@ they check.
 
 from __future__ import annotations
 
-import importlib.util
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -15,12 +13,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from opt3dgs_optim import cuda, curvature, ops
+from opt3dgs_optim import cuda
 from opt3dgs_optim.awsgld import AWSGLD
-from opt3dgs_optim.backend import backend_info
-from opt3dgs_optim.energy import EnergyHistogram
+from opt3dgs_optim.backend import Backend, backend_info
+from opt3dgs_optim.covariance import add_covariance_noise, covariance_noise
+from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, two_loop
 from opt3dgs_optim.lqnadam import LQNAdam
-from opt3dgs_optim.noise import covariance_noise
+from opt3dgs_optim.parts.histogram import EnergyHistogram
 
 HISTORY_SIZE = 5
 ROWS = 1000
@@ -42,11 +41,10 @@ class CannotCheckError(Exception):
     """A check cannot be made here."""
 
 
-def run_checks(device: torch.device, show: Callable[[str], None]) -> list[Check]:
-    """All checks on `device`, `show`ing the name of each before it starts."""
+def run_checks(device: torch.device) -> list[Check]:
+    """All checks on `device`."""
     done = []
     for name, check in CHECKS.items():
-        show(name)
         try:
             done.append(Check(name, "ok", check(device)))
         except CannotCheckError as reason:
@@ -70,6 +68,14 @@ def _pairs(device: torch.device) -> tuple[Tensor, Tensor]:
     return s, torch.einsum("nij,knj->kni", hessian, s)
 
 
+def _gaussians(device: torch.device) -> list[Tensor]:
+    """Log scales, quaternions, logits around the gate's threshold, and normal numbers."""
+    shapes = ((ROWS, 3), (ROWS, 4), (ROWS,), (ROWS, 3))
+    drawn = [_draw(*shape, device=device, seed=10 + i) for i, shape in enumerate(shapes)]
+    drawn[2] -= 5
+    return drawn
+
+
 def _within(found: Tensor, expected: Tensor, limit: float, what: str) -> str:
     """The relative difference in words; ArithmeticError if it is over `limit`."""
     difference = float((found - expected).abs().max() / expected.abs().max())
@@ -91,19 +97,12 @@ def dense_bfgs(s: Tensor, y: Tensor) -> Tensor:
     return matrix
 
 
-def two_loop_against_dense_matrices(device: torch.device) -> str:
+def recursion_against_dense_matrices(device: torch.device) -> str:
     """The recursion equals the product with the dense matrix."""
     (s, y), grad = _pairs(device), _draw(ROWS, 3, device=device, seed=3)
-    found = curvature.two_loop(grad, curvature.history_from_pairs(s, y), HISTORY_SIZE)
+    found = two_loop(grad, history_from_pairs(s, y), HISTORY_SIZE)
     expected = torch.einsum("nij,nj->ni", dense_bfgs(s, y), grad)
     return _within(found, expected, EXACT, "dense BFGS matrices, float64")
-
-
-def two_loop_secant_equation(device: torch.device) -> str:
-    """H y = s for the newest pair, whatever the older ones are."""
-    s, y = _pairs(device)
-    found = curvature.two_loop(y[-1], curvature.history_from_pairs(s, y), HISTORY_SIZE)
-    return _within(found, s[-1], EXACT, "H y = s, float64")
 
 
 def adam_when_all_is_off(device: torch.device) -> str:
@@ -111,11 +110,10 @@ def adam_when_all_is_off(device: torch.device) -> str:
     for make, steps in ((AWSGLD, 5), (LQNAdam, 1)):
         ours = torch.nn.Parameter(_draw(ROWS, 3, device=device).float())
         theirs = torch.nn.Parameter(ours.detach().clone())
-        pair = make([ours], lr=0.01), torch.optim.Adam([theirs], lr=0.01)
+        optimizers = make([ours], lr=0.01), torch.optim.Adam([theirs], lr=0.01)
         for step in range(steps):
-            grad = _draw(ROWS, 3, device=device, seed=step).float()
-            ours.grad, theirs.grad = grad.clone(), grad.clone()
-            for optimizer in pair:
+            for x, optimizer in zip((ours, theirs), optimizers, strict=True):
+                x.grad = _draw(ROWS, 3, device=device, seed=step).float()
                 optimizer.step()
         if not torch.equal(ours, theirs):
             raise ArithmeticError(f"{make.__name__} with nothing on differs from torch.optim.Adam")
@@ -139,14 +137,6 @@ def covariance_of_the_noise(device: torch.device) -> str:
     return _within(found, expected, EXACT, "R S S R^T, float64")
 
 
-def _gaussians(device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    shapes = ((ROWS, 3), (ROWS, 4), (ROWS,), (ROWS, 3))
-    scales, quats, opacities, eta = (
-        _draw(*shape, device=device, seed=10 + i) for i, shape in enumerate(shapes)
-    )
-    return scales, quats, opacities - 5, eta  # opacities around the gate's threshold
-
-
 def histogram_weights(device: torch.device) -> str:
     """Weights stay positive with sum 1; nu is 1 in the warm-up and moves after it."""
     histogram = EnergyHistogram(20, (0.0, 1.0), temperature=0.1, warmup=50)
@@ -162,65 +152,42 @@ def histogram_weights(device: torch.device) -> str:
 
 def kernels_against_torch(device: torch.device) -> str:
     """The CUDA kernels against the same in torch; without a GPU they are compiled at most."""
-    if device.type != "cuda":
-        raise CannotCheckError(_compiled("the kernels need a CUDA device"))
     info = backend_info(device)
-    if info.backend != "cuda":
-        raise CannotCheckError(_compiled(info.reason))
-    begin = time.perf_counter()
-    said = [
-        _kernel_pair(device, *kind) for kind in ((torch.float64, EXACT), (torch.float32, ROUNDED))
-    ]
-    torch.cuda.synchronize(device)
-    return f"{'; '.join(said)}; {time.perf_counter() - begin:.1f} s with their compilation"
-
-
-def _compiled(obstacle: str) -> str:
-    if torch.version.hip is not None or not _has_cuda_core():
-        return f"not compiled, not launched: {obstacle}, and cuda.core is not installed"
+    if info.backend == "cuda":
+        return (
+            f"{_kernels(device, torch.float64, EXACT)}; {_kernels(device, torch.float32, ROUNDED)}"
+        )
     try:
-        begin = time.perf_counter()
-        for name in cuda.KERNELS:
+        for name in sorted(set(cuda.KERNELS.values())):
             size = HISTORY_SIZE if name == "lqn.cu" else None
             cuda.compile_cubin(name, torch.float32, PROBE, history_size=size)
-    except Exception as error:  # an incomplete NVRTC: no harm where there is no device
-        return f"not compiled ({type(error).__name__}: {error}), not launched: {obstacle}"
-    seconds = time.perf_counter() - begin
-    return f"compiled for {PROBE} in {seconds:.1f} s, but not launched: {obstacle}"
+    except Exception as error:  # no cuda.core, an incomplete NVRTC: no harm where nothing launches
+        tried = f"not compiled ({type(error).__name__}: {error})"
+    else:
+        tried = f"compiled for {PROBE}"
+    raise CannotCheckError(f"{tried}, not launched: {info.reason}")
 
 
-def _has_cuda_core() -> bool:
-    try:
-        return importlib.util.find_spec("cuda.core") is not None
-    except ModuleNotFoundError:  # not even the package above it
-        return False
-
-
-def _kernel_pair(device: torch.device, dtype: torch.dtype, limit: float) -> str:
+def _kernels(device: torch.device, dtype: torch.dtype, limit: float) -> str:
     s, y = (tensor.to(dtype) for tensor in _pairs(device))
     position, grad = (_draw(ROWS, 3, device=device, seed=i).to(dtype) for i in (5, 6))
-    directions, moved = [], []
-    scales, quats, opacities, eta = (tensor.to(dtype) for tensor in _gaussians(device))
-    for backend in ("cuda", "torch"):
-        history = curvature.laid_out(curvature.history_from_pairs(s, y), contiguous=True)
-        options = {"min_cosine": 1e-6, "powell": False, "graft": True, "gamma_clamp": None}
-        directions.append(
-            ops.lqn_direction(position, grad, history, HISTORY_SIZE, backend=backend, **options)[0]
+    *gaussians, eta = (tensor.to(dtype) for tensor in _gaussians(device))
+    found = []
+    backends: tuple[Backend, ...] = ("cuda", "torch")
+    for backend in backends:
+        means, history = torch.zeros_like(position), history_from_pairs(s, y)
+        fed, *_ = lqn_direction(
+            position, grad, history, HISTORY_SIZE, min_cosine=1e-6, graft=True, backend=backend
         )
-        means = torch.zeros_like(position)
-        lr = torch.ones((), device=device)
-        ops.add_covariance_noise(
-            means, scales, quats, opacities, eta=eta, lr=lr, noise_scale=1.0, backend=backend
-        )
-        moved.append(means)
+        add_covariance_noise(means, *gaussians, eta=eta, lr=1.0, noise_scale=1.0, backend=backend)
+        found.append((fed, means))
     kind = str(dtype).removeprefix("torch.")
-    _within(moved[0], moved[1], limit, f"the torch noise, {kind}")
-    return _within(directions[0], directions[1], limit, f"torch, {kind}")
+    _within(found[0][1], found[1][1], limit, f"the torch noise, {kind}")
+    return _within(found[0][0], found[1][0], limit, f"torch, {kind}")
 
 
 CHECKS: dict[str, Callable[[torch.device], str]] = {
-    "two-loop recursion": two_loop_against_dense_matrices,
-    "secant equation": two_loop_secant_equation,
+    "two-loop recursion": recursion_against_dense_matrices,
     "Adam with all off": adam_when_all_is_off,
     "covariance noise": covariance_of_the_noise,
     "energy histogram": histogram_weights,

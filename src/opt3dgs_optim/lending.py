@@ -2,18 +2,40 @@
 
 from __future__ import annotations
 
-from typing import Any
+import logging
+import math
+from typing import Any, TypedDict
 
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.part import Group
+from opt3dgs_optim.course import Course
+from opt3dgs_optim.part import Group, Part
+from opt3dgs_optim.rows import Frozen
+
+LOGGER = logging.getLogger("opt3dgs_optim")
+
+
+class AdamOptions(TypedDict, total=False):
+    """torch.optim.Adam's keyword-only options."""
+
+    foreach: bool | None
+    maximize: bool
+    capturable: bool
+    differentiable: bool
+    fused: bool | None
+    decoupled_weight_decay: bool
 
 
 class Lent:
-    """Learning rates, gradients and flags that stand in place of others for one step."""
+    """Learning rates, gradients and flags that stand in place of others for one step.
+
+    Attributes:
+        frozen: rows that are to be put back after it.
+    """
 
     def __init__(self) -> None:
+        self.frozen: list[Frozen] = []
         self._items: list[tuple[dict[str, Any], str, Any]] = []
         self._attributes: list[tuple[Any, str, Any]] = []
 
@@ -60,8 +82,72 @@ class Lent:
         self.item(group, "lr", rate * factor)
 
     def flag(self, optimizer: Any, valid: Tensor) -> None:
-        """Merge "the loss is not finite" with the GradScaler's flag, on the device."""
-        flag, theirs = (~valid).to(torch.float32), getattr(optimizer, "found_inf", None)
-        if theirs is not None:
-            flag = torch.maximum(flag, theirs.reshape(()).to(flag.device))
-        self.attribute(optimizer, "found_inf", flag)
+        """Tell torch's step on the device whether it is to be made, as a GradScaler would."""
+        self.attribute(optimizer, "found_inf", (~valid).to(torch.float32))
+
+
+def use_fused(optimizer: Any) -> None:
+    """Only torch's fused path takes a factor, and drops a step, on the device."""
+    optimizer.defaults["fused"] = True
+    optimizer._step_supports_amp_scaling = True
+    for group in optimizer.param_groups:
+        group["fused"] = True
+        for param in group["params"]:
+            state = optimizer.state.get(param)
+            if state:
+                state["step"] = state["step"].to(param.device, torch.float32)
+
+
+def feed(
+    parts: list[Part],
+    group: Group,
+    param: Tensor,
+    grad: Tensor,
+    state: dict[str, Any],
+    course: Course,
+    scale: Tensor | None,
+) -> Tensor:
+    """What parts make of a gradient; they see that of what is minimised, without AMP's scale."""
+    unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
+    plain = scale is None and unit == 1.0
+    fed = grad if plain else grad / unit
+    for part in parts:
+        fed = part.before(group, param, fed, state, course)
+    return fed if plain else fed * unit
+
+
+def guard(grad: Tensor, course: Course, told: bool) -> bool:
+    """Take a gradient that is not finite as zero, number by number, in place.
+
+    Returns:
+        Whether there was such a number; False where only the device knows.
+    """
+    on_host = grad.device.type == "cpu"
+    # The sum is finite unless a summand is not, or it overflows.
+    if on_host and math.isfinite(abs(grad.sum().item())):
+        return False
+    grad.nan_to_num_(0.0, 0.0, 0.0)
+    if on_host and not told:
+        LOGGER.warning(
+            "iteration %d: a gradient of shape %s is not finite; such numbers are taken as zero, "
+            "here and later",
+            course.current,
+            tuple(grad.shape),
+        )
+    return on_host
+
+
+def refuse_capture(call: str, course: Course) -> None:
+    """RuntimeError in the capture of a CUDA graph: its replays would repeat what parts say now."""
+    if course.parts and torch.cuda.is_initialized() and torch.cuda.is_current_stream_capturing():
+        raise RuntimeError(
+            f"{call}.step: a CUDA graph is being captured, but its replays would repeat this "
+            "iteration's factors and phase; leave the optimizers' steps out of it"
+        )
+
+
+def times(factor: float | Tensor | None, other: float | Tensor | None) -> float | Tensor | None:
+    """The product of two factors on a step, of which None is 1."""
+    if factor is None or other is None:
+        return other if factor is None else factor
+    return factor * other

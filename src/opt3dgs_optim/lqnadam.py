@@ -8,8 +8,9 @@ from torch import Tensor
 
 from opt3dgs_optim.backend import Backend
 from opt3dgs_optim.course import Course
+from opt3dgs_optim.lending import AdamOptions
 from opt3dgs_optim.parts.curvature import Curvature
-from opt3dgs_optim.stepadam import AdamOptions, StepAdam
+from opt3dgs_optim.stepadam import StepAdam
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -18,16 +19,13 @@ if TYPE_CHECKING:
 class LQNAdam(StepAdam):
     """Adam fed with the local quasi-Newton direction of every point (eq. 17).
 
-    The part `Curvature` on every parameter, from the first step on; see there for what a point is
-    and how its pairs are kept. In a training, `PhaseScheduler` has it in the last phase.
+    The part `Curvature` on every parameter, from the first step on; see there.
 
     Args:
         params, lr, betas, eps, weight_decay, amsgrad: as in `torch.optim.Adam`.
         history_size, min_cosine, graft, backend: as in `Curvature`.
         adam: `foreach, maximize, capturable, fused, decoupled_weight_decay`, as in
             `torch.optim.Adam`.
-
-    Memory: 32 K bytes per point beyond Adam's (K > 3, D = 3, float32).
 
     Examples:
         >>> import torch

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from opt3dgs_optim.checks import check_count, check_flag, check_number, warn_user
-from opt3dgs_optim.course import CHECK_STEPS, Course
+from opt3dgs_optim.course import Course
 from opt3dgs_optim.describe import block
 from opt3dgs_optim.names import GAUSSIAN_NAMES, canonical_name
 from opt3dgs_optim.part import Part, Phase
@@ -129,10 +129,8 @@ class PhaseScheduler(Course):
         K = 5 consecutive pairs, L2, fresh moments. Single parts: `paper_parts`.
         """
         check_count(f"{CALL}.paper", "total_steps", total_steps, 1)
-        parts = paper_parts(total_steps)
-        return cls(
-            total_steps, switch, parts, adaptive=adaptive, log=log, process_group=process_group
-        )
+        options = {"adaptive": adaptive, "log": log, "process_group": process_group}
+        return cls(total_steps, switch, paper_parts(total_steps), **options)
 
     @property
     def phase(self) -> Phase:
@@ -208,13 +206,13 @@ class PhaseScheduler(Course):
         self.current = self.iteration if iteration is None else iteration
         self._watch_clock()
         value = loss if isinstance(loss, Tensor) else torch.tensor(float(loss))
-        value = value.detach().reshape(())
+        value = value.detach().reshape(()) if value.dim() else value.detach()
         self.take(value if self._over_ranks is None else self._over_ranks(value))
         if self.log is not None:
             phase = self.phase_of(self.current)
             name = "" if phase is None else phase.value
             self.log.step(self.current, phase=name, energy=value, **self.numbers())
-        if self.adaptive and self.num_observed % self._check_steps() == 0:
+        if self.adaptive and self.num_observed % self.check_steps == 0:
             for event, part, reason in self.judge(self._over_ranks):
                 if self.log is not None:
                     self.log.event(event, self.current, part=part, reason=reason)
@@ -234,8 +232,13 @@ class PhaseScheduler(Course):
                 f"{tuple(target.shape)}, but one shape is needed"
             )
         error = render - target
+        part = self.pixel_part()
+        return error.abs().mean() if part is None else part.pixel_loss(error)
+
+    def pixel_part(self) -> Part | None:
+        """The part whose photometric term holds for the iteration whose loss comes next."""
         parts = self._hooks[self.phase, "pixel_loss"]
-        return parts[-1].pixel_loss(error) if parts else error.abs().mean()
+        return parts[-1] if parts else None
 
     # -- mistakes of a set-up, said early ------------------------------------------------------
 
@@ -251,7 +254,7 @@ class PhaseScheduler(Course):
             since = "" if self.num_observed else " at all"
             warn_user(
                 f"{CALL}: the optimizers have stepped {SILENCE} times without an energy{since}, so "
-                f"that {self._parts_in_words()} stand still; call observe(loss) once per "
+                f"that {', '.join(self.part_names())} stand still; call observe(loss) once per "
                 "iteration, before the steps"
             )
         return self.num_observed > 0
@@ -264,7 +267,7 @@ class PhaseScheduler(Course):
             self._told = True
             warn_user(
                 f"{CALL}: {patience} losses were observed and no upgraded optimizer has stepped: "
-                f"{self._parts_in_words()} do nothing; call upgrade(...) again where the "
+                f"{', '.join(self.part_names())} do nothing; call upgrade(...) again where the "
                 "trainer makes its optimizers anew"
             )
         self._stepped, self._unheard = False, 0
@@ -284,16 +287,7 @@ class PhaseScheduler(Course):
 
     def expect(self, steps: int) -> None:
         """Moments came without a state of ours; the next energy's iteration should fit them."""
-        if steps:
-            self._adam_steps = steps
-
-    def _parts_in_words(self) -> str:
-        return ", ".join(self.part_names()) or "no parts"
-
-    def _check_steps(self) -> int:
-        """Iterations between looks at the evidence: a tenth of a short exploitation."""
-        left = self.total_steps - self.switch_step
-        return min(CHECK_STEPS, max(left // 10, 10)) if self.exploiting else CHECK_STEPS
+        self._adam_steps = steps or self._adam_steps
 
     def __repr__(self) -> str:
         switch = f"switch at {self.switch_step}"

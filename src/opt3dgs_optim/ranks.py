@@ -11,12 +11,8 @@ from torch import Tensor
 class RankMean:
     """Averages tensors over a process group, every rank weighing the same.
 
-    Args:
-        call: whose option `process_group` is, for the messages.
-        process_group: a `torch.distributed.ProcessGroup`, e.g. `torch.distributed.group.WORLD`.
-
-    Raises:
-        ValueError: torch.distributed is not initialised, or this process is not in the group.
+    ValueError for `call` if torch.distributed is not initialised, or this process is not in the
+    `torch.distributed.ProcessGroup`.
     """
 
     def __init__(self, call: str, process_group: Any) -> None:
@@ -36,10 +32,9 @@ class RankMean:
         self._size = distributed.get_world_size(process_group)
 
     def __call__(self, values: Tensor) -> Tensor:
-        """The means over the ranks, of the shape of `values`.
+        """The means over the ranks, of the shape of `values`; every rank must call as often.
 
-        A value that is not finite on one rank is not finite on all. Every rank must call as often.
-        Nothing is read back to the host.
+        A value that is not finite on one rank is not finite on all.
         """
         total = values.detach().clone()
         if total.dtype in (torch.float16, torch.bfloat16):

@@ -10,8 +10,6 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
-from opt3dgs_optim.checks import check_keys, warn_user
-
 
 class _Seen(NamedTuple):
     """What belonged together after a parameter's last step: an edit of one alone shows."""
@@ -46,11 +44,39 @@ class Ledger:
                 seen = _Seen(weakref.ref(param), rows_of(param), weakref.ref(state["exp_avg"]))
                 self._seen[state[key]] = seen
 
-    def edited_along(self, param: Tensor, state: Mapping[str, Any], key: str) -> bool:
-        """Whether a tensor was edited by rows with the moments: not where they alone were."""
-        seen = self._seen.get(state[key])
-        left_behind = seen is not None and seen.moment() is not state["exp_avg"]
-        return state[key].shape[0] == rows_of(param) and not left_behind
+    def forget(
+        self,
+        call: str,
+        states: list[tuple[Tensor, dict[str, Any]]],
+        keys: Iterable[str],
+        rows: Tensor,
+        moments: bool,
+    ) -> None:
+        """Zero these rows under `keys`, and of the moments too if asked; see `reset_points`."""
+        is_mask = rows.dtype == torch.bool
+        fitting = [
+            (param, state)
+            for param, state in states
+            if param.dim() > 0 and (not is_mask or rows.shape == param.shape[:1])
+        ]
+        if states and not fitting:
+            raise ValueError(
+                f"{call}: rows has shape {tuple(rows.shape)}, but a mask of the first dimension "
+                f"of {[tuple(param.shape) for param, _ in states]} is needed"
+            )
+        for param, state in fitting:
+            for key in [key for key in keys if key in state]:
+                seen = self._seen.get(state[key])
+                # Edited by rows with the moments: not where they alone were.
+                left_behind = seen is not None and seen.moment() is not state["exp_avg"]
+                if left_behind or state[key].shape[0] != rows_of(param):
+                    del state[key]
+                else:
+                    state[key][rows.to(param.device)] = 0
+                    self.remember(param, state, (key,))
+            for key in ("exp_avg", "exp_avg_sq", "max_exp_avg_sq") if moments else ():
+                if key in state and state[key].shape[0] == param.shape[0]:
+                    state[key][rows.to(param.device)] = 0
 
     def _knows(self, param: Tensor, tensor: Tensor) -> bool:
         seen = self._seen.get(tensor)
@@ -108,29 +134,39 @@ def check_mask(call: str, masks: list[Any], num_points: int | None) -> Tensor:
     return mask if mask.dtype == torch.bool else mask != 0
 
 
-def check_rows(call: str, params: list[Tensor], keys: Iterable[str], state: Any) -> None:
-    """ValueError unless loaded moments fit the parameters; what parts kept of other rows goes.
+def check_mask_rows(call: str, rows: int, params: list[tuple[bool, Tensor]]) -> None:
+    """ValueError unless a mask of `rows` fits the parameters that it is about, and there are any.
 
-    The number of rows may differ: some trainers load the optimizer first, the points afterwards.
+    Only against those with a gradient: a mask may be older than the others' rows, as where a
+    trainer adds points between rendering and step; such parameters are not stepped.
     """
-    for param in params:
-        own = state.get(param)
-        if not own and isinstance(own, (Mapping, type(None))):
-            continue
-        check_keys(call, own, ())
-        for key in ("exp_avg", "exp_avg_sq"):
-            value = own.get(key)
-            if not isinstance(value, Tensor) or value.shape[1:] != param.shape[1:]:
-                shape = tuple(value.shape) if isinstance(value, Tensor) else value
-                raise ValueError(
-                    f"{call}: {key} has shape {shape}, but the parameter has {tuple(param.shape)}"
-                )
-        if "step" not in own:
-            raise ValueError(f"{call}: no 'step' among {list(own)}; an Adam's state is needed")
-        for key in keys:
-            if key in own and own[key].shape[0] != rows_of(param):
-                warn_user(
-                    f"{call}: {key} of {own[key].shape[0]} rows for a parameter of "
-                    f"{rows_of(param)}: dropped, and collected anew"
-                )
-                del own[key]
+    present = [(takes, param) for takes, param in params if param.grad is not None]
+    shapes = [tuple(param.shape) for takes, param in present if takes]
+    if present and (not shapes or any(shape[:1] != (rows,) for shape in shapes)):
+        shapes = shapes or [tuple(param.shape) for _, param in present]
+        raise ValueError(
+            f"{call}: the mask has {rows} rows, but the parameters have shapes {shapes}; a mask of "
+            "their first dimension is needed"
+        )
+
+
+def reset_points(optimizers: Any, rows: Tensor, *, moments: bool = False) -> None:
+    """Say which points have moved by other means than the optimizers: what parts kept of them goes.
+
+    For a trainer that knows what its density control did. Call it after each edit of the
+    parameters: curvature pairs of all other points stay in use, where they would otherwise be
+    dropped with the exchanged Parameter object. The state's rows must have been edited along
+    (gsplat does; INRIA's edits leave the pairs behind, and they are dropped).
+
+    Args:
+        optimizers: an upgraded optimizer, or a dict of them (others in it are left alone).
+        rows: [N] bool mask or a vector of indices, of the points as they are now.
+        moments: whether to start their Adam moments anew too.
+
+    Raises:
+        ValueError: a mask fits no parameter.
+    """
+    every = optimizers.values() if isinstance(optimizers, Mapping) else [optimizers]
+    for optimizer in every:
+        if hasattr(optimizer, "reset_points"):
+            optimizer.reset_points(rows, moments=moments)

@@ -3,38 +3,30 @@
 from __future__ import annotations
 
 import inspect
-import logging
-import math
-from collections.abc import Callable, Mapping
-from typing import Any, TypedDict
+from collections.abc import Callable
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 from torch._compile import _disable_dynamo
 from torch.optim import Adam
 
+from opt3dgs_optim.checkpoint import STATE_KEY, check_rows, loading
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.describe import block, group_lines
-from opt3dgs_optim.lending import Lent
-from opt3dgs_optim.names import SLOT, slot
+from opt3dgs_optim.lending import Lent, feed, guard, refuse_capture, times, use_fused
+from opt3dgs_optim.names import SLOT, canonical_name
 from opt3dgs_optim.part import Group, Part
-from opt3dgs_optim.rows import Frozen, Ledger, check_mask, check_rows, shaped
+from opt3dgs_optim.rows import (
+    Frozen,
+    Ledger,
+    check_mask,
+    check_mask_rows,
+    shaped,
+)
 
 # Unwrapped: torch's step hooks and its profiler are around our step already.
 ADAM_STEP = inspect.unwrap(Adam.step)
-STATE_KEY = "opt3dgs"  # in param_groups[0] of a state_dict: the course's state
-LOGGER = logging.getLogger("opt3dgs_optim")
-
-
-class AdamOptions(TypedDict, total=False):
-    """torch.optim.Adam's keyword-only options."""
-
-    foreach: bool | None
-    maximize: bool
-    capturable: bool
-    differentiable: bool
-    fused: bool | None
-    decoupled_weight_decay: bool
 
 
 class StepAdam(Adam):
@@ -47,7 +39,7 @@ class StepAdam(Adam):
 
     course: Course
     any_group = False  # whether the parts act on groups that are no Gaussian parameter's, too
-    _base: type[Adam] = Adam  # whose step it is that the parts surround
+    base: type[Adam] = Adam  # whose step it is that the parts surround
     _ledger: Ledger
     _told = False  # of a gradient that is not finite
 
@@ -59,30 +51,25 @@ class StepAdam(Adam):
             base: the class whose step the parts surround: torch's Adam, or one with arithmetic of
                 its own, whose step then gets the mask.
         """
-        self.course, self._base, self._ledger = course, base, Ledger()
+        self.course, self.base, self._ledger = course, base, Ledger()
         self._patch_step_function()  # torch's, for a class that was given to a made optimizer
         groups = self.param_groups
         own_path = any(g[k] is not None for g in groups for k in ("fused", "foreach"))
         own_path = own_path or any(g["capturable"] for g in groups)
         tensors = [p for group in groups for p in group["params"]]
         if base is Adam and not own_path and tensors and all(p.is_cuda for p in tensors):
-            self._use_fused()
-        self._trust_rows()
+            use_fused(self)
+        self.trust_rows()
 
-    def _use_fused(self) -> None:
-        """Only torch's fused path takes a factor, and drops a step, on the device."""
-        self.defaults["fused"] = True
-        self._step_supports_amp_scaling = True
-        for group in self.param_groups:
-            group["fused"] = True
-            for param in group["params"]:
-                state = self.state.get(param)
-                if state:
-                    state["step"] = state["step"].to(param.device, torch.float32)
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """As torch's; notes which Gaussian parameter the group's name says that it holds."""
+        super().add_param_group(param_group)
+        group = self.param_groups[-1]
+        group.setdefault(SLOT, canonical_name(group.get("name")))
 
     def acts_on(self, part: Part, group: Group) -> bool:
         """Whether a part acts on a group."""
-        name = slot(group)
+        name = group.get(SLOT)
         return part.names is None or name in part.names or (name is None and self.any_group)
 
     # -- the step ------------------------------------------------------------------------------
@@ -99,9 +86,9 @@ class StepAdam(Adam):
     ) -> Any:
         """One step: of all rows, or only of those that a camera saw.
 
-        With a mask, the other rows keep parameters and state, whatever the parts do; the bias
-        correction is that of the whole parameter. It costs a copy of both. Parameters without a
-        gradient are left alone, whatever the mask, as in INRIA's and gsplat's own masked steps.
+        With a mask, the other rows keep parameters and state, whatever the parts do, for a copy of
+        both; the bias correction is the whole parameter's. Parameters without a gradient are left
+        alone, whatever the mask, as in INRIA's and gsplat's own masked steps.
 
         Args:
             closure: evaluates the model and returns the loss; or the mask, as gsplat
@@ -118,11 +105,7 @@ class StepAdam(Adam):
             RuntimeError: a CUDA graph is being captured, and there are parts.
         """
         self._opt_called = True  # what learning-rate schedulers would note by wrapping this method
-        if self.course.parts and _is_captured():
-            raise RuntimeError(
-                f"{type(self).__name__}.step: a CUDA graph is being captured, but its replays would "
-                "repeat this iteration's factors and phase; leave the optimizers' steps out of it"
-            )
+        refuse_capture(type(self).__name__, self.course)
         masks: list[Any] = [each for each in (visible, visibility) if each is not None]
         if isinstance(closure, Tensor):
             masks, closure = [closure, *masks], None
@@ -133,72 +116,77 @@ class StepAdam(Adam):
                 loss = closure()
         with torch.set_grad_enabled(self.defaults["differentiable"]):
             acting = self.course.stepping(loss)
-            if not acting and mask is None:
-                self._step_base(None)
-            elif self.course.valid is not False and not self._overflowed_on_host():
-                self._step_parts(mask, acting)
+            if self.course.valid is not False:
+                self._step(mask, acting)
         return loss
 
     # Learning-rate schedulers, which would wrap `step` on the instance, need not: `step` tells.
     step._wrapped_by_lr_sched = True  # pyright: ignore[reportFunctionMemberAccess]
 
-    def _overflowed_on_host(self) -> bool:
-        """Whether a GradScaler has told a fused optimizer on a CPU that the step is not made."""
-        found = getattr(self, "found_inf", None)
-        return found is not None and found.device.type == "cpu" and bool(found)
-
-    def _step_parts(self, mask: Tensor | None, acting: bool) -> None:
-        """A step with the parts, unless they do not act yet, of the rows of a mask."""
-        if mask is not None:
-            self._check_mask(mask)
-        course, shared = self.course, Lent()
-        found = getattr(self, "found_inf", None)
-        if found is not None:  # a GradScaler's, of which parts know nothing
-            fits = found.reshape(()) == 0
-            shared.attribute(course, "valid", fits & course.valid)
+    def _step(self, mask: Tensor | None, acting: bool) -> None:
+        """A step that a GradScaler may tell not to be made, of which parts know nothing."""
+        found, shared = getattr(self, "found_inf", None), Lent()
+        if found is not None and isinstance(self.course.valid, Tensor):
+            shared.attribute(self.course, "valid", (found.reshape(()) == 0) & self.course.valid)
+        elif found is not None and bool(found):
+            return
         try:
-            moved, frozen = self._step_lent(mask, acting)
-            for group, param in moved if acting else ():
-                self._finish(group, param)
-            for rows in frozen:
-                rows.put_back()
+            self._step_parts(mask, acting)
         finally:
             shared.take_back()
 
-    def _step_lent(
-        self, mask: Tensor | None, acting: bool
-    ) -> tuple[list[tuple[Group, Tensor]], list[Frozen]]:
-        """The step of torch's Adam; what has moved, and what is to be put back."""
+    def _step_parts(self, mask: Tensor | None, acting: bool) -> None:
         course, lent = self.course, Lent()
-        frozen: list[Frozen] = []
-        moved: list[tuple[Group, Tensor]] = []
-        befores = course.hooks("before") if acting else []
-        factors = course.hooks("factor") if acting else []
+        names = ("before", "factor", "after")
+        hooks = [course.hooks(name) if acting else [] for name in names]
+        if mask is not None:
+            self._check_mask(mask)
+        moved: list[tuple[Group, Tensor, list[Part]]] = []
         try:
             for group in self.param_groups:
-                parts = [part for part in befores if self.acts_on(part, group)]
-                for param in group["params"]:
-                    if param.grad is not None and not param.grad.is_sparse:
-                        self._prepare(group, param, mask, parts, lent, frozen)
-                        moved.append((group, param))
-                factor = None
-                for part in factors:
-                    if self.acts_on(part, group):
-                        factor = _times(factor, part.factor(group, course))
-                if factor is not None:
-                    lent.rate(group, factor, course.valid)
+                own = [[part for part in parts if self.acts_on(part, group)] for parts in hooks]
+                params = [p for p in group["params"] if p.grad is not None and not p.grad.is_sparse]
+                self._prepare(group, params, mask, own, lent)
+                moved += [(group, param, own[2]) for param in params]
             if isinstance(course.valid, Tensor) and self._drops_on_device():
                 lent.flag(self, course.valid)
             self._step_base(mask)
         finally:
             lent.take_back()
-        return moved, frozen
+        for group, param, parts in moved:
+            for part in parts:
+                part.after(group, param, self.state[param], course)
+            if course.keys:
+                self._ledger.remember(param, self.state[param], course.keys)
+        for rows in lent.frozen:
+            rows.put_back()
+
+    def _prepare(
+        self,
+        group: Group,
+        params: list[Tensor],
+        mask: Tensor | None,
+        own: list[list[Part]],
+        lent: Lent,
+    ) -> None:
+        """Lend the group what its step needs; `own` has the parts before, in and after it."""
+        befores, factors, afters = own
+        for param in params:
+            self._told |= guard(cast(Tensor, param.grad), self.course, self._told)
+            moving = self._moving(group, param, mask, bool(befores or afters))
+            if moving is not None or befores:
+                self._lend_gradient(group, param, moving, befores, lent)
+        factor = None
+        for part in factors:
+            factor = times(factor, part.factor(group, self.course))
+        if factor is not None:
+            lent.rate(group, factor, self.course.valid)
 
     def _step_base(self, mask: Tensor | None) -> None:
-        if self._base is Adam:
+        if self.base is Adam:
             ADAM_STEP(self)
             return
-        step = inspect.unwrap(self._base.step)
+        step = inspect.unwrap(self.base.step)
         if mask is None:
             step(self)
             return
@@ -207,138 +195,69 @@ class StepAdam(Adam):
         takes_number = len(inspect.signature(step).parameters) > 2  # INRIA's: step(mask, N)
         step(self, mask, mask.numel()) if takes_number else step(self, mask)
 
-    def _prepare(
-        self,
-        group: Group,
-        param: Tensor,
-        mask: Tensor | None,
-        parts: list[Part],
-        lent: Lent,
-        frozen: list[Frozen],
+    def _lend_gradient(
+        self, group: Group, param: Tensor, moving: Tensor | None, parts: list[Part], lent: Lent
     ) -> None:
         """Put what Adam is to be fed into `param.grad`."""
-        grad = param.grad
-        assert grad is not None
-        fed = grad
-        self._guard(grad)
-        moving = self._moving(group, param, mask)
-        if moving is None and not parts:
-            return
-        state = self.state[param]
+        fed, state = cast(Tensor, param.grad), self.state[param]
         if not state:  # torch makes its moments only where there is nothing else yet
             self._init_group({**group, "params": [param]}, [], [], [], [], [], [])
         if moving is not None:
-            frozen.append(Frozen(moving, param, state))
-            fed = torch.where(shaped(moving, grad), grad, 0.0)
+            lent.frozen.append(Frozen(moving, param, state))
+            fed = torch.where(shaped(moving, fed), fed, 0.0)
+        self._ledger.drop_strangers(param, state, self.course.keys)
         if parts:
-            self._ledger.drop_strangers(param, state, self.course.keys)
-            # Parts get the gradient of what is minimised, in unscaled units.
             scale = getattr(self, "grad_scale", None)
-            unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
-            plain = scale is None and unit == 1.0
-            fed = fed if plain else fed / unit
-            for part in parts:
-                fed = part.before(group, param, fed, state, self.course)
-            fed = fed if plain else fed * unit
-        if fed is not grad:
+            fed = feed(parts, group, param, fed, state, self.course, scale)
+        if fed is not param.grad:
             lent.attribute(param, "grad", fed)
 
-    def _guard(self, grad: Tensor) -> None:
-        """Take a gradient that is not finite as zero, number by number, in place."""
-        if grad.device.type == "cpu":
-            # The sum is finite unless a summand is not, or it overflows.
-            if math.isfinite(abs(grad.sum().item())):
-                return
-            if not self._told:
-                self._told = True
-                LOGGER.warning(
-                    "iteration %d: a gradient of shape %s is not finite; such numbers are taken "
-                    "as zero, here and later", self.course.current, tuple(grad.shape)
-                )  # fmt: skip
-        grad.nan_to_num_(0.0, 0.0, 0.0)
-
-    def _moving(self, group: Group, param: Tensor, mask: Tensor | None) -> Tensor | None:
-        """The rows that this step may move, [N] or 0-d bool; None: all."""
+    def _moving(
+        self, group: Group, param: Tensor, mask: Tensor | None, with_parts: bool
+    ) -> Tensor | None:
+        """The rows that may move, [N] or 0-d bool; None: all, or the base's own step knows."""
+        valid = self.course.valid
         if mask is not None and self._takes_mask(group, mask.numel()):
-            if self._base is not Adam and not self.course.hooks("after"):
-                return None  # its own masked step leaves the others alone
+            if self.base is not Adam and not with_parts:
+                return None
             rows = mask.to(param.device)
-            return rows & self.course.valid if isinstance(self.course.valid, Tensor) else rows
-        dropped = isinstance(self.course.valid, Tensor) and not self._drops_on_device()
-        return self.course.valid if dropped else None  # pyright: ignore[reportReturnType]
+            return rows & valid if isinstance(valid, Tensor) else rows
+        return valid if isinstance(valid, Tensor) and not self._drops_on_device() else None
 
     def _drops_on_device(self) -> bool:
         """Whether torch's own step can be told on the device not to be made."""
-        return self._base is Adam and all(group["fused"] for group in self.param_groups)
-
-    def _finish(self, group: Group, param: Tensor) -> None:
-        """After the parameter has moved and the group's rate is its own again."""
-        state = self.state[param]
-        for part in self.course.hooks("after"):
-            if self.acts_on(part, group):
-                part.after(group, param, state, self.course)
-        if self.course.keys:
-            self._ledger.remember(param, state, self.course.keys)
-
-    # -- masks ---------------------------------------------------------------------------------
+        return self.base is Adam and all(group["fused"] for group in self.param_groups)
 
     def _takes_mask(self, group: Group, rows: int) -> bool:
         """Whether a mask of so many rows is about this group."""
-        if slot(group) is not None:
+        if group.get(SLOT) is not None:
             return True
         return self.any_group and any(p.shape[:1] == (rows,) for p in group["params"])
 
     def _check_mask(self, mask: Tensor) -> None:
-        """Only against parameters with a gradient: a mask may be older than the others' rows."""
         call, rows = f"{type(self).__name__}.step", mask.numel()
-        present = [
-            (self._takes_mask(group, rows), param)
-            for group in self.param_groups
-            for param in group["params"]
-            if param.grad is not None
-        ]
-        shapes = [tuple(param.shape) for takes, param in present if takes]
-        if present and (not shapes or any(shape[:1] != (rows,) for shape in shapes)):
-            shapes = shapes or [tuple(param.shape) for _, param in present]
-            raise ValueError(
-                f"{call}: the mask has {rows} rows, but the parameters have shapes {shapes}; a "
-                "mask of their first dimension is needed"
-            )
+        taking = [self._takes_mask(group, rows) for group in self.param_groups]
+        every = list(zip(taking, self.param_groups, strict=True))
+        check_mask_rows(call, rows, [(takes, p) for takes, g in every for p in g["params"]])
         if self.defaults["differentiable"]:
             raise ValueError(f"{call}: a mask with differentiable=True is not possible")
 
     def reset_points(self, rows: Tensor, *, moments: bool = False) -> None:
-        """Say which points have moved by other means than `step()`; see `reset_points`."""
-        mask = rows.dtype == torch.bool
-        groups = [g for g in self.param_groups if self.any_group or slot(g) is not None]
-        every = [p for group in groups for p in group["params"]]
-        fitting = [p for p in every if p.dim() > 0 and (not mask or rows.shape == p.shape[:1])]
-        if every and not fitting:
-            raise ValueError(
-                f"{type(self).__name__}.reset_points: rows has shape {tuple(rows.shape)}, but a "
-                f"mask of the first dimension of {[tuple(p.shape) for p in every]} is needed"
-            )
-        for param in fitting:
-            state = self.state.get(param, {})
-            for key in [key for key in self.course.keys if key in state]:
-                if self._ledger.edited_along(param, state, key):
-                    state[key][rows.to(param.device)] = 0
-                    self._ledger.remember(param, state, (key,))
-                else:
-                    del state[key]
-            for key in ("exp_avg", "exp_avg_sq", "max_exp_avg_sq") if moments else ():
-                if key in state and state[key].shape[0] == param.shape[0]:
-                    state[key][rows.to(param.device)] = 0
+        """See the function `reset_points`."""
+        groups = [g for g in self.param_groups if self.any_group or g.get(SLOT) is not None]
+        states = [(p, self.state.get(p, {})) for group in groups for p in group["params"]]
+        call = f"{type(self).__name__}.reset_points"
+        self._ledger.forget(call, states, self.course.keys, rows, moments)
 
     # -- copies and checkpoints ----------------------------------------------------------------
 
-    def _trust_rows(self) -> None:
+    def trust_rows(self) -> None:
         """Take what the parts have kept as that of the parameters' present rows."""
         for param, state in self.state.items():
             self._ledger.remember(param, state, self.course.keys)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "course": self.course, "_base": self._base}
+        return {**super().__getstate__(), "course": self.course, "base": self.base}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         is_copy = "course" in state
@@ -349,7 +268,7 @@ class StepAdam(Adam):
         super().__setstate__(state)
         if is_copy:  # the parameters are other objects, the rows the same
             self._ledger = Ledger()
-            self._trust_rows()
+            self.trust_rows()
 
     def state_dict(self) -> dict[str, Any]:
         """torch's, with the course's inside `param_groups[0]`, and nothing of strangers' rows."""
@@ -370,62 +289,9 @@ class StepAdam(Adam):
         Raises:
             ValueError: it does not fit; then nothing has been loaded.
         """
-        before = self.state, self.param_groups
-        names = [group.get(SLOT) for group in self.param_groups]
-        super().load_state_dict(state_dict)
-        try:
-            self.take_loaded()
-        except ValueError:
-            self.state, self.param_groups = before
-            raise
-        for group, name in zip(self.param_groups, names, strict=True):
-            if name is not None:
-                group[SLOT] = name
-        if self._base is Adam and self.defaults["fused"]:
-            self._use_fused()
-        self._trust_rows()
-
-    def take_loaded(self) -> None:
-        """Take the course's state out of the groups, where a checkpoint has put it."""
-        shared = self.param_groups[0].pop(STATE_KEY, None)
-        if shared is not None:
-            self.course.load_state_dict(shared)
-        else:
-            steps = [float(state["step"]) for state in self.state.values() if "step" in state]
-            self.course.expect(int(max(steps, default=0)))
+        with loading(self):
+            super().load_state_dict(state_dict)
 
     def __repr__(self) -> str:
         lines = [str(part) for part in self.course.parts] + group_lines(self.param_groups)
         return block(type(self).__name__, lines)
-
-
-def _is_captured() -> bool:
-    return torch.cuda.is_initialized() and torch.cuda.is_current_stream_capturing()
-
-
-def _times(factor: float | Tensor | None, other: float | Tensor | None) -> float | Tensor | None:
-    if factor is None or other is None:
-        return other if factor is None else factor
-    return factor * other
-
-
-def reset_points(optimizers: Any, rows: Tensor, *, moments: bool = False) -> None:
-    """Say which points have moved by other means than the optimizers: what parts kept of them goes.
-
-    For a trainer that knows what its density control did. Call it after each edit of the
-    parameters: curvature pairs of all other points stay in use, where they would otherwise be
-    dropped with the exchanged Parameter object. The state's rows must have been edited along
-    (gsplat does; INRIA's edits leave the pairs behind, and they are dropped).
-
-    Args:
-        optimizers: an upgraded optimizer, or a dict of them (others in it are left alone).
-        rows: [N] bool mask or a vector of indices, of the points as they are now.
-        moments: whether to start their Adam moments anew too.
-
-    Raises:
-        ValueError: a mask fits no parameter.
-    """
-    every = optimizers.values() if isinstance(optimizers, Mapping) else [optimizers]
-    for optimizer in every:
-        if isinstance(optimizer, StepAdam):
-            optimizer.reset_points(rows, moments=moments)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from torch.optim import Adam
 
+from opt3dgs_optim.checkpoint import take_loaded
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.describe import group_name
 from opt3dgs_optim.names import SLOT, canonical_name
@@ -70,7 +71,7 @@ def take(found: Found, course: Course) -> None:
     vars(optimizer).pop("step", None)  # a learning-rate scheduler's wrapper of the old class's
     optimizer.__class__ = StepAdam
     optimizer.follow(course, found.base)
-    optimizer.take_loaded()
+    take_loaded(optimizer)
 
 
 def _base_of(optimizer: Any, shown: str) -> type[Adam]:

@@ -8,13 +8,20 @@ from typing import Any
 
 import pytest
 import torch
-from trainers import edit_rows, gsplat_optimizers, inria_optimizer, make_splats, only, state_of, train
+from trainers import (
+    edit_rows,
+    gsplat_optimizers,
+    inria_optimizer,
+    make_splats,
+    only,
+    state_of,
+    train,
+)
 
 from opt3dgs_optim import Fading, PhaseScheduler
 
 TOTAL = 60
 CPU = torch.device("cpu")
-
 
 
 def test_events_are_spread_evenly_and_each_happens_once() -> None:
@@ -138,7 +145,9 @@ def test_an_iteration_that_jumps_loses_no_event() -> None:
 
 
 def test_several_steps_per_iteration_fade_once() -> None:
-    assert torch.allclose(trained(EVENTS, range(1, 100), 3), trained(EVENTS, range(1, 100)), atol=1e-3)
+    assert torch.allclose(
+        trained(EVENTS, range(1, 100), 3), trained(EVENTS, range(1, 100)), atol=1e-3
+    )
 
 
 def test_a_rewound_training_does_not_fade_what_is_over() -> None:

@@ -107,3 +107,50 @@ def adam_steps(
         m_hat, v_hat = m / (1 - betas[0] ** t), v / (1 - betas[1] ** t)
         x = x - lr * factor * m_hat / (np.sqrt(v_hat) + eps)
     return x
+
+
+class MovingHistogram:
+    """Partitions of the energy's recent deviations, with sums over the partitions."""
+
+    def __init__(self, warmup: int, clamp: tuple[float, float] | None, m: int = 48) -> None:
+        self.m, self.warmup, self.clamp = m, warmup, clamp
+        self.q = np.full(m, 1 / m)
+        self.mean = self.absolute = self.mean_slope = 0.0
+        self.k = 0
+
+    @property
+    def deviation(self) -> float:
+        """Of a Gaussian with this mean absolute deviation."""
+        return self.absolute * math.sqrt(math.pi / 2)
+
+    def visit(self, z: float) -> np.ndarray:
+        """A Gaussian of 0.4 deviations around z, over the partitions' centers."""
+        centers = (np.arange(self.m) + 0.5) * 12 / self.m - 6
+        exponent = centers * z / 0.16 - centers**2 / 0.32
+        return np.exp(exponent - exponent.max()) / np.exp(exponent - exponent.max()).sum()
+
+    def observe(self, energy: float) -> float:
+        """nu from the density as it is, then its update."""
+        self.k += 1
+        if self.k == 1:
+            self.mean = energy
+        distance = energy - self.mean
+        unit = self.absolute + 1e-6 * abs(distance)
+        limit = 4 * math.sqrt(math.pi / 2) if self.k > 4 else 1e6
+        t = min(max(distance / unit, -limit), limit) if unit else 0.0
+        z = t * math.sqrt(2 / math.pi)
+        kernel = self.visit(z)
+        # d log q / dz of q read through the kernel: that of exp(-(c - z)^2 / 2 h^2)
+        centers = (np.arange(self.m) + 0.5) * 12 / self.m - 6
+        read = kernel * self.q
+        slope = ((centers - z) * read).sum() / 0.16 / (read.sum() + 0.05 / self.m)
+        slope *= 0.5 * 1.32  # 1 + 2 * 0.4^2: two Gaussians of 0.4 widen the density
+        nu = 1 + slope - self.mean_slope
+        if self.clamp is not None:
+            nu = min(max(nu, self.clamp[0]), self.clamp[1])
+        rate = max(1 / self.k, 0.01)
+        self.mean += rate * t * unit
+        self.absolute += rate * (abs(t * unit) - self.absolute)
+        self.mean_slope += rate * (slope - self.mean_slope)
+        self.q += rate * (kernel - self.q)
+        return nu if self.k > self.warmup else 1.0

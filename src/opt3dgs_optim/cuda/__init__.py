@@ -59,19 +59,15 @@ def compile_cubin(
         dtype: torch.float32 or torch.float64.
         arch: without one, cuda.core would ask the driver.
         history_size: K; of "lqn.cu" only.
-        cache: a cuda.core program cache.
-        logs: an object with `write`, for what the compiler says.
-        ptxas_options: for the assembler, such as "-v".
+        cache, logs, ptxas_options: cuda.core's.
 
     Returns:
         cuda.core's ObjectCode.
     """
     core = importlib.import_module("cuda.core")
+    defined = macros(dtype, history_size) or None
     options = core.ProgramOptions(
-        arch=arch,
-        std="c++17",
-        define_macro=macros(dtype, history_size) or None,
-        ptxas_options=ptxas_options,
+        arch=arch, std="c++17", define_macro=defined, ptxas_options=ptxas_options
     )
     return core.Program(source(name), "c++", options).compile("cubin", logs=logs, cache=cache)
 
@@ -110,14 +106,9 @@ def launch(
     *arguments: Tensor | np.generic | int,
     history_size: int | None = None,
 ) -> None:
-    """Run a kernel on the device and current stream of `like`, compiled for its dtype.
+    """Run a kernel of `KERNELS` on the device and current stream of `like`, for its dtype.
 
-    Args:
-        kernel: a key of `KERNELS`.
-        like: float32 or float64.
-        threads: at least as many are started; none for 0.
-        arguments: contiguous tensors, as their addresses, and numpy numbers of C's size.
-        history_size: K, of the kernels that are compiled for it.
+    `arguments` are contiguous tensors, passed as their addresses, and numpy numbers of C's size.
     """
     if threads == 0:
         return
@@ -180,9 +171,10 @@ def add_covariance_noise(
     A learning rate on the GPU is read there, when the kernel runs; one on the CPU is passed on.
     """
     rows, real = means.shape[0], _real(means.dtype)
-    on_device = isinstance(lr, Tensor) and lr.is_cuda
-    rate = lr.to(torch.float32) if on_device else 0  # a null pointer
-    factor = noise_scale if on_device else noise_scale * float(lr)
+    if isinstance(lr, Tensor) and lr.is_cuda:
+        rate, factor = lr.to(torch.float32), noise_scale
+    else:
+        rate, factor = 0, noise_scale * float(lr)  # a null pointer
     target = means.contiguous()
     tensors = (tensor.contiguous() for tensor in (scales, quats, opacities, eta))
     numbers = (real(value) for value in (factor, sharpness, threshold))
@@ -201,7 +193,8 @@ def missing() -> str | None:
     except ModuleNotFoundError:
         found = False
     if not found:
-        return "cuda.core is not installed (pip install 'opt3dgs_optim[cuda]')"
+        extra = "cuda12" if (torch.version.cuda or "").startswith("12") else "cuda"
+        return f"cuda.core is not installed (pip install 'opt3dgs_optim[{extra}]')"
     if not torch.cuda.is_available():
         return "torch sees no CUDA device: no NVIDIA driver, or a build of torch without CUDA"
     try:

@@ -7,8 +7,13 @@
 
 static constexpr int LANES = History<Real, HISTORY_SIZE>::lanes;
 
-// More blocks asked for per multiprocessor make ptxas use more registers here, up to spills.
-extern "C" __global__ void __launch_bounds__(128)
+// A history in registers spills unless ptxas may take as many as it likes; a longer one needs fewer.
+#if HISTORY_SIZE <= 5
+#define LQN_BOUNDS __launch_bounds__(128, 1)
+#else
+#define LQN_BOUNDS __launch_bounds__(128)
+#endif
+extern "C" __global__ void LQN_BOUNDS
     lqn_direction(const Real* __restrict__ positions, const Real* __restrict__ grads, Real* histories,
                   Real* __restrict__ directions, unsigned char* __restrict__ accepted,
                   unsigned char* __restrict__ candidates, long long rows, Real min_cosine, int graft) {
@@ -22,7 +27,7 @@ extern "C" __global__ void __launch_bounds__(128)
   candidates[row] = flags.candidate;
 }
 
-extern "C" __global__ void __launch_bounds__(128)
+extern "C" __global__ void LQN_BOUNDS
     two_loop(const Real* __restrict__ grads, Real* histories, Real* __restrict__ results, long long rows) {
   const long long row = static_cast<long long>(blockIdx.x) * blockDim.x + threadIdx.x;
   if (row >= rows) return;

@@ -1,4 +1,4 @@
-// The arithmetic of one point, for the GPU and, through tests/support/cuda_host_shim.h, for a host compiler.
+// The arithmetic of one point, for the GPU and, through tests/cuda/cuda_host_shim.h, for a host compiler.
 // No includes, no barriers, no shared memory, no atomics: one thread, one point.
 // The same formulas in the same order as in opt3dgs_optim/lbfgs.
 #pragma once

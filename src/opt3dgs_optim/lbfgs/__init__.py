@@ -12,8 +12,7 @@ from opt3dgs_optim.lbfgs.history import (
     laid_out,
     new_history,
 )
-from opt3dgs_optim.lbfgs.lqn_direction import lqn_direction
-from opt3dgs_optim.lbfgs.two_loop import two_loop
+from opt3dgs_optim.lbfgs.two_loop import lqn_direction, two_loop
 
 __all__ = [
     "MAX_HISTORY",

@@ -5,9 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.lbfgs.columns import columns, row_chunks
 from opt3dgs_optim.lbfgs.history import header
-from opt3dgs_optim.lbfgs.pairs import dot, length
+from opt3dgs_optim.lbfgs.pairs import columns, dot, length, row_chunks
 from opt3dgs_optim.lbfgs.two_loop import two_loop
 
 

@@ -13,9 +13,8 @@ The header holds the point's last visible position and gradient and a counter. W
 into the spare lanes of slots 0 .. D (slots = K: no further memory, 160 bytes per point in float32
 for K = 5, D = 3); otherwise it gets a slot of its own (slots = K + 1).
 
-A new pair moves the older ones down a slot. A ring would write less, but every reader would have
-to gather by row, which costs torch more than all the arithmetic; and the header dirties the same
-memory sectors anyway. In memory, a history that torch computes on is transposed (strides of a
+A new pair moves the older ones down a slot: a ring would write less, but every reader would have to
+gather by row. In memory, a history that torch computes on is transposed (strides of a
 [slots, lanes, N] tensor), one that the CUDA kernel computes on is contiguous; every function here
 takes both.
 """
@@ -27,8 +26,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.lbfgs.columns import columns
-from opt3dgs_optim.lbfgs.pairs import Pair, normalised_pair
+from opt3dgs_optim.lbfgs.pairs import Pair, columns, normalised_pair
 
 MAX_HISTORY = 16
 
@@ -46,9 +44,9 @@ def new_history(points: Tensor, history_size: int, *, contiguous: bool = False) 
     """
     dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
     rows, *cells = history_shape(points, history_size)
-    if contiguous:
-        return torch.zeros(rows, *cells, dtype=dtype, device=points.device)
-    return torch.zeros(*cells, rows, dtype=dtype, device=points.device).movedim(-1, 0)
+    shape = (rows, *cells) if contiguous else (*cells, rows)
+    zeros = torch.zeros(shape, dtype=dtype, device=points.device)
+    return zeros if contiguous else zeros.movedim(-1, 0)
 
 
 def laid_out(history: Tensor, *, contiguous: bool) -> Tensor:
@@ -108,14 +106,10 @@ def push(history: Tensor, history_size: int, pair: Pair, accept: Tensor) -> None
 
 
 def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:
-    """A history tensor of K given pairs per point, oldest first.
+    """A history for `two_loop(grad, history, K)` of K given pairs per point, oldest first.
 
     Args:
-        s: [K, N, D] parameter differences.
-        y: [K, N, D] gradient differences, with s.y > 0.
-
-    Returns:
-        A history for `two_loop(grad, history, history_size=K)`.
+        s, y: [K, N, D] parameter and gradient differences, with s.y > 0.
     """
     size = s.shape[0]
     history = new_history(s[0], size)

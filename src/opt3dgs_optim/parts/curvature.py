@@ -118,15 +118,16 @@ class Curvature(Part):
             graft=self.graft,
             backend=self.backend,
         )
-        self._count(torch.stack([accepted.sum(), candidates.sum()]), course)
+        self._count(torch.stack([accepted.count_nonzero(), candidates.count_nonzero()]), course)
         return fed.reshape(grad.shape)
 
     def _history(self, state: dict[str, Any], position: Tensor) -> Tensor:
         shape = history_shape(position, self.history_size)
-        kernel = position.shape[1] == 3 and uses_kernel(
-            self.backend, position.device, position.dtype
+        kernel = position.is_cuda and uses_kernel(
+            self.backend, position.device, position.dtype, position.shape[1]
         )
         if HISTORY not in state or tuple(state[HISTORY].shape) != shape:
+            state.pop(HISTORY, None)  # before the new one, or both would be in memory
             state[HISTORY] = new_history(position, self.history_size, contiguous=kernel)
         state[HISTORY] = laid_out(state[HISTORY], contiguous=kernel)
         return state[HISTORY]

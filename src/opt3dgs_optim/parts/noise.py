@@ -11,7 +11,7 @@ from torch import Tensor
 from opt3dgs_optim.backend import BACKENDS, Backend
 from opt3dgs_optim.checks import check_choice, check_number, warn_user
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.covariance import GATE_OPACITY, GATE_SHARPNESS, add_covariance_noise
+from opt3dgs_optim.covariance import add_covariance_noise, largest_noise
 from opt3dgs_optim.part import Group, Part, Phase
 
 GaussianTensors = Mapping[str, Tensor]
@@ -28,8 +28,8 @@ class PositionNoise(Part):
 
     Args:
         gaussians: the trainer's dict with `scales` [N, 3] log, `quats` [N, 4] wxyz and
-            `opacities` [N] or [N, 1] logits, or a function that returns it. It is read anew in
-            every step, because density control replaces the tensors in it.
+            `opacities` [N] or [N, 1] logits, or a function that returns it; read in every step,
+            because density control replaces the tensors in it.
         scale: noise_lr of 3DGS-MCMC.
         during: the phase in which it is added; None: both.
         generator: random generator of the parameters' device, or None for torch's own.
@@ -105,9 +105,7 @@ class PositionNoise(Part):
     def add_to(self, means: Tensor, lr: float | Tensor, valid: Tensor | bool = True) -> None:
         """Add the noise to `means` [N, 3] in place; lr is their present learning rate."""
         source = self.tensors(means.shape[0])
-        rate = lr if isinstance(lr, Tensor) else torch.tensor(lr, dtype=torch.float64)
-        if isinstance(valid, Tensor):
-            rate = torch.where(valid, rate, 0.0)
+        rate = torch.where(valid, lr, 0.0) if isinstance(valid, Tensor) else lr
         add_covariance_noise(
             means,
             *(source[name].detach() for name in ("scales", "quats", "opacities")),
@@ -118,17 +116,10 @@ class PositionNoise(Part):
         )
 
     def evidence(self, course: Course) -> Tensor:
-        """[1]: the largest noise of any Gaussian, in learning rates of the positions.
-
-        Noise is lr * scale * gate * Sigma eta (eq. 2), so its deviation along the longest axis is
-        lr * scale * gate * s^2; an Adam step is about lr.
-        """
+        """[1]: the largest noise of any Gaussian, in learning rates of the positions."""
         source = self.tensors()
-        scales, opacities = source["scales"].detach(), source["opacities"].detach().reshape(-1)
-        if scales.numel() == 0:
-            return scales.new_zeros(1)
-        gate = torch.sigmoid(-GATE_SHARPNESS * (torch.sigmoid(opacities) - GATE_OPACITY))
-        return (self.scale * (gate * (2 * scales.amax(1)).exp()).amax()).reshape(1)
+        scales, opacities = source["scales"].detach(), source["opacities"].detach()
+        return largest_noise(scales, opacities, self.scale).reshape(1)
 
     def useless(self, evidence: list[float], course: Course) -> str | None:
         """Where no Gaussian is near the opacity gate; looked at again at every check."""

@@ -1,0 +1,129 @@
+"""The examples' rasterizer as trainers call theirs: activated values, 2D gradients, any camera."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from splatting.camera import Camera
+from splatting.projection import perspective_jacobians, rotation_matrices
+from splatting.rasterizer import render
+from splatting.spherical_harmonics import SH_0, sh_colors
+from torch import Tensor
+
+BLUR = 0.3  # pixels^2, as the trainers' rasterizers add it
+
+
+class View(NamedTuple):
+    """A pinhole camera whose pose may carry gradients."""
+
+    viewmat: Tensor  # [4, 4] world to camera
+    fx: float  # pixels
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def still(self) -> Camera:
+        """The camera at the origin, looking along z."""
+        eye = torch.eye(4, dtype=self.viewmat.dtype)
+        return Camera(eye, self.fx, self.fy, self.cx, self.cy, self.width, self.height)
+
+
+class Drawn(NamedTuple):
+    """A rendering, and what density control asks for."""
+
+    image: Tensor  # [H, W, 3]
+    alpha: Tensor  # [H, W]
+    visible: Tensor  # [N] bool
+    means2d: Tensor  # [N, 2] pixels, without gradients
+    radii: Tensor  # [N] pixels, three standard deviations, 0 where not visible
+    depths: Tensor  # [N] world units, with gradients
+
+
+def draw(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    view: View,
+    background: Tensor | None = None,
+    offset: Tensor | None = None,
+) -> Drawn:
+    """Render Gaussians given by their activated values.
+
+    The Gaussians are moved into the camera's frame first, so that the pose gets gradients from
+    any rasterizer. A shift in pixels becomes one in that frame; the covariance's small dependence
+    on it is in its gradient too, which the trainers' own rasterizers leave out.
+
+    Args:
+        means: [N, 3] world units.
+        quats: [N, 4] wxyz.
+        scales: [N, 3] world units.
+        opacities: [N] in 0..1.
+        colors: [N, 3], at least 0.
+        view: the camera.
+        background: [3].
+        offset: [N, 2] pixels, zeros whose gradient is that of the projected means.
+    """
+    rotation, shift = view.viewmat[:3, :3], view.viewmat[:3, 3]
+    inside = means @ rotation.T + shift
+    depths = inside[:, 2]
+    if offset is not None:
+        focal = torch.tensor([view.fx, view.fy], dtype=means.dtype)
+        pixels = offset * depths.detach().clamp(min=1e-6)[:, None] / focal
+        inside = inside + torch.cat([pixels, torch.zeros_like(pixels[:, :1])], 1)
+    camera = view.still()
+    gaussians = {
+        "means": inside,
+        "quats": _product(_quaternion(rotation), quats),
+        "scales": scales.clamp(min=1e-20).log(),
+        "opacities": torch.logit(opacities.clamp(1e-7, 1 - 1e-7)),
+        "sh0": ((colors - 0.5) / SH_0)[:, None],
+    }
+    rendering = render(gaussians, camera, sh_degree=0, background=background)
+    with torch.no_grad():
+        means2d, radii = _footprints(inside, gaussians["quats"], scales, camera)
+        radii = torch.where(rendering.visible, radii, torch.zeros_like(radii))
+    return Drawn(rendering.image, rendering.alpha, rendering.visible, means2d, radii, depths)
+
+
+def view_colors(means: Tensor, coefficients: Tensor, degree: int, viewmat: Tensor) -> Tensor:
+    """Colours [N, 3] of spherical harmonics [N, K, 3] up to a degree, seen from a camera."""
+    position = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    return sh_colors(means, position, coefficients[:, : (degree + 1) ** 2], degree)
+
+
+def _footprints(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> tuple:
+    """Projected means [N, 2], and radii [N] of three standard deviations, in whole pixels."""
+    z = means[:, 2:].clamp(min=1e-6)
+    focal = torch.tensor([camera.fx, camera.fy], dtype=means.dtype)
+    means2d = means[:, :2] / z * focal + torch.tensor([camera.cx, camera.cy], dtype=means.dtype)
+    front = torch.cat([means[:, :2], z], 1)
+    half = perspective_jacobians(front, camera) @ (rotation_matrices(quats) * scales[:, None])
+    covariance = half @ half.transpose(1, 2) + BLUR * torch.eye(2, dtype=means.dtype)
+    middle = covariance.diagonal(dim1=1, dim2=2).mean(1)
+    spread = (middle.square() - torch.linalg.det(covariance)).clamp(min=0.1).sqrt()
+    return means2d, (3 * (middle + spread).sqrt()).ceil()
+
+
+def _quaternion(rotation: Tensor) -> Tensor:
+    """wxyz of a rotation matrix [3, 3], not normalised: the best conditioned of four forms."""
+    m = rotation
+    (a, b, c), (d, e, f), (g, h, i) = m[0], m[1], m[2]
+    forms = [
+        torch.stack([1 + a + e + i, h - f, c - g, d - b]),
+        torch.stack([h - f, 1 + a - e - i, b + d, c + g]),
+        torch.stack([c - g, b + d, 1 - a + e - i, f + h]),
+        torch.stack([d - b, c + g, f + h, 1 - a - e + i]),
+    ]
+    return forms[int(torch.stack([form[k] for k, form in enumerate(forms)]).argmax())]
+
+
+def _product(left: Tensor, right: Tensor) -> Tensor:
+    """left [4] times each of right [N, 4], wxyz."""
+    w, x, y, z = (left / left.norm()).unbind()
+    rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
+    return right @ torch.stack([torch.stack(row) for row in rows]).T

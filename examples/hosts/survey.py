@@ -1,0 +1,220 @@
+"""Which trainers `hosts diff` edits, and what ran: makes docs/hosts/survey.md.
+
+    python examples/hosts/survey.py --trainers DIR --write
+    python examples/hosts/survey.py --trainers DIR --scene SCENE --run --write
+
+DIR has a folder for each repository. Without `--run` the trainings of the last time stay in the
+page, with their date; they are kept in survey.json beside it. `--run` needs an hour of two cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import platform
+import re
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import torch
+from hosts.trials import ITERATIONS, TRIALS, Done, Trial, copy_scene, edited_copy, run
+
+from opt3dgs_optim import __version__
+from opt3dgs_optim.hosts import diff
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "hosts" / "survey.md"
+SCRIPTS = ("*train*.py", "prune_finetune.py")
+OTHERS = re.compile(
+    r"(^|/)(submodules|tests?|scripts|docs|utils?|preprocess|ext|internal|Tracking[^/]*)/"
+)
+MORE = ("sugar_trainers/*.py", "nerfstudio/engine/trainer.py", "internal/gaussian_splatting.py")
+NEVER = "the lines to add by hand are printed"
+
+
+@dataclass(frozen=True)
+class Script:
+    """What `diff` says of one file."""
+
+    trainer: str
+    path: str
+    commit: str
+    edited: bool
+    said: str  # notes, or why it is refused
+    lines: int
+
+
+def scripts_of(folder: Path) -> list[Path]:
+    """The training scripts of a repository."""
+    found = {p for pattern in SCRIPTS for p in folder.rglob(pattern)}
+    kept = {p for p in found if not OTHERS.search(str(p.relative_to(folder)))}
+    kept |= {p for pattern in MORE for p in folder.glob(pattern)}
+    return sorted(p for p in kept if "backward(" in p.read_text(errors="ignore"))
+
+
+def commit_of(folder: Path) -> str:
+    """The short commit, of git or of a file `.commit` in the folder."""
+    if (folder / ".commit").is_file():
+        words = (folder / ".commit").read_text().split()
+        return f"{words[0][:7]} ({words[-1]})"
+    command = ["git", "-C", str(folder), "log", "-1", "--format=%h (%cs)"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return done.stdout.strip() or "unknown"
+
+
+def survey(trainers: Path) -> list[Script]:
+    """`diff` over every training script."""
+    rows = []
+    for folder in sorted(p for p in trainers.iterdir() if p.is_dir()):
+        for path in scripts_of(folder):
+            name = str(path.relative_to(folder))
+            try:
+                done = diff(path)
+            except ValueError as error:
+                rows.append(Script(folder.name, name, commit_of(folder), False, str(error), 0))
+                continue
+            lines = len(re.findall(r"^\+(?!\+\+)", done.diff, re.M))
+            notes = "; ".join(done.notes)
+            rows.append(Script(folder.name, name, commit_of(folder), True, notes, lines))
+    return rows
+
+
+# -- trainings -------------------------------------------------------------------------------------
+
+
+def outcome(trial: Trial, trainers: Path, scene: Path, work: Path) -> dict[str, Any]:
+    """Stock, edited, and going on from both checkpoints."""
+    stock_script = trainers / trial.trainer / trial.script
+    script = edited_copy(trial, trainers, work / "edited" / trial.trainer)
+    folder = work / re.sub(r"\W+", "_", trial.name)
+    row: dict[str, Any] = {"name": trial.name, "commit": commit_of(trainers / trial.trainer)}
+
+    def train(file: Path, out: str, *more: str) -> Done:
+        command = trial.command(scene, folder / out, ITERATIONS)
+        return run(file, [*command, *more], folder / "cwd", trusted=True)
+
+    stock, ours = train(stock_script, "stock"), train(script, "ours")
+    row["stock"], row["ours"] = _shown(stock), _shown(ours)
+    checkpoint = trial.checkpoint(folder / "ours", ITERATIONS)
+    row["checkpoint"] = "yes" if checkpoint.is_file() else "-"
+    row["resume"] = "-"
+    if checkpoint.is_file() and not trial.gsplat:
+        own = train(script, "again", *trial.going_on(checkpoint))
+        theirs = trial.checkpoint(folder / "stock", ITERATIONS)
+        other = train(script, "taken", *trial.going_on(theirs)) if theirs.is_file() else own
+        row["resume"] = f"own: {_shown(own)}; stock's: {_shown(other)}"
+    return row
+
+
+def _kept(rows: list[dict[str, Any]], new: dict[str, Any], scene: str) -> dict[str, Any]:
+    """The trainings to keep: the new one in the place of an old one."""
+    known = [trial.name for trial in TRIALS]
+    every = {row["name"]: row for row in rows if row["name"] in known} | {new["name"]: new}
+    return {
+        "iterations": ITERATIONS,
+        "scene": scene,
+        "date": datetime.date.today().isoformat(),
+        "torch": torch.__version__,
+        "machine": f"{platform.machine()}, Python {platform.python_version()}",
+        "rows": sorted(every.values(), key=lambda row: known.index(row["name"])),
+    }
+
+
+def _shown(done: Done) -> str:
+    if done.code == 0:
+        return f"{done.psnr:.2f} dB" if done.psnr is not None else "runs"
+    return f"stops: {done.reason[:90]}"
+
+
+# -- the page --------------------------------------------------------------------------------------
+
+
+def page(rows: list[Script], trials: dict[str, Any]) -> str:
+    """The page's text."""
+    edited = [row for row in rows if row.edited]
+    names = {row.trainer for row in rows}
+    trainings = []
+    if trials["rows"]:
+        trainings = [
+            f"{trials['iterations']} iterations of the real script on a CPU through `on_cpu.py`, "
+            f"on {trials['scene']}, stock and with the lines; PSNR of the test views at the end. "
+            "So short a run shows that the lines work, not what they gain. "
+            f"{trials['date']}, torch {trials['torch']}, {trials['machine']}."
+        ]
+    text = [
+        "# Which trainers were tried",
+        "",
+        "`python examples/hosts/survey.py --trainers DIR --write` makes this page"
+        f" (opt3dgs_optim {__version__}, {datetime.date.today().isoformat()}).",
+        "",
+        "## Trainings",
+        "",
+        *trainings,
+        "",
+        "| trainer and options | commit | stock | edited | checkpoint | resume |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in trials["rows"]:
+        cells = (row[key] for key in ("name", "commit", "stock", "ours", "checkpoint", "resume"))
+        text.append("| " + " | ".join(_cell(c) for c in cells) + " |")
+    text += [
+        "",
+        "gsplat's scripts evaluate a checkpoint and do not go on from one.",
+        "",
+        "## `hosts diff` over public trainers",
+        "",
+        f"{len(rows)} training scripts of {len(names)} repositories: {len(edited)} are edited "
+        "(each result compiles and defines every name it uses), the others are refused; "
+        f"for these {NEVER}.",
+        "",
+        "| trainer | script | commit | lines | notes, or why it is refused |",
+        "|---|---|---|---|---|",
+    ]
+    for row in rows:
+        said = row.said if row.edited else f"**refused**: {row.said}"
+        cells = (row.trainer, row.path, row.commit, str(row.lines or "-"), said)
+        text.append("| " + " | ".join(_cell(c) for c in cells) + " |")
+    return "\n".join(text) + "\n"
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n", " ").replace("<", "&lt;") or "-"
+
+
+def main() -> None:
+    """Survey, run if asked for, and print or write the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--trainers", type=Path, required=True, help="a folder of repositories")
+    parser.add_argument("--scene", type=Path, help="a COLMAP scene with images and images_4")
+    parser.add_argument("--run", action="store_true", help="run the trainings too")
+    parser.add_argument("--only", default="", help="run only those whose name contains this")
+    parser.add_argument("--write", action="store_true", help=f"write {PAGE.name}")
+    options = parser.parse_args()
+    kept = PAGE.with_suffix(".json")
+    trials = json.loads(kept.read_text()) if kept.is_file() else {"rows": []}
+    if options.run:
+        if options.scene is None:
+            parser.error("--run needs --scene")
+        chosen = [trial for trial in TRIALS if options.only in trial.name]
+        with tempfile.TemporaryDirectory() as work:
+            scene = copy_scene(options.scene, Path(work) / "scene")
+            for trial in chosen:
+                new = outcome(trial, options.trainers, scene, Path(work))
+                print(json.dumps(new), flush=True)
+                trials = _kept(trials["rows"], new, options.scene.name)
+                kept.write_text(json.dumps(trials, indent=1) + "\n")
+    text = page(survey(options.trainers), trials)
+    if options.write:
+        PAGE.write_text(text, encoding="utf-8")
+    else:
+        print(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,205 @@
+"""Short trainings of real trainers on a CPU, stock and edited: what `survey.py` and tests run."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import struct
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image
+
+from opt3dgs_optim.hosts import write
+
+ON_CPU = Path(__file__).resolve().parent / "on_cpu.py"
+ITERATIONS = 100
+GSPLAT = "examples/simple_trainer.py"
+EVERY_POINT = 5  # of the scene's sparse points, every fifth: seconds instead of minutes
+LIMIT = 1200  # seconds a training
+
+INRIA_OPTIONS = (
+    *("--images", "images_jpg", "--eval", "--densify_from_iter", "10"),
+    *("--densification_interval", "10", "--opacity_reset_interval", "35"),
+)
+SHORT_GSPLAT = (
+    *("--disable_viewer", "--data_factor", "4"),
+    *("--strategy.refine_start_iter", "10", "--strategy.refine_every", "10"),
+)
+NO_VIDEO = ("--disable_video",)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One way to run one trainer.
+
+    Args:
+        trainer: the folder of its sources.
+        script: its path there.
+        options: beside scene, iterations and output, which `command` adds.
+        refused: what a refusal says, where the edited trainer must refuse to start.
+        stock_fails: what the stock trainer stops with, where it does not run itself.
+    """
+
+    trainer: str
+    script: str
+    options: tuple[str, ...]
+    refused: str | None = None
+    stock_fails: str | None = None
+
+    @property
+    def name(self) -> str:
+        """For tests and tables."""
+        own = [o for o in self.options if o not in (*INRIA_OPTIONS, *SHORT_GSPLAT, *NO_VIDEO)]
+        return " ".join([self.trainer, *own])
+
+    @property
+    def gsplat(self) -> bool:
+        """Whether it is one of gsplat's scripts."""
+        return self.trainer.startswith("gsplat")
+
+    def command(self, scene: Path, out: Path, iterations: int) -> list[str]:
+        """The script's arguments."""
+        n = str(iterations)
+        if self.gsplat:
+            where = ["--data_dir", str(scene), "--result_dir", str(out)]
+            steps = ["--max_steps", n, "--eval_steps", n, "--save_steps", n]
+            return [*self.options[:1], *where, *steps, *self.options[1:]]
+        where = ["-s", str(scene), "-m", str(out), "--iterations", n, "--test_iterations", n]
+        return [*where, "--checkpoint_iterations", str(iterations // 2), *self.options]
+
+    def checkpoint(self, out: Path, iterations: int) -> Path:
+        """The file that a run leaves behind."""
+        if self.gsplat:
+            return out / "ckpts" / f"ckpt_{iterations - 1}_rank0.pt"
+        return out / f"chkpnt{iterations // 2}.pth"
+
+    def going_on(self, checkpoint: Path) -> list[str]:
+        """The options to go on from a checkpoint; gsplat only evaluates one."""
+        return ["--ckpt" if self.gsplat else "--start_checkpoint", str(checkpoint)]
+
+
+def _gsplat(version: str, *options: str, **said: str) -> Trial:
+    video = () if version == "gsplat-1.4.0" else NO_VIDEO
+    return Trial(version, GSPLAT, (*options[:1], *SHORT_GSPLAT, *video, *options[1:]), **said)
+
+
+def _inria(trainer: str, *options: str, script: str = "train.py") -> Trial:
+    return Trial(trainer, script, (*INRIA_OPTIONS, *options))
+
+
+_MINI = "--densify_until_iter 40 --simp_iteration1 40 --simp_iteration2 70 --imp_metric indoor"
+# taming cannot clone none or split none: a budget for few refinements, and points of both kinds.
+_TAMING = "--mode final_count --budget 6000 --cams 2 --densify_until_iter 60 --percent_dense 0.03"
+_TAMING += " --opacity_reset_interval 1000"  # afterwards no gradient is large enough to split
+_NO_FUSED = "unexpected keyword argument 'fused'"
+TRIALS = (
+    _gsplat("gsplat-1.4.0", "mcmc"),
+    _gsplat("gsplat-1.4.0", "default", "--packed"),
+    _gsplat("gsplat-1.5.3", "mcmc"),
+    _gsplat("gsplat-1.5.3", "default"),
+    _gsplat("gsplat-1.5.3", "default", "--visible_adam"),
+    _gsplat("gsplat-1.5.3", "default", "--packed"),
+    _gsplat("gsplat-1.5.3", "default", "--packed", "--sparse_grad", refused="SparseAdam"),
+    _gsplat("gsplat-1.5.3", "mcmc", "--app_opt"),
+    _gsplat("gsplat-1.5.3", "mcmc", "--pose_opt"),
+    _gsplat("gsplat-1.5.3", "mcmc", "--use_bilateral_grid"),
+    _gsplat("gsplat-1.5.3", "mcmc", "--batch_size", "2"),
+    _gsplat("gsplat-main", "mcmc"),
+    _gsplat("gsplat-main", "default"),
+    _gsplat("gsplat-main", "default", "--visible_adam", stock_fails=_NO_FUSED),
+    _inria("gaussian-splatting", "--disable_viewer"),
+    _inria("gaussian-splatting", "--disable_viewer", "--optimizer_type", "sparse_adam"),
+    _inria("3dgs-mcmc", "--cap_max", "2500", "--init_type", "sfm"),
+    _inria("taming-3dgs", *_TAMING.split()),
+    _inria(
+        "mini-splatting",
+        *_MINI.split(),
+        script="ms/train.py",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Done:
+    """A finished run."""
+
+    code: int
+    output: str
+    seconds: float
+
+    @property
+    def psnr(self) -> float | None:
+        """The last one that the trainer printed, dB."""
+        found = re.findall(r"PSNR:? ([\d.]+)", self.output)
+        return float(found[-1]) if found else None
+
+    @property
+    def reason(self) -> str:
+        """The last line that is no progress bar."""
+        lines = [line.strip() for line in re.split(r"[\r\n]", self.output)]
+        errors = [line for line in lines if re.match(r"[\w.]*(Error|Exit|Exception): ", line)]
+        return (errors or [line for line in lines if line] or ["no output"])[-1]
+
+
+def copy_scene(source: Path, target: Path) -> Path:
+    """A scene as these trainers read it: photos as .png and as .jpg, a part of the points."""
+    for folder in ("images", "sparse"):
+        shutil.copytree(source / folder, target / folder)
+    shutil.copytree(source / "images_4", target / "images_jpg")
+    (target / "images_4").mkdir()
+    for photo in (source / "images_4").iterdir():
+        with Image.open(photo) as image:
+            image.save(target / "images_4" / f"{photo.stem}.png")
+    path = target / "sparse" / "0" / "points3D.bin"
+    data, at, kept = path.read_bytes(), 8, []
+    (count,) = struct.unpack_from("<Q", data)
+    for index in range(count):  # id, position, colour, error: 43 bytes; then the track
+        (track,) = struct.unpack_from("<Q", data, at + 43)
+        if index % EVERY_POINT == 0:
+            kept.append(data[at : at + 43] + struct.pack("<Q", 0))
+        at += 51 + 8 * track
+    path.unlink()
+    path.write_bytes(struct.pack("<Q", len(kept)) + b"".join(kept))
+    return target
+
+
+def edited_copy(trial: Trial, trainers: Path, target: Path) -> Path:
+    """The trainer's Python files with our lines in the script; returns the script."""
+    if not target.is_dir():
+        plain = shutil.ignore_patterns(".git", "*.png", "*.jpg", "*.gif", "*.mp4", "*.so")
+        shutil.copytree(trainers / trial.trainer, target, ignore=plain)
+        write(target / trial.script)
+    return target / trial.script
+
+
+def run(script: Path, arguments: list[str], folder: Path, *, trusted: bool = False) -> Done:
+    """Run a script on the CPU in `folder`.
+
+    Args:
+        script: stock or edited.
+        arguments: its own.
+        folder: the working folder; some trainers write there.
+        trusted: whether its checkpoint may hold more than tensors, as INRIA's do.
+    """
+    environment = dict(os.environ)
+    if trusted:
+        environment["TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD"] = "1"
+    folder.mkdir(parents=True, exist_ok=True)
+    start = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, str(ON_CPU), str(script), *arguments],
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        timeout=LIMIT,
+        check=False,
+    )
+    return Done(done.returncode, done.stdout, time.perf_counter() - start)

@@ -1,0 +1,208 @@
+"""Whether a training falls while nu is on: before and after the histogram followed the energy.
+
+    python examples/studies/collapse.py SCENE-FOLDER --arm default --seed 0   (train and record)
+    python examples/studies/collapse.py                                       (table and picture)
+
+An arm is stock 3DGS-MCMC with nu and nothing else, a twelfth of the run as warm-up. `default` is
+`EnergyHistogram()`; `frozen` what was the default until 2026-11-22: the paper's update, range and
+temperature measured once, in the first twenty-fourth of the run; `stock` has no nu. The training
+PSNR is looked at 60 times; a fall is how far it is below its best so far.
+
+Writes `docs/results/histogram/collapse.json`, `collapse.md` and `collapse.png`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import numpy as np
+import torch
+
+from opt3dgs_optim import EnergyHistogram, Part
+
+OUT = Path(__file__).resolve().parents[2] / "docs" / "results" / "histogram"
+ARMS = ("stock", "frozen", "default")
+LABELS = {
+    "stock": "stock, no ν",
+    "frozen": "before: measured once",
+    "default": "after: follows the energy",
+}
+COLORS = {"stock": "0.6", "frozen": "#d55e00", "default": "#0072b2"}
+LOOKS = 60
+WARMUP = 1 / 12
+EVERY = 4  # iterations between two that the picture shows
+
+
+class Frozen(Part):
+    """The default of old: range and temperature measured once, then the paper's update."""
+
+    def __init__(self, warmup: int) -> None:
+        self.warmup, self.histogram = warmup, EnergyHistogram.paper(warmup=warmup)
+        self._first: list[float] = []
+
+    def observe(self, energy: Any, valid: Any, course: Any) -> None:
+        """Measure for half of the warm-up, over the last eighth of it."""
+        if len(self._first) < self.warmup // 2:
+            self._first.append(float(energy))
+            if len(self._first) < self.warmup // 2:
+                return
+            weights = (1 - 8 / (self.warmup // 2)) ** np.arange(len(self._first))[::-1]
+            mean = np.average(self._first, weights=weights)
+            deviation = np.sqrt(np.average((np.array(self._first) - mean) ** 2, weights=weights))
+            self.histogram = EnergyHistogram.paper(
+                energy_range=(max(mean - 30 * deviation, 0.0), mean + 4 * deviation),
+                temperature=deviation / 6,
+                warmup=self.warmup - len(self._first),
+            )
+            return
+        self.histogram.observe(energy)
+
+    def factor(self, group: Any, course: Any) -> Any:
+        """Nu."""
+        return self.histogram.factor(group, course)
+
+
+def train(folder: Path, arm: str, seed: int, iterations: int, points: int) -> dict[str, Any]:
+    """Train; return what is recorded, the curve and the trace included."""
+    from splatting.arms import NOISE_LR, Arm
+    from splatting.fit import Fit, FitOptions
+    from splatting.scenes import load_scene
+
+    from opt3dgs_optim import PhaseScheduler, PositionNoise
+
+    torch.set_num_threads(1)
+    warmup = round(iterations * WARMUP)
+    part = {"stock": None, "frozen": Frozen(warmup), "default": EnergyHistogram(warmup=warmup)}[arm]
+    parts: list[Part] = [PositionNoise(lambda: fit.gaussians, NOISE_LR)]
+    parts += [] if part is None else [part]
+    made = Arm(arm, arm, make=lambda *_: PhaseScheduler(iterations, iterations, parts=parts))
+    fit = Fit(load_scene(folder), made, FitOptions(iterations, points, seed, switch=1.0))
+    histogram = part.histogram if isinstance(part, Frozen) else part
+    curve, trace = [], []
+    while fit.iteration < iterations:
+        loss = fit.step()
+        if part is not None:
+            histogram = part.histogram if isinstance(part, Frozen) else part
+            trace.append([float(loss), float(histogram.multiplier), *histogram.calibrated_range])
+        if fit.iteration % (iterations // LOOKS) == 0:
+            curve.append({"iteration": fit.iteration, **fit.evaluate()})
+    clamp = None if histogram is None else histogram.clamp
+    return recorded(folder.name, arm, seed, iterations, curve, trace, clamp)
+
+
+def recorded(
+    scene: str, arm: str, seed: int, iterations: int, curve: list, trace: list, clamp: Any
+) -> dict[str, Any]:
+    """The figures of a training."""
+    psnr = np.array([look["train_psnr"] for look in curve])
+    falls = np.maximum.accumulate(psnr) - psnr
+    record = {
+        "scene": scene,
+        "arm": arm,
+        "seed": seed,
+        "iterations": iterations,
+        "largest_fall": round(float(falls.max()), 3),
+        "looks_below_1_db": int((falls > 1).sum()),
+        "psnr": round(curve[-1]["psnr"], 3),
+        "train_psnr": round(curve[-1]["train_psnr"], 3),
+        "machine": f"{platform.system()} {platform.machine()}, torch {torch.__version__}",
+        "date": time.strftime("%Y-%m-%d", time.gmtime()),
+        "curve": [round(value, 3) for value in psnr.tolist()],
+    }
+    if trace:
+        nu = np.array(trace)[round(iterations * WARMUP) :, 1]
+        record["nu_mean"] = round(float(nu.mean()), 3)
+        record["nu_deviation"] = round(float(nu.std()), 3)
+        low, high = clamp
+        record["at_clamp"] = round(float(((nu <= low) | (nu >= high)).mean()), 5)
+        shown = [[float(f"{value:.4g}") for value in line[:4]] for line in trace[::EVERY]]
+        record["trace"] = shown  # loss, nu, low and high end of the partitions
+    return record
+
+
+def table(records: list[dict[str, Any]]) -> str:
+    """Markdown: a row per training."""
+    lines = [
+        "| scene, iterations | arm | seed | largest fall, dB | looks > 1 dB below the best | "
+        "ν mean | ν deviation | at the clamp | test PSNR |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for r in sorted(records, key=lambda r: (r["scene"], r["iterations"], ARMS.index(r["arm"]),
+                                            r["seed"])):  # fmt: skip
+        nu = ["", "", ""]
+        if "nu_mean" in r:
+            nu = [f"{r['nu_mean']:.2f}", f"{r['nu_deviation']:.2f}", f"{r['at_clamp']:.1%}"]
+        lines.append(
+            f"| {r['scene']}, {r['iterations']:,} | {LABELS[r['arm']]} | {r['seed']} | "
+            f"{r['largest_fall']:.2f} | {r['looks_below_1_db']} of {LOOKS} | {' | '.join(nu)} | "
+            f"{r['psnr']:.2f} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def draw(records: list[dict[str, Any]], path: Path) -> None:
+    """Training PSNR, and energy, range and nu of one training before and after."""
+    import matplotlib.pyplot as plt
+
+    one = {r["arm"]: r for r in records if (r["scene"], r["seed"]) == ("lund_door", 0)}
+    fig, axes = plt.subplots(3, 2, figsize=(10, 7), sharex=True, layout="constrained")
+    for column, arm in enumerate(("frozen", "default")):
+        top, middle, bottom = axes[:, column]
+        record = one[arm]
+        looks = np.arange(1, LOOKS + 1) * record["iterations"] / LOOKS
+        if "stock" in one:
+            top.plot(looks, one["stock"]["curve"], color=COLORS["stock"], label=LABELS["stock"])
+        top.plot(looks, record["curve"], color=COLORS[arm], label=LABELS[arm])
+        top.set(title=LABELS[arm], ylim=(15, 36))
+        top.legend(loc="lower right", frameon=False)
+        loss, nu, low, high = np.array(record["trace"]).T
+        k = np.arange(len(loss)) * EVERY
+        started = k >= record["iterations"] * WARMUP / 2
+        middle.fill_between(k[started], low[started], high[started], color=COLORS[arm], alpha=0.15,
+                            lw=0, label="range of the partitions")  # fmt: skip
+        middle.plot(k, loss, ".", ms=1.5, color=COLORS[arm], label="energy")
+        middle.set(ylim=(0, 0.2))
+        middle.legend(loc="upper right", frameon=False)
+        bottom.plot(k, nu, ".", ms=1.5, color=COLORS[arm])
+        bottom.axhline(1, color="0.6", lw=0.8)
+        bottom.set(ylim=(-5.5, 5.5))
+    axes[0, 0].set_ylabel("training PSNR, dB")
+    axes[1, 0].set_ylabel("energy")
+    axes[2, 0].set_ylabel("ν")
+    fig.supxlabel("iteration", fontsize=10)
+    where = f"lund_door, seed 0; {one['default']['machine']}, {one['default']['date']}"
+    fig.text(1.005, 0.5, where, rotation=90, va="center", fontsize=6, color="0.5")
+    fig.savefig(path, dpi=130, bbox_inches="tight")
+
+
+def main() -> None:
+    """Train and record, or write table and picture."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", type=Path, nargs="?", help="a scene's folder; none: table only")
+    parser.add_argument("--arm", choices=ARMS, default="default")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--iterations", type=int, default=3_000)
+    parser.add_argument("--points", type=int, default=4_000)
+    args = parser.parse_args()
+    path = OUT / "collapse.json"
+    records = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
+    if args.scene is not None:
+        new = train(args.scene, args.arm, args.seed, args.iterations, args.points)
+        key = ("scene", "arm", "seed", "iterations")
+        records = [r for r in records if any(r[k] != new[k] for k in key)] + [new]
+        OUT.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(records) + "\n", encoding="utf-8")
+    (OUT / "collapse.md").write_text(table(records), encoding="utf-8")
+    draw(records, OUT / "collapse.png")
+
+
+if __name__ == "__main__":
+    main()

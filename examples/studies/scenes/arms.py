@@ -1,0 +1,288 @@
+"""The arms of the study: each part alone, its control, and what goes beyond the paper."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatting.arms import Arm, MakeParts, constant, fixed, histogram
+from torch import Tensor
+
+from opt3dgs_optim import (
+    Annealing,
+    ConstantMultiplier,
+    Curvature,
+    Fading,
+    FreshMoments,
+    Part,
+    Phase,
+    PhaseScheduler,
+    Pooling,
+    SquaredLoss,
+    paper_parts,
+)
+from studies.scenes.parts.chosen_fading import ChosenFading
+from studies.scenes.parts.own_step import OwnStep
+
+BASELINE = "mcmc"
+ALL_ANNEALED = "annealed-4-0.4+faded"
+DEFAULTS = "annealed-4-opacities-1+faded"  # what `PhaseScheduler(total_steps)` is
+POOLED = f"{DEFAULTS}+pooled"
+UNFADED_OPACITIES = f"{DEFAULTS}-opacities-unfaded"
+V_ONLY = f"{DEFAULTS}-v-only"
+EVENT_STEPS = 10  # iterations for one event of fading in a run of 3,000, where it was chosen
+# As measured, so that a change of the package's defaults does not change what an arm was.
+ANNEALING = Annealing(4.0, 0.4, opacity_peak=1.0)
+FADING = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=300)
+# What the arms beyond the paper are made of, by the arm's name; what a table calls them; and the
+# names of the arms that add a last phase.
+TRUNKS: dict[str, list[Part]] = {
+    "annealed-8-0.4": [Annealing(8.0, 0.4, opacity_peak=8.0)],
+    "faded": [FADING],
+    DEFAULTS: [ANNEALING, FADING],
+    POOLED: [ANNEALING, FADING, Pooling()],
+}
+WORDS = {"annealed-8-0.4": "annealed", "faded": "faded", DEFAULTS: "the defaults", POOLED: "pooled"}
+LABELS = {"annealed": "annealed-8-0.4", "defaults": DEFAULTS, "pooled": POOLED}
+
+
+@dataclass(frozen=True)
+class StudyArm(Arm):
+    """One way of training, the arm that it is measured against, and where it branches off."""
+
+    control: str = BASELINE
+    switch: float = 1.0  # where exploitation starts
+    trunk: str | None = None  # branch off this arm's run at the switch
+    retired: bool = False  # its code is gone, its records are kept
+
+    def make(
+        self, iterations: int, switch: float, nu: float | None, gaussians: dict[str, Tensor]
+    ) -> PhaseScheduler:
+        """As `Arm.make`; the switch is the arm's own: trunk and branches share `FitOptions`."""
+        return super().make(iterations, self.switch, nu, gaussians)
+
+
+def of(*parts: Part) -> MakeParts:
+    """These parts, which learn nothing."""
+    return lambda _iterations, _nu: [*parts]
+
+
+def core() -> list[StudyArm]:
+    """Whole trainings that only the trainer's learning rates, nu or the moments distinguish."""
+    rates = [
+        StudyArm(f"rates-x{k:g}", f"all steps times {k:g}", of(ConstantMultiplier(k)))
+        for k in (1.5, 2.0, 3.0)
+    ]
+    annealed = [
+        StudyArm(
+            f"annealed-{peak:g}-{final:g}",
+            f"all steps times {peak:g} falling to {final:g}",
+            of(Annealing(peak, final, opacity_peak=peak)),
+        )
+        for peak, final in ((4.0, 0.4), (8.0, 0.4), (8.0, 0.1), (16.0, 0.4))
+    ]
+    both = of(Annealing(4.0, 0.4, opacity_peak=4.0), FADING)
+    paper = "a constant multiplier, the paper's mean nu"
+    return [
+        StudyArm(BASELINE, "stock 3DGS-MCMC, torch's Adam"),
+        StudyArm("awsgld", "with the flat-histogram multiplier", histogram),
+        StudyArm("constant", "a constant multiplier, its mean nu", constant, needs="awsgld"),
+        *rates,
+        *annealed,
+        StudyArm("faded", "moments of random points faded", of(FADING)),
+        StudyArm(ALL_ANNEALED, "annealed from 4, and faded", both, control="annealed-8-0.4"),
+        StudyArm(
+            DEFAULTS,
+            "the same, but opacities annealed from 1",
+            of(*TRUNKS[DEFAULTS]),
+            control=ALL_ANNEALED,
+        ),
+        StudyArm(
+            POOLED, "the defaults, second moments pooled", of(*TRUNKS[POOLED]), control=DEFAULTS
+        ),
+        StudyArm(
+            "paper",
+            "everything, the paper's settings",
+            lambda iterations, _nu: paper_parts(iterations),
+            switch=29 / 30,
+        ),
+        StudyArm("paper-constant", paper, constant, needs="paper"),
+    ]
+
+
+def with_nu() -> list[StudyArm]:
+    """The multiplier on top of annealing and fading, beside a constant of its mean."""
+    words = ", with a constant multiplier: the next arm's mean nu"
+    return [
+        arm
+        for trunk in ("annealed-8-0.4", "faded", DEFAULTS)
+        for arm in (
+            StudyArm(
+                f"{trunk}+constant",
+                WORDS[trunk] + words,
+                _on(trunk, constant),
+                needs=f"{trunk}+awsgld",
+                control=trunk,
+            ),
+            StudyArm(
+                f"{trunk}+awsgld",
+                f"{WORDS[trunk]}, with the flat-histogram multiplier",
+                _on(trunk, histogram),
+                control=f"{trunk}+constant",
+            ),
+        )
+    ]
+
+
+def _on(trunk: str, parts: MakeParts) -> MakeParts:
+    return lambda iterations, nu: [*TRUNKS[trunk], *parts(iterations, nu)]
+
+
+def last_phases() -> list[StudyArm]:
+    """What changes at the switch, branched off one and the same exploration."""
+    lqn = "the same with L-BFGS directions, consecutive pairs"
+    kinds: dict[str, tuple[str, str | None, MakeParts]] = {
+        "l1+reset": ("L1, moments reset", None, fixed(FreshMoments)),
+        "l2": ("L2, moments kept", None, fixed(SquaredLoss)),
+        "l2+reset": ("L2, moments reset", None, fixed(SquaredLoss, FreshMoments)),
+        "l2+reset+lqn": (lqn, "l2+reset", fixed(SquaredLoss, FreshMoments, Curvature)),
+        "l1+reset+lqn": (
+            "L1, moments reset, L-BFGS directions",
+            "l1+reset",
+            fixed(FreshMoments, Curvature),
+        ),
+        "noise-off": ("no noise", None, fixed()),
+    }
+    return [
+        StudyArm(
+            f"{name}@1/{share}",
+            f"{what}, in the last 1/{share}",
+            parts,
+            control=f"{control}@1/{share}" if control else BASELINE,
+            switch=1 - 1 / share,
+            trunk=BASELINE,
+            noise_during=Phase.EXPLORATION if name == "noise-off" else None,
+        )
+        for share in (30, 10, 4)
+        for name, (what, control, parts) in kinds.items()
+    ]
+
+
+def on_top() -> list[StudyArm]:
+    """The last phase on top of annealing and fading: does curvature earn its place there?"""
+    kinds: dict[str, tuple[str | None, MakeParts]] = {
+        "l2": (None, fixed(SquaredLoss)),
+        "l1+reset": (None, fixed(FreshMoments)),
+        "l1+reset+lqn": ("l1+reset", fixed(FreshMoments, Curvature)),
+        "lqn": (None, fixed(Curvature)),
+        "noise-off": (None, fixed()),
+    }
+    return [
+        StudyArm(
+            f"{label}+{name}@1/10",
+            f"{WORDS[trunk]}, then {name} in the last tenth",
+            _on(trunk, parts),
+            control=f"{label}+{control}@1/10" if control else trunk,
+            switch=0.9,
+            trunk=trunk,
+            noise_during=Phase.EXPLORATION if name == "noise-off" else None,
+        )
+        for label, trunk in LABELS.items()
+        for name, (control, parts) in kinds.items()
+    ]
+
+
+def leads() -> list[StudyArm]:
+    """What else an optimizer can do without touching the representation."""
+    no_opacities = Fading(events=300, names=("means", "scales", "quats", "sh0", "shN"))
+    v_only = Fading(events=300, exp_avg=1.0)
+    ratio = "the points whose exp_avg^2 / exp_avg_sq is"
+    return [
+        StudyArm("faded-v-only", "exp_avg_sq faded, exp_avg kept", of(v_only), control="faded"),
+        StudyArm(
+            V_ONLY,
+            "the defaults, exp_avg_sq faded, exp_avg kept",
+            of(ANNEALING, v_only),
+            control=DEFAULTS,
+        ),
+        StudyArm(
+            UNFADED_OPACITIES,
+            "the defaults, opacities not faded",
+            of(ANNEALING, no_opacities),
+            control=DEFAULTS,
+        ),
+        StudyArm("faded-stale", f"{ratio} smallest", of(ChosenFading("stale")), control="faded"),
+        StudyArm("faded-fresh", f"{ratio} largest", of(ChosenFading("fresh")), control="faded"),
+        *long_runs(),
+    ]
+
+
+def long_runs() -> list[StudyArm]:
+    """What a run of 30,000 iterations may need instead of the defaults."""
+    return [
+        StudyArm(
+            "faded-3000",
+            "faded as often as in 3,000 iterations: every tenth",
+            lambda iterations, _nu: [_often(iterations)],
+            control="faded",
+        ),
+        StudyArm(
+            "defaults-3000",
+            "the defaults, faded every tenth iteration",
+            lambda iterations, _nu: [ANNEALING, _often(iterations)],
+            control=DEFAULTS,
+        ),
+        StudyArm(
+            "annealed-2",
+            "the defaults, annealed from 2",
+            of(Annealing(2.0, 0.4, opacity_peak=1.0), FADING),
+            control=DEFAULTS,
+        ),
+        StudyArm(
+            "own-step",
+            "root mean square of the steps on a schedule, whatever the learning rates",
+            lambda _iterations, _nu: [OwnStep()],
+            control=DEFAULTS,
+        ),
+    ]
+
+
+def _often(iterations: int) -> Fading:
+    return Fading(events=max(iterations // EVENT_STEPS, 1))
+
+
+def retired(group: str) -> list[StudyArm]:
+    """Arms of a group whose code is gone: the records tell of them."""
+    with Path(__file__).with_name("retired.csv").open(encoding="utf-8", newline="") as file:
+        return [
+            StudyArm(row["arm"], row["what"], control=row["control"], retired=True)
+            for row in csv.DictReader(file)
+            if row["group"] == group
+        ]
+
+
+GROUPS: dict[str, list[StudyArm]] = {
+    "core": core(),
+    "with-nu": with_nu(),
+    "options": retired("options"),
+    "tails": [*last_phases(), *retired("tails")],
+    "on-top": on_top(),
+    "leads": [*leads(), *retired("leads")],
+}
+STUDY_ARMS = {arm.name: arm for arms in GROUPS.values() for arm in arms}
+
+
+def find_study_arm(name: str) -> StudyArm:
+    """The arm of that name, to be trained; ValueError that lists the others."""
+    found = STUDY_ARMS.get(name)
+    if found is None or found.retired:
+        what = "unknown" if found is None else "retired: its records are kept, its code is not"
+        left = ", ".join(arm.name for arm in STUDY_ARMS.values() if not arm.retired)
+        raise ValueError(f"arm {name!r} is {what}; there are {left}")
+    return found
+
+
+def label(arm: str) -> str:
+    """An arm's name in tables and plots, where the defaults' is long."""
+    return arm.replace(DEFAULTS, "defaults")

@@ -1,0 +1,1 @@
+"""Parts of the study's own, each in a file of its own."""

@@ -1,0 +1,154 @@
+"""What the study trains, in the order in which it matters most."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from studies.scenes.arms import (
+    ALL_ANNEALED,
+    DEFAULTS,
+    GROUPS,
+    POOLED,
+    STUDY_ARMS,
+    UNFADED_OPACITIES,
+    V_ONLY,
+    long_runs,
+)
+from studies.scenes.training import Spec
+
+SCENES = ("plush", "banana", "lund_door", "brighton_beach", "embedded")
+QUICK_SCENES = ("banana", "embedded")  # for the options of a part
+MANY_VIEWS_SCENES = ("bonsai", "lego", "plush")
+ROTATED_SCENES = (*MANY_VIEWS_SCENES, "embedded", "banana", "lund_door", "brighton_beach")
+ROTATED_ARMS = (
+    *("mcmc", DEFAULTS, "defaults-3000", "faded", "paper", "paper-constant"),
+    *("faded-3000", "rates-x2", POOLED, "annealed-2", "own-step"),
+)
+LONG_ARMS = tuple(arm.name for arm in long_runs())
+FULL_PARTS_SCENES = ("brighton_beach", "lund_door")  # where the defaults lose
+POINTS = 4_000
+NUM_POINTS = {"embedded": 2_000, "bonsai": 10_000, "lego": 10_000}
+CONFIRMED = ("faded-v-only", V_ONLY)  # what gained most among the other leads
+FIRST_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "annealed-8-0.4", "faded")
+
+
+@dataclass(frozen=True)
+class Training:
+    """A training of the plan and where it lives."""
+
+    spec: Spec
+    folder: Path
+    needs: tuple[Path, ...] = field(default=())  # folders of trainings that come first
+    trunk: Path | None = None
+    nu_from: Path | None = None
+
+
+def stages(seeds: int = 3) -> dict[str, list[Spec]]:
+    """The trainings of every stage; their scenes are names, not yet folders."""
+    arms = {
+        group: [arm.name for arm in found if not arm.retired] for group, found in GROUPS.items()
+    }
+    later = [name for name in arms["core"] if name not in FIRST_ARMS]
+    tails = [*arms["tails"], *arms["on-top"]]
+    on_defaults = [name for name in arms["with-nu"] if name.startswith(DEFAULTS)]
+    later += [name for name in arms["with-nu"] if name not in on_defaults]
+    beyond = [name for name in arms["leads"] if name not in LONG_ARMS]
+
+    def cross(
+        scenes: Sequence[str],
+        arms: Sequence[str],
+        count: int,
+        iterations: int,
+        share: float = 1.0,
+        **others: Any,
+    ) -> list[Spec]:
+        return [
+            Spec(scene, arm, seed, iterations, round(points_of(scene) * share), **others)
+            for seed in range(count)
+            for scene in scenes
+            for arm in arms
+        ]
+
+    two = ["mcmc", DEFAULTS]
+    longer = ["annealed-8-0.4", "annealed-4-0.4", "faded"]
+    return {
+        "core": cross(SCENES, FIRST_ARMS, seeds, 3_000),
+        "tails": cross(SCENES, tails, seeds, 3_000),
+        "long": cross(SCENES, [*two, ALL_ANNEALED, POOLED], seeds, 7_500),
+        "defaults": cross(SCENES, [ALL_ANNEALED, DEFAULTS, POOLED], seeds, 3_000),
+        "long-parts": cross(SCENES, [*longer, UNFADED_OPACITIES], 1, 7_500),
+        "full": cross(SCENES, [*two, POOLED], 1, 30_000),
+        "rotated-first": cross(MANY_VIEWS_SCENES, two, 1, 30_000, rotated=True),
+        "rotated": [
+            spec
+            for seed in range(seeds)
+            for scenes in (MANY_VIEWS_SCENES, ROTATED_SCENES[len(MANY_VIEWS_SCENES) :])
+            for arm in ROTATED_ARMS
+            for spec in cross(scenes, [arm], seeds, 30_000, rotated=True)
+            if spec.seed == seed
+        ],
+        "full-parts": cross(FULL_PARTS_SCENES, [UNFADED_OPACITIES], 1, 30_000),
+        "with-nu": cross(SCENES, on_defaults, seeds, 3_000),
+        "rest": cross(QUICK_SCENES, later, seeds, 3_000),
+        "leads": cross(QUICK_SCENES, beyond, seeds, 3_000),
+        "confirmed": cross(SCENES, CONFIRMED, seeds, 3_000),
+        "random": cross(SCENES, two, seeds, 3_000, init="random"),
+        "small": cross(SCENES, two, seeds, 3_000, share=0.25),
+        "harmonics": cross(SCENES, two, 1, 3_000, sh_degree=3),
+        "rest-all": cross(SCENES, later, seeds, 3_000),
+        "long-all": cross(SCENES, longer, seeds, 7_500),
+    }
+
+
+def points_of(scene: str) -> int:
+    """The most Gaussians of a scene."""
+    return NUM_POINTS.get(scene, POINTS)
+
+
+def plan(root: Path, out: Path, only: list[str] | None = None, seeds: int = 3) -> list[Training]:
+    """The trainings of the named stages, or of all.
+
+    Args:
+        root: folder that holds the scenes' folders.
+        out: folder for the trainings.
+    """
+    chosen = stages(seeds)
+    unknown = set(only or ()) - set(chosen)
+    if unknown:
+        raise ValueError(f"--stages {sorted(unknown)}: unknown; there are {', '.join(chosen)}")
+    trainings: dict[Path, Training] = {}
+    for stage in only or list(chosen):
+        for spec in chosen[stage]:
+            source = spec.scene if spec.scene == "embedded" else str(root / spec.scene)
+            for training in _with_needs(replace(spec, scene=source), out):
+                trainings.setdefault(training.folder, training)
+    return list(trainings.values())
+
+
+def _with_needs(spec: Spec, out: Path) -> list[Training]:
+    arm = STUDY_ARMS[spec.arm]
+    needed: list[Training] = []
+    folders: dict[str, Path | None] = {"trunk": None, "nu": None}
+    for key, name in (("trunk", arm.trunk), ("nu", arm.needs)):
+        if name is not None:
+            other = replace(spec, arm=name)
+            needed += _with_needs(other, out)
+            folders[key] = folder_of(other, out)
+    first = tuple(folder for folder in folders.values() if folder is not None)
+    own = Training(spec, folder_of(spec, out), first, folders["trunk"], folders["nu"])
+    return [*needed, own]
+
+
+def folder_of(spec: Spec, out: Path) -> Path:
+    """Where a training lives."""
+    kind = f"{spec.points}-{spec.iterations}-{spec.init}"
+    if spec.sh_degree:
+        kind += f"-sh{spec.sh_degree}"
+    if spec.size != "images_4":
+        kind += f"-{spec.size}"
+    kind += "-rotated" * spec.rotated
+    arm = spec.arm.replace("/", "_")
+    return out / Path(spec.scene).name / kind / arm / f"seed-{spec.seed}"

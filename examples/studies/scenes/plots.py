@@ -1,0 +1,109 @@
+"""The study's plots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+
+mpl.use("Agg")
+
+import matplotlib.pyplot as plt
+
+from studies.scenes.analysis import Gain, Study
+from studies.scenes.arms import BASELINE, DEFAULTS, POOLED, label
+from studies.scenes.records import Record, Setting
+
+# Okabe and Ito's colours: told apart with any kind of colour vision.
+COLOURS = {
+    BASELINE: "#000000",
+    "awsgld": "#d55e00",
+    "constant": "#e69f00",
+    "rates-x2": "#f0e442",
+    "faded": "#cc79a7",
+    "annealed-8-0.4": "#56b4e9",
+    DEFAULTS: "#0072b2",
+    POOLED: "#009e73",
+}
+SHOWN_FROM = 0.25  # of an arm's seconds: what it falls to before may be out of the picture
+VERDICT_COLOURS = {"pays": "#009e73", "does not pay": "#999999", "undecided": "#e69f00"}
+DPI = 150
+
+
+def plot_curves(study: Study, settings: Sequence[Setting], arms: Sequence[str], path: Path) -> None:
+    """Test PSNR over CPU seconds, one panel per scene: mean over seeds, band from least to most."""
+    columns = min(3, len(settings))
+    rows = -(-len(settings) // columns)
+    figure, axes = plt.subplots(
+        rows, columns, figsize=(4.2 * columns, 3.2 * rows), squeeze=False, layout="constrained"
+    )
+    handles: dict[str, object] = {}
+    for axis, setting in zip(axes.flat, settings, strict=False):
+        shown: list[float] = []
+        for arm in arms:
+            records = list(study.runs(setting, arm).values())
+            if not records:
+                continue
+            seconds, table = _curves(records)
+            low, high, colour = table.min(0), table.max(0), COLOURS[arm]
+            (line,) = axis.plot(seconds, table.mean(0), color=colour, linewidth=1.6)
+            axis.fill_between(seconds, low, high, color=colour, alpha=0.15, lw=0)
+            handles.setdefault(label(arm), line)
+            late = seconds >= SHOWN_FROM * seconds[-1]
+            shown += [*low[late], high.max()]
+        axis.set_title(f"{setting.scene}, {setting.points:,} points", fontsize=10)
+        margin = 0.05 * (max(shown) - min(shown))
+        axis.set_ylim(min(shown) - margin, max(shown) + margin)
+        axis.grid(alpha=0.3)
+    for axis in axes.flat[len(settings) :]:
+        axis.axis("off")
+    for axis in axes[-1]:
+        axis.set_xlabel("CPU seconds")
+    for row in axes:
+        row[0].set_ylabel("test PSNR (dB)")
+    figure.legend(
+        list(handles.values()),  # pyright: ignore[reportArgumentType]
+        list(handles),
+        loc="outside lower center",
+        ncols=min(len(handles), 4),
+        frameon=False,
+    )
+    figure.savefig(path, dpi=DPI)
+    plt.close(figure)
+
+
+def _curves(records: Sequence[Record]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean seconds and every seed's PSNR, at the same evaluations."""
+    seconds = np.mean([record.curve["seconds"] for record in records], axis=0)
+    return seconds, np.array([record.curve["psnr"] for record in records])
+
+
+def plot_gains(gains: Sequence[Gain], path: Path, title: str) -> None:
+    """Gain at equal seconds of every arm over its control, with twice the deviation."""
+    height = 0.9 + 0.32 * len(gains)
+    figure, axis = plt.subplots(figsize=(8.4, height), layout="constrained")
+    places = np.arange(len(gains))[::-1]
+    for place, gain in zip(places, gains, strict=True):
+        axis.errorbar(
+            gain.equal_seconds,
+            place,
+            xerr=2 * gain.spread,
+            fmt="o",
+            color=VERDICT_COLOURS[gain.verdict],
+            capsize=3,
+        )
+    axis.axvline(0.0, color="black", linewidth=0.8)
+    labels = [f"{label(g.arm)}  (vs {label(g.control)})" for g in gains]
+    axis.set_yticks(places, labels, fontsize=8)
+    axis.set_ylim(-0.7, len(gains) - 0.3)
+    axis.set_xlabel("gain at equal seconds (dB), ± 2 deviations over seeds")
+    axis.grid(axis="x", alpha=0.3)
+    axis.set_title(title, fontsize=10)
+    for verdict, colour in VERDICT_COLOURS.items():
+        if any(gain.verdict == verdict for gain in gains):
+            axis.plot([], [], "o", color=colour, label=verdict)
+    axis.legend(fontsize=8, loc="best")
+    figure.savefig(path, dpi=DPI)
+    plt.close(figure)

@@ -1,0 +1,210 @@
+"""Tables, plots and decisions: python examples/studies/scenes/report.py [--runs runs/study]
+
+With `--runs`, first adds the finished trainings to docs/results/study/records.json. Then
+everything is made from that file alone: the plots beside it, `decisions.json`, and the tables
+between the markers of docs/evidence.md, docs/results/study/tables.md and the README.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from studies.scenes.analysis import Gain, Study, baseline_of
+from studies.scenes.arms import (
+    ALL_ANNEALED,
+    BASELINE,
+    DEFAULTS,
+    GROUPS,
+    POOLED,
+    UNFADED_OPACITIES,
+    label,
+)
+from studies.scenes.decisions import decide
+from studies.scenes.plots import plot_curves, plot_gains
+from studies.scenes.records import gather, merge, read, write
+from studies.scenes.tables import (
+    front_table,
+    gains_table,
+    goals_table,
+    machines_line,
+    nu_table,
+    scenes_table,
+)
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+FOLDER = REPOSITORY / "docs" / "results" / "study"
+PAGE = REPOSITORY / "docs" / "evidence.md"
+PAGES = (PAGE, FOLDER / "tables.md", REPOSITORY / "README.md")  # that have tables
+FRONT = (  # what it is, arm, control
+    ("**the defaults**", DEFAULTS, BASELINE),
+    ("the paper's preset, all parts", "paper", BASELINE),
+    ("AW-SGLD against a constant multiplier of its mean", "awsgld", "constant"),
+    ("L-BFGS against the same last phase without", "l2+reset+lqn@1/30", "l2+reset@1/30"),
+)
+SHORT = 3_000
+ALONE = ("mcmc", "faded", "annealed-4-0.4", "annealed-8-0.4")
+LONG_ARMS = (*ALONE, ALL_ANNEALED, DEFAULTS, UNFADED_OPACITIES, POOLED)
+BEST = DEFAULTS
+FEW_VIEWS_SCENES = ("brighton_beach", "plush")  # fewest views to speak of over-fitting, and most
+FEW_VIEWS_ARMS = (
+    "mcmc",
+    *(f"{ALL_ANNEALED}{x}" for x in ("", "-means-1", "+decoupled", "+regularisers-0")),
+    *(f"{DEFAULTS}+eps-{x}-0.1" for x in ("opacities", "all")),
+    *(f"{arm}+regularisers-0" for arm in (DEFAULTS, POOLED)),
+    *(UNFADED_OPACITIES, BEST, POOLED),
+)
+CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4", BEST)
+MARKER = re.compile(r"(<!-- study:([a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def tables(study: Study) -> dict[str, str]:
+    """Every generated piece of the page, by the name in its marker."""
+    short = study.settings(SHORT)
+    names = {kind: [arm.name for arm in arms] for kind, arms in GROUPS.items()}
+    gains = {kind: study.gains(short, arms) for kind, arms in names.items()}
+    long = {
+        "7,500 iterations": study.settings(7_500),
+        "30,000 iterations": study.settings(30_000),
+    }
+    few = [s for s in long["7,500 iterations"] if s.scene in FEW_VIEWS_SCENES]
+    made = {
+        "machines": machines_line(study.records()),
+        "core": gains_table(gains["core"]),
+        "with-nu": gains_table(gains["with-nu"]),
+        "scenes": scenes_table(study, short, [*names["core"], *names["with-nu"]]),
+        "nu": nu_table(study, short, [*names["core"], *names["with-nu"], *names["options"]]),
+        "tails": gains_table(gains["tails"]),
+        "on-top": gains_table(gains["on-top"]),
+        "options": gains_table(gains["options"]) if gains["options"] else _missing("options"),
+        "leads": gains_table(gains["leads"]) if gains["leads"] else _missing("leads"),
+        "long": goals_table(study, {"3,000 iterations": short, **long}, BEST, BASELINE),
+        "pooled": goals_table(study, {"3,000 iterations": short, **long}, POOLED, BASELINE),
+        "long-scenes": scenes_table(study, long["7,500 iterations"], LONG_ARMS),
+        "few-views": scenes_table(study, few, FEW_VIEWS_ARMS),
+        "full-scenes": scenes_table(study, long["30,000 iterations"], LONG_ARMS),
+        "decisions": _decisions_table(study),
+        "front": front_table(study, {n: study.settings(n) for n in (SHORT, 7_500, 30_000)}, FRONT),
+    }
+    for stage, settings in (
+        ("random", study.settings(SHORT, "random")),
+        ("small", study.settings(SHORT, share=0.25)),
+        ("harmonics", study.settings(SHORT, sh_degree=3)),
+    ):
+        found = study.gain(settings, BEST, BASELINE)
+        kinds = {"3,000 iterations": settings}
+        made[stage] = goals_table(study, kinds, BEST, BASELINE) if found else _missing(stage)
+    return made
+
+
+def _missing(stage: str) -> str:
+    """What stands where nothing has been trained yet."""
+    return (
+        f"Not measured yet: `python examples/studies/scenes/run.py --scenes DIR --stages {stage}`."
+    )
+
+
+def _decisions_table(study: Study) -> str:
+    lines = [
+        "| part | decided by | iterations | gain at equal seconds (dB) | scenes, seeds | default |",
+        "|---|---|---:|---:|---|---|",
+    ]
+    for part, decision in decide(study).items():
+        gain = decision.gain
+        shown, count = "-", "-"
+        if gain is not None:
+            shown = f"{gain.equal_seconds:+.2f} ± {gain.spread:.2f}"
+            count = f"{len(gain.scenes)}, {gain.seeds}"
+        on = "on" if decision.on else "off"
+        lines.append(
+            f"| {part} | `{label(decision.arm)}` against `{label(decision.control)}` "
+            f"| {decision.iterations:,} | {shown} | {count} | {on} |"
+        )
+    return "\n".join(lines)
+
+
+def plots(study: Study, folder: Path) -> list[Path]:
+    """Draw everything; return the files."""
+    short, drawn = study.settings(SHORT), []
+    for name, settings, arms in (
+        ("curves.png", short, CURVE_ARMS),
+        (
+            "curves_long.png",
+            study.settings(7_500),
+            ("mcmc", "faded", "annealed-8-0.4", BEST, POOLED),
+        ),
+        ("curves_full.png", study.settings(30_000), ("mcmc", BEST, POOLED)),
+    ):
+        if settings:
+            plot_curves(study, settings, arms, folder / name)
+            drawn.append(folder / name)
+    for name, kinds in (
+        ("gains.png", ("core", "with-nu")),
+        ("gains_tails.png", ("tails", "on-top")),
+        ("gains_leads.png", ("leads",)),
+    ):
+        gains: list[Gain] = []
+        for kind in kinds:
+            gains += study.gains(short, [arm.name for arm in GROUPS[kind]])
+        if gains:
+            plot_gains(gains, folder / name, _title(study, gains))
+            drawn.append(folder / name)
+    return drawn
+
+
+def _title(study: Study, gains: Sequence[Gain]) -> str:
+    scenes = {scene for gain in gains for scene in gain.scenes}
+    settings = [s for s in study.settings(SHORT) if s.scene in scenes]
+    baseline = f"{BASELINE} {baseline_of(study, settings):.2f} dB"
+    return f"{', '.join(sorted(scenes))}\n{SHORT:,} iterations; {baseline}"
+
+
+def fill(page: str, made: dict[str, str]) -> str:
+    """The page with every table between its markers; ValueError for an unknown marker."""
+
+    def put(match: re.Match[str]) -> str:
+        if match[2] not in made:
+            raise ValueError(f"marker study:{match[2]} is unknown; there are {', '.join(made)}")
+        return f"{match[1]}{made[match[2]]}\n{match[3]}"
+
+    return MARKER.sub(put, page)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line; 0, or 2 after one line that says what is wrong."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--runs", type=Path, metavar="DIR", help="folder of study/run.py")
+    args = parser.parse_args(arguments)
+    records = FOLDER / "records.json"
+    try:
+        if args.runs is not None:
+            found = gather(args.runs)
+            if not found:
+                raise ValueError(f"--runs {args.runs}: holds no finished training")
+            FOLDER.mkdir(parents=True, exist_ok=True)
+            old = json.loads(records.read_text(encoding="utf-8")) if records.exists() else {}
+            write(merge(old.get("records", []), found), records)
+        study = Study(read(records))
+        made = tables(study)
+        for page in PAGES:
+            page.write_text(fill(page.read_text(encoding="utf-8"), made), encoding="utf-8")
+        decisions = {part: decision.on for part, decision in decide(study).items()}
+        text = json.dumps(decisions, indent=1) + "\n"
+        (FOLDER / "decisions.json").write_text(text, encoding="utf-8")
+        drawn = plots(study, FOLDER)
+    except (OSError, ValueError) as error:
+        print(f"report: {error}", file=sys.stderr)
+        return 2
+    for path in [records, FOLDER / "decisions.json", *drawn, *PAGES]:
+        print(path)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,171 @@
+"""The figures of docs/results/stability/stability.md: from the JSON beside it, between its markers.
+
+`stability.py` calls this; nothing is measured here.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from mutants import reasons, survivor_key  # tests/, where `stability` has put them within reach
+
+LEAST_COVERAGE = 95.0  # per cent, of branches and of statements; modules below are listed
+SLOW = "python -m pytest -m slow --junitxml=build/slow.xml"
+COVERAGE = (
+    "python -m pytest --cov --cov-config=tests/coverage.ini --cov-report=json:build/coverage.json"
+)
+MARK, END = "<!-- {name}: made by examples/studies/stability/stability.py -->", "<!-- end -->"
+
+
+def table(header: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
+    """A Markdown table."""
+    head = list(header)
+    lines = [head, ["---"] * len(head), *rows]
+    return "".join("| " + " | ".join(str(cell) for cell in line) + " |\n" for line in lines)
+
+
+# -- what other commands have left ---------------------------------------------------------------
+
+
+def slow_result(files: Iterable[Path], machine: str) -> dict[str, Any]:
+    """Outcome and seconds of every test of junit files of pytest; a later file's replace."""
+    tests: dict[str, dict[str, Any]] = {}
+    day = ""
+    for xml in files:
+        for suite in ElementTree.parse(xml).iter("testsuite"):
+            day = max(day, suite.get("timestamp", "").partition("T")[0])
+            for case in suite.iter("testcase"):
+                kinds = ("failure", "error", "skipped")
+                bad = [kind for kind in kinds if case.find(kind) is not None]
+                name = f"{case.get('classname', '').removeprefix('tests.')}::{case.get('name')}"
+                seconds = round(float(case.get("time", 0)), 1)
+                outcome = bad[0] if bad else "passed"
+                tests[name] = {"test": name, "seconds": seconds, "outcome": outcome}
+    about = {"command": SLOW, "date": day, "machine": machine}
+    return {"about": about, "tests": list(tests.values())}
+
+
+def coverage_result(report: Path, machine: str, note: str = "") -> dict[str, Any]:
+    """Lines and branches of every module, of the JSON report of coverage.py."""
+    found = json.loads(report.read_text())
+    keys = ("num_statements", "covered_lines", "num_branches", "covered_branches")
+    modules = {
+        path.rpartition("opt3dgs_optim/")[2]: {key: entry["summary"][key] for key in keys}
+        for path, entry in sorted(found["files"].items())
+    }
+    day = found["meta"]["timestamp"].partition("T")[0]
+    about = {"command": COVERAGE, "date": day, "machine": machine, "note": note}
+    return {"about": about, "modules": modules}
+
+
+# -- what the page says --------------------------------------------------------------------------
+
+
+def slow_block(result: dict[str, Any]) -> str:
+    tests, about = result["tests"], result["about"]
+    passed = sum(test["outcome"] == "passed" for test in tests)
+    minutes = sum(test["seconds"] for test in tests) / 60
+    said = (
+        f"Last run {about['date']} ({about['machine']}, which had other work too): {passed} of "
+        f"{len(tests)} passed, in {minutes:.0f} minutes together.\n\n"
+    )
+    rows = [(f"`{t['test']}`", t["outcome"], f"{t['seconds']:.0f}") for t in tests]
+    return said + table(("test", "outcome", "seconds"), rows)
+
+
+def share(part: float, whole: float) -> float:
+    return 100.0 * part / whole if whole else 100.0
+
+
+def line_share(entry: dict[str, int]) -> float:
+    """Per cent of the statements that ran."""
+    return share(entry["covered_lines"], entry["num_statements"])
+
+
+def branch_share(entry: dict[str, int]) -> float:
+    """Per cent of the branches that were taken."""
+    return share(entry["covered_branches"], entry["num_branches"])
+
+
+def total(modules: dict[str, dict[str, int]]) -> dict[str, int]:
+    """The sums over all modules."""
+    keys = next(iter(modules.values()))
+    return {key: sum(entry[key] for entry in modules.values()) for key in keys}
+
+
+def coverage_block(result: dict[str, Any]) -> str:
+    modules, about = result["modules"], result["about"]
+    whole = total(modules)
+    said = (
+        f"Last run {about['date']} ({', '.join(filter(None, (about['machine'], about['note'])))}): "
+        f"{branch_share(whole):.1f} % of the {whole['num_branches']} branches of `src` were taken, "
+        f"{line_share(whole):.1f} % of its {whole['num_statements']} statements ran.\n"
+    )
+    low = [
+        (f"`{name}`", f"{branch_share(entry):.0f} %", f"{line_share(entry):.0f} %")
+        for name, entry in modules.items()
+        if min(branch_share(entry), line_share(entry)) < LEAST_COVERAGE
+    ]
+    if not low:
+        return said
+    rest = table(("module", "branches", "statements"), low)
+    return f"{said}\nModules below {LEAST_COVERAGE:.0f} %:\n\n{rest}"
+
+
+def mutants_block(result: dict[str, Any]) -> str:
+    modules, about = result["modules"], result["about"]
+    many = sum(entry["mutants"] for entry in modules.values())
+    dead = sum(entry["killed"] for entry in modules.values())
+    why = reasons()
+    survivors = [
+        (
+            f"`{name}` {one['function'].rpartition('.')[2]}",
+            _code(one["before"]),
+            _code(one["after"]),
+            why.get((name, *survivor_key(one)), "a gap"),
+        )
+        for name, entry in modules.items()
+        for one in entry["survivors"]
+    ]
+    rows = [(f"`{name}`", entry["mutants"], entry["killed"]) for name, entry in modules.items()]
+    text = (
+        f"Last run {about['date']} ({about['machine']}): {many} places were changed, one at a "
+        f"time, and the tests noticed {dead} ({share(dead, many):.1f} %). The others count as not "
+        "noticed, whatever the reason.\n\n"
+    )
+    text += table(("module", "mutants", "noticed"), rows)
+    if not survivors:
+        return text
+    return text + "\n" + table(("where", "was", "became", "why nothing notices"), survivors)
+
+
+def _code(text: str) -> str:
+    return "`" + text.partition("  #")[0].replace("|", "\\|") + "`"
+
+
+BLOCKS: dict[str, Callable[[dict[str, Any]], str]] = {
+    "slow": slow_block,
+    "coverage": coverage_block,
+    "mutants": mutants_block,
+}
+
+
+def filled(page: str, folder: Path, tables: str) -> str:
+    """The page with `tables`, and every block of the JSON of its name in `folder`, written anew."""
+    texts = {"tables": tables}
+    for name, make in BLOCKS.items():
+        path = folder / f"{name}.json"
+        texts[name] = make(json.loads(path.read_text())) if path.exists() else "Not run yet.\n"
+    for name, text in texts.items():
+        mark = MARK.format(name=name)
+        block = f"{mark}\n\n{text}\n{END}"
+        pattern = re.escape(mark) + ".*?" + re.escape(END)
+        page, hits = re.subn(pattern, lambda _, block=block: block, page, flags=re.S)
+        if hits != 1:
+            raise ValueError(f"the page has {hits} places for {name!r}, but 1 is needed")
+    return page

@@ -1,0 +1,9 @@
+"""The package in other people's trainers: `python -m opt3dgs_optim.hosts diff PATH_TO_TRAINER`.
+
+`edits` writes the lines that a training script needs, `nerfstudio` adds methods to nerfstudio.
+"""
+
+from opt3dgs_optim.hosts.cli import main
+from opt3dgs_optim.hosts.edits import Edited, diff, edited, write
+
+__all__ = ["Edited", "diff", "edited", "main", "write"]

@@ -1,0 +1,244 @@
+"""How the visits of the energy's partitions are counted, and the multiplier nu that follows.
+
+Two ways. `FixedPartitions` is the paper's: a fixed range, Theta by stochastic approximation.
+`MovingPartitions` is the default: partitions of the energy's recent deviations, which go where the
+energy goes, and Theta from a smoothed density of the recent visits, whose error is known.
+
+Equation numbers are those of the Opt3DGS paper (every displayed equation counted; 7 partition,
+13 index, 14 multiplier, 16 update of the weights). The paper's text is not implementable word for
+word; where this module differs, the comment at the line says why.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+FLOOR = 1e-8  # smallest weight of a fixed range before renormalisation; log theta never sees 0
+# Of the moving partitions; lengths are in deviations of the energy.
+MEMORY = 100  # energies that mean, deviation and density remember
+REACH = 6.0  # half of the range
+BANDWIDTH = 0.4  # of the Gaussian by which a visit is spread, and by which the density is read
+EVEN = 0.05  # share of the visits that is spread over all partitions: no visits, no slope
+LIMIT = 4.0  # an energy further away counts as one at this distance
+UNLIMITED = 4  # energies at the start, whose deviation is not known yet
+MEAN_ABS = math.sqrt(2 / math.pi)  # mean absolute deviation of a Gaussian of deviation 1
+RESOLUTION = 1e-6  # smallest deviation, as a share of the present distance from the mean
+
+
+class FixedPartitions:
+    """Eq. 7, 13, 14 and 16 as the paper has them; all state stays on the energies' device.
+
+    Args:
+        num_partitions: m.
+        energy_range: (low, high), cut uniformly; the first and the last partition are open.
+        zeta, temperature: of eq. 14.
+        warmup: number of energies during which nu is 1 while Theta is being estimated.
+        clamp: (low, high) bounds of nu, or None.
+    """
+
+    def __init__(
+        self,
+        num_partitions: int,
+        energy_range: tuple[float, float],
+        zeta: float,
+        temperature: float,
+        warmup: int,
+        clamp: tuple[float, float] | None,
+    ) -> None:
+        self.num_partitions, self.energy_range, self.zeta = num_partitions, energy_range, zeta
+        self.tau, self.warmup, self.clamp = temperature, warmup, clamp
+
+    def allocate(self, device: torch.device) -> None:
+        """Begin anew on a device."""
+        # MPS has no float64.
+        dtype = torch.float32 if device.type == "mps" else torch.float64
+        m, (low, high) = self.num_partitions, self.energy_range
+        scalar = torch.tensor([low, (high - low) / m, self.tau, 0, 1], dtype=dtype, device=device)
+        self._low, self._width, self._tau, self._count, self.nu = scalar.unbind()
+        self.weights = torch.full((m,), 1.0 / m, dtype=dtype, device=device)
+
+    def take(self, energy: Tensor, valid: Tensor | bool) -> None:
+        """Nu from the present weights, then their update with `energy`, 0-d."""
+        valid = torch.as_tensor(valid, device=energy.device)
+        value = torch.where(valid, energy.to(self.weights.dtype), 0.0)
+        # J of eq. 13, counted from 0: u[J-1] < energy <= u[J], the end partitions open.
+        index = torch.ceil((value - self._low) / self._width) - 1
+        index = index.clamp(0, self.num_partitions - 1).long().reshape(1)
+        nu = torch.where(self._count < self.warmup, 1.0, self._multiplier(index))
+        # In place: a CUDA graph of a step reads nu where it was captured.
+        self.nu.copy_(torch.where(valid, nu, self.nu))
+        self._update(index, valid)
+        self._count.add_(valid)
+
+    def _multiplier(self, index: Tensor) -> Tensor:
+        """Nu of eq. 14 for partition `index`, before the warm-up is considered."""
+        log_weights = self.weights.log()
+        # "theta(J - 1) v 1" in the paper is a clamp of the index (its source, CSGLD, Deng et al.
+        # 2020); read as max(theta, 1) it would give nu = -3973 at the first step.
+        difference = log_weights[index] - log_weights[(index - 1).clamp(min=0)]
+        nu = 1 + self.zeta * self._tau * difference.reshape(()) / self._width
+        if self.clamp is not None:
+            nu = nu.clamp(*self.clamp)
+        # du is not the width of the two open end partitions: no slope is known there.
+        inner = ((index > 0) & (index < self.num_partitions - 1)).reshape(())
+        return torch.where(inner, nu, 1.0)
+
+    def _update(self, index: Tensor, valid: Tensor) -> None:
+        """Eq. 16, with a floor: theta += lambda theta_J^zeta (1[i = J] - theta)."""
+        theta = self.weights
+        step_size = (10 / (self._count**0.8 + 100)).clamp(max=1e-2)  # not in the paper
+        rate = step_size * theta[index] ** self.zeta * valid
+        theta = theta - rate * theta
+        theta = theta.index_add(0, index, rate).clamp(min=FLOOR)
+        self.weights.copy_(torch.where(valid, theta / theta.sum(), self.weights))
+
+    def coordinates(self) -> tuple[float, float, float]:
+        """Low and high end of the range, and tau. Synchronises."""
+        low = float(self._low)
+        return low, low + float(self._width) * self.num_partitions, float(self._tau)
+
+    def state(self) -> dict[str, Any]:
+        """Plain floats and lists. Synchronises."""
+        scalars = torch.stack([self._low, self._width, self._tau, self._count, self.nu])
+        return {"weights": self.weights.tolist(), "scalars": scalars.tolist()}
+
+    def check(self, call: str, state: Mapping[str, Any]) -> None:
+        """ValueError unless the weights are weights, and the range is one."""
+        if min(state["weights"]) <= 0 or abs(math.fsum(state["weights"]) - 1) > 1e-6:
+            raise ValueError(f"{call}: weights must be positive with sum 1")
+        _, width, tau, count, _ = state["scalars"]
+        if not (width > 0 and tau >= 0 and count >= 0):
+            raise ValueError(f"{call}: scalars={state['scalars']!r}, but width > 0 is needed")
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Restore `state()`."""
+        self.weights.copy_(torch.tensor(state["weights"], dtype=torch.float64))
+        scalars = (self._low, self._width, self._tau, self._count, self.nu)
+        for scalar, value in zip(scalars, state["scalars"], strict=True):
+            scalar.fill_(value)
+
+
+class MovingPartitions:
+    """Partitions of z = (energy - recent mean) / recent deviation, over -6 to 6 deviations.
+
+    q is the density of the recent z. A visit is spread over the partitions by a Gaussian k of
+    0.4 deviations, q += (k - q) / 100, and the slope is that of q read through k again:
+
+        Theta ~ q^(1 / (1 - zeta)),    nu = 1 + zeta tau dlog Theta/du = 1 + dlog q/dz / 2
+
+    That Theta is where eq. 16 converges to, too (its field is p_i theta_i^zeta - theta_i times a
+    sum, zero at theta_i^(1 - zeta) ~ p_i), but the gain of a visit does not depend on theta. With
+    tau = (1 - zeta) / (2 zeta) deviations zeta drops out of nu: a Gaussian energy has the slope
+    -z, so |nu - 1| = 1 two deviations out, and nu's deviation is 1/2, whatever zeta. Smoothing by
+    k twice widens a Gaussian's variance to 1 + 2 * 0.4^2, and the slope is corrected by that.
+
+    The mean of dlog q/dz over the visits is 0, for any density that ends somewhere; of a smoothed
+    one it is -.2 for an exponential energy, and while the energy falls. So the slope's own recent
+    mean is taken away: nu's mean is 1, and what nu does is no change of the learning rate.
+
+    All means are of the last 100 energies, weighed exponentially. The deviation is the mean
+    absolute one, and an energy counts for at most four deviations: a spike moves them by 4 %.
+
+    Few operators: one packed state follows one packed target by one `lerp_`, and all products with
+    q are one `addmv`.
+    """
+
+    def __init__(self, num_partitions: int, zeta: float, clamp: tuple[float, float] | None) -> None:
+        self.num_partitions, self.zeta = num_partitions, zeta
+        self.clamp = (-math.inf, math.inf) if clamp is None else clamp
+
+    def allocate(self, device: torch.device) -> None:
+        """Begin anew on a device."""
+        # A loss has float32's digits; elsewhere than on a CPU float64 is slow or missing.
+        dtype = torch.float64 if device.type == "cpu" else torch.float32
+        like: dict[str, Any] = {"dtype": dtype, "device": device}
+        m, h2 = self.num_partitions, BANDWIDTH**2
+        width = 2 * REACH / m
+        center = (torch.arange(m, dtype=torch.float64) + 0.5) * width - REACH
+        # Log of the Gaussian around z = MEAN_ABS * t, up to what softmax takes away.
+        self._log_kernel = (-center * center / (2 * h2)).to(**like)
+        self._log_kernel_slope = (center * (MEAN_ABS / h2)).to(**like)
+        # With V = [k q, t]: rows of slope * (sum k q c + even * z), sum k q + even, -slope * z.
+        slope, even = 0.5 * (1 + 2 * h2) / h2, EVEN / m
+        rows = torch.zeros(3, m + 1, dtype=torch.float64)
+        rows[0, :m], rows[1, :m] = slope * center, 1.0
+        rows[0, m], rows[2, m] = slope * even * MEAN_ABS, -slope * MEAN_ABS
+        self._rows = rows.to(**like)
+        self._offsets = torch.tensor([0.0, even, 0.0], **like)
+        self._products, self._sums = torch.zeros(m + 1, **like), torch.zeros(3, **like)
+        # Mean, mean absolute deviation, mean of the slope, q; and what they are drawn to.
+        self._state, self._target = torch.full((2, m + 3), 1.0 / m, **like).unbind()
+        self._state[:3] = torch.tensor([0.0, 1.0, 0.0])
+        self.nu = torch.ones((), **like)
+        self._tiny = torch.full((), 1e-150 if dtype == torch.float64 else 1e-30, **like)
+        self._views()
+
+    def _views(self) -> None:
+        # Made once: a view is an operator too.
+        self._mean, self._deviation, self._mean_slope = self._state[:3].unbind()
+        self._to_mean, self._to_deviation, self._slope = self._target[:3].unbind()
+        self._q, self._kernel, self._kq = self._state[3:], self._target[3:], self._products[:-1]
+        self._t = self._products[-1]
+        self._up, self._below, self._base = self._sums.unbind()
+
+    def take(self, energy: Tensor, valid: Tensor | Literal[True], count: int) -> None:
+        """Nu from the present density, then its update with `energy`, 0-d, the `count`-th."""
+        if count == 1:
+            self._mean.copy_(energy if valid is True else torch.where(valid, energy, 0.0))
+        limit = LIMIT / MEAN_ABS if count > UNLIMITED else 1 / RESOLUTION
+        # t = z / MEAN_ABS: distance from the mean in mean absolute deviations. Where those have
+        # vanished, as after a constant loss, they grow again by the second term.
+        distance = torch.sub(energy, self._mean)
+        if valid is not True:
+            distance.nan_to_num_(0.0, 0.0, 0.0)
+        unit = torch.add(self._deviation, distance.abs(), alpha=RESOLUTION)
+        t = torch.clamp(torch.div(distance, unit), -limit, limit, out=self._t)
+        log_kernel = torch.addcmul(self._log_kernel, self._log_kernel_slope, t)
+        torch.softmax(log_kernel, 0, out=self._kernel)
+        torch.mul(self._kernel, self._q, out=self._kq)
+        torch.addmv(self._offsets, self._rows, self._products, out=self._sums)
+        slope = torch.addcdiv(self._base, self._up, self._below, out=self._slope)
+        nu = torch.sub(slope, self._mean_slope).add_(1.0)
+        torch.clamp(nu, *self.clamp, out=self.nu)
+        step = torch.mul(t, unit)
+        torch.add(self._mean, step, out=self._to_mean)
+        torch.hypot(step, self._tiny, out=self._to_deviation)
+        rate = max(1 / count, 1 / MEMORY)
+        self._state.lerp_(self._target, rate if valid is True else rate * valid)
+
+    @property
+    def weights(self) -> Tensor:
+        """Theta, [m], sum 1."""
+        q = (1 - EVEN) * self._q.double() + EVEN / self.num_partitions
+        return torch.softmax(q.log() / (1 - self.zeta), 0)
+
+    def coordinates(self) -> tuple[float, float, float]:
+        """Low and high end of the range, and tau. Synchronises."""
+        mean, deviation = self._state[:2].tolist()
+        deviation /= MEAN_ABS
+        tau = (1 - self.zeta) / (2 * self.zeta) * deviation
+        return mean - REACH * deviation, mean + REACH * deviation, tau
+
+    def state(self) -> dict[str, Any]:
+        """Plain floats and lists. Synchronises."""
+        return {"recent": self._state.tolist(), "nu": float(self.nu)}
+
+    def check(self, call: str, state: Mapping[str, Any]) -> None:
+        """ValueError unless the density is one."""
+        _, deviation, _, *q = state["recent"]
+        if deviation < 0 or min(q) < 0 or abs(math.fsum(q) - 1) > 1e-3:
+            raise ValueError(f"{call}: recent={state['recent']!r}, but a density is needed")
+
+    def recent(self) -> tuple[Tensor, Tensor]:
+        """The energy's recent mean and deviation, 0-d, in units of the loss."""
+        return self._mean.clone(), self._deviation / MEAN_ABS
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Restore `state()`."""
+        self._state.copy_(torch.tensor(state["recent"], dtype=torch.float64))
+        self.nu.fill_(state["nu"])

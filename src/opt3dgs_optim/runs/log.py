@@ -1,0 +1,313 @@
+"""The run log: one JSON object a line, written while a trainer runs, without slowing it down.
+
+Lines are `{"kind": "start" | "step" | "evaluation" | "event", "iteration": ..., "seconds": ...}`
+plus whatever the call adds; `read_run` reads them back. `seconds` are run seconds: wall clock since
+the log was opened, without what `RunLog.paused` enclosed, carried on over a resume. JSON has no NaN
+or infinity: they are written as the strings "nan", "inf" and "-inf" and read back as floats.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import platform
+import re
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import datetime, timezone
+from enum import Enum
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim.runs.lines import LineFile, index, number, plain, text
+from opt3dgs_optim.runs.read import read_run
+
+LOGGER = logging.getLogger("opt3dgs_optim")
+RESERVED = ("kind", "iteration", "seconds", "phase", "event")
+
+
+class _Pending(NamedTuple):
+    """A line that waits for numbers on their way from a GPU (or for a line before it)."""
+
+    line: dict[str, Any]
+    names: Sequence[str] = ()
+    host: Tensor | None = None  # [len(names)] float64, pinned
+    ready: Any = None  # torch.cuda.Event, recorded after the copy into `host`
+
+
+class RunLog:
+    """Append the course of one training run to the JSON-lines file `path`.
+
+    A killed process loses at most the line it was writing and, on a GPU, the few step lines whose
+    numbers were still on their way. An existing log is continued, its clock too; to go on from a
+    checkpoint use `resume`.
+
+    A step line costs no host synchronisation: CUDA scalars are copied to pinned memory in stream
+    order and written at a later call. Evaluations, events, `paused`, `flush` and `close` do wait
+    for the GPU. No autograd graph is kept.
+
+    Args:
+        path: the log file; missing parent folders are made.
+        metadata: what describes the run (`arm`, `seed`, `scene`, options): strings, numbers,
+            booleans, None, lists and mappings of these. The report groups by `arm` and pairs
+            by `seed`. `command` replaces the command line recorded otherwise (base names only).
+        every: write step lines only at iterations that are multiples of `every`.
+
+    Raises:
+        ValueError: `every` < 1, metadata nested too deep, or `path` is no run log.
+        TypeError: metadata that JSON cannot hold.
+        BlockingIOError: another RunLog has the file open (noticed where files can be locked).
+
+    Examples:
+        >>> import os, tempfile
+        >>> path = os.path.join(tempfile.mkdtemp(), "mcmc-0.jsonl")
+        >>> with RunLog(path, metadata={"arm": "mcmc", "seed": 0}) as log:
+        ...     log.step(1, phase="exploration", loss=torch.tensor(0.25), nu=1.5)
+        ...     with log.paused():
+        ...         psnr = 21.5  # evaluate here
+        ...     log.evaluation(1, psnr=psnr)
+        >>> read_run(path).evaluations["psnr"]
+        array([21.5])
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        metadata: Mapping[str, Any] | None = None,
+        every: int = 1,
+    ) -> None:
+        if not isinstance(every, int) or every < 1:
+            raise ValueError(f"RunLog(every={every!r}): must be an integer >= 1")
+        described = plain("RunLog(metadata)", dict(metadata or {}))
+        self.path = Path(path)
+        self.every = every
+        self._pending: deque[_Pending] = deque()
+        self._mirrors: list[Any] = []
+        self._pauses = 0
+        self._file = LineFile(self.path)
+        try:
+            last = read_run(self.path).records[-1:]
+            self._base: float = last[0]["seconds"] if last else 0.0
+            self._since: float | None = time.perf_counter()
+            start = self._line("start", last[0]["iteration"] if last else 0)
+            self._file.append(start | _origin() | {"metadata": described})
+        except BaseException:
+            self._file.close()
+            raise
+
+    @classmethod
+    def resume(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        iteration: int,
+        metadata: Mapping[str, Any] | None = None,
+        every: int = 1,
+    ) -> RunLog:
+        """Continue the log of a run that goes on from a checkpoint taken at `iteration`.
+
+        The clock goes on from the last second recorded at an iteration <= `iteration`, and a
+        "resumed" event tells readers to drop what was logged past it. Arguments and errors are
+        those of the class, and FileNotFoundError if there is no log at `path`.
+        """
+        iteration = index("RunLog.resume", iteration)
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"RunLog.resume: no run log at {os.fspath(path)!r}")
+        log = cls(path, metadata=metadata, every=every)
+        records = [r for r in read_run(path).records[:-1] if r["iteration"] <= iteration]
+        log._base = records[-1]["seconds"] if records else 0.0
+        log._since = time.perf_counter()
+        log.event("resumed", iteration)
+        return log
+
+    def mirror(self, writer: Any) -> None:
+        """Send every number that is logged from now on to TensorBoard or Weights & Biases too.
+
+        `log.mirror(SummaryWriter("runs/garden"))`, of `torch.utils.tensorboard`; in gsplat's
+        trainer, which has one, `log.mirror(self.writer)`; `log.mirror(wandb.init(project="3dgs"))`.
+        Tags are `step/NAME` and `evaluation/NAME`, run seconds among them. Numbers go out with
+        their line. A writer that raises gets nothing more, and the logger `opt3dgs_optim` says so.
+
+        Args:
+            writer: has `add_scalar(tag, value, step)`, or `log({tag: value}, step=step)`.
+
+        Raises:
+            TypeError: it has neither.
+        """
+        if not callable(getattr(writer, "add_scalar", getattr(writer, "log", None))):
+            raise TypeError(f"RunLog.mirror({writer!r}): must have add_scalar() or log()")
+        self._mirrors.append(writer)
+
+    @property
+    def seconds(self) -> float:
+        """Run seconds so far: wall clock, without pauses, of all sessions of this run."""
+        running = 0.0 if self._since is None else time.perf_counter() - self._since
+        return self._base + running
+
+    def step(
+        self, iteration: int, *, phase: str | Enum | None = None, **columns: float | Tensor
+    ) -> None:
+        """Log one optimization step; `columns` are numbers or one-element tensors.
+
+        Any name will do, and a column may begin or end at any step. The report marks where
+        `phase` changes, and shows the means of the columns that are no loss.
+
+        Raises:
+            ValueError: a negative iteration, a reserved name or a tensor of several elements.
+            TypeError: a value that is no number.
+        """
+        iteration = index("RunLog.step", iteration)
+        if iteration % self.every == 0:
+            line = self._line("step", iteration)
+            if phase is not None:
+                line["phase"] = text(str(phase.value if isinstance(phase, Enum) else phase))
+            self._pending.append(_pack("RunLog.step", line, columns))
+        self._drain(wait=False)
+
+    def evaluation(self, iteration: int, **metrics: float | Tensor) -> None:
+        """Log metrics (`psnr` in dB, `ssim`, `points`, ...), a number each; raises as `step`."""
+        line = self._line("evaluation", index("RunLog.evaluation", iteration))
+        self._pending.append(_pack("RunLog.evaluation", line, metrics))
+        self._drain(wait=True)
+
+    def event(self, kind: str, iteration: int, **info: Any) -> None:
+        """Log that something happened: "switch", "interrupted", "finished", ...
+
+        `info` may hold what `metadata` may, and one-element tensors. Raises as `step`.
+        """
+        _check_names("RunLog.event", info)
+        line = self._line("event", index("RunLog.event", iteration)) | {"event": text(kind)}
+        self._pending.append(_Pending(line | plain("RunLog.event", info)))
+        self._drain(wait=True)
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Let the run's clock stand still, for an evaluation or a checkpoint; may be nested.
+
+        Waits for the GPU on both sides, so that queued training work counts and the work done
+        inside does not.
+        """
+        if self._pauses == 0:
+            _synchronize()
+            self._base, self._since = self.seconds, None
+        self._pauses += 1
+        try:
+            yield
+        finally:
+            self._pauses -= 1
+            if self._pauses == 0:
+                _synchronize()
+                self._since = time.perf_counter()
+
+    def flush(self) -> None:
+        """Wait for numbers still on the GPU, write their lines, and force the file to the disk."""
+        self._drain(wait=True)
+        self._file.sync()
+
+    def close(self) -> None:
+        """Write what is pending and release the file; a second call does nothing."""
+        try:
+            self._drain(wait=True)
+        finally:
+            self._pending.clear()
+            self._file.close()
+
+    def __enter__(self) -> RunLog:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _line(self, kind: str, iteration: int) -> dict[str, Any]:
+        if self._file.closed:
+            raise ValueError(f"RunLog.{kind}: the log {str(self.path)!r} is closed")
+        return {"kind": kind, "iteration": iteration, "seconds": round(self.seconds, 6)}
+
+    def _drain(self, *, wait: bool) -> None:
+        """Write pending lines in order, up to the first whose numbers have not arrived."""
+        while self._pending:
+            line, names, host, ready = self._pending[0]
+            if host is not None:
+                if wait:
+                    ready.synchronize()
+                elif not ready.query():
+                    return
+                values = zip(names, host.tolist(), strict=True)
+                line |= {name: number("RunLog", name, value) for name, value in values}
+            self._pending.popleft()
+            self._file.append(line)
+            if self._mirrors and line["kind"] != "event":
+                self._send(line)
+
+    def _send(self, line: dict[str, Any]) -> None:
+        names = sorted(line.keys() - {"kind", "iteration", "phase"})
+        values = {f"{line['kind']}/{name}": float(line[name]) for name in names}
+        for writer in list(self._mirrors):
+            try:
+                if hasattr(writer, "add_scalar"):
+                    for tag, value in values.items():
+                        writer.add_scalar(tag, value, line["iteration"])
+                else:
+                    writer.log(values, step=line["iteration"])
+            except Exception as error:  # whatever it is, the training is worth more
+                self._mirrors.remove(writer)
+                LOGGER.warning("RunLog.mirror: %r failed and gets no more: %r", writer, error)
+
+
+def _origin() -> dict[str, Any]:
+    """What runs, where and since when; no host name, no folders."""
+    machine = f"{platform.platform()}, {os.cpu_count()} CPUs"
+    if torch.cuda.is_initialized():
+        machine += f", {torch.cuda.get_device_name()}"
+    # "--data=/home/me/plush" becomes "--data=plush".
+    words = [re.sub(r"[^=]*[/\\](?=[^=]*$)", "", word.rstrip("/\\")) for word in sys.argv]
+    return {
+        "time": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "command": text(" ".join(words)),
+        "machine": f"{machine}, Python {platform.python_version()}, torch {torch.__version__}",
+    }
+
+
+def _synchronize() -> None:
+    """Wait for the GPU, where one is in use; asking it anything else would start CUDA."""
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+
+
+def _pack(call: str, line: dict[str, Any], values: Mapping[str, Any]) -> _Pending:
+    """Put host numbers into `line` and send CUDA ones on their way to pinned memory."""
+    _check_names(call, values)
+    on_gpu = {name: value for name, value in values.items() if _on_gpu(value)}
+    line |= {n: number(call, n, value) for n, value in values.items() if n not in on_gpu}
+    sent = _to_pinned(list(on_gpu.values())) if on_gpu else ()
+    return _Pending(line, list(on_gpu), *sent)
+
+
+def _on_gpu(value: Any) -> bool:
+    return isinstance(value, Tensor) and value.is_cuda and value.numel() == 1
+
+
+def _to_pinned(values: list[Tensor]) -> tuple[Tensor, Any]:
+    """Copy CUDA scalars to the host in stream order: (pinned [n] float64, event of completion)."""
+    device = values[0].device
+    packed = [v.detach().reshape(()).to(device, torch.float64, non_blocking=True) for v in values]
+    host = torch.empty(len(values), dtype=torch.float64, pin_memory=True)
+    host.copy_(torch.stack(packed), non_blocking=True)
+    ready = torch.cuda.Event()
+    ready.record(torch.cuda.current_stream(device))
+    return host, ready
+
+
+def _check_names(call: str, values: Mapping[str, Any]) -> None:
+    for name in values:
+        if name in RESERVED or not name.isprintable():
+            raise ValueError(
+                f"{call}({name!a}=...): reserved; choose a printable name not in {RESERVED}"
+            )

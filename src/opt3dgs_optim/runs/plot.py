@@ -1,0 +1,147 @@
+"""A report as a picture: the metric over seconds and over iterations."""
+
+from __future__ import annotations
+
+import textwrap
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from opt3dgs_optim.runs.read import Run
+from opt3dgs_optim.runs.stats import Arm, Comparison, higher_is_better
+
+# Okabe and Ito's colour-blind-safe palette, without the yellow that white swallows.
+COLOURS = ("#333333", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+STYLES = ("-", "--", ":")  # one for each round through the colours
+FAINT = "#8a8a8a"
+LABELS = {"psnr": "PSNR (dB)", "train_psnr": "training PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS"}
+AXES = {"seconds": "run time (s)", "iteration": "iteration"}
+RC: dict[Any, Any] = {  # text.*: a $ is a $
+    **dict.fromkeys(("axes.spines.top", "axes.spines.right", "text.usetex"), False),
+    **dict.fromkeys(("text.parse_math", "legend.frameon"), False),
+    **{"axes.xmargin": 0.02, "axes.grid": True, "axes.grid.axis": "y", "axes.axisbelow": True},
+    **{"grid.color": "#e4e4e4", "grid.linewidth": 0.6, "axes.edgecolor": "#999999"},
+}
+LARGEST = 1e30  # far below where matplotlib's own arithmetic overflows
+
+Curve = tuple[np.ndarray, np.ndarray]
+
+
+def draw(comparison: Comparison, path: Path, footer: str) -> None:
+    """Draw `comparison` into the PNG file `path`, with `footer` in small print.
+
+    Lines are means over seeds, bands reach from the least to the greatest. No matplotlib backend
+    is chosen and no global setting stays changed.
+
+    Raises:
+        ModuleNotFoundError: matplotlib is not installed.
+    """
+    import matplotlib
+
+    with matplotlib.rc_context(RC), warnings.catch_warnings():
+        # Names in letters that matplotlib's font lacks are drawn as boxes.
+        warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)
+        _figure(comparison, footer).savefig(path)
+
+
+def _figure(comparison: Comparison, footer: str) -> Any:
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    labels = [_label(arm, comparison) for arm in comparison.arms]
+    columns = max(1, min(4, 150 // (max(map(len, labels)) + 8)))  # of the legend
+    above = 0.6 + 0.25 * -(-len(labels) // columns)  # inches, as all here
+    height = above + 3.6 + 1.0
+    figure = Figure(figsize=(11, height), dpi=150, facecolor="white")
+    place = {"left": 0.075, "right": 0.985, "top": 1 - above / height, "bottom": 1.0 / height}
+    panels = figure.subplots(1, len(AXES), sharey=True, gridspec_kw=place | {"wspace": 0.06})
+    for panel, (axis, name) in zip(panels, AXES.items(), strict=True):
+        _panel(panel, comparison, axis)
+        panel.set_xlabel(name)
+    metric = _cut(LABELS.get(comparison.metric, comparison.metric), 40)
+    panels[0].set_ylabel(metric)
+    lines = [Line2D([], [], lw=2.4, **_look(arm)) for arm in comparison.arms]
+    # " ": a label may begin with "_", which would hide it
+    corner = {"loc": "upper left", "bbox_to_anchor": (0.068, 1 - 0.4 / height)}
+    figure.legend(lines, [f" {label}" for label in labels], ncols=columns, **corner)
+    scene = "" if comparison.scene is None else f", {comparison.scene}"
+    title = _cut(f"{metric} against run time and iterations{scene}", 85)
+    figure.text(0.075, 1 - 0.15 / height, title, fontsize=13, weight="bold", va="top")
+    better = "higher" if higher_is_better(comparison.metric) else "lower"
+    caption = f"Lines: mean over seeds; bands: least to greatest; {better} is better. Dashed: "
+    caption += f"the baseline's final mean. Dotted: next phase. {footer}"
+    small = textwrap.fill(_cut(caption, 520), 175)
+    figure.text(0.075, 0.1 / height, small, fontsize=7.5, color="#666666", va="bottom")
+    return figure
+
+
+def _label(arm: Arm, comparison: Comparison) -> str:
+    seeds = f"{len(arm.runs)} seeds" if len(arm.runs) > 1 else "1 seed"
+    return f"{_cut(arm.name, 60)} ({seeds}{', baseline' * (arm.name == comparison.baseline)})"
+
+
+def _cut(text: str, length: int) -> str:
+    return "".join(c if c.isprintable() else " " for c in text[:length])
+
+
+def _look(arm: Arm) -> dict[str, Any]:
+    style = STYLES[arm.colour // len(COLOURS) % len(STYLES)]
+    return {"color": COLOURS[arm.colour % len(COLOURS)], "linestyle": style}
+
+
+def _panel(panel: Any, comparison: Comparison, axis: str) -> None:
+    """The metric over seconds or iterations."""
+    seen: list[Curve] = []
+    for arm in comparison.arms:
+        curves = [curve for run in arm.runs if len((curve := _curve(run, comparison, axis))[0])]
+        if not curves:
+            continue
+        x, table = _on_common_grid(curves)
+        if len(table) > 1:
+            low, high = table.min(axis=0), table.max(axis=0)
+            panel.fill_between(x, low, high, color=_look(arm)["color"], alpha=0.16, lw=0)
+        panel.plot(x, table.mean(axis=0), lw=1.8, **_look(arm))
+        seen += curves
+        for switch in _switches(arm.runs[0], axis):
+            panel.axvline(switch, lw=1.0, ls=":", color=FAINT, zorder=1)
+    if not seen:
+        panel.text(0.5, 0.5, "nothing finite", transform=panel.transAxes, ha="center", color=FAINT)
+        return
+    _zoom(panel, seen)
+    low, high = panel.get_ylim()
+    if comparison.target is not None and low < comparison.target < high:
+        panel.axhline(comparison.target, lw=0.8, ls="--", color=FAINT, zorder=1)
+
+
+def _curve(run: Run, comparison: Comparison, axis: str) -> Curve:
+    """All finite evaluations of a run."""
+    iteration, seconds, values = run.series(comparison.metric)
+    shown = np.abs(values) < LARGEST
+    return (seconds if axis == "seconds" else iteration)[shown], values[shown]
+
+
+def _on_common_grid(curves: list[Curve]) -> Curve:
+    """All points of all curves inside the range they share: exact for piecewise lines."""
+    end = min(x[-1] for x, _ in curves)
+    start = min(end, max(x[0] for x, _ in curves))
+    x = np.unique(np.concatenate([[start, end], *(x for x, _ in curves)]))
+    x = x[(x >= start) & (x <= end)]
+    return x, np.stack([np.interp(x, *curve) for curve in curves])
+
+
+def _zoom(panel: Any, curves: list[Curve]) -> None:
+    """Cut off the steep first fifth of the run, which would flatten the differences to be seen."""
+    last = max(x[-1] for x, _ in curves)
+    shown = np.concatenate([y[x >= 0.2 * last] for x, y in curves])
+    low, high = float(shown.min()), float(shown.max())
+    room = 0.06 * (high - low) or 0.05 * abs(high) or 1.0
+    panel.set_ylim(low - room, high + room)
+
+
+def _switches(run: Run, axis: str) -> list[float]:
+    """Where the steps' phase becomes another."""
+    phase = run.steps.get("phase", np.array([], str))
+    told = np.flatnonzero(phase != "")
+    return [float(run.steps[axis][i]) for i in told[1:][phase[told][1:] != phase[told][:-1]]]

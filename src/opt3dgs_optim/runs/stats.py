@@ -1,0 +1,198 @@
+"""What a report says in numbers: runs grouped by scene and arm, compared with a baseline arm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from opt3dgs_optim.runs.read import Run
+
+KNOWN = ("psnr", "ssim", "train_psnr", "lpips")  # listed first
+LOWER_IS_BETTER = ("lpips", "loss", "error", "mse", "mae", "l1", "l2", "energy", "flip")
+
+
+@dataclass(frozen=True)
+class Stat:
+    """Mean and sample standard deviation (None for n = 1) over `n` runs."""
+
+    mean: float
+    std: float | None
+    n: int
+
+    @staticmethod
+    def of(values: Sequence[float]) -> Stat | None:
+        """The statistic of `values`, or None if there are none; a NaN among them shows."""
+        if len(values) == 0:
+            return None
+        with np.errstate(all="ignore"):  # inf - inf, squares of 1e200
+            std = float(np.std(values, ddof=1)) if len(values) > 1 else None
+            return Stat(float(np.mean(values)), std, len(values))
+
+
+@dataclass
+class Arm:
+    """The runs of one arm on one scene, and what they come to, by the heading in the table."""
+
+    name: str
+    runs: list[Run]
+    colour: int  # the same on every scene; 0 is the baseline's
+    numbers: dict[str, Stat | None]
+
+
+@dataclass
+class Comparison:
+    """All arms on one scene."""
+
+    scene: str | None
+    metric: str
+    baseline: str | None  # None: it did not run on this scene
+    target: float | None  # the baseline's mean final metric
+    arms: list[Arm]
+    notes: list[str]
+
+
+def compare(
+    runs: Sequence[Run], metric: str | None = None, baseline: str | None = None
+) -> list[Comparison]:
+    """Group `runs` by the metadata `scene` and `arm` (else the file's name) and compare.
+
+    `metric` None takes psnr, else the first that is logged; `baseline` None takes "mcmc" if there,
+    else the first arm.
+
+    Raises:
+        ValueError: no log has that metric, or no run that arm.
+    """
+    scenes: dict[str | None, dict[str, list[Run]]] = {}
+    for run in runs:
+        scene = run.metadata.get("scene")
+        arms = scenes.setdefault(None if scene is None else str(scene), {})
+        arms.setdefault(str(run.metadata.get("arm", run.name)), []).append(run)
+    names = list(dict.fromkeys(name for arms in scenes.values() for name in arms))
+    metrics = metric_names(runs)
+    if metric is None:
+        metric = metrics[0] if metrics else KNOWN[0]
+    elif metric not in metrics:
+        there = ", ".join(metrics) or "no metrics at all"
+        raise ValueError(f"--metric {metric!r}: in no log; there are {there}")
+    if baseline is None:
+        baseline = "mcmc" if "mcmc" in names else names[0]
+    elif baseline not in names:
+        raise ValueError(f"--baseline {baseline!r}: no such arm; there are {', '.join(names)}")
+    order = list(dict.fromkeys([baseline, *names]))
+    return [_compare_scene(scene, arms, order, metric) for scene, arms in scenes.items()]
+
+
+def _compare_scene(
+    scene: str | None, runs: dict[str, list[Run]], order: list[str], metric: str
+) -> Comparison:
+    everything = [run for arm in runs.values() for run in arm]
+    metrics, columns = metric_names(everything), step_names(everything)
+    references = runs.get(order[0], [])
+    final = _stat(references, metric, lambda values: values[-1])
+    target = final.mean if final and np.isfinite(final.mean) else None
+    arms = []
+    for colour, name in enumerate(order):
+        if name not in runs:
+            continue
+        own = runs[name]
+        numbers = {f"final {m}": _stat(own, m, lambda values: values[-1]) for m in metrics}
+        seconds = [max((r["seconds"] for r in run.records), default=0.0) for run in own]
+        iterations = [max((r["iteration"] for r in run.records), default=0) for run in own]
+        rates = [i / s for i, s in zip(iterations, seconds, strict=True) if s > 0]
+        numbers |= {"seconds": Stat.of(seconds), "iterations": Stat.of(iterations)}
+        numbers |= {"iterations/s": Stat.of(rates)}
+        numbers |= {f"mean {c}": _stat(own, c, _finite_mean, "step") for c in columns}
+        reached = [_first_time(run, metric, target) for run in own]
+        known = [seconds for seconds in reached if seconds is not None]
+        numbers[f"seconds to baseline {metric}"] = Stat.of(known)
+        gains = [] if name == order[0] else _gains(own, references, metric)
+        numbers[f"{metric} gain at equal seconds"] = Stat.of(gains)
+        arms.append(Arm(name, own, colour, numbers))
+    notes = [note for arm in arms for run in arm.runs if (note := _note(run, arm.name, metric))]
+    return Comparison(scene, metric, order[0] if references else None, target, arms, notes)
+
+
+def metric_names(runs: Sequence[Run]) -> list[str]:
+    """Every metric the runs evaluated, PSNR, SSIM and training PSNR first."""
+    found = dict.fromkeys(name for run in runs for name in run.evaluations)
+    named = [*(name for name in KNOWN if name in found), *found]
+    return [name for name in dict.fromkeys(named) if name not in ("iteration", "seconds")]
+
+
+def step_names(runs: Sequence[Run]) -> list[str]:
+    """The columns of the step lines that are no loss: what the parts say of themselves."""
+    found = dict.fromkeys(name for run in runs for name in run.steps if higher_is_better(name))
+    return [name for name in found if name not in ("iteration", "seconds", "phase")]
+
+
+def higher_is_better(metric: str) -> bool:
+    """False for names that say error, loss, lpips and the like."""
+    return not any(word in metric.lower() for word in LOWER_IS_BETTER)
+
+
+def _stat(runs: list[Run], name: str, of: Any, kind: str = "evaluation") -> Stat | None:
+    """Of the values of `name` in every run that logs it: `of` them, None to leave a run out."""
+    series = [run.series(name, kind)[2] for run in runs]
+    values = [of(values) for values in series if len(values)]
+    return Stat.of([float(value) for value in values if value is not None])
+
+
+def _finite_mean(values: np.ndarray) -> float | None:
+    values = values[np.isfinite(values)]
+    with np.errstate(over="ignore"):
+        return float(values.mean()) if len(values) else None
+
+
+def _curve(run: Run, metric: str) -> tuple[np.ndarray, np.ndarray]:
+    """(seconds, metric turned so that more is better)."""
+    _, seconds, values = run.series(metric)
+    return seconds, values if higher_is_better(metric) else -values
+
+
+def _first_time(run: Run, metric: str, target: float | None) -> float | None:
+    """Seconds until the metric first reaches `target`, linear between evaluations."""
+    if target is None:
+        return None
+    seconds, values = _curve(run, metric)
+    goal = target if higher_is_better(metric) else -target
+    reached = np.flatnonzero(values >= goal)
+    if len(reached) == 0:
+        return None
+    i = int(reached[0])
+    if i == 0 or not np.isfinite(values[i - 1 : i + 1]).all():
+        return float(seconds[i])
+    return float(np.interp(goal, values[i - 1 : i + 1], seconds[i - 1 : i + 1]))
+
+
+def _gains(runs: list[Run], references: list[Run], metric: str) -> list[float]:
+    """For every seed that both have: the gain at the smaller of the two final times."""
+    by_seed = {repr(run.metadata.get("seed")): _curve(run, metric) for run in references}
+    gains = []
+    for run in runs:
+        ours, theirs = _curve(run, metric), by_seed.get(repr(run.metadata.get("seed")))
+        if theirs is None or len(ours[0]) == 0 or len(theirs[0]) == 0:
+            continue
+        time = min(ours[0][-1], theirs[0][-1])
+        if time >= max(ours[0][0], theirs[0][0]):
+            gains.append(float(np.interp(time, *ours) - np.interp(time, *theirs)))
+    return gains
+
+
+def _note(run: Run, arm: str, metric: str) -> str | None:
+    """What a reader must know of a run before trusting the table."""
+    values = run.series(metric)[2]
+    odd = int((~np.isfinite(values)).sum())
+    if all(record["kind"] == "start" for record in run.records):
+        note = "empty run, nothing logged"
+    elif len(values) == 0:
+        note = f"no evaluation of {metric}"
+    elif odd:
+        note = f"{metric} not finite in {odd} evaluations"
+    elif len(values) == 1:
+        note = f"a single evaluation of {metric}"
+    else:
+        return None
+    return f"{run.name} ({arm}): {note}"

@@ -1,0 +1,262 @@
+"""The package's .cu files, compiled by g++ and compared with pure torch: what the tests share."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import opt3dgs_optim
+from opt3dgs_optim.covariance import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
+from opt3dgs_optim.cuda import BLOCK, macros
+from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
+
+HERE = Path(__file__).parent
+SOURCES = Path(opt3dgs_optim.__file__).parent / "cuda"
+GUARD_ROWS = 300  # written by nobody: more than one block beyond the last row
+GUARD = 12345.0
+OPTIONS = {"min_cosine": 1e-6, "graft": True}
+BUILDS = Path(tempfile.gettempdir()) / "opt3dgs_optim_host_kernels"
+
+
+def compiler() -> str | None:
+    """g++, or None: then the tests that need it skip with this as the reason."""
+    return shutil.which("g++")
+
+
+def compile_host(
+    out: Path, size: int, dtype: torch.dtype, sources: Path = SOURCES, *extra: str
+) -> Path:
+    """Compile the kernels for one history size: a library, or a program for the sanitizers."""
+    defines = [f"-D{name}={value}" for name, value in macros(dtype, size)]
+    program = any(flag.startswith("-fsanitize") for flag in extra)
+    library = ["-shared", "-fPIC", str(HERE / "cuda_host_kernels.cpp")]
+    what = [str(HERE / "cuda_host_main.cpp")] if program else library
+    flags = ["-std=c++17", "-O1", "-Wall", "-Werror", "-Wno-unknown-pragmas", *extra]
+    command = ["g++", *flags, *defines, f"-I{HERE}", f"-I{sources}", *what, "-o", str(out)]
+    subprocess.run(command, check=True, capture_output=True, text=True)
+    return out
+
+
+@cache
+def host_kernels(size: int, dtype: torch.dtype) -> HostKernels:
+    """The kernels for one history size; see `built`."""
+    return HostKernels.load(built(size, dtype), dtype)
+
+
+def built(size: int, dtype: torch.dtype, *extra: str) -> Path:
+    """`compile_host` of the package's sources, once for all processes and runs.
+
+    The name says what went in: sources, flags and compiler. Two workers that build the same thing
+    at a time each rename a whole file of their own into place.
+    """
+    digest = hashlib.sha256(repr((_digest(), size, dtype, extra)).encode()).hexdigest()[:24]
+    path = BUILDS / f"k{size}_{dtype.itemsize}_{digest}"
+    if not path.exists():
+        BUILDS.mkdir(parents=True, exist_ok=True)
+        own = path.with_suffix(f".{os.getpid()}")
+        compile_host(own, size, dtype, SOURCES, *extra)
+        own.replace(path)
+    return path
+
+
+@cache
+def _digest() -> str:
+    """Of all that a build is made of."""
+    files = sorted([*SOURCES.glob("*.cu*"), *HERE.glob("cuda_host_*"), Path(__file__)])
+    version = subprocess.run(["g++", "--version"], check=True, capture_output=True).stdout
+    contents = b"".join(file.name.encode() + file.read_bytes() for file in files)
+    return hashlib.sha256(version + contents).hexdigest()
+
+
+@dataclass
+class HostKernels:
+    """The compiled kernels, called as the operators are."""
+
+    library: ctypes.CDLL
+    dtype: torch.dtype
+
+    @classmethod
+    def load(cls, path: Path, dtype: torch.dtype) -> HostKernels:
+        return cls(ctypes.CDLL(str(path)), dtype)
+
+    def _call(self, name: str, tensors: list[Tensor], rows: int, *scalars: object) -> None:
+        real = ctypes.c_double if self.dtype == torch.float64 else ctypes.c_float
+        values = [real(v) if isinstance(v, float) else v for v in scalars]
+        pointers = [ctypes.c_void_p(t.data_ptr()) for t in tensors]
+        values.insert(0 if name == "run_lqn" else len(values), ctypes.c_longlong(rows))
+        getattr(self.library, name)(ctypes.c_uint(BLOCK), *pointers, *values)
+
+    def lqn(
+        self,
+        position: Tensor,
+        grad: Tensor,
+        history: Tensor,
+        *,
+        min_cosine: float,
+        graft: bool,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """As `lqn_direction`; raises AssertionError if a row beyond the last one was written."""
+        n = grad.shape[0]
+        inputs = [t.to(self.dtype).contiguous() for t in (position, grad)]
+        cells = guarded(history.to(self.dtype))
+        direction = guarded(torch.zeros(n, 3, dtype=self.dtype))
+        flags = [guarded(torch.zeros(n, dtype=torch.uint8)) for _ in range(2)]
+        # The inputs end with the last row: room for what a missing tail guard reads.
+        tensors = [guarded(t) for t in inputs] + [cells, direction, *flags]
+        self._call("run_lqn", tensors, n, float(min_cosine), int(graft))
+        for tensor in tensors:
+            check_guard(tensor, n)
+        history.copy_(cells[:n])
+        return direction[:n], flags[0][:n].bool(), flags[1][:n].bool()
+
+    def two_loop(self, grad: Tensor, history: Tensor) -> Tensor:
+        """As `lbfgs.two_loop`; `history` must stay as it is."""
+        n = grad.shape[0]
+        tensors = [guarded(t.to(self.dtype).contiguous()) for t in (grad, history, 0 * grad)]
+        tensors[0][n:] *= -1  # H g = g in the rows beyond the last: let that not be the guard
+        self._call("run_two_loop", tensors, n)
+        for tensor in tensors[1:]:
+            check_guard(tensor, n)
+        assert torch.equal(tensors[1][:n], history.to(self.dtype))
+        return tensors[2][:n]
+
+    def noise(
+        self, means: Tensor, gaussians: dict[str, Tensor], eta: Tensor, lr: float, scale: float
+    ) -> Tensor:
+        """The means with the noise added."""
+        n = means.shape[0]
+        rate = torch.tensor([lr], dtype=torch.float32)
+        names = ("scales", "quats", "opacities")
+        tensors = [guarded(t) for t in (means, *(gaussians[name] for name in names), eta)]
+        self._call("run_noise", [*tensors, rate], n, scale, GATE_SHARPNESS, GATE_OPACITY)
+        for tensor in tensors:
+            check_guard(tensor, n)
+        return tensors[0][:n]
+
+
+def guarded(tensor: Tensor) -> Tensor:
+    """A contiguous copy with rows behind it that nobody may write."""
+    value = 77 if tensor.dtype == torch.uint8 else GUARD
+    return torch.cat([tensor, tensor.new_full((GUARD_ROWS, *tensor.shape[1:]), value)])
+
+
+def check_guard(tensor: Tensor, rows: int) -> None:
+    value = 77 if tensor.dtype == torch.uint8 else GUARD
+    assert bool((tensor[rows:] == value).all()), "rows beyond the last one were written"
+
+
+# -- what the kernels are run on -------------------------------------------------------------------
+
+
+class Problem:
+    """N quadratics in three dimensions, a fifth of them with a negative eigenvalue."""
+
+    def __init__(self, n: int, seed: int = 0) -> None:
+        g = self.generator = torch.Generator().manual_seed(seed)
+        basis = torch.linalg.qr(torch.randn(n, 3, 3, generator=g, dtype=torch.float64)).Q
+        eigenvalues = 10 ** (2 * torch.rand(n, 3, generator=g, dtype=torch.float64) - 1)
+        eigenvalues[: n // 5, 0] *= -1
+        self.hessian = basis @ torch.diag_embed(eigenvalues) @ basis.mT
+        self.start = torch.randn(n, 3, generator=g, dtype=torch.float64)
+        self.n = n
+
+    def views(self, steps: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """Per step: gradient noise [N, 3], what each row is (visible, unseen, NaN, inf), resets."""
+        g, n = self.generator, self.n
+        for step in range(steps):
+            noise = 0.01 * torch.randn(n, 3, generator=g, dtype=torch.float64)
+            kind = torch.rand(n, generator=g)
+            reset = torch.rand(n, generator=g) < (0.1 if step in (5, 9) else 0.0)
+            yield noise, kind, reset
+
+    def gradient(self, x: Tensor, noise: Tensor, kind: Tensor) -> Tensor:
+        grad = (self.hessian @ x.unsqueeze(2)).squeeze(2) + noise
+        grad[kind < 0.15] = 0.0
+        grad[(kind > 0.96)] = torch.nan
+        grad[kind > 0.98, 1] = torch.inf
+        return grad
+
+
+def free_run(
+    step: Callable[..., tuple[Tensor, Tensor, Tensor]], problem: Problem, size: int, steps: int = 13
+) -> list[Tensor]:
+    """Positions, directions, flags and history of a run on its own state."""
+    x = problem.start.clone()
+    history = new_history(x, size, contiguous=True)
+    problem.generator.manual_seed(1)
+    seen = []
+    for noise, kind, reset in problem.views(steps):
+        history[reset] = 0
+        grad = problem.gradient(x, noise, kind)
+        direction, accepted, candidates = step(x, grad, history)
+        x = x - 0.05 * torch.nan_to_num(direction, nan=0.0, posinf=0.0, neginf=0.0)
+        seen += [x, direction, accepted.double(), candidates.double()]
+    return [*seen, history]
+
+
+def compare_runs(kernels: HostKernels, n: int, size: int, **changed: object) -> float:
+    """The largest relative difference from pure torch over 13 free-running steps, in float64."""
+    options = {**OPTIONS, **changed}
+    problem = Problem(n)
+    reference = free_run(lambda x, g, h: lqn_direction(x, g, h, size, **options), problem, size)  # pyright: ignore
+    result = free_run(lambda x, g, h: kernels.lqn(x, g, h, **options), problem, size)  # pyright: ignore
+    return max(map(relative_difference, result, reference), default=0.0)
+
+
+def compare_two_loops(kernels: HostKernels, n: int, size: int) -> float:
+    """The largest relative difference of the recursion alone, in float64.
+
+    Of gradients of all sizes, zeros among them, and with points that have no pair.
+    """
+    g = torch.Generator().manual_seed(n + size)
+    s = torch.randn(size, n, 3, generator=g, dtype=torch.float64)
+    hessian = torch.randn(n, 3, 3, generator=g, dtype=torch.float64)
+    hessian = hessian @ hessian.mT + torch.eye(3)
+    history = history_from_pairs(s, torch.einsum("nij,knj->kni", hessian, s))
+    grad = torch.randn(n, 3, generator=g, dtype=torch.float64)
+    grad *= 10.0 ** (60 * torch.rand(n, 1, generator=g, dtype=torch.float64) - 30)
+    history[::7], grad[::5] = 0, 0
+    return relative_difference(kernels.two_loop(grad, history), two_loop(grad, history, size))
+
+
+def relative_difference(result: Tensor, reference: Tensor) -> float:
+    """Largest difference over the reference's row size; infinite where only one is NaN."""
+    if reference.numel() == 0:
+        return 0.0
+    result, reference = result.double().flatten(1 if result.dim() > 1 else 0), reference.double()
+    reference = reference.reshape(result.shape)
+    same = (result == reference) | (result.isnan() & reference.isnan())
+    # Values of one row belong together: rounding is relative to the largest of them.
+    size = reference.abs().nan_to_num(posinf=0.0)
+    size = size.amax(dim=-1, keepdim=True).clamp(min=1e-300) if size.dim() > 1 else size + 1e-300
+    gap = torch.where(same, 0.0, (result - reference).abs() / size)
+    return float(gap.nan_to_num(nan=torch.inf).max())
+
+
+def noise_case(n: int, dtype: torch.dtype) -> tuple[Tensor, dict[str, Tensor], Tensor]:
+    """Means, Gaussians whose gate is half open, and eta."""
+    g = torch.Generator().manual_seed(2)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g, dtype=torch.float64).to(dtype)
+
+    gaussians = {"scales": draw(n, 3) - 1, "quats": 3 * draw(n, 4), "opacities": draw(n) - 5.3}
+    return draw(n, 3), gaussians, draw(n, 3)
+
+
+def expected_noise(gaussians: dict[str, Tensor], eta: Tensor) -> Tensor:
+    """Pure torch's noise for a `noise_case`."""
+    names = ("scales", "quats", "opacities")
+    scales, quats, opacities = (gaussians[name] for name in names)
+    return covariance_noise(scales, quats, opacities, eta)

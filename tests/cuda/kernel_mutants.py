@@ -1,0 +1,120 @@
+"""Break the .cu files on purpose, one place at a time, and see the comparison notice.
+
+    python tests/cuda/kernel_mutants.py
+
+prints one line per mutant and fails if one gets through. The kernels are compiled by g++ and run on
+the host, as in tests/cuda/test_kernel_host.py; no GPU is needed.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from kernel_host import (
+    SOURCES,
+    HostKernels,
+    compare_runs,
+    compare_two_loops,
+    compile_host,
+    expected_noise,
+    noise_case,
+    relative_difference,
+)
+
+SIZE = 5
+ROWS = 257  # not a multiple of a block: the tail guard has something to do
+
+
+class Mutant(NamedTuple):
+    """A change of one place in one file."""
+
+    name: str
+    file: str
+    old: str
+    new: str
+
+
+GUARD_LINE = "if (row >= rows) return;"
+MUTANTS = (
+    Mutant("sign in the second loop", "two_loop.cuh", "alpha[j] - beta", "alpha[j] + beta"),
+    Mutant("slot of a pair", "two_loop.cuh", "s[j > 0 ? j - 1 : 0].v", "s[j > 1 ? j - 2 : 0].v"),
+    Mutant("noise component", "noise.cu", "m[1] += noise.y", "m[1] += noise.z"),
+    Mutant("sign of the gate", "noise.cu", "sigmoid(-sharpness *", "sigmoid(sharpness *"),
+    Mutant("tail guard", "lqn.cu", f"{GUARD_LINE}\n  Vec3", "if (row > rows) return;\n  Vec3"),
+    Mutant(
+        "tail guard of the recursion",
+        "lqn.cu",
+        f"{GUARD_LINE}\n  write_row(results",
+        "write_row(results",
+    ),
+    Mutant(
+        "scale of the recursion",
+        "two_loop.cuh",
+        "History<T, K>(row)), scale)",
+        "History<T, K>(row)), T(1))",
+    ),
+    Mutant("tail guard of the noise", "noise.cu", GUARD_LINE, ""),
+    Mutant("test of acceptance", "two_loop.cuh", "pair.cosine > min", "pair.cosine < min"),
+    Mutant("clamp of the counter", "two_loop.cuh", "history.counter < T(K + 1)", "true"),
+    Mutant(
+        "length of the grafted step", "two_loop.cuh", "sqrt(dot(unit, unit)) / size", "T(1) / size"
+    ),
+    Mutant("conjugate quaternion", "noise.cu", "times(axis, T(-1))", "axis"),
+)
+
+
+def complaint(kernels: HostKernels) -> str | None:
+    """What the comparison with pure torch says of these kernels; None if nothing."""
+    try:
+        difference = max(compare_runs(kernels, ROWS, SIZE), compare_two_loops(kernels, ROWS, SIZE))
+        means, gaussians, eta = noise_case(ROWS, torch.float64)
+        result = kernels.noise(means, gaussians, eta, 0.25, 2.0)
+    except AssertionError as error:
+        return str(error)
+    if not difference < 1e-10:
+        return f"lqn_direction or two_loop differs by {difference:.1e}"
+    expected = means + expected_noise(gaussians, eta) * 0.5
+    difference = relative_difference(result, expected)
+    return None if difference < 1e-12 else f"add_covariance_noise differs by {difference:.1e}"
+
+
+def mutated(mutant: Mutant | None, folder: Path) -> HostKernels:
+    """The kernels with one mutant applied, compiled in `folder`; None: as they are.
+
+    Raises:
+        ValueError: the text that the mutant replaces does not occur exactly once.
+    """
+    sources = folder / "sources"
+    shutil.copytree(SOURCES, sources)
+    if mutant is not None:
+        path = sources / mutant.file
+        text = path.read_text()
+        if text.count(mutant.old) != 1:
+            raise ValueError(
+                f"mutant {mutant.name!r}: {mutant.old!r} occurs {text.count(mutant.old)} times in "
+                f"{mutant.file}, but exactly once is needed"
+            )
+        path.write_text(text.replace(mutant.old, mutant.new))
+    return HostKernels.load(
+        compile_host(folder / "kernels.so", SIZE, torch.float64, sources), torch.float64
+    )
+
+
+def main() -> int:
+    survivors = 0
+    for mutant in (None, *MUTANTS):
+        with tempfile.TemporaryDirectory() as folder:
+            said = complaint(mutated(mutant, Path(folder)))
+        name = "unchanged" if mutant is None else mutant.name
+        survivors += (said is None) != (mutant is None)
+        print(f"{name}: {said or 'no difference'}")
+    return 1 if survivors else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,233 @@
+"""What only a GPU shows: launch, streams, graph capture. `pytest -m cuda` on a machine with one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from kernel_host import OPTIONS, Problem, free_run, noise_case, relative_difference
+from opt3dgs_optim.noise import CovarianceNoise
+from torch import Tensor
+from trainers import everything
+
+from opt3dgs_optim import AWSGLD, Annealing, Fading, LQNAdam, Pooling, backend_info
+from opt3dgs_optim.covariance import add_covariance_noise
+from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
+from opt3dgs_optim.lqnadam import CurvatureOptions
+
+REASON = "torch sees no CUDA device"
+if torch.cuda.is_available():
+    REASON = backend_info("cuda").reason
+pytestmark = [
+    pytest.mark.cuda,
+    pytest.mark.skipif(
+        not torch.cuda.is_available() or backend_info("cuda").backend != "cuda", reason=REASON
+    ),
+]
+KERNEL = {**OPTIONS, "backend": "cuda"}
+ROWS = (0, 1, 255, 256, 257, 1000, 4096)
+
+
+def on_gpu(x: Tensor, grad: Tensor, history: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The operator on the GPU, for tensors of the CPU."""
+    cells = history.cuda()
+    result = lqn_direction(x.cuda(), grad.cuda(), cells, size, **KERNEL)  # pyright: ignore
+    history.copy_(cells)
+    return tuple(part.cpu() for part in result)  # pyright: ignore
+
+
+@pytest.mark.parametrize("size", [1, 3, 5, 8, 16])
+@pytest.mark.parametrize("rows", ROWS)
+def test_free_running_in_float64(rows: int, size: int) -> None:
+    problem = Problem(rows)
+    result = free_run(lambda x, g, h: on_gpu(x, g, h, size), problem, size)
+    expected = free_run(
+        lambda x, g, h: lqn_direction(x, g, h, size, **OPTIONS),  # pyright: ignore
+        problem,
+        size,
+    )
+    for a, b in zip(result, expected, strict=True):
+        assert relative_difference(a, b) < 1e-10
+
+
+@pytest.mark.parametrize("rows", ROWS)
+def test_single_step_in_float32(rows: int) -> None:
+    options = {**OPTIONS, "min_cosine": 0.1}
+    x, grad = Problem(rows).start.float(), Problem(rows, 1).start.float()
+    history = new_history(x, 5, contiguous=True)
+    for k in range(4):
+        lqn_direction(x + 0.1 * k * grad, grad * (1 + k), history, 5, **options)  # pyright: ignore
+    twin = history.cuda()
+    options["backend"] = "cuda"
+    result = lqn_direction(x.cuda(), grad.cuda(), twin, 5, **options)  # pyright: ignore
+    del options["backend"]
+    expected = lqn_direction(x, grad, history, 5, **options)  # pyright: ignore
+    same = (result[1].cpu() == expected[1]) & (result[2].cpu() == expected[2])
+    assert bool(same.all()) or float((~same).float().mean()) < 1e-3
+    assert relative_difference(result[0].cpu()[same], expected[0][same]) < 1e-5
+
+
+@pytest.mark.parametrize("size", [1, 3, 5, 8, 16])
+@pytest.mark.parametrize("rows", ROWS)
+def test_recursion_alone(rows: int, size: int) -> None:
+    """`two_loop` of tensors on the GPU is the kernel's, in either layout of the history."""
+    s, g = torch.randn(size, rows, 3), torch.randn(rows, 3, dtype=torch.float64)
+    history = history_from_pairs(s.double(), s.double() * torch.tensor([1.0, 3.0, 9.0]))
+    expected = two_loop(g, history, size)
+    for cells in (history.cuda(), history.cuda().contiguous()):
+        result = two_loop(g.cuda(), cells, size)
+        assert relative_difference(result.cpu(), expected) < 1e-10
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("rows", ROWS)
+def test_noise(rows: int, dtype: torch.dtype) -> None:
+    means, gaussians, eta = noise_case(rows, dtype)
+    moved = means.cuda()
+    tensors = [gaussians[name].cuda() for name in ("scales", "quats", "opacities")]
+    lr = torch.tensor(0.25, device="cuda")
+    add_covariance_noise(moved, *tensors, eta=eta.cuda(), lr=lr, noise_scale=2.0, backend="cuda")
+    add_covariance_noise(means, *gaussians.values(), eta=eta, lr=lr.cpu(), noise_scale=2.0)
+    limit = 1e-12 if dtype == torch.float64 else 1e-5
+    assert relative_difference(moved.cpu(), means) < limit
+
+
+def test_noise_is_reproduced_by_the_seed() -> None:
+    outcomes = []
+    for _ in range(2):
+        means, gaussians, _ = noise_case(1000, torch.float32)
+        x = means.cuda()
+        torch.manual_seed(7)
+        on_device = {name: tensor.cuda() for name, tensor in gaussians.items()}
+        CovarianceNoise(on_device, 1.0, backend="cuda").add_to(x, 0.1)
+        outcomes.append(x)
+    assert torch.equal(*outcomes)
+
+
+def test_side_stream_and_no_synchronisation() -> None:
+    x, grad = torch.randn(5000, 3, device="cuda"), torch.randn(5000, 3, device="cuda")
+    history = new_history(x, 5, contiguous=True)
+    lqn_direction(x, grad, history, 5, **KERNEL)  # pyright: ignore
+    expected, _, _ = lqn_direction(x + 1, 2 * grad, history.clone(), 5, **KERNEL)  # pyright: ignore
+    stream = torch.cuda.Stream()
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        with torch.cuda.stream(stream):
+            moved, turned = x + 1, 2 * grad
+            result, _, _ = lqn_direction(moved, turned, history, 5, **KERNEL)  # pyright: ignore
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    stream.synchronize()
+    assert torch.equal(result, expected)
+
+
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="one GPU only")
+def test_second_device() -> None:
+    x, grad = torch.randn(300, 3, device="cuda:1"), torch.randn(300, 3, device="cuda:1")
+    history = new_history(x, 5, contiguous=True)
+    result, _, _ = lqn_direction(x, grad, history, 5, **KERNEL)  # pyright: ignore
+    assert torch.equal(result, grad)
+
+
+class FixedMultiplier:
+    """What AWSGLD asks of a histogram, with a nu that the test writes."""
+
+    def __init__(self) -> None:
+        self.num_observed = 1
+        self.multiplier = torch.ones((), device="cuda")
+        self.last_finite = torch.ones((), dtype=torch.bool, device="cuda")
+
+
+def capture(body: Callable[[], None]) -> torch.cuda.CUDAGraph:
+    """Warm up on a side stream (compiles, loads, allocates), then capture."""
+    side = torch.cuda.Stream()
+    with torch.cuda.stream(side):
+        for _ in range(3):
+            body()
+    side.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        body()
+    return graph
+
+
+@pytest.mark.parametrize("kind", ["exploration", "exploitation"])
+def test_twenty_steps_captured_and_replayed(kind: str) -> None:
+    """A replay sees the lr and nu that have been written since the capture."""
+    curvatures = torch.tensor([1.0, 5.0, 25.0], device="cuda")
+    outcomes = []
+    for captured in (False, True):
+        x = torch.nn.Parameter(noise_case(1000, torch.float32)[0].cuda())
+        x.grad = torch.ones_like(x)
+        lr, nu = torch.tensor(1e-3, device="cuda"), FixedMultiplier()
+        options = {"lr": lr, "fused": True, "capturable": True}
+        if kind == "exploration":
+            optimizer = AWSGLD([x], histogram=nu, **options)  # pyright: ignore
+        else:
+            optimizer = LQNAdam([x], backend="cuda", **options)
+
+        def body(x: torch.nn.Parameter = x, optimizer: torch.optim.Adam = optimizer) -> None:
+            assert x.grad is not None
+            x.grad.copy_(x.detach() * curvatures)
+            optimizer.step()
+
+        if captured:
+            body_or_replay = capture(body).replay
+        else:
+            for _ in range(3):
+                body()
+            body_or_replay = body
+        for step in range(20):
+            lr.fill_(1e-3 * (1 + step / 10))
+            nu.multiplier.fill_(1 - step / 20)
+            body_or_replay()
+        outcomes.append(x.detach().clone())
+    torch.testing.assert_close(outcomes[0], outcomes[1], rtol=1e-6, atol=1e-7)
+
+
+def test_captured_noise_follows_the_learning_rate() -> None:
+    means, gaussians, _ = noise_case(1000, torch.float32)
+    x, lr = means.cuda(), torch.tensor(1e-3, device="cuda")
+    noise = CovarianceNoise({k: v.cuda() for k, v in gaussians.items()}, 1.0, backend="cuda")
+    graph = capture(lambda: noise.add_to(x, lr))
+    moves = []
+    for rate in (0.0, 1.0, 2.0):
+        lr.fill_(rate)
+        before = x.clone()
+        graph.replay()
+        moves.append(float((x - before).norm()))
+    assert moves[0] == 0.0
+    assert moves[2] / moves[1] == pytest.approx(2.0, rel=0.5)  # another draw of eta
+
+
+def test_phase_scheduler_steps_without_synchronisation() -> None:
+    means, gaussians, _ = noise_case(1000, torch.float32)
+    splats = {k: torch.nn.Parameter(v.cuda()) for k, v in {"means": means, **gaussians}.items()}
+    adams = {
+        name: torch.optim.Adam([{"params": [p], "lr": 1e-3, "name": name}], fused=True)
+        for name, p in splats.items()
+    }
+    ours: dict[str, Any] = {
+        "annealing": Annealing(),
+        "fading": Fading(events=10),
+        "pooling": Pooling(),
+        "curvature": CurvatureOptions(backend="cuda"),
+    }
+    phases = everything(40, switch=20, noise_scale=1.0, **ours)
+    optimizers = phases.upgrade(adams, splats)
+    loss = torch.tensor(0.1, device="cuda")
+    for step in range(40):
+        for p in splats.values():
+            p.grad = torch.randn_like(p)
+        quiet = step not in (0, 1, 20, 21)  # first use of a phase compiles and allocates
+        torch.cuda.set_sync_debug_mode("error" if quiet else "default")
+        try:
+            phases.observe(loss)
+            for optimizer in optimizers.values():
+                optimizer.step()
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+    assert all(bool(torch.isfinite(p).all()) for p in splats.values())

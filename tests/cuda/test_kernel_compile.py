@@ -1,0 +1,170 @@
+"""NVRTC and nvcc compile the kernels for every architecture, without spills. No GPU is needed."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+import torch
+
+from opt3dgs_optim import cuda
+
+ARCHITECTURES = ("75", "80", "86", "89", "90", "100", "120")
+MAX_REGISTERS = 96
+# The short history in registers at both ends of its range, the long one that is read twice.
+SIZES = (1, 3, 4, 5, 6, 8, 16)
+
+
+class Compiled(NamedTuple):
+    """What ptxas said, and the PTX."""
+
+    log: str
+    ptx: str
+
+
+def with_nvcc(name: str, arch: str, dtype: torch.dtype, size: int | None, folder: Path) -> Compiled:
+    source = folder / "kernel.cu"
+    source.write_text(cuda.source(name))
+    defines = [f"-D{key}={value}" for key, value in cuda.macros(dtype, size)]
+    command = ["nvcc", "-std=c++17", *defines, str(source), "-o"]
+    usage = subprocess.run(
+        [*command, str(folder / "k.cubin"), "-cubin", f"-arch=sm_{arch}", "-Xptxas=-v"],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    ptx = folder / "k.ptx"
+    subprocess.run([*command, str(ptx), "-ptx", f"-arch=compute_{arch}"], check=True)
+    return Compiled(usage.stdout + usage.stderr, ptx.read_text())
+
+
+def with_nvrtc(
+    name: str,
+    arch: str,
+    dtype: torch.dtype,
+    size: int | None,
+    folder: Path,
+) -> Compiled:
+    log = io.StringIO()
+    options = {"history_size": size, "ptxas_options": ["-v"]}
+    code = cuda.compile_cubin(name, dtype, f"sm_{arch}", logs=log, **options)
+    assert code.get_kernel is not None
+    return Compiled(log.getvalue(), nvrtc_ptx(name, arch, dtype, size))
+
+
+def nvrtc_ptx(name: str, arch: str, dtype: torch.dtype, size: int | None) -> str:
+    """cuda.core asks the driver before it gives PTX; NVRTC itself does not."""
+    from cuda.bindings import nvrtc  # pyright: ignore[reportMissingImports, reportAttributeAccessIssue]
+
+    options = ["-std=c++17", f"-arch=compute_{arch}"]
+    options += [f"-D{key}={value}" for key, value in cuda.macros(dtype, size)]
+    _, program = nvrtc.nvrtcCreateProgram(cuda.source(name).encode(), b"kernel.cu", 0, [], [])
+    (error,) = nvrtc.nvrtcCompileProgram(program, len(options), [o.encode() for o in options])
+    assert int(error) == 0
+    _, length = nvrtc.nvrtcGetPTXSize(program)
+    ptx = b" " * length
+    nvrtc.nvrtcGetPTX(program, ptx)
+    return ptx.decode()
+
+
+def has_cuda_core() -> bool:
+    try:
+        return importlib.util.find_spec("cuda.core") is not None
+    except ModuleNotFoundError:
+        return False
+
+
+TOOLS = [
+    pytest.param(
+        with_nvcc,
+        id="nvcc",
+        marks=pytest.mark.skipif(shutil.which("nvcc") is None, reason="nvcc is not installed"),
+    ),
+    pytest.param(
+        with_nvrtc,
+        id="nvrtc",
+        marks=pytest.mark.skipif(
+            not has_cuda_core(), reason="cuda.core is not installed (extra 'cuda')"
+        ),
+    ),
+]
+
+
+def vector_bytes(ptx: str) -> int:
+    """Bytes read by loads of 16 bytes or more (32 from sm_100 on)."""
+    widths = re.findall(r"ld\.global(?:\.nc)?\.v(\d)\.[bfu](\d+)", ptx)
+    sizes = [int(count) * int(bits) // 8 for count, bits in widths]
+    return sum(size for size in sizes if size >= 16)
+
+
+def check(compiled: Compiled, dtype: torch.dtype, vector_loads: int) -> None:
+    """Of every kernel in the file: no stack, no spills, few registers, wide loads."""
+    stack = r"(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads"
+    used = re.findall(stack, compiled.log)
+    entries = re.split(r"\.entry", compiled.ptx)[1:]
+    assert len(entries) == len(used) >= 1
+    assert set(used) == {("0", "0", "0")}
+    for entry in entries:
+        assert vector_bytes(entry) >= 16 * vector_loads
+    assert ".local" not in compiled.ptx
+    if dtype == torch.float32:
+        registers = list(map(int, re.findall(r"Used (\d+) registers", compiled.log)))
+        assert len(registers) == len(entries)
+        assert max(registers) <= MAX_REGISTERS
+        assert re.search(r"\.f64\b", compiled.ptx) is None
+
+
+@pytest.mark.parametrize("tool", TOOLS)
+@pytest.mark.parametrize("arch", ARCHITECTURES)
+def test_float32_kernels(tool, arch: str, tmp_path: Path) -> None:
+    # nvcc takes a second for each: the default history size, and the longest.
+    for size in SIZES if tool is with_nvrtc else (5, 16):
+        compiled = tool("lqn.cu", arch, torch.float32, size, tmp_path)
+        check(compiled, torch.float32, 2 * size)
+    check(tool("noise.cu", arch, torch.float32, None, tmp_path), torch.float32, 1)
+
+
+@pytest.mark.parametrize("tool", TOOLS)
+def test_float64_kernels_for_tests(tool, tmp_path: Path) -> None:
+    check(tool("lqn.cu", "80", torch.float64, 5, tmp_path), torch.float64, 20)
+    check(tool("noise.cu", "80", torch.float64, None, tmp_path), torch.float64, 2)
+
+
+@pytest.mark.skipif(not has_cuda_core(), reason="cuda.core is not installed (extra 'cuda')")
+def test_compiled_kernels_are_cached_on_disk(tmp_path: Path) -> None:
+    from cuda.core.utils import FileStreamProgramCache  # pyright: ignore[reportMissingImports]
+
+    compiled_now = True
+    with FileStreamProgramCache(tmp_path / "cache") as cache:
+        for _ in range(2):
+            log = io.StringIO()
+            code = cuda.compile_cubin(
+                "lqn.cu",
+                torch.float32,
+                "sm_90",
+                history_size=5,
+                cache=cache,
+                logs=log,
+                ptxas_options=["-v"],
+            )
+            compiled_now = "registers" in log.getvalue()
+            assert len(code.code) > 1000
+    assert not compiled_now  # the second time it came from the disk
+
+
+def test_sources_need_no_include_path() -> None:
+    for kernel, name in cuda.KERNELS.items():
+        assert "#include" not in cuda.source(name)
+        assert f" {kernel}(" in cuda.source(name)
+
+
+def test_no_barriers_shared_memory_warps_or_atomics() -> None:
+    """What the host shim could not run."""
+    for name in cuda.KERNELS.values():
+        assert not re.search(r"__sync|__shared__|__shfl|__ballot|atomic[A-Z]", cuda.source(name))

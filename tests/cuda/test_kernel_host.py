@@ -1,0 +1,168 @@
+"""The unchanged .cu files, run on the host, against pure torch. No GPU is needed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from kernel_host import (
+    OPTIONS,
+    HostKernels,
+    Problem,
+    built,
+    compare_runs,
+    compare_two_loops,
+    compiler,
+    expected_noise,
+    host_kernels,
+    noise_case,
+    relative_difference,
+)
+from torch import Tensor
+
+from opt3dgs_optim.lbfgs import lqn_direction, new_history, two_loop
+
+pytestmark = pytest.mark.skipif(compiler() is None, reason="g++ is not installed")
+
+SIZES = (1, 3, 5, 8, 16)
+ROWS = (0, 1, 255, 256, 257, 1000, 4096)
+DTYPES = (torch.float64, torch.float32)
+
+
+@pytest.fixture(scope="session")
+def kernels() -> dict[tuple[int, torch.dtype], HostKernels]:
+    return {(size, dtype): host_kernels(size, dtype) for size in SIZES for dtype in DTYPES}
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("rows", ROWS)
+def test_free_running_in_float64(kernels: dict, rows: int, size: int) -> None:
+    """13 steps on its own state: rounding is 1e-16, its growth over the steps the rest of 1e-10."""
+    assert compare_runs(kernels[size, torch.float64], rows, size) < 1e-10
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("rows", ROWS)
+def test_recursion_alone(kernels: dict, rows: int, size: int) -> None:
+    """Pairs of condition up to 1e3: rounding of ten updates."""
+    assert compare_two_loops(kernels[size, torch.float64], rows, size) < 1e-10
+
+
+@pytest.mark.parametrize(
+    "changed", [{"graft": False}, {"graft": False, "min_cosine": 0.3}], ids=str
+)
+@pytest.mark.parametrize("size", SIZES)
+def test_free_running_with_every_option(kernels: dict, size: int, changed: dict) -> None:
+    assert compare_runs(kernels[size, torch.float64], 257, size, **changed) < 1e-10
+
+
+def recorded_steps(rows: int, size: int, steps: int = 13) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Position, gradient and the history before it, of each step of a run of pure torch."""
+    problem = Problem(rows)
+    x = problem.start.clone()
+    history = new_history(x, size)
+    states = []
+    for noise, kind, reset in problem.views(steps):
+        history[reset] = 0
+        grad = problem.gradient(x, noise, kind)
+        states.append((x.clone(), grad, history.clone()))
+        direction, _, _ = lqn_direction(x, grad, history, size, **OPTIONS)  # pyright: ignore
+        x = x - 0.05 * torch.nan_to_num(direction, nan=0.0, posinf=0.0, neginf=0.0)
+    return states
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_single_steps_in_float32(kernels: dict, size: int) -> None:
+    """Each step from the same float32 state; 1e-5 is eps times what the recursion amplifies.
+
+    Pairs of little curvature amplify without bound, in any order of summation: a min_cosine of 0.1
+    keeps them out here.
+    """
+    options = {**OPTIONS, "min_cosine": 0.1}
+    for state in recorded_steps(1000, size):
+        x, grad, before = (t.float() for t in state)
+        ours, theirs = before.clone(), before.contiguous()
+        expected = lqn_direction(x, grad, ours, size, **options)  # pyright: ignore
+        result = kernels[size, torch.float32].lqn(x, grad, theirs, **options)
+        agree = (result[1] == expected[1]) & (result[2] == expected[2])
+        assert float((~agree).float().mean()) <= 1e-3  # a cosine within rounding of the bound
+        for a, b in [(result[0], expected[0]), (theirs, ours)]:
+            assert relative_difference(a[agree], b[agree]) < 1e-5
+
+
+def test_rows_that_are_not_visible_stay_bit_for_bit(kernels: dict) -> None:
+    x, grad, history = recorded_steps(256, 5)[-1]
+    grad[::3] = 0.0
+    grad[1::3, 2] = torch.nan
+    before = history.contiguous().clone()
+    after = before.clone()
+    direction, accepted, candidates = kernels[5, torch.float64].lqn(x, grad, after, **OPTIONS)
+    unseen = torch.arange(256) % 3 != 2
+    assert torch.equal(after[unseen], before[unseen])
+    assert torch.equal(direction[unseen].nan_to_num(9.0), grad[unseen].nan_to_num(9.0))
+    assert not bool((accepted | candidates)[unseen].any())
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_point_without_pairs_keeps_its_gradient_bit_for_bit(kernels: dict, size: int) -> None:
+    for dtype in DTYPES:
+        x, grad = torch.randn(300, 3, dtype=dtype), torch.randn(300, 3, dtype=dtype)
+        history = new_history(x, size, contiguous=True)
+        direction, _, _ = kernels[size, dtype].lqn(x, grad, history, **OPTIONS)
+        assert torch.equal(direction, grad)
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+@pytest.mark.parametrize("rows", ROWS)
+def test_noise(kernels: dict, rows: int, dtype: torch.dtype) -> None:
+    means, gaussians, eta = noise_case(rows, dtype)
+    result = kernels[5, dtype].noise(means, gaussians, eta, 0.25, 2.0)
+    noise = expected_noise(gaussians, eta) * 0.5
+    # In float32 the gate's exponential turns an error of x into 100 x.
+    tolerance = 1e-12 if dtype == torch.float64 else 1e-5
+    assert relative_difference(result, means + noise) < tolerance
+
+
+# -- the same under the sanitizers -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_under_address_and_undefined_sanitizers(tmp_path: Path, size: int) -> None:
+    """A program of its own, with buffers of exactly N rows; its output is compared all the same."""
+    flags = ("-g", "-fsanitize=address", "-fsanitize=undefined", "-fno-sanitize-recover=all")
+    program = built(size, torch.float64, *flags)
+    for rows in (0, 1, 255, 257, 1000):
+        expected = _write_input(tmp_path / "in", rows, size)
+        command = [str(program), str(tmp_path / "in"), str(tmp_path / "out")]
+        run = subprocess.run(command, capture_output=True, text=True, check=False, env=_quiet())
+        assert run.returncode == 0, run.stderr
+        result = torch.from_numpy(np.fromfile(tmp_path / "out", dtype=np.float64))
+        result = result.reshape(len(expected), rows, 3)
+        for part, reference in zip(result, expected, strict=True):
+            assert relative_difference(part, reference) < 1e-10
+
+
+def _quiet() -> dict[str, str]:
+    return {**os.environ, "ASAN_OPTIONS": "detect_leaks=1", "UBSAN_OPTIONS": "print_stacktrace=1"}
+
+
+def _write_input(path: Path, rows: int, size: int) -> list[Tensor]:
+    """Steps as the program reads them; what it should write: directions, then noisy means."""
+    states = recorded_steps(rows, size)
+    means, gaussians, eta = noise_case(rows, torch.float64)
+    history = new_history(means, size, contiguous=True)
+    parts: list[Tensor] = [torch.tensor([rows, len(states)], dtype=torch.float64)]
+    expected = []
+    for x, grad, before in states:
+        reset = (before.abs().sum(dim=(1, 2)) == 0).double()
+        parts += [x, grad, reset]
+        history[reset.bool()] = 0
+        expected.append(lqn_direction(x, grad, history, size, **OPTIONS)[0])  # pyright: ignore
+        expected.append(two_loop(x, history, size))
+    parts += [means, gaussians["scales"], gaussians["quats"], gaussians["opacities"], eta]
+    torch.cat([part.flatten() for part in parts]).numpy().tofile(path)
+    return [*expected, means + expected_noise(gaussians, eta) * 0.5]

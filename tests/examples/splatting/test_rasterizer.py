@@ -1,0 +1,531 @@
+"""The examples' rasterizer: the reference against closed forms, the compiled one against it."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numba
+import numpy as np
+import pytest
+import torch
+from bench_raster import synthetic_scene
+from splatting.camera import Camera
+from splatting.compositing import composite
+from splatting.fast.kernel import kernel
+from splatting.fast.tiles import depth_order
+from splatting.projection import project, rotation_matrices
+from splatting.rasterizer import Backend, render
+from splatting.spherical_harmonics import SH_0, sh_basis
+from torch import Tensor
+
+BACKENDS: tuple[Backend, ...] = ("reference", "fast")
+# The fast twin is float32; what it gives is compared within its rounding.
+DTYPES = {"reference": torch.float64, "fast": torch.float32}
+
+
+def look_at_origin(width: int = 24, height: int = 17, dtype: torch.dtype = torch.float64) -> Camera:
+    """A camera that is special in nothing: turned, off-centre, fx != fy."""
+    viewmat = torch.eye(4, dtype=dtype)
+    quat = torch.tensor([[0.9, 0.3, -0.2, 0.1]], dtype=dtype)
+    viewmat[:3, :3] = rotation_matrices(quat)[0]
+    viewmat[:3, 3] = torch.tensor([0.1, -0.2, 3.0], dtype=dtype)
+    return Camera(viewmat, 1.1 * width, 1.2 * width, 0.47 * width, 0.55 * height, width, height)
+
+
+def straight_camera(size: int = 9) -> Camera:
+    """At the origin, looking along z, the principal point at the centre of the middle pixel."""
+    return Camera(torch.eye(4).double(), 10.0, 10.0, size / 2, size / 2, size, size)
+
+
+def scene(points: int, degree: int, seed: int = 0) -> dict[str, Tensor]:
+    return {k: v.double() for k, v in synthetic_scene(points, degree, seed).items()}
+
+
+def one_point(depth: float = 2.0, color: float = 0.8, opacity: float = 0.6) -> dict[str, Tensor]:
+    """A sphere of radius 0.1 on the axis of `straight_camera`."""
+    return {
+        "means": torch.tensor([[0.0, 0.0, depth]]).double(),
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).double(),
+        "scales": torch.full((1, 3), math.log(0.1)).double(),
+        "opacities": torch.logit(torch.tensor([opacity]).double()),
+        "sh0": torch.full((1, 1, 3), (color - 0.5) / SH_0).double(),
+    }
+
+
+def as_read(gaussians: dict[str, Tensor], backend: Backend) -> dict[str, Tensor]:
+    """In the backend's precision."""
+    return {name: value.to(DTYPES[backend]) for name, value in gaussians.items()}
+
+
+def stack(*scenes: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: torch.cat([s[name] for s in scenes]) for name in scenes[0]}
+
+
+def image_and_gradients(
+    gaussians: dict[str, Tensor],
+    camera: Camera,
+    backend: Backend,
+    dtype: torch.dtype,
+    sh_degree: int | None = None,
+) -> dict[str, Tensor]:
+    """Image, alpha, visible and the gradients of a random functional of image and alpha."""
+    leaves = {k: v.to(dtype).clone().requires_grad_() for k, v in gaussians.items()}
+    leaves["background"] = torch.tensor([0.2, 0.5, 0.9], dtype=dtype, requires_grad=True)
+    rendering = render(
+        leaves, camera, background=leaves["background"], backend=backend, sh_degree=sh_degree
+    )
+    generator = torch.Generator().manual_seed(7)
+    weights = torch.randn(camera.height, camera.width, 4, generator=generator).to(dtype)
+    (
+        (rendering.image * weights[..., :3]).sum() + (rendering.alpha * weights[..., 3]).sum()
+    ).backward()
+    result = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+    assert result.keys() == leaves.keys()
+    image, alpha = rendering.image.detach(), rendering.alpha.detach()
+    return {**result, "image": image, "alpha": alpha, "visible": rendering.visible}
+
+
+def assert_close(actual: dict[str, Tensor], expected: dict[str, Tensor], tolerance: float) -> None:
+    """Largest difference below tolerance times largest value, for each entry."""
+    assert torch.equal(actual["visible"], expected["visible"])
+    for name in expected.keys() - {"visible"}:
+        assert actual[name].shape == expected[name].shape
+        assert torch.isfinite(actual[name]).all(), name
+        if expected[name].numel() == 0:
+            continue
+        difference = (actual[name].double() - expected[name].double()).abs().max()
+        assert difference <= tolerance * expected[name].abs().max().clamp(min=1e-3), name
+
+
+# Spherical harmonics
+
+
+def legendre_harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
+    """The real spherical harmonics from their definition by derivatives of Legendre polynomials."""
+    x, y, z = directions.T
+    azimuth, columns = np.arctan2(y, x), []
+    for n in range(degree + 1):
+        for m in range(-n, n + 1):
+            order = abs(m)
+            polynomial = np.polynomial.legendre.Legendre.basis(n).deriv(order)
+            legendre = (-1) ** order * (1 - z * z) ** (order / 2) * polynomial(z)
+            ratio = math.factorial(n - order) / math.factorial(n + order)
+            norm = math.sqrt((2 * n + 1) / (4 * math.pi) * ratio * (2 if m else 1))
+            wave = np.sin(order * azimuth) if m < 0 else np.cos(order * azimuth)
+            columns.append(norm * legendre * wave)
+    return np.stack(columns, -1)
+
+
+def test_harmonics_agree_with_their_definition():
+    directions = torch.randn(50, 3, generator=torch.Generator().manual_seed(0)).double()
+    directions /= directions.norm(dim=1, keepdim=True)
+    expected = legendre_harmonics(directions.numpy(), 3)
+    np.testing.assert_allclose(sh_basis(directions, 3).numpy(), expected, rtol=0, atol=1e-13)
+
+
+def test_harmonics_are_orthonormal():
+    # Gauss-Legendre in z times equidistant angles: exact for products of degree 3.
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    angles = np.arange(16) * 2 * math.pi / 16
+    z, angle = (a.ravel() for a in np.meshgrid(nodes, angles, indexing="ij"))
+    sine = np.sqrt(1 - z * z)
+    directions = np.stack([sine * np.cos(angle), sine * np.sin(angle), z], -1)
+    basis = sh_basis(torch.from_numpy(directions), 3).numpy()
+    weights = np.repeat(weights, 16) * 2 * math.pi / 16
+    np.testing.assert_allclose((basis.T * weights) @ basis, np.eye(16), rtol=0, atol=1e-13)
+
+
+# Projection
+
+
+def test_covariance_is_that_of_the_linearised_camera():
+    camera, points = look_at_origin(), scene(5, 0)
+    projection = project(points["means"], points["quats"], points["scales"], camera)
+
+    def pixel(mean: Tensor) -> Tensor:
+        x, y, z = camera.viewmat[:3, :3] @ mean + camera.viewmat[:3, 3]
+        return torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
+
+    for i, mean in enumerate(points["means"]):
+        rotation = rotation_matrices(points["quats"][i : i + 1])[0]
+        covariance = rotation @ torch.diag(torch.exp(2 * points["scales"][i])) @ rotation.T
+        jacobian = torch.autograd.functional.jacobian(pixel, mean)
+        expected = jacobian @ covariance @ jacobian.T + 0.3 * torch.eye(2).double()
+        torch.testing.assert_close(projection.means[i], pixel(mean))
+        torch.testing.assert_close(projection.covariances[i], expected[[0, 0, 1], [0, 1, 1]])
+        torch.testing.assert_close(projection.determinants[i], torch.det(expected))
+        inverse = torch.linalg.inv(expected)
+        torch.testing.assert_close(projection.conics[i], inverse[[0, 0, 1], [0, 1, 1]])
+
+
+def test_determinant_survives_needles_in_float32():
+    points = one_point()
+    points["scales"] = torch.tensor([[4.0, -9.0, -9.0]]).double()
+    points["quats"] = torch.tensor([[0.92, 0.0, 0.0, 0.39]]).double()  # across the image
+    arguments = points["means"], points["quats"], points["scales"]
+    expected = project(*arguments, straight_camera()).determinants
+    camera = straight_camera().to(torch.float32)
+    means, quats, scales = (a.float() for a in arguments)
+    actual = project(means, quats, scales, camera).determinants
+    torch.testing.assert_close(actual.double(), expected, rtol=1e-5, atol=0)
+
+
+# Known answers
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_single_gaussian(backend: Backend):
+    background = torch.tensor([0.1, 0.2, 0.3]).double()
+    gaussians = as_read(one_point(), backend)
+    rendering = render(gaussians, straight_camera(), background=background, backend=backend)
+    # Variance: (focal * radius / depth)^2 + blur.
+    variance = (10 * 0.1 / 2) ** 2 + 0.3
+    offsets = torch.arange(9).double() - 4
+    squares = offsets[:, None] ** 2 + offsets**2
+    alpha = 0.6 * torch.exp(-squares / (2 * variance))
+    alpha[alpha < 1 / 255] = 0
+    # The opacity and the colour of the scene pass through float32.
+    torch.testing.assert_close(rendering.alpha.double(), alpha, rtol=2e-6, atol=1e-7)
+    expected = alpha[..., None] * 0.8 + (1 - alpha[..., None]) * background
+    torch.testing.assert_close(rendering.image.double(), expected, rtol=2e-6, atol=1e-7)
+    assert rendering.visible.tolist() == [True]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_nearer_point_covers_farther(backend: Backend):
+    # Given in the wrong order; 0.5 of the nearer one, then half of 0.8 of the farther one.
+    gaussians = stack(one_point(3.0, 1.0, 0.8), one_point(2.0, 0.25, 0.5))
+    rendering = render(as_read(gaussians, backend), straight_camera(), backend=backend)
+    expected = torch.full((3,), 0.5 * 0.25 + 0.5 * 0.8 * 1.0).double()
+    torch.testing.assert_close(rendering.image[4, 4].double(), expected, rtol=1e-6, atol=0)
+    assert rendering.alpha[4, 4].item() == pytest.approx(0.9, rel=1e-6)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_finished_pixel_leaves_out_the_point_that_would_finish_it(backend: Backend):
+    # 0.999 of the first; the second would leave a transmittance of 1e-6 <= 1e-4.
+    gaussians = stack(one_point(2.0, 0.25, 0.9999), one_point(3.0, 1.0, 0.9999))
+    rendering = render(as_read(gaussians, backend), straight_camera(), backend=backend)
+    assert rendering.image[4, 4, 0].item() == pytest.approx(0.999 * 0.25, rel=1e-6)
+    assert rendering.alpha[4, 4].item() == pytest.approx(0.999, rel=1e-6)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_empty_scene_is_background(backend: Backend):
+    background = torch.tensor([0.1, 0.2, 0.3]).to(DTYPES[backend])
+    gaussians = as_read(scene(0, 3), backend)
+    rendering = render(gaussians, look_at_origin(), background=background, backend=backend)
+    assert torch.equal(rendering.image, background.expand(17, 24, 3))
+    assert torch.equal(rendering.alpha, torch.zeros_like(rendering.alpha))
+    assert rendering.visible.shape == (0,)
+
+
+def test_compositing_against_a_loop_over_pixels():
+    """The rules one by one: sort, skip, clamp, stop before the limit, background."""
+    generator = torch.Generator().manual_seed(3)
+    n, width, height = 60, 7, 5
+    means = 8 * torch.rand(n, 2, generator=generator).double() - 0.5
+    factors = torch.randn(n, 2, 2, generator=generator).double()
+    inverses = torch.linalg.inv(factors @ factors.mT + 0.3 * torch.eye(2).double())
+    conics = torch.stack([inverses[:, 0, 0], inverses[:, 0, 1], inverses[:, 1, 1]], -1)
+    colors = torch.rand(n, 3, generator=generator).double()
+    opacities = torch.sqrt(torch.rand(n, generator=generator).double())
+    opacities[::7] = 1.0
+    depths, background = torch.rand(n, generator=generator).double(), torch.ones(3).double()
+    image, alpha = composite(
+        means, conics, colors, opacities, depths, background=background, width=width, height=height
+    )
+    for row, column in itertools.product(range(height), range(width)):
+        expected, transmittance = torch.zeros(3).double(), 1.0
+        for i in sorted(range(n), key=lambda i: depths[i].item()):
+            offset = torch.tensor([column + 0.5, row + 0.5]).double() - means[i]
+            exponent = 0.5 * (offset @ inverses[i] @ offset).item()
+            contribution = min(0.999, opacities[i].item() * math.exp(-exponent))
+            if contribution < 1 / 255:
+                continue
+            if transmittance * (1 - contribution) <= 1e-4:
+                break
+            expected += transmittance * contribution * colors[i]
+            transmittance *= 1 - contribution
+        torch.testing.assert_close(image[row, column], expected + transmittance * background)
+        assert alpha[row, column].item() == pytest.approx(1 - transmittance)
+
+
+# Gradients
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_gradcheck(degree: int):
+    gaussians = scene(4, degree, seed=degree)
+    gaussians["sh0"] = gaussians["sh0"].abs()  # no colour near 0, where max(., 0) has a kink
+    camera = look_at_origin(5, 4)
+    names = [*gaussians, "background"]
+    inputs = [*gaussians.values(), torch.tensor([0.3, 0.6, 0.9]).double()]
+
+    def function(*values: Tensor) -> tuple[Tensor, Tensor]:
+        named = dict(zip(names, values, strict=True))
+        rendering = render(named, camera, background=named["background"], backend="reference")
+        return rendering.image, rendering.alpha
+
+    leaves = [value.requires_grad_() for value in inputs]
+    assert render(gaussians, camera).visible.all()
+    assert torch.autograd.gradcheck(function, leaves)
+
+
+def test_reference_differentiates_the_camera():
+    gaussians, camera = scene(3, 1), look_at_origin(5, 4)
+
+    def function(viewmat: Tensor) -> Tensor:
+        moved = Camera(viewmat, camera.fx, camera.fy, camera.cx, camera.cy, 5, 4)
+        return render(gaussians, moved, backend="reference").image
+
+    assert torch.autograd.gradcheck(function, [camera.viewmat.requires_grad_()])
+
+
+# The compiled rasterizer against the reference
+
+
+def behind_and_beside() -> dict[str, Tensor]:
+    gaussians = scene(80, 3)
+    gaussians["means"] = 8 * gaussians["means"]  # the camera is at a distance of 3
+    return gaussians
+
+
+def extreme_scales() -> dict[str, Tensor]:
+    gaussians = scene(80, 2)
+    gaussians["scales"][::4] += 6
+    gaussians["scales"][1::4] -= 20
+    gaussians["scales"][2::8, 0] += 5  # needles
+    gaussians["scales"][3::8, 1] -= 10  # discs
+    gaussians["scales"][5::8] += 20
+    gaussians["opacities"] -= 2
+    return gaussians
+
+
+def saturated_opacities() -> dict[str, Tensor]:
+    gaussians = scene(80, 1)
+    gaussians["opacities"][::2] = 20.0
+    gaussians["opacities"][1::2] *= 3
+    gaussians["opacities"][::5] = -20.0
+    return gaussians
+
+
+def identical_depths() -> dict[str, Tensor]:
+    """Planes of equal depth: their points must be blended in the order in which they are given."""
+    gaussians = scene(80, 0)
+    rotation = look_at_origin().viewmat[:3, :3]
+    points = gaussians["means"] @ rotation.T
+    points[:, 2] = (2 * points[:, 2]).round() / 2
+    # Exactly equal in floating point too: all of a plane at one place.
+    points[:, :2] = 0.3 * points[:, 2:]
+    gaussians["means"] = points @ rotation
+    return gaussians
+
+
+SCENES = {
+    "no points": lambda: scene(0, 3),
+    "one point": lambda: scene(1, 3),
+    "7 points": lambda: scene(7, 2),
+    "1000 points": lambda: scene(1000, 3),
+    "no shN": lambda: {k: v for k, v in scene(50, 0).items() if k != "shN"},
+    "behind and beside": behind_and_beside,
+    "extreme scales": extreme_scales,
+    "saturated opacities": saturated_opacities,
+    "identical depths": identical_depths,
+}
+
+
+def assert_twins_agree(gaussians: dict[str, Tensor], camera: Camera, tolerance: float) -> None:
+    """The fast twin against the float64 reference, from the same float32 numbers."""
+    rounded = {name: value.float() for name, value in gaussians.items()}
+    camera = camera.to(torch.float32)
+    exact = {name: value.double() for name, value in rounded.items()}
+    expected = image_and_gradients(exact, camera.to(torch.float64), "reference", torch.float64)
+    assert_close(image_and_gradients(rounded, camera, "fast", torch.float32), expected, tolerance)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_fast_agrees_with_reference(name: str):
+    # float32 sums of float32 products: about 5e-7, and 2e-6 where scales are extreme. A pixel on
+    # the wrong side of a threshold would exceed this a hundred times.
+    assert_twins_agree(SCENES[name](), look_at_origin(), 1e-5)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 13), (37, 2), (8, 8), (65, 47)])
+def test_fast_agrees_at_odd_image_sizes(size: tuple[int, int]):
+    assert_twins_agree(scene(40, 1), look_at_origin(*size), 1e-5)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_fast_agrees_where_thousands_of_edges_pass_pixels(seed: int):
+    """Large Gaussians of many layers: alpha >= 1/255 is decided as in float64, pixel by pixel."""
+    gaussians = scene(600, 1, seed)
+    gaussians["scales"] += 1.0
+    assert_twins_agree(gaussians, look_at_origin(72, 50), 1e-4)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_lower_sh_degree_ignores_higher_harmonics(backend: Backend):
+    gaussians, camera = as_read(scene(20, 3), backend), look_at_origin()
+    full = image_and_gradients(gaussians, camera, backend, DTYPES[backend], sh_degree=1)
+    assert torch.equal(full["shN"][:, 3:], torch.zeros_like(full["shN"][:, 3:]))
+    assert full["shN"][:, :3].abs().max() > 0
+    truncated = {**gaussians, "shN": gaussians["shN"][:, :3]}
+    expected = render(truncated, camera, backend=backend).image
+    assert torch.equal(render(gaussians, camera, backend=backend, sh_degree=1).image, expected)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_order_of_points_does_not_matter(backend: Backend):
+    gaussians, camera = scene(100, 2), look_at_origin()
+    order = torch.randperm(100, generator=torch.Generator().manual_seed(1))
+    expected = image_and_gradients(gaussians, camera, backend, DTYPES[backend])
+    shuffled = {name: value[order] for name, value in gaussians.items()}
+    actual = image_and_gradients(shuffled, camera, backend, DTYPES[backend])
+    for name in (*gaussians, "visible"):
+        expected[name] = expected[name][order]
+    assert_close(actual, expected, 1e-12 if backend == "reference" else 1e-5)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_same_input_gives_same_bits(backend: Backend):
+    gaussians, camera = scene(200, 3), look_at_origin()
+    first = image_and_gradients(gaussians, camera, backend, torch.float32)
+    second = image_and_gradients(gaussians, camera, backend, torch.float32)
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_step_before_backward_changes_no_gradient():
+    gaussians, camera = as_read(scene(20, 1), "fast"), look_at_origin()
+    leaves = [value.requires_grad_() for value in gaussians.values()]
+    image = render(gaussians, camera).image
+    expected = torch.autograd.grad(image.sum(), leaves, retain_graph=True)
+    with torch.no_grad():
+        for leaf in leaves:
+            leaf.add_(1)
+    actual = torch.autograd.grad(image.sum(), leaves)
+    assert all(torch.equal(a, b) for a, b in zip(actual, expected, strict=True))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_invisible_points_change_nothing(backend: Backend):
+    gaussians, camera = as_read(behind_and_beside(), backend), look_at_origin()
+    everything = render(gaussians, camera, backend=backend)
+    assert 0 < everything.visible.sum() < len(everything.visible)
+    left = {name: value[everything.visible] for name, value in gaussians.items()}
+    assert torch.equal(render(left, camera, backend=backend).image, everything.image)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    ("name", "value"), [("means", math.nan), ("scales", math.inf), ("opacities", math.nan)]
+)
+def test_broken_point_is_invisible(name: str, value: float, backend: Backend):
+    gaussians, camera = scene(10, 1), look_at_origin()
+    gaussians[name][3] = value
+    result = image_and_gradients(gaussians, camera, backend, DTYPES[backend])
+    assert not result["visible"][3]
+    assert all(torch.isfinite(tensor).all() for tensor in result.values())
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"means": None}, r"lacks \['means'\]"),
+        ({"quats": torch.zeros(5, 3)}, r"quats has shape \(5, 3\), must be \(5, 4\)"),
+        ({"opacities": torch.zeros(5, 1)}, r"opacities has shape \(5, 1\), must be \(5,\)"),
+        ({"sh0": torch.zeros(4, 1, 3)}, r"sh0 has shape \(4, 1, 3\), must be \(5, 1, 3\)"),
+        ({"shN": torch.zeros(5, 4, 3)}, r"shN has shape \(5, 4, 3\).*K in \[0, 3, 8, 15\]"),
+        ({"shN": torch.zeros(5, 9)}, r"shN has shape \(5, 9\)"),
+        ({"scales": torch.zeros(5, 3).half()}, r"scales is torch.float16 on cpu, must be as means"),
+    ],
+)
+def test_wrong_gaussians_are_refused(changes: dict[str, Tensor | None], message: str):
+    gaussians = {**synthetic_scene(5, 1), **changes}
+    kept = {name: value for name, value in gaussians.items() if value is not None}
+    with pytest.raises(ValueError, match=f"^render: .*{message}"):
+        render(kept, look_at_origin())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sh_degree": 2}, "sh_degree is 2, must be from 0 to the stored 1"),
+        ({"sh_degree": -1}, "sh_degree is -1"),
+        ({"background": torch.zeros(4)}, r"background has shape \(4,\), must be \(3,\)"),
+        ({"backend": "cuda"}, "backend is 'cuda', must be one of"),
+    ],
+)
+def test_wrong_options_are_refused(options: dict, message: str):
+    with pytest.raises(ValueError, match=f"^render: {message}"):
+        render(synthetic_scene(5, 1), look_at_origin(), **options)
+
+
+def test_wrong_dtype_and_camera_are_refused():
+    halves = {name: value.half() for name, value in synthetic_scene(5, 1).items()}
+    with pytest.raises(ValueError, match=r"means is torch.float16, must be torch.float32 or"):
+        render(halves, look_at_origin())
+    camera = look_at_origin()
+    with pytest.raises(ValueError, match=r"viewmat has shape \(3, 4\)"):
+        render(scene(5, 1), Camera(camera.viewmat[:3], 1, 1, 1, 1, 2, 2))
+    with pytest.raises(ValueError, match="0 x 2 pixels"):
+        render(scene(5, 1), Camera(camera.viewmat, 1, 1, 1, 1, 0, 2))
+    with pytest.raises(ValueError, match=r'"fast" with means torch.float64 on cpu, must be'):
+        render(scene(5, 1), camera, backend="fast")
+    camera.viewmat.requires_grad_()
+    with pytest.raises(ValueError, match="requires_grad True"):
+        render(as_read(scene(5, 1), "fast"), camera, backend="fast")
+
+
+def test_auto_takes_the_fast_twin_where_it_can():
+    camera = look_at_origin()
+    cases: tuple[tuple[torch.dtype, Backend], ...] = (
+        (torch.float32, "fast"),
+        (torch.float64, "reference"),
+    )
+    for dtype, backend in cases:
+        gaussians = {name: value.to(dtype) for name, value in scene(30, 1).items()}
+        expected = render(gaussians, camera, backend=backend).image
+        assert torch.equal(render(gaussians, camera).image, expected)
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh0", "shN"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30, -1e30])
+def test_fast_survives_broken_numbers(name: str, value: float):
+    gaussians, camera = as_read(scene(40, 1), "fast"), look_at_origin()
+    gaussians[name][::3] = value
+    result = image_and_gradients(gaussians, camera, "fast", torch.float32)
+    assert result["image"].shape == (17, 24, 3)
+    broken = torch.zeros(40, dtype=torch.bool)
+    broken[::3] = True
+    if math.isnan(value) and name != "quats" and name[:2] != "sh":
+        assert not (result["visible"] & broken).any()
+
+
+def test_depth_order_is_a_stable_sort():
+    generator = np.random.default_rng(0)
+    for depths in (
+        np.exp(generator.normal(size=5000) * 9),
+        np.full(50, 3.0),
+        np.round(generator.random(3000), 2) + 1,
+        np.array([2.0]),
+        np.array([]),
+    ):
+        expected = np.argsort(depths, kind="stable")
+        np.testing.assert_array_equal(depth_order(depths), expected)
+
+
+def test_kernels_compile_where_nothing_can_be_cached(monkeypatch: pytest.MonkeyPatch):
+    compile_kernel = numba.njit
+
+    def without_directory(*, cache: bool = False, **options):
+        if cache:
+            raise RuntimeError("cannot cache function: no locator available")
+        return compile_kernel(**options)
+
+    monkeypatch.setattr(numba, "njit", without_directory)
+    assert kernel(lambda x: x + 1)(2) == 3

@@ -1,0 +1,162 @@
+"""Scene loading: two layouts that must agree, splits, sizes, and errors that name the file.
+
+The captures next to the repository are read too where they are present.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scene_files import (
+    HEIGHT,
+    PINHOLE,
+    POINTS,
+    WIDTH,
+    image_names,
+    poses,
+    quat_to_rotation,
+    write_scene,
+)
+from splatting.scenes import load_scene
+
+_SHARED = Path(__file__).resolve().parents[4] / "shared" / "scenes"
+_REAL = ("banana", "brighton_beach", "lund_door", "plush")
+
+
+@pytest.mark.parametrize("layout", ["bin", "txt", "json"])
+@pytest.mark.parametrize(("size", "scale"), [("images_4", 0.25), ("images", 1.0)])
+def test_every_layout_gives_the_scene_that_was_written(tmp_path, layout, size, scale):
+    scene = load_scene(write_scene(tmp_path / "toy", layout), size)
+    assert scene.name == "toy"
+    assert [view.name for view in scene.test] == ["photo_00.png", "photo_08.png"]
+    assert [view.name for view in scene.train] == [
+        image_names(10)[i] for i in (1, 2, 3, 4, 5, 6, 7, 9)
+    ]
+    table = torch.tensor(POINTS, dtype=torch.float32)
+    assert torch.equal(scene.points, table[:, :3])
+    torch.testing.assert_close(scene.colors, table[:, 3:] / 255)
+    positions = []
+    for view in (*scene.train, *scene.test):
+        quat, shift = poses(10)[image_names(10).index(view.name)]
+        camera = view.camera
+        expected = torch.eye(4)
+        expected[:3, :3] = torch.from_numpy(quat_to_rotation(quat))
+        expected[:3, 3] = torch.tensor(shift)
+        torch.testing.assert_close(camera.viewmat, expected)
+        got = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+        assert got == tuple(scale * number for number in (*PINHOLE, WIDTH, HEIGHT))
+        assert view.image.shape == (camera.height, camera.width, 3)
+        assert view.image.dtype == torch.float32
+        folder = tmp_path / "toy" / size
+        pixels = torch.from_numpy(np.array(Image.open(folder / view.name)))
+        assert torch.equal((view.image * 255).round().byte(), pixels)
+        if view in scene.train:
+            positions.append(-quat_to_rotation(quat).T @ np.array(shift))
+    offsets = np.array(positions) - np.mean(positions, axis=0)
+    # 1e-6: float32 poses
+    assert scene.extent == pytest.approx(1.1 * np.linalg.norm(offsets, axis=1).max(), rel=1e-6)
+
+
+def test_auto_prefers_colmap_and_layout_chooses(tmp_path):
+    folder = write_scene(write_scene(tmp_path / "s", "bin"), "json")
+    (folder / "transforms.json").write_text("{")
+    assert len(load_scene(folder).train) == 8
+    with pytest.raises(ValueError, match=r"transforms.json: not valid JSON"):
+        load_scene(folder, layout="transforms")
+
+
+def test_split_json_decides(tmp_path):
+    folder = write_scene(tmp_path / "s", "json")
+    names = image_names(10)
+    split = {"train": names[5:8], "test": names[:2]}  # the others are left out
+    (folder / "split.json").write_text(json.dumps(split))
+    scene = load_scene(folder)
+    assert [view.name for view in scene.train] == names[5:8]
+    assert [view.name for view in scene.test] == names[:2]
+
+
+@pytest.mark.parametrize(
+    ("split", "message"),
+    [
+        ({"train": image_names(3)}, "expected lists of image names under 'train' and 'test'"),
+        ({"train": image_names(3), "test": ["x.png"]}, r"names \['x.png'\], which"),
+        ({"train": image_names(3), "test": image_names(1)}, "more than once, or in both"),
+        ({"train": image_names(1), "test": []}, "at least 2 train views, got 1 of 10"),
+    ],
+)
+def test_bad_splits_are_named(tmp_path, split, message):
+    folder = write_scene(tmp_path / "s", "json")
+    (folder / "split.json").write_text(json.dumps(split))
+    with pytest.raises(ValueError, match=message):
+        load_scene(folder)
+
+
+def test_bad_images_are_named(tmp_path):
+    folder = write_scene(tmp_path / "s", "bin")
+    path = folder / "images_4" / "photo_03.png"
+    Image.new("RGB", (10, 9)).save(path)
+    with pytest.raises(ValueError, match=r"photo_03.png: image is 10x9, .*40x24"):
+        load_scene(folder)
+    path.write_bytes(b"no image")
+    with pytest.raises(ValueError, match=r"photo_03.png: expected an image"):
+        load_scene(folder)
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match=r"photo_03.png: missing"):
+        load_scene(folder)
+    shutil.rmtree(folder / "images_4")
+    with pytest.raises(FileNotFoundError, match=r"images_4: missing.*size='images_4'"):
+        load_scene(folder)
+
+
+def test_too_few_views_and_cameras_at_one_place(tmp_path):
+    with pytest.raises(ValueError, match="at least 2 train views, got 1 of 2 views"):
+        load_scene(write_scene(tmp_path / "two", "bin", count=2))
+    folder = write_scene(tmp_path / "still", "txt", count=4)
+    lines = [f"{i} 1 0 0 0 0 0 0 7 {name}\n\n" for i, name in enumerate(image_names(4))]
+    (folder / "sparse" / "images.txt").write_text("".join(lines))
+    with pytest.raises(ValueError, match=r"train cameras span 0.0, expected distinct positions"):
+        load_scene(folder)
+    (folder / "sparse" / "images.txt").write_text("".join(lines[:1] * 3))
+    with pytest.raises(ValueError, match=r"listed more than once: \['photo_00.png'\]"):
+        load_scene(folder)
+
+
+def test_bad_sources_and_options(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere is no folder; expected one, or 'embed"):
+        load_scene(tmp_path / "nowhere")
+    with pytest.raises(FileNotFoundError, match=r"expected sparse/0/ \(COLMAP\) or transforms"):
+        load_scene(tmp_path)
+    (tmp_path / "sparse").mkdir()
+    with pytest.raises(FileNotFoundError, match="expected cameras, images and points3D"):
+        load_scene(tmp_path)
+    with pytest.raises(ValueError, match=r"size='big', allowed are \('small', 'large'\)"):
+        load_scene(tmp_path, "big")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="layout='nerf', allowed are"):
+        load_scene(tmp_path, layout="nerf")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("name", _REAL)
+def test_both_readers_agree_on_a_capture(name):
+    if not (_SHARED / name).is_dir():
+        pytest.skip(f"no capture at {_SHARED / name}")
+    colmap, transforms = (
+        load_scene(_SHARED / name, layout=layout) for layout in ("colmap", "transforms")
+    )
+    # 1e-6 relative: transforms.json took a detour over a float64 inverse
+    assert colmap.extent == pytest.approx(transforms.extent, rel=1e-6)
+    for mine, other in ((colmap.train, transforms.train), (colmap.test, transforms.test)):
+        for one, two in zip(mine, other, strict=True):
+            assert one.name == two.name
+            assert torch.equal(one.image, two.image)
+            torch.testing.assert_close(one.camera.viewmat, two.camera.viewmat, rtol=0, atol=1e-5)
+            for field in ("fx", "fy", "cx", "cy", "width", "height"):
+                mine_value, other_value = getattr(one.camera, field), getattr(two.camera, field)
+                assert mine_value == pytest.approx(other_value, rel=1e-12), field
+    assert torch.equal(colmap.points, transforms.points)
+    assert torch.equal(colmap.colors, transforms.colors)

@@ -1,0 +1,79 @@
+"""docs/results/stability/stability.md says what its committed measurements say, and they say enough."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mutants import TARGETS, reasons, survivor_key
+from studies.stability import stability, stability_page
+
+DOCS = Path(__file__).resolve().parents[3] / "docs"
+FOLDER = DOCS / "results/stability"
+
+
+def result(name: str) -> dict[str, Any]:
+    return json.loads((FOLDER / f"{name}.json").read_text())
+
+
+def test_tables_are_those_of_the_measurements() -> None:
+    assert stability.report(result("stability")) in (FOLDER / "stability.md").read_text()
+
+
+def filled(page: str) -> str:
+    return stability_page.filled(page, FOLDER, stability.report(result("stability")))
+
+
+def test_page_is_that_of_the_measurements() -> None:
+    page = (FOLDER / "stability.md").read_text()
+    assert filled(page) == page
+
+
+def test_a_changed_figure_shows() -> None:
+    page = (FOLDER / "stability.md").read_text()
+    coverage = stability_page.coverage_block(result("coverage"))
+    assert coverage in page
+    assert filled(page.replace(coverage, "99.9 %")) == page
+    with pytest.raises(ValueError, match="0 places for 'tables'"):
+        filled("an empty page")
+
+
+def test_every_arm_is_measured_over_iterations_and_seconds() -> None:
+    measured = result("stability")
+    kinds = [measured[kind].values() for kind in ("problems", "valleys", "quadratics")]
+    for courses in itertools.chain(*kinds):
+        assert set(courses) == set(stability.ARMS)
+        for course in courses.values():
+            iterations, seconds, errors = zip(*course, strict=True)
+            assert list(iterations) == sorted(iterations)
+            assert list(seconds) == sorted(seconds)
+            assert min(errors) > 0
+    for name in ("iterations", "seconds", "conditions"):
+        assert (FOLDER / f"{name}.png").stat().st_size > 10_000
+
+
+def test_long_tests_passed() -> None:
+    tests = result("slow")["tests"]
+    assert {test["outcome"] for test in tests} == {"passed"}
+    for wanted in ("million", "long", "ManyRowEdits", "ten thousand", "inductor", "millions"):
+        assert any(wanted in test["test"] for test in tests), wanted
+
+
+def test_coverage_is_enough() -> None:
+    whole = stability_page.total(result("coverage")["modules"])
+    assert stability_page.branch_share(whole) >= stability_page.LEAST_COVERAGE
+    assert stability_page.line_share(whole) >= stability_page.LEAST_COVERAGE
+
+
+def test_mutants_are_noticed_and_survivors_explained() -> None:
+    modules = result("mutants")["modules"]
+    assert set(modules) == set(TARGETS)
+    many = sum(entry["mutants"] for entry in modules.values())
+    assert sum(entry["killed"] for entry in modules.values()) >= 0.9 * many
+    for name, entry in modules.items():
+        assert entry["mutants"] - entry["killed"] == len(entry["survivors"])
+        for one in entry["survivors"]:
+            assert reasons()[(name, *survivor_key(one))], one

@@ -1,0 +1,340 @@
+"""The study: its page equals its records, its rule the defaults, and its trainings can resume."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shutil
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from splatting.arms import Arm
+from splatting.fit import Fit, FitOptions
+from splatting.scenes import load_scene
+from studies.scenes import report, steps
+from studies.scenes.analysis import Study
+from studies.scenes.arms import BASELINE, STUDY_ARMS, find_study_arm
+from studies.scenes.decisions import COMPARISONS, decide
+from studies.scenes.parts.chosen_fading import chosen_rows
+from studies.scenes.parts.own_step import OwnStep
+from studies.scenes.parts.step_lengths import StepLengths
+from studies.scenes.plan import plan
+from studies.scenes.records import COLUMNS, Record, Setting, gather, merge, read, write
+from studies.scenes.run import main as run_study
+from studies.scenes.tables import machines_line
+from studies.scenes.training import Spec, machine, train
+from studies.scenes.view_angles import nearest_angles
+from torch import Tensor
+
+from opt3dgs_optim import DEFAULTS, Annealing, Fading
+
+RECORDS = report.FOLDER / "records.json"
+
+
+def record(arm: str, scene: str, seed: int, psnr: float, seconds: float = 10.0) -> Record:
+    """A straight curve from 10 dB at 0 s."""
+    curve = {name: np.array([0.0, 1.0]) for name in COLUMNS}
+    curve["seconds"] = np.array([0.0, seconds])
+    curve["psnr"] = np.array([10.0, psnr])
+    setting = Setting(scene, 100, 3000, "sfm")
+    return Record(setting, arm, seed, curve, None, 1, 1, None, "a machine", f"2026-01-0{seed + 1}")
+
+
+def test_the_pages_are_made_from_the_records() -> None:
+    made = report.tables(Study(read(RECORDS)))
+    for path in report.PAGES:
+        page = path.read_text(encoding="utf-8")
+        assert "<!-- study:decisions -->" in page
+        assert report.fill(page, made) == page, path
+
+
+def test_the_defaults_are_what_the_page_concludes() -> None:
+    decided = {part: decision.on for part, decision in decide(Study(read(RECORDS))).items()}
+    committed = json.loads((report.FOLDER / "decisions.json").read_text(encoding="utf-8"))
+    assert committed == decided
+    on = {part for part, is_on in decided.items() if is_on and "." not in part}
+    assert {type(part).__name__ for part in DEFAULTS} == on
+    annealing = Annealing()
+    assert (annealing.opacity_peak != annealing.peak) == decided["Annealing.opacity_peak"]
+
+
+def test_the_defaults_are_the_measured_arm() -> None:
+    measured = find_study_arm(report.BEST).parts
+    assert measured is not None
+    assert measured(300, None) == list(DEFAULTS)
+    peak, opacities = Annealing().peak, Annealing().opacity_peak
+    unpooled = f"annealed-{peak:g}-opacities-{opacities:g}+faded"
+    assert COMPARISONS["Annealing.opacity_peak"][0] == unpooled
+    assert COMPARISONS["Pooling"][1] == report.BEST
+
+
+def test_gain_at_equal_seconds_and_its_spread() -> None:
+    records = [
+        record(arm, scene, seed, psnr + 0.1 * seed * (arm != BASELINE), seconds)
+        for scene in "abcde"
+        for seed in range(3)
+        for arm, psnr, seconds in ((BASELINE, 20.0, 10.0), ("faded", 22.0, 20.0))
+    ]
+    study = Study(records)
+    gain = study.gain(study.settings(3000), "faded")
+    assert gain is not None
+    # At 10 s the slower arm is half-way: 10 + 12 / 2 = 16 dB, 0.05 more for each seed.
+    assert gain.equal_seconds == pytest.approx(-4.0 + 0.05)
+    assert gain.spread == pytest.approx(0.05)
+    assert gain.equal_iterations == pytest.approx(2.1)
+    assert gain.seconds == pytest.approx(2.0)
+    assert gain.reach == pytest.approx(np.mean([20 * 10 / (12 + 0.1 * s) / 10 for s in range(3)]))
+    assert gain.verdict == "does not pay"
+
+
+@pytest.mark.parametrize(
+    ("seeds", "gains", "verdict"),
+    [
+        (3, (0.5, 0.6, 0.7), "pays"),
+        (3, (0.1, 0.9, -0.3), "does not pay"),
+        (2, (5.0, 5.0), "undecided"),
+    ],
+)
+def test_the_rule(seeds: int, gains: tuple[float, ...], verdict: str) -> None:
+    records = [
+        record(arm, scene, seed, 20.0 + (gains[seed] if arm != BASELINE else 0.0))
+        for scene in "abcde"
+        for seed in range(seeds)
+        for arm in (BASELINE, "faded")
+    ]
+    study = Study(records)
+    gain = study.gain(study.settings(3000), "faded")
+    assert gain is not None
+    assert gain.verdict == verdict
+
+
+def test_the_plan_names_known_arms_and_puts_what_is_needed_first() -> None:
+    trainings = plan(Path("scenes"), Path("runs"))
+    seen: set[Path] = set()
+    for training in trainings:
+        assert training.spec.arm in STUDY_ARMS
+        assert set(training.needs) <= seen, training
+        seen.add(training.folder)
+    assert len(seen) == len(trainings)
+    assert all(arm.control in STUDY_ARMS for arm in STUDY_ARMS.values())
+    with pytest.raises(ValueError, match="nonsense"):
+        plan(Path("scenes"), Path("runs"), ["nonsense"])
+
+
+def test_a_training_resumes_and_branches(tmp_path: Path) -> None:
+    spec = Spec("embedded", BASELINE, 0, 40, 120)
+    whole = train(spec, _made(tmp_path / "whole"), None, None)
+    # Stopped after the evaluation at 20: the record is ahead of the checkpoint, as when killed.
+    stopped = _made(tmp_path / "stopped")
+    train(spec, stopped, None, None)
+    cut = json.loads((stopped / "record.json").read_text(encoding="utf-8"))
+    del cut["finished"]
+    (stopped / "record.json").write_text(json.dumps(cut), encoding="utf-8")
+    (tmp_path / "whole" / "at-30.pt").rename(stopped / "checkpoint.pt")
+    again = train(spec, stopped, None, None)
+    assert _psnr(again) == _psnr(whole)
+
+    branch = Spec("embedded", "l2@1/4", 0, 40, 120)
+    tail = train(branch, _made(tmp_path / "branch"), stopped_trunk(tmp_path, spec), None)
+    assert (
+        _psnr(tail)[: _iterations(tail).index(30) + 1]
+        == (_psnr(whole)[: _iterations(whole).index(30) + 1])
+    )
+    assert _psnr(tail)[-1] != _psnr(whole)[-1]
+
+
+def stopped_trunk(tmp_path: Path, spec: Spec) -> Path:
+    trunk = _made(tmp_path / "trunk")
+    train(spec, trunk, None, None)
+    return trunk
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+def _psnr(made: dict[str, object]) -> list[float]:
+    curve = made["curve"]
+    assert isinstance(curve, list)
+    return [row["psnr"] for row in curve]
+
+
+def _iterations(made: dict[str, object]) -> list[int]:
+    curve = made["curve"]
+    assert isinstance(curve, list)
+    return [row["iteration"] for row in curve]
+
+
+@pytest.mark.parametrize("name", ["own-step", "annealed-2", "defaults-3000", "faded-fresh"])
+def test_arms_train(tmp_path: Path, name: str) -> None:
+    made = train(Spec("embedded", name, 0, 60, 80), tmp_path, None, None)
+    assert np.isfinite(_psnr(made)).all()
+
+
+_embedded = cache(lambda: load_scene("embedded"))  # seconds to make
+
+
+def _fit(arm: str, iterations: int = 3000) -> Fit:
+    return Fit(_embedded(), find_study_arm(arm), FitOptions(iterations, 120))
+
+
+def test_records_survive_writing(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    train(Spec("embedded", "faded", 1, 20, 80), tmp_path / "a", None, None)
+    train(Spec("embedded", "faded", 1, 20, 80, sh_degree=1), tmp_path / "b", None, None)
+    path = tmp_path / "records.json"
+    write(merge(gather(tmp_path / "a"), gather(tmp_path / "b")), path)
+    one, other = read(path)
+    assert (one.arm, one.seed, one.setting.iterations) == ("faded", 1, 20)
+    assert one.seconds > 0
+    assert other.state_bytes > one.state_bytes
+    assert other.setting == replace(one.setting, sh_degree=1)
+    assert one.machine == machine()
+    assert torch.__version__ in one.machine
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", one.date)
+    assert Study([one, other]).settings(20) == [one.setting]
+    assert Study([one, other]).settings(20, sh_degree=1) == [other.setting]
+
+
+def test_the_picture_of_the_steps_is_drawn_from_its_file(tmp_path: Path) -> None:
+    committed = report.FOLDER / "steps.json"
+    data = json.loads(committed.read_text(encoding="utf-8"))
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", data["date"])
+    assert "torch" in data["machine"]
+    shutil.copy(committed, tmp_path)
+    assert steps.main(["--redraw", "-o", str(tmp_path)]) == 0
+    assert (tmp_path / "steps.png").stat().st_size > 10_000
+
+
+def test_angles_between_views() -> None:
+    scene = _embedded()
+    first, second = scene.train[:2]
+    directions = [
+        np.asarray(v.camera.position - scene.points.median(0).values) for v in (first, second)
+    ]
+    lengths = [np.linalg.norm(d) for d in directions]
+    between = math.degrees(math.acos(directions[0] @ directions[1] / math.prod(lengths)))
+    assert nearest_angles(replace(scene, train=[first], test=[second])) == pytest.approx(
+        [between], rel=1e-3
+    )
+    assert nearest_angles(replace(scene, test=[first])) == pytest.approx([0.0], abs=0.1)
+
+
+def test_machines_and_days_are_said() -> None:
+    records = [record("mcmc", "a", seed, 20.0) for seed in (2, 0, 1)]
+    other = replace(records[0], machine="another", date="2026-02-01")
+    assert machines_line([*records, other]) == (
+        "3 trainings, 2026-01-01 to 2026-01-03: a machine, one thread each.\n"
+        "1 training, 2026-02-01: another, one thread each."
+    )
+
+
+def test_new_records_take_the_place_of_old_ones() -> None:
+    def one(seed: int, seconds: float) -> dict[str, object]:
+        key = {"scene": "a", "points": 1, "iterations": 2, "init": "sfm", "arm": "mcmc"}
+        return {**key, "sh_degree": 0, "seed": seed, "seconds": seconds}
+
+    merged = merge([one(0, 1.0), one(1, 1.0)], [one(2, 2.0), one(1, 2.0)])
+    assert merged == [one(0, 1.0), one(1, 2.0), one(2, 2.0)]
+
+
+def test_bad_calls_say_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_study(["--scenes", str(tmp_path), "--stages", "nonsense"]) == 2
+    assert "nonsense" in capsys.readouterr().err
+    assert report.main(["--runs", str(tmp_path)]) == 2
+    assert "no finished training" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="unknown; there are mcmc"):
+        find_study_arm("nonsense")
+    with pytest.raises(ValueError, match="marker study:nonsense"):
+        report.fill("<!-- study:nonsense -->\n<!-- end -->", {})
+
+
+def test_stale_and_fresh_rows_are_found() -> None:
+    first = torch.tensor([[0.1, 0.0], [1.0, 1.0], [0.5, 0.0], [0.0, 0.0], [0.01, 0.01]])
+    moments = {"exp_avg": first, "exp_avg_sq": torch.tensor([[1.0, 1.0]] * 3 + [[0, 0], [1, 1]])}
+    # ratios: 0.005, 1, 0.125, never a gradient, 0.0001
+    assert chosen_rows(moments, 0.4, stale=True).tolist() == [4, 0]
+    assert chosen_rows(moments, 0.4, stale=False).tolist() == [1, 2]
+    assert sorted(chosen_rows(moments, 1.0, stale=True).tolist()) == [0, 1, 2, 4]
+
+
+@pytest.mark.parametrize("name", ["faded-stale", "faded-fresh"])
+def test_fading_of_chosen_points(name: str) -> None:
+    fit = _fit(name, iterations=60)
+    changed: dict[str, float] = {}
+    for _ in range(6):
+        before = {n: _second_moment(fit, n) for n in fit.gaussians}
+        fit.step()
+        for n, old in before.items():
+            # Without an event exp_avg_sq falls by a thousandth at most.
+            fallen = (_second_moment(fit, n) < 0.9 * old).reshape(len(old), -1).all(1)
+            changed[n] = max(changed.get(n, 0.0), fallen.float().mean().item())
+    assert min(changed.values()) > 0.0, changed
+
+
+def _second_moment(fit: Fit, name: str) -> Tensor:
+    state = fit.optimizers[name].state.get(fit.gaussians[name], {})
+    return state.get("exp_avg_sq", torch.zeros_like(fit.gaussians[name])).clone()
+
+
+def _own_step_lengths(times: float) -> dict[str, list[float]]:
+    """Root mean square of every parameter's first steps, with the trainer's rates so changed."""
+    lengths, own = StepLengths(every=1), OwnStep()
+    arm = Arm("own", "", lambda _iterations, _nu: [own, lengths])
+    fit = Fit(_embedded(), arm, FitOptions(40, 120))
+    found: dict[str, list[float]] = {name: [] for name in fit.gaussians}
+    fit.rates = {name: times * rate for name, rate in fit.rates.items()}
+    for optimizer in fit.optimizers.values():
+        optimizer.param_groups[0]["lr"] *= times
+    for iteration in range(12):
+        rates = {name: o.param_groups[0]["lr"] for name, o in fit.optimizers.items()}
+        fit.step()
+        # The Gaussians begin round: nothing turns them in the first step.
+        for name, rows in lengths.rows.items() if iteration > 2 else []:
+            length = rows[-1][1] * rates[name]
+            # Points that no view has seen yet stand still, and do not count as steps.
+            assert 0.3 < length / own.wanted(name, iteration / 40) < 1.5, (name, iteration)
+            found[name].append(length)
+    return found
+
+
+def test_own_steps_have_the_wanted_size_whatever_the_rates() -> None:
+    usual = _own_step_lengths(1.0)
+    for times in (0.1, 0.3, 3.0, 10.0):
+        for name, lengths in _own_step_lengths(times).items():
+            # Lengths are rounded to 1e-5 of a rate.
+            assert lengths == pytest.approx(usual[name], rel=1e-2), (name, times)
+
+
+def test_own_steps_resume(tmp_path: Path) -> None:
+    whole, resumed = _fit("own-step", 60), _fit("own-step", 60)
+    for _ in range(25):
+        whole.step()
+    whole.save(tmp_path / "at.pt")
+    resumed.load(tmp_path / "at.pt")
+    for fit in (whole, resumed):
+        for _ in range(10):
+            fit.step()
+    assert all(torch.equal(p, resumed.gaussians[n]) for n, p in whole.gaussians.items())
+
+
+def test_a_retired_arm_is_drawn_but_not_trained() -> None:
+    assert STUDY_ARMS["matrix"].retired
+    with pytest.raises(ValueError, match="'matrix' is retired: its records are kept"):
+        find_study_arm("matrix")
+    assert "matrix" in report.tables(Study(read(RECORDS)))["leads"]
+
+
+def test_fading_follows_the_length_of_the_run() -> None:
+    for name in ("faded-3000", "defaults-3000"):
+        make = find_study_arm(name).parts
+        assert make is not None
+        fading = next(part for part in make(30_000, None) if isinstance(part, Fading))
+        assert fading.events == 3_000

@@ -1,0 +1,128 @@
+"""The comparison's command line, end to end and tiny."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from opt3dgs_optim.runs import read_run
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+TINY = ["--iterations", "40", "--points", "120", "--seeds", "1", "--switch", "0.75"]
+
+
+def compare(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, str(EXAMPLES / "error_vs_time.py"), *words],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "tiny"
+    result = compare(*TINY, "--arms", "mcmc,mcmc+constant-multiplier,opt3dgs", "-o", str(out))
+    assert result.returncode == 0, result.stderr
+    assert "| mcmc+constant-multiplier |" in result.stdout
+    return out
+
+
+def test_reports_all_arms_and_the_one_that_the_control_needs(finished: Path) -> None:
+    report = json.loads((finished / "report.json").read_text())
+    arms = {arm["arm"]: arm for arm in report["scenes"][0]["arms"]}
+    assert set(arms) == {"mcmc", "mcmc+awsgld", "mcmc+constant-multiplier", "opt3dgs"}
+    for arm in arms.values():
+        assert arm["final"]["psnr"]["mean"] > 5  # forty iterations from nearly black
+    assert {"mcmc+awsgld", "mcmc+constant-multiplier"} <= set(arms)
+    assert arms["mcmc+constant-multiplier"]["mean_nu"]["mean"] == pytest.approx(
+        arms["mcmc+awsgld"]["mean_nu"]["mean"], rel=1e-5
+    )
+
+
+def test_draws_the_report_and_the_renders(finished: Path) -> None:
+    for name in ("report.png", "renders.png"):
+        with Image.open(finished / name) as picture:
+            assert min(picture.size) > 300
+            assert len(picture.convert("RGB").getcolors(1 << 24) or []) > 500
+
+
+def test_no_folder_of_this_machine_is_recorded(finished: Path) -> None:
+    for name in ("report.md", "report.json"):
+        assert str(finished.parent) not in (finished / name).read_text()
+
+
+def test_second_start_repeats_nothing(finished: Path) -> None:
+    log = finished / "mcmc" / "seed-0" / "log.jsonl"
+    before = log.read_bytes()
+    result = compare(*TINY, "--arms", "mcmc,opt3dgs", "-o", str(finished))
+    assert result.returncode == 0, result.stderr
+    assert log.read_bytes() == before
+
+
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
+def test_interruption_leaves_checkpoints_and_the_same_command_goes_on(
+    kind: signal.Signals, tmp_path: Path
+) -> None:
+    words = ["--iterations", "300", "--points", "120", "--seeds", "1", "--arms", "mcmc,adam"]
+    words += ["--jobs", "2", "-o", str(tmp_path)]
+    process = subprocess.Popen(
+        [sys.executable, str(EXAMPLES / "error_vs_time.py"), *words],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
+    logs = [tmp_path / arm / "seed-0" / "log.jsonl" for arm in ("mcmc", "adam")]
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        if all(log.exists() and log.read_bytes().count(b"\n") > 25 for log in logs):
+            break
+        time.sleep(0.01)
+    process.send_signal(kind)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130, stderr
+    assert b"goes on from the checkpoints" in stderr
+    for log in logs:
+        run = read_run(log)
+        if run.events[-1]["event"] == "interrupted":
+            assert (log.parent / "checkpoint.pt").exists()
+    assert any(read_run(log).events[-1]["event"] == "interrupted" for log in logs)
+    result = compare(*words)
+    assert result.returncode == 0, result.stderr
+    for log in logs:
+        assert read_run(log).steps["iteration"].tolist() == list(range(1, 301))
+
+
+def test_folder_with_other_options_is_refused(finished: Path) -> None:
+    result = compare("--iterations", "41", "--points", "120", "--arms", "mcmc", "-o", str(finished))
+    assert result.returncode == 2
+    assert "use another -o" in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--arms", "mcmc,sgd"], "'sgd' is unknown"),
+        (["--scene", "/nowhere/at/all"], "/nowhere/at/all"),
+        (["--seeds", "0"], "--seeds 0"),
+        (["--arms", ""], "--arms '': names no arm"),
+        (["--iterations", "0"], "iterations=0"),
+        (["-o", "/dev/null/here"], "/dev/null"),
+    ],
+)
+def test_bad_options_are_one_line(words: list[str], message: str) -> None:
+    result = compare(*words)
+    assert result.returncode == 2
+    assert message in result.stderr
+    assert result.stderr.count("\n") == 1

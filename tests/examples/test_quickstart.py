@@ -1,0 +1,32 @@
+"""The first example that anybody runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import quickstart
+
+
+def test_it_fits_prints_and_draws(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(quickstart, "ITERATIONS", 200)
+    picture = tmp_path / "new" / "quick.png"
+    assert quickstart.main(["-o", str(picture)]) == 0
+    stock, ours, written = capsys.readouterr().out.splitlines()
+    assert stock.startswith("stock 3DGS-MCMC: ")
+    assert written == str(picture)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    psnr = [float(line.split(": ")[1].split()[0]) for line in (stock, ours)]
+    assert psnr[1] > psnr[0] + 1
+
+
+@pytest.mark.parametrize("out", ["/dev/null/quick.png", "."])
+def test_a_place_that_cannot_be_written_is_one_line(
+    out: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert quickstart.main(["-o", out]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("quickstart: ")
+    assert said.count("\n") == 1

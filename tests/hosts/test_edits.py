@@ -1,0 +1,253 @@
+"""`python -m opt3dgs_optim.hosts diff`: lines that fit the file, or a refusal that says why."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from trainer_files import GSPLAT, INRIA, MINI_SPLATTING, SYNTHETIC, TAMING, added
+
+from opt3dgs_optim.hosts import diff, main, write
+
+IMPORT = "from opt3dgs_optim import PhaseScheduler"
+OURS = [
+    "phases = PhaseScheduler(opt.iterations)",
+    "gaussians.optimizer = phases.upgrade(gaussians.optimizer)",
+    "Ll1 = phases.pixel_loss(image, gt_image)",
+    "phases.observe(loss, iteration=iteration - 1)",
+]
+
+
+def saved(folder: Path, text: str, name: str = "train.py") -> Path:
+    path = folder / name
+    path.write_bytes(text.encode())
+    return path
+
+
+def lines_for(folder: Path, text: str) -> list[str]:
+    return added(diff(saved(folder, text)).diff)
+
+
+@pytest.mark.parametrize("kind", SYNTHETIC)
+def test_what_is_written_is_what_was_shown(tmp_path: Path, kind: str) -> None:
+    path = saved(tmp_path, SYNTHETIC[kind])
+    lines = added(diff(path).diff)
+    assert lines[0] == IMPORT
+    backup = write(path)
+    assert backup.name == "train.py.orig"
+    assert backup.read_text() == SYNTHETIC[kind]
+    after = path.read_text()
+    compile(after, str(path), "exec")
+    old = SYNTHETIC[kind].splitlines()
+    assert [line.strip() for line in after.splitlines() if line not in old] == lines
+
+
+def test_the_lines_of_inria(tmp_path: Path) -> None:
+    path = saved(tmp_path, INRIA)
+    assert added(diff(path).diff) == [IMPORT, *OURS]
+    assert diff(path).notes == ["left alone: gaussians.exposure_optimizer"]
+    write(path)
+    text = path.read_text()
+    # after restore(), which makes a new optimizer
+    assert text.index("restore(") < text.index(OURS[0]) < text.index("for iteration")
+    assert "l1_test += l1_loss(" in text
+
+
+def test_the_lines_of_gsplat(tmp_path: Path) -> None:
+    path = saved(tmp_path, GSPLAT)
+    ranks = ", process_group=torch.distributed.group.WORLD if world_size > 1 else None"
+    lines = [
+        IMPORT,
+        f"phases = PhaseScheduler(max_steps{ranks})",
+        "self.optimizers = phases.upgrade(self.optimizers)",
+        "l1loss = phases.pixel_loss(colors, pixels)",
+        "phases.observe(loss)",
+    ]
+    assert added(diff(path).diff) == lines
+    write(path)
+    text = path.read_text()  # above the learning-rate schedulers
+    assert text.index("max_steps = cfg") < text.index(lines[1]) < text.index("schedulers = [")
+
+
+def test_world_size_only_where_it_is_defined(tmp_path: Path) -> None:
+    assert "phases = PhaseScheduler(max_steps)" in lines_for(tmp_path, SYNTHETIC["gsplat 2DGS"])
+
+
+@pytest.mark.parametrize("name", ["convexes", "student_gaussians"])
+def test_the_models_name_is_the_files(tmp_path: Path, name: str) -> None:
+    lines = lines_for(tmp_path, INRIA.replace("gaussians", name))
+    assert f"{name}.optimizer = phases.upgrade({name}.optimizer)" in lines
+
+
+def test_other_names_of_loss_options_and_ours(tmp_path: Path) -> None:
+    text = INRIA.replace("        loss.b", "        total_loss = loss\n        total_loss.b")
+    assert "phases.observe(total_loss, iteration=iteration - 1)" in lines_for(tmp_path, text)
+    text = INRIA.replace("opt.iterations", "final_iter").replace("opt, pipe", "final_iter, opt")
+    assert "phases = PhaseScheduler(final_iter)" in lines_for(tmp_path, text)
+    text = INRIA.replace("first_iter = 0\n", "phases = first_iter = 0\n")
+    assert "opt3dgs_phases = PhaseScheduler(opt.iterations)" in lines_for(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    ("loop", "observe"),
+    [
+        ("range(1, opt.iterations + 1)", "phases.observe(loss, iteration=iteration - 1)"),
+        ("range(first_iter, opt.iterations)", "phases.observe(loss, iteration=iteration)"),
+        ("range(opt.iterations)", "phases.observe(loss)"),
+    ],
+)
+def test_the_trainers_own_count(tmp_path: Path, loop: str, observe: str) -> None:
+    text = INRIA.replace("range(first_iter, opt.iterations + 1)", loop)
+    assert observe in lines_for(tmp_path, text)
+
+
+def test_a_new_set_up_in_the_loop_is_upgraded_too(tmp_path: Path) -> None:
+    path = saved(tmp_path, MINI_SPLATTING)
+    write(path)
+    text = path.read_text()
+    assert text.count(OURS[1]) == 2
+    assert re.search(
+        rf"simp_iteration1:\n +gaussians\.training_setup\(opt\)\n +{re.escape(OURS[1])}", text
+    )
+
+
+def test_a_second_optimizer_is_taken_along(tmp_path: Path) -> None:
+    second = "gaussians.shoptimizer = phases.upgrade(gaussians.shoptimizer)"
+    assert second in lines_for(tmp_path, TAMING)
+    # Stepped in a method of the model: read from the model's file.
+    text = INRIA.replace("gaussians.optimizer.step()", "gaussians.optimizer_step(iteration)")
+    assert second not in lines_for(tmp_path, text)
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "gaussian_model.py").write_text("self.shoptimizer = torch.optim.Adam([])")
+    assert second in lines_for(tmp_path, text)
+
+
+def test_groups_without_positions_are_noted(tmp_path: Path) -> None:
+    (tmp_path / "scene").mkdir()
+    model = "groups = [{'params': [a], 'name': 'anchor'}, {'params': [b], 'name': 'opacity'}]\n"
+    (tmp_path / "scene" / "gaussian_model.py").write_text(model)
+    (note, _) = diff(saved(tmp_path, INRIA)).notes
+    assert "named xyz or means" in note
+    assert "anchor, opacity" in note
+
+
+def test_branches_of_an_if(tmp_path: Path) -> None:
+    text = INRIA.replace(
+        "        loss.backward()\n",
+        """\
+        if amp:
+            scaler.scale(loss).backward()
+        else:
+            loss.backward()
+""",
+    )
+    assert lines_for(tmp_path, text).count(OURS[3]) == 2
+
+
+def test_an_l1_term_of_another_kind_is_noted(tmp_path: Path) -> None:
+    path = saved(tmp_path, INRIA.replace("= l1_loss(image", "= l1_loss_mask(image"))
+    assert added(diff(path).diff) == [IMPORT, *OURS[:2], OURS[3]]
+    assert "no L1 = l1_loss" in diff(path).notes[1]
+
+
+@pytest.mark.parametrize("end", ["\r\n", "\r", "\n"])
+def test_line_ends_are_kept(tmp_path: Path, end: str) -> None:
+    path = saved(tmp_path, INRIA.replace("\n", end))
+    write(path)
+    data = path.read_bytes().decode()
+    assert data.count(end) == INRIA.count("\n") + 4
+    assert data.replace(end, "").count("\n") == data.replace(end, "").count("\r") == 0
+
+
+def test_one_odd_line_end_stays_the_only_one(tmp_path: Path) -> None:
+    path = saved(tmp_path, INRIA.replace("import torch\n", "import torch\r\n", 1))
+    write(path)
+    assert path.read_bytes().count(b"\r\n") == 1
+
+
+REFUSED = {
+    "print('hello')\n": "with a loss.backward",
+    INRIA.replace("range(first_iter, opt.iterations + 1)", "loader"): "cannot be read from it",
+    INRIA.replace(
+        "        loss.backward()\n", 2 * "        loss.backward()\n"
+    ): "one loss.backward",
+    INRIA.replace("gaussians.optimizer.step()", "adam.minimise()"): "is not clear",
+    INRIA.replace("optimizer.step()", "optimizer.step(sig=1)"): "no step of an Adam",
+    INRIA.replace("dataset, opt, pipe", "dataset, pipe"): "the name opt is not defined",
+    INRIA.replace("import torch\n", "import torch;").replace("\n\n\ndef", ";x = 1\n\n\ndef"): (
+        "several statements"
+    ),
+    INRIA + "def f(:\n": "cannot be read as Python",
+    INRIA.replace("import torch", "import nerfstudio"): "needs no change",
+    "from opt3dgs_optim import AWSGLD\n" + INRIA: "imports opt3dgs_optim already",
+}
+
+
+@pytest.mark.parametrize("text", REFUSED, ids=REFUSED.values())
+def test_what_is_not_certain_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture, text: str
+) -> None:
+    path = saved(tmp_path, text)
+    assert main(["diff", str(path), "--write"]) == 1
+    said = capsys.readouterr().err
+    assert REFUSED[text] in said
+    assert "phases = PhaseScheduler(TOTAL_STEPS)" in said  # the lines to add by hand
+    assert path.read_text() == text
+    assert not (tmp_path / "train.py.orig").exists()
+
+
+def test_other_files_and_folders(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    for name in ("trainer.cpp", "train.rs"):
+        assert main(["diff", str(saved(tmp_path, "", name))]) == 1
+        assert "LichtFeld Studio (C++) and Brush (Rust)" in capsys.readouterr().err
+    saved(tmp_path, INRIA)
+    assert main(["diff", str(tmp_path)]) == 1
+    assert "name the training script (train.py)" in capsys.readouterr().err
+    assert main(["diff", str(tmp_path / "none.py")]) == 1
+    assert "cannot be read" in capsys.readouterr().err
+
+
+def test_a_second_time_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    path = saved(tmp_path, INRIA)
+    assert main(["diff", str(path), "--write"]) == 0
+    assert "train.py.orig" in capsys.readouterr().out
+    once = path.read_text()
+    assert main(["diff", str(path)]) == 1
+    assert "imports opt3dgs_optim already" in capsys.readouterr().err
+    path.write_text(INRIA)  # the user's own file again, the backup still there
+    assert main(["diff", str(path), "--write"]) == 1
+    assert "exists already" in capsys.readouterr().err
+    assert path.read_text() == INRIA != once
+
+
+@pytest.mark.parametrize("fails", ["target", "backup"])
+def test_a_file_that_cannot_be_written_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: str
+) -> None:
+    """No backup stays behind that would block the next try."""
+    path = saved(tmp_path, INRIA)
+
+    def refuse(self: Path, *args: Any, **kwargs: Any) -> Any:
+        raise PermissionError(13, "Permission denied")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open" if fails == "target" else "write_bytes", refuse)
+        if fails == "target":
+            patch.setattr(Path, "read_bytes", lambda self: INRIA.encode())
+        with pytest.raises(ValueError, match="cannot be written"):
+            write(path)
+    assert path.read_text() == INRIA
+    assert list(tmp_path.iterdir()) == [path]
+    write(path)
+
+
+def test_as_a_module_it_prints_the_lines(tmp_path: Path) -> None:
+    path = saved(tmp_path, INRIA)
+    command = [sys.executable, "-m", "opt3dgs_optim.hosts", "diff", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert added(done.stdout) == [IMPORT, *OURS]
+    assert path.read_text() == INRIA

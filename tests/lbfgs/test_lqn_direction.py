@@ -1,0 +1,242 @@
+"""One operator: under torch's own checks, its routing, its memory and its calls."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import weakref
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from points_first import direction, record
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+import opt3dgs_optim
+from opt3dgs_optim import cuda
+from opt3dgs_optim.lbfgs import foresight, laid_out, lqn_direction, new_history, two_loop
+from opt3dgs_optim.lbfgs import pairs as columns_of
+from opt3dgs_optim.lbfgs.two_loop import step
+
+OPERATOR = torch.ops.opt3dgs_optim.lqn_direction.default
+# inductor imports parts of torch that torch itself has deprecated
+pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
+
+
+COMPILERS = pytest.mark.parametrize(
+    "compiler",
+    [
+        "aot_eager",
+        pytest.param(
+            "inductor",
+            marks=pytest.mark.skipif(
+                shutil.which("g++") is None, reason="inductor needs g++ on a CPU"
+            ),
+        ),
+    ],
+)
+
+
+def points(
+    n: int, dtype: torch.dtype = torch.float32, dim: int = 3
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Position, gradient and a history with two pairs."""
+    g = torch.Generator().manual_seed(n)
+    draws = torch.randn(6, n, dim, generator=g, dtype=torch.float64).to(dtype)
+    history = new_history(draws[0], 5)
+    for x in draws[:3]:
+        record(history, 5, x, 2 * x, torch.ones(n, dtype=torch.bool), min_cosine=1e-6)
+    return draws[3], draws[4], history
+
+
+@pytest.mark.parametrize("graft", [True, False])
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("n", [0, 1, 257])
+def test_opcheck(n: int, dim: int, graft: bool) -> None:
+    options = {"min_cosine": 1e-6, "graft": graft, "backend": "auto"}
+    torch.library.opcheck(OPERATOR, (*points(n, dim=dim), 5), options)
+
+
+@COMPILERS
+def test_lqn_direction_compiles_without_a_graph_break(compiler: str) -> None:
+    x, grad, history = points(100)
+    eager_history = history.clone()
+
+    def both(x: Tensor, grad: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
+        fed, accepted, _ = lqn_direction(2 * x, grad, history, 5, min_cosine=1e-6, graft=True)
+        return 2 * fed, accepted.sum()
+
+    expected = both(x, grad, eager_history)
+    compiled = torch.compile(both, fullgraph=True, backend=compiler)(x, grad, history)
+    torch.testing.assert_close(compiled[0], expected[0], rtol=0, atol=0)
+    assert int(compiled[1]) == int(expected[1])
+    assert torch.equal(history, eager_history)
+
+
+@pytest.mark.slow
+def test_pure_torch_compiles_with_inductor() -> None:
+    """The path of ROCm, MPS and CPU; slow only because of the compiler."""
+    _, grad, history = points(1000)
+    compiled = torch.compile(two_loop, fullgraph=True)(grad, history, 5)
+    torch.testing.assert_close(compiled, two_loop(grad, history, 5), rtol=1e-5, atol=1e-6)
+
+
+def test_operator_is_record_then_direction() -> None:
+    x, grad, history = points(300, torch.float64)
+    grad[::5] = 0
+    grad[1::5, 1] = torch.nan
+    twin = history.clone()
+    fed, accepted, candidates = lqn_direction(x, grad, history, 5, min_cosine=1e-6, graft=True)
+    visible = (grad != 0).any(1) & grad.isfinite().all(1)
+    flags = record(twin, 5, x, grad, visible, min_cosine=1e-6)
+    expected = direction(grad, twin, 5, graft=True)
+    assert torch.equal(accepted, flags[0])
+    assert torch.equal(candidates, flags[1])
+    assert torch.equal(history, twin)
+    torch.testing.assert_close(fed, expected, rtol=0, atol=0, equal_nan=True)
+
+
+def test_both_memory_layouts_give_the_same_numbers() -> None:
+    x, grad, history = points(40)
+    outcomes = []
+    for contiguous in (False, True):
+        copy = laid_out(history.clone(), contiguous=contiguous)
+        assert copy.is_contiguous() == contiguous
+        fed, _, _ = lqn_direction(x, grad, copy, 5, min_cosine=1e-6, graft=True)
+        outcomes.append((fed, copy))
+    assert torch.equal(outcomes[0][0], outcomes[1][0])
+    assert torch.equal(outcomes[0][1], outcomes[1][1])
+
+
+def test_wrong_shapes_are_named() -> None:
+    x, grad, history = points(7)
+    with pytest.raises(ValueError, match=r"lqn_direction: history has shape \(6, 5, 8\)"):
+        lqn_direction(x, grad, history[:6], 5, min_cosine=0.0, graft=True)
+
+
+# -- what it costs ---------------------------------------------------------------------------------
+
+
+class LiveBytes(TorchDispatchMode):
+    """The most bytes that the tensors made in its scope have held at a time."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.alive: list[tuple[weakref.ref[Tensor], int, int]] = []  # tensor, address, bytes
+        self.most = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        found = func(*args, **(kwargs or {}))
+        given = {a.untyped_storage().data_ptr() for a in args if isinstance(a, Tensor)}
+        for one in found if isinstance(found, (list, tuple)) else [found]:
+            if isinstance(one, Tensor):
+                storage = one.untyped_storage()
+                ours = any(at == storage.data_ptr() for _, at, _ in self.alive)
+                if ours or storage.data_ptr() not in given:  # not a view of an argument
+                    self.alive.append((weakref.ref(one), storage.data_ptr(), storage.nbytes()))
+        self.alive = [entry for entry in self.alive if entry[0]() is not None]
+        self.most = max(self.most, sum({at: size for _, at, size in self.alive}.values()))
+        return found
+
+
+@pytest.mark.parametrize("contiguous", [False, True])
+@pytest.mark.parametrize("dim", [1, 3, 4])
+def test_memory_is_that_of_the_results_and_one_chunk(
+    dim: int, contiguous: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """10^7 points: 14 bytes each beside history, position and gradient, whatever D is."""
+    n, chunk = 100_000, 1000
+    monkeypatch.setattr(columns_of, "CHUNK", chunk)
+    x, grad, history = points(n, dim=dim)
+    history = laid_out(history, contiguous=contiguous)
+    with LiveBytes() as memory:
+        step(x, grad, history, 5, min_cosine=1e-6, graft=True, backend="torch")
+    results = n * (4 * dim + 2)
+    # of a chunk: less than its history, three times
+    assert results <= memory.most < results + 3 * chunk * history[0].numel() * 4
+    with LiveBytes() as memory:
+        foresight(history, 5, x, grad)
+    assert memory.most < 3 * chunk * history[0].numel() * 4
+
+
+def test_a_gpu_works_on_a_million_rows_at_a_time() -> None:
+    chunks = columns_of.row_chunks(torch.empty(2_500_000, 3, device="meta"))
+    assert [c.stop for c in chunks] == [1 << 20, 2 << 20, 2_500_000]
+    assert columns_of.row_chunks(torch.empty(0, 3, device="meta")) == [slice(0, 0)]
+
+
+@pytest.mark.parametrize("dim", [2, 3, 7])
+def test_python_calls(dim: int) -> None:
+    """Of the package, in one call; at 1,000 points they are what it costs."""
+    x, grad, history = points(100, dim=dim)
+    calls = 0
+
+    def count(frame: Any, event: str, _: Any) -> None:
+        nonlocal calls
+        home = str(Path(opt3dgs_optim.__file__).parent)
+        calls += event == "call" and frame.f_code.co_filename.startswith(home)
+
+    sys.setprofile(count)
+    try:
+        lqn_direction(x, grad, history, 5, min_cosine=1e-6, graft=True)
+    finally:
+        sys.setprofile(None)
+    assert 10 < calls <= 45
+
+
+def test_it_is_one_operator() -> None:
+    x, grad, history = points(100)
+    names = []
+
+    class Names(TorchDispatchMode):
+        def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None):
+            names.append(str(func))
+            return func(*args, **(kwargs or {}))
+
+    with Names():
+        lqn_direction(x, grad, history, 5, min_cosine=1e-6, graft=True)
+    assert names == ["opt3dgs_optim.lqn_direction.default"]
+
+
+# -- which backend runs ----------------------------------------------------------------------------
+
+
+def test_the_kernel_is_for_three_coordinates() -> None:
+    with pytest.raises(RuntimeError, match=r"points of 2 coordinates, but the kernels are for 3"):
+        lqn_direction(*points(7, dim=2), 5, min_cosine=0.0, graft=True, backend="cuda")
+    with pytest.raises(RuntimeError, match=r"asked for on cpu in torch\.float32"):
+        lqn_direction(*points(7), 5, min_cosine=0.0, graft=True, backend="cuda")
+
+
+@pytest.mark.parametrize("spoiled", ["position", "history", "shape"])
+def test_the_kernel_gets_what_it_can_read(spoiled: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It reads by the gradient's dtype and shape: another one would be read beyond its end."""
+    monkeypatch.setattr("opt3dgs_optim.backend.cuda.missing", lambda: None)
+    monkeypatch.setattr("opt3dgs_optim.backend._obstacle", lambda *_: None)
+    called = []
+    monkeypatch.setattr(cuda, "lqn_direction", lambda *given: called.append(given))
+    x, grad, history = points(7, torch.float64)
+    if spoiled == "shape":
+        x = x[:6]
+    elif spoiled == "position":
+        x = x.float()
+    else:
+        history = history.float()
+    with pytest.raises(ValueError, match=r"lqn_direction: (position|history)"):
+        step(x, grad, history, 5, min_cosine=0.0, graft=True, backend="cuda")
+    assert not called
+
+
+def test_two_loop_is_the_kernels_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, grad, history = points(7)
+    asked = []
+    module = sys.modules["opt3dgs_optim.lbfgs.two_loop"]
+    monkeypatch.setattr(module, "uses_kernel", lambda *given: asked.append(given) or True)
+    monkeypatch.setattr(cuda, "two_loop", lambda *given: given)
+    assert two_loop(grad, history, 5) == (grad, history, 5)
+    assert asked == [("auto", grad.device, grad.dtype)]
+    flat, _, other = points(7, dim=2)
+    assert two_loop(flat, other, 5).shape == (7, 2)
+    assert two_loop(grad.double(), history, 5).dtype == torch.float64  # not the history's

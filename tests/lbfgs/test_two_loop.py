@@ -1,0 +1,287 @@
+"""The two-loop recursion against the dense BFGS recursion, and what makes it per-point."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles import dense_bfgs
+from points_first import direction, record
+from torch import Tensor
+
+from opt3dgs_optim.lbfgs import history_from_pairs, new_history, two_loop
+from opt3dgs_optim.lbfgs.history import header
+
+SIZES = st.tuples(st.integers(1, 6), st.integers(1, 4), st.integers(1, 9), st.integers(0, 2**31))
+
+
+def convex_pairs(k: int, d: int, n: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Random s [K, N, D], y = A s with A [N, D, D] positive definite (condition about 10)."""
+    generator = torch.Generator().manual_seed(seed)
+    root = torch.randn(n, d, d, generator=generator, dtype=torch.float64)
+    matrix = root @ root.mT + torch.eye(d, dtype=torch.float64)
+    s = torch.randn(k, n, d, generator=generator, dtype=torch.float64)
+    return s, torch.einsum("nij,knj->kni", matrix, s), matrix
+
+
+def dyadic(x: Tensor) -> Tensor:
+    """To multiples of 2^-30: sums of a few dozen such numbers are exact in float64."""
+    grid = 2.0**-30
+    rounded = (x / grid).round() * grid
+    return torch.where(rounded == 0, grid, rounded)  # a difference of 0 would be no pair
+
+
+def gradients(n: int, d: int, seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed + 1)
+    return torch.randn(n, d, generator=generator, dtype=torch.float64)
+
+
+@settings(max_examples=150, deadline=None)
+@given(SIZES)
+def test_equals_dense_bfgs(sizes: tuple[int, int, int, int]) -> None:
+    k, d, n, seed = sizes
+    s, y, _ = convex_pairs(k, d, n, seed)
+    g = gradients(n, d, seed)
+    result = two_loop(g, history_from_pairs(s, y), k)
+    for row in range(n):
+        h = dense_bfgs(s[:, row].numpy(), y[:, row].numpy())
+        # two orders of the same float64 sums; conditioning amplifies to at most 1e4 ulp here
+        np.testing.assert_allclose(result[row].numpy(), h @ g[row].numpy(), rtol=1e-9, atol=1e-9)
+
+
+@settings(max_examples=100, deadline=None)
+@given(SIZES)
+def test_secant_equation(sizes: tuple[int, int, int, int]) -> None:
+    """H y = s for the newest pair, whatever came before."""
+    k, d, n, seed = sizes
+    s, y, _ = convex_pairs(k, d, n, seed)
+    torch.testing.assert_close(
+        two_loop(y[-1], history_from_pairs(s, y), k), s[-1], rtol=1e-8, atol=1e-9
+    )
+
+
+@settings(max_examples=100, deadline=None)
+@given(SIZES)
+def test_descent(sizes: tuple[int, int, int, int]) -> None:
+    k, d, n, seed = sizes
+    s, y, _ = convex_pairs(k, d, n, seed)
+    g = gradients(n, d, seed)
+    assert bool(((two_loop(g, history_from_pairs(s, y), k) * g).sum(1) > 0).all())
+
+
+@settings(max_examples=60, deadline=None)
+@given(SIZES, st.integers(-40, 40), st.integers(-40, 40))
+def test_scale_equivariance(sizes: tuple[int, int, int, int], a: int, b: int) -> None:
+    """x -> 2^a x and f -> 2^b f scale H g by 2^(a), exactly up to rounding."""
+    k, d, n, seed = sizes
+    s, y, _ = convex_pairs(k, d, n, seed)
+    g = gradients(n, d, seed)
+    plain = two_loop(g, history_from_pairs(s, y), k)
+    x, f = 2.0**a, 2.0**b
+    scaled = two_loop(g * f / x, history_from_pairs(s * x, y * f / x), k)
+    torch.testing.assert_close(scaled, plain * x, rtol=1e-9, atol=1e-12 * x)
+
+
+@settings(max_examples=60, deadline=None)
+@given(SIZES)
+def test_rotation_equivariance(sizes: tuple[int, int, int, int]) -> None:
+    k, d, n, seed = sizes
+    s, y, _ = convex_pairs(k, d, n, seed)
+    g = gradients(n, d, seed)
+    rotation = torch.linalg.qr(gradients(d, d, seed + 7)).Q
+    plain = two_loop(g, history_from_pairs(s, y), k)
+    turned = two_loop(g @ rotation, history_from_pairs(s @ rotation, y @ rotation), k)
+    torch.testing.assert_close(turned, plain @ rotation, rtol=1e-8, atol=1e-9)
+
+
+@settings(max_examples=40, deadline=None)
+@given(SIZES)
+def test_points_do_not_see_each_other(sizes: tuple[int, int, int, int]) -> None:
+    k, d, n, seed = sizes
+    s, y, _ = convex_pairs(k, d, n, seed)
+    g = gradients(n, d, seed)
+    history = history_from_pairs(s, y)
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))
+    whole = two_loop(g, history, k)
+    # other rows, other SIMD lanes: equal to rounding
+    torch.testing.assert_close(
+        two_loop(g[order], history[order], k), whole[order], rtol=1e-13, atol=0
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(SIZES, st.integers(1, 16))
+def test_partly_filled_is_a_shorter_history(sizes: tuple[int, int, int, int], room: int) -> None:
+    k, d, n, seed = sizes
+    size = min(k + room, 16)
+    s, y = map(dyadic, convex_pairs(k, d, n, seed)[:2])
+    g = gradients(n, d, seed)
+    roomy = empty(n, d, size)
+    feed(roomy, size, s, y)
+    torch.testing.assert_close(
+        two_loop(g, roomy, size), two_loop(g, history_from_pairs(s, y), k), rtol=1e-12, atol=1e-13
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(SIZES, st.integers(1, 40))
+def test_ring_keeps_the_newest_pairs(sizes: tuple[int, int, int, int], more: int) -> None:
+    k, d, n, seed = sizes
+    s, y = map(dyadic, convex_pairs(k + more, d, n, seed)[:2])
+    g = gradients(n, d, seed)
+    ring = empty(n, d, k)
+    feed(ring, k, s, y)
+    last = history_from_pairs(s[-k:], y[-k:])
+    assert torch.equal(two_loop(g, ring, k), two_loop(g, last, k))
+    assert float(header(ring, k).counter.max()) <= 2 * k  # never near float32's 2^24
+
+
+def empty(n: int, d: int, size: int) -> Tensor:
+    history = new_history(torch.zeros(n, d, dtype=torch.float64), size)
+    header(history, size).counter.fill_(1)
+    return history
+
+
+def feed(history: Tensor, size: int, s: Tensor, y: Tensor) -> None:
+    """Record pairs the way an optimizer does: positions and gradients that differ by s and y.
+
+    Of dyadic s and y: then their differences are s and y to the last digit.
+    """
+    n, d = s.shape[1:]
+    history.zero_()
+    x, g = torch.zeros(n, d, dtype=s.dtype), torch.zeros(n, d, dtype=s.dtype)
+    visible = torch.ones(n, dtype=torch.bool)
+    record(history, size, x, g, visible, min_cosine=0.0)
+    for k in range(s.shape[0]):
+        x, g = x + s[k], g + y[k]
+        record(history, size, x, g, visible, min_cosine=0.0)
+
+
+def test_empty_history_returns_the_gradient_bit_for_bit() -> None:
+    g = torch.randn(5, 3)
+    history = new_history(g, 5)
+    assert torch.equal(direction(g, history, 5, graft=True), g)
+    assert torch.equal(direction(g, history, 5, graft=False), g)
+    torch.testing.assert_close(two_loop(g, history, 5), g, rtol=1e-6, atol=0)
+
+
+def test_160_bytes_per_point_for_five_pairs() -> None:
+    history = new_history(torch.zeros(10, 3), 5)
+    assert history.shape == (10, 5, 8)
+    assert history.element_size() * history[0].numel() == 160
+
+
+@pytest.mark.parametrize("size", [1, 3, 4, 5, 16])
+@pytest.mark.parametrize("dim", [1, 2, 3, 4, 7])
+def test_header_and_pairs_do_not_overlap(size: int, dim: int) -> None:
+    history = new_history(torch.zeros(2, dim, dtype=torch.float64), size)
+    head = header(history, size)
+    head.position.fill_(1)
+    head.gradient.fill_(2)
+    head.counter.fill_(3)
+    assert float(history.sum()) == 2 * (dim * 1 + dim * 2 + 3)
+    if size > dim:
+        assert history.shape[1] == size
+    assert float(history[:, :size, :dim].sum()) == 0
+    assert float(history[:, :size, dim + 1 : 2 * dim + 1].sum()) == 0
+
+
+def test_grafting_keeps_the_gradients_length() -> None:
+    s, y, _ = convex_pairs(4, 3, 20, 3)
+    g = gradients(20, 3, 3) * 10.0 ** torch.arange(-10, 10, dtype=torch.float64).unsqueeze(1)
+    history = history_from_pairs(s * 1e-3, y)
+    grafted = direction(g, history, 4, graft=True)
+    torch.testing.assert_close(grafted.norm(dim=1), g.norm(dim=1), rtol=1e-12, atol=0)
+    free = direction(g, history, 4, graft=False)
+    torch.testing.assert_close(free, two_loop(g, history, 4))
+
+
+@pytest.mark.parametrize("exponent", [-37, -30, -20, 0, 20, 29])
+def test_no_overflow_or_underflow_in_float32(exponent: int) -> None:
+    """Gradients from 1e-37 to 1e29: s.y and y.y themselves would leave the range."""
+    s, y, _ = convex_pairs(5, 3, 50, 11)
+    g = gradients(50, 3, 5)
+    size = 10.0**exponent
+    expected = direction(g, history_from_pairs(s, y), 5, graft=True)
+    history = history_from_pairs((s * 1e-4).float(), (y * size).float())
+    result = direction((g * size).float(), history, 5, graft=True)
+    assert bool(torch.isfinite(result).all())
+    # float32 inputs, condition about 100
+    torch.testing.assert_close(result.double() / size, expected, rtol=1e-3, atol=1e-3)
+
+
+def test_record_rejects_negative_curvature_and_equal_points() -> None:
+    visible = torch.ones(4, dtype=torch.bool)
+    history = new_history(torch.zeros(4, 3), 5)
+    x0, g0 = torch.zeros(4, 3), torch.ones(4, 3)
+    accepted, candidates = record(history, 5, x0, g0, visible, min_cosine=1e-6)
+    assert not candidates.any()
+    x1 = torch.tensor([[1.0, 0, 0], [1, 0, 0], [0, 0, 0], [1, 0, 0]])
+    y = torch.tensor([[2.0, 0, 0], [-2, 0, 0], [1, 0, 0], [0, 0, 0]])
+    accepted, candidates = record(history, 5, x1, g0 + y, visible, min_cosine=1e-6)
+    assert candidates.all()
+    assert accepted.tolist() == [True, False, False, False]
+
+
+def test_acceptance_is_relative_not_absolute() -> None:
+    """torch's LBFGS asks for s.y > 1e-10; the pairs of a splat have s.y of 1e-13."""
+    visible = torch.ones(1, dtype=torch.bool)
+    history = new_history(torch.zeros(1, 3), 5)
+    record(history, 5, torch.zeros(1, 3), torch.full((1, 3), 1e-6), visible, min_cosine=1e-6)
+    accepted, _ = record(
+        history, 5, torch.full((1, 3), 1e-7), torch.full((1, 3), 2e-6), visible, min_cosine=1e-6
+    )
+    assert accepted.all()
+
+
+def test_invisible_rows_keep_their_history() -> None:
+    torch.manual_seed(0)
+    s, y, _ = convex_pairs(3, 3, 6, 0)
+    history = history_from_pairs(s, y)
+    before = history.clone()
+    visible = torch.tensor([True, False] * 3)
+    record(history, 3, gradients(6, 3, 1), gradients(6, 3, 2), visible, min_cosine=0.0)
+    assert torch.equal(history[~visible], before[~visible])
+    assert not torch.equal(history[visible], before[visible])
+
+
+def test_non_descent_falls_back_to_the_gradient() -> None:
+    """A pair of negative curvature that somebody wrote by hand must not turn the step around."""
+    history = new_history(torch.zeros(1, 3, dtype=torch.float64), 5)
+    head = header(history, 5)
+    head.counter.fill_(2)
+    history[0, 0, :3] = torch.tensor([-1.0, 0, 0])
+    history[0, 0, 4:7] = torch.tensor([1.0, 0, 0])
+    g = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
+    assert torch.equal(direction(g, history, 5, graft=False), g)
+
+
+@pytest.mark.parametrize("poison", [float("nan"), float("inf")])
+def test_poisoned_history_falls_back_to_the_gradient(poison: float) -> None:
+    s, y, _ = convex_pairs(5, 3, 4, 0)
+    history = history_from_pairs(s, y)
+    history[1, 2, 0] = poison
+    g = gradients(4, 3, 0)
+    result = direction(g, history, 5, graft=True)
+    assert torch.equal(result[1], g[1])
+    assert bool(torch.isfinite(result).all())
+
+
+def test_wrong_shapes_are_named() -> None:
+    with pytest.raises(ValueError, match=r"two_loop: history has shape \(4, 5, 8\)"):
+        two_loop(torch.zeros(4, 2), new_history(torch.zeros(4, 3), 5), 5)
+    with pytest.raises(ValueError, match="two_loop"):
+        two_loop(torch.zeros(3, 3), new_history(torch.zeros(4, 3), 5), 5)
+    with pytest.raises(ValueError, match="two_loop"):
+        two_loop(torch.zeros(4, 3), new_history(torch.zeros(4, 3), 5), 7)
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_no_points_and_one_point(n: int) -> None:
+    g = torch.ones(n, 3)
+    history = new_history(g, 5)
+    visible = torch.ones(n, dtype=torch.bool)
+    record(history, 5, g, g, visible, min_cosine=0.0)
+    assert direction(g, history, 5, graft=True).shape == (n, 3)

@@ -1,0 +1,505 @@
+"""The flat histogram: the paper's update against loops, the default against what it promises."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles import LoopHistogram, MovingHistogram
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from opt3dgs_optim import Course, EnergyHistogram
+
+FIXED: dict[str, Any] = {"energy_range": (0.0, 1.0), "temperature": 0.05, "warmup": 0}
+ENERGIES = st.one_of(
+    st.floats(-2.0, 3.0),
+    st.integers(0, 8).map(lambda i: i / 8),  # exactly on the edges
+    st.sampled_from([math.nan, math.inf, -math.inf, 1e149, -1e149]),
+)
+
+
+def stream(count: int, seed: int = 0) -> list[float]:
+    """Losses around 0.5, no two alike."""
+    return np.random.default_rng(seed).normal(0.5, 0.1, count).tolist()
+
+
+def nus_of(histogram: EnergyHistogram, energies: Any) -> np.ndarray:
+    return np.array([float(histogram.observe(energy)) for energy in energies])
+
+
+# -- the paper's update ----------------------------------------------------------------------------
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(ENERGIES, max_size=60), st.sampled_from([None, (-5.0, 5.0), (0.25, 4.0)]))
+def test_the_papers_update_is_its_loops(
+    energies: list[float], clamp: tuple[float, float] | None
+) -> None:
+    histogram = EnergyHistogram(8, (0.0, 1.0), temperature=0.05, warmup=3, clamp=clamp)
+    oracle = LoopHistogram(8, (0.0, 1.0), 0.75, 0.05, 3, clamp)
+    for energy in energies:
+        nu, expected = float(histogram.observe(energy)), oracle.observe(energy)
+        if math.isfinite(energy):
+            assert nu == pytest.approx(expected, rel=1e-9, abs=1e-9)
+    # 60 float64 updates of well-scaled numbers
+    assert histogram.weights.tolist() == pytest.approx(oracle.theta, rel=1e-12)
+
+
+def test_first_multiplier_is_one_and_not_minus_3973() -> None:
+    """Erratum: "theta(J - 1) v 1" is an index clamp."""
+    histogram = EnergyHistogram.paper(warmup=0)
+    assert float(histogram.observe(0.1)) == 1.0
+
+
+def test_the_papers_settings() -> None:
+    histogram = EnergyHistogram.paper()
+    assert histogram.calibrated_range == pytest.approx((0.0, 0.2))
+    assert (histogram.num_partitions, histogram.zeta, histogram.warmup) == (200, 0.75, 2500)
+    assert histogram.clamp == (-5.0, 5.0)
+    assert histogram.calibrated_temperature == 2e-3
+    width = 0.2 / 200
+    assert histogram.zeta * histogram.calibrated_temperature / width == pytest.approx(1.5)
+    assert EnergyHistogram.paper(zeta=0.5).zeta == 0.5
+
+
+def having(weights: Tensor, **options: Any) -> EnergyHistogram:
+    """A fixed histogram with these weights, at its next energy."""
+    histogram = EnergyHistogram(
+        **{**FIXED, "num_partitions": len(weights), "clamp": None} | options
+    )
+    state = histogram.state_dict()
+    histogram.load_state_dict({**state, "weights": (weights / weights.sum()).tolist()})
+    return histogram
+
+
+def uneven(count: int = 24) -> Tensor:
+    return torch.rand(count, generator=torch.Generator().manual_seed(3), dtype=torch.float64) + 0.1
+
+
+@pytest.mark.parametrize("index", range(24))
+@pytest.mark.parametrize("low", [-5.0, 0.0, 2.0])
+def test_backward_difference_of_every_partition(index: int, low: float) -> None:
+    weights = uneven()
+    histogram = having(weights, energy_range=(low, low + 3.0))
+    nu = float(histogram.observe(low + 3.0 * (index + 0.5) / 24))
+    slope = float((weights[index] / weights[index - 1]).log()) * 24 / 3.0
+    inner = 0 < index < 23
+    assert nu == pytest.approx(1 + 0.75 * 0.05 * slope if inner else 1.0, rel=1e-12)
+    assert int((histogram.weights - weights / weights.sum()).argmax()) == index
+
+
+def test_a_clamp_bounds_nu() -> None:
+    weights = uneven()
+    free = [float(having(weights).observe((k + 0.5) / 24)) for k in range(24)]
+    held = [float(having(weights, clamp=(0.9, 1.05)).observe((k + 0.5) / 24)) for k in range(24)]
+    assert held == [min(max(nu, 0.9), 1.05) for nu in free]
+    assert {0.9, 1.05} < set(held)
+
+
+@pytest.mark.parametrize("count", [0, 1, 1000, 100_000])
+def test_the_decaying_step_size(count: int) -> None:
+    """lambda = min(1e-2, 10 / (k^0.8 + 100)), seen on the weights of four partitions."""
+    histogram = having(torch.ones(4, dtype=torch.float64))
+    state = histogram.state_dict()
+    state["scalars"][3] = float(count)
+    histogram.load_state_dict(state)
+    histogram.observe(0.3)
+    rate = min(1e-2, 10 / (count**0.8 + 100)) * 0.25**0.75
+    expected = [0.25 + rate * ((k == 1) - 0.25) for k in range(4)]
+    assert histogram.weights.tolist() == pytest.approx(expected, rel=1e-12)
+
+
+def test_the_papers_weights_estimate_the_density_to_the_power_of_two() -> None:
+    """theta -> p^(1 / (1 - zeta)), not the cumulative density as the paper's text says."""
+    histogram = EnergyHistogram(4, (0.0, 4.0), zeta=0.5, temperature=1.0, warmup=0)
+    p = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
+    generator = torch.Generator().manual_seed(1)
+    draws = torch.multinomial(p, 30_000, replacement=True, generator=generator)
+    mean = torch.zeros(4, dtype=torch.float64)
+    for k, j in enumerate(draws.tolist()):
+        histogram.observe(j + 0.5)
+        if k >= 10_000:
+            mean += histogram.weights / 20_000
+    expected = p**2 / (p**2).sum()  # 1 / (1 - .5) = 2
+    # Deviation of the time average over 20,000 correlated draws: about 0.01.
+    assert torch.allclose(mean, expected, atol=0.03)
+
+
+@pytest.mark.parametrize(
+    "updates", [5_000, pytest.param(1_000_000, marks=pytest.mark.slow, id="million")]
+)
+def test_the_papers_weights_stay_positive_with_sum_one(updates: int) -> None:
+    histogram = EnergyHistogram.paper(warmup=0)
+    generator = torch.Generator().manual_seed(0)
+    walk = 0.1 + 0.05 * torch.linspace(0, 20, updates, dtype=torch.float64).sin()
+    walk += 0.02 * torch.randn(updates, generator=generator, dtype=torch.float64)
+    for energy in walk:
+        histogram.observe(energy)
+    assert float(histogram.weights.min()) > 0
+    assert abs(float(histogram.weights.sum()) - 1) < 1e-12
+
+
+def test_the_papers_weights_recover_from_the_floor_after_a_million_updates() -> None:
+    """All weight in one partition, the others on the floor, lambda as small as it gets."""
+    histogram = EnergyHistogram.paper(warmup=0)
+    state = histogram.state_dict()
+    state["weights"] = [1e-8] * 199 + [1 - 199e-8]
+    state["scalars"][3] = 1e6  # the number of finite energies so far
+    histogram.load_state_dict(state)
+    for _ in range(2_000):
+        assert math.isfinite(float(histogram.observe(0.05)))
+    assert float(histogram.weights.min()) > 0
+    assert abs(float(histogram.weights.sum()) - 1) < 1e-12
+    assert float(histogram.weights[49]) > 1e-8  # 0.05 is the 50th partition's upper edge
+
+
+# -- partitions that follow the energy -------------------------------------------------------------
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.lists(st.floats(-2.0, 3.0), min_size=1, max_size=60),
+    st.sampled_from([None, (-1.0, 3.0), (0.9, 1.1)]),
+)
+def test_the_default_is_its_loops(energies: list[float], clamp: tuple[float, float] | None) -> None:
+    histogram = EnergyHistogram(warmup=4, clamp=clamp)
+    oracle = MovingHistogram(4, clamp)
+    for energy in energies:
+        nu, expected = float(histogram.observe(energy)), oracle.observe(energy)
+        # Rounding, over slopes of up to 1 / 0.4^2 per deviation.
+        assert nu == pytest.approx(expected, abs=1e-9)
+    low, high = histogram.calibrated_range
+    assert (high - low) / 12 == pytest.approx(oracle.deviation, rel=1e-9)
+    assert (high + low) / 2 == pytest.approx(oracle.mean, rel=1e-9, abs=1e-9 * (high - low))
+
+
+@pytest.mark.parametrize("zeta", [0.25, 0.5, 0.75])
+def test_nus_error_is_known(zeta: float) -> None:
+    """On a stationary Gaussian energy |nu - 1| = z / 2, so its deviation is 1/2 by design."""
+    z = np.random.default_rng(0).normal(size=6_000)
+    nus = nus_of(EnergyHistogram(zeta=zeta), 0.3 + 0.02 * z)[3_000:]
+    # 3,000 draws of deviation 1/2: 0.01.
+    assert nus.mean() == pytest.approx(1.0, abs=0.03)
+    assert nus.std() == pytest.approx(0.5, rel=0.2)
+    slope, _ = np.polyfit(z[3_000:], nus, 1)
+    assert slope == pytest.approx(-0.5, rel=0.2)
+    out = np.abs(z[3_000:])
+    two_out = np.abs(nus - 1)[(out > 1.8) & (out < 2.2)].mean()
+    assert two_out == pytest.approx(1.0, rel=0.2)
+
+
+def test_zeta_is_in_theta_and_not_in_nu() -> None:
+    """Theta = q^(1 / (1 - zeta)), and tau takes that exponent away again."""
+    flat, steep = (EnergyHistogram(zeta=zeta) for zeta in (0.5, 0.75))
+    assert nus_of(flat, stream(600)).tolist() == nus_of(steep, stream(600)).tolist()
+    q = flat.weights.sqrt()
+    assert torch.allclose(steep.weights, q**4 / (q**4).sum(), rtol=1e-9)
+    assert flat.calibrated_temperature == pytest.approx(3 * steep.calibrated_temperature)
+
+
+def test_the_range_follows_the_energy() -> None:
+    histogram = EnergyHistogram()
+    nus_of(histogram, stream(600))
+    low, high = histogram.calibrated_range
+    # Mean and deviation of about 100 energies: known to 7 and 10 %.
+    assert (low + high) / 2 == pytest.approx(0.5, abs=0.05)
+    assert (high - low) / 12 == pytest.approx(0.1, rel=0.35)
+    assert histogram.calibrated_temperature == pytest.approx((high - low) / 12 / 6)
+    nus_of(histogram, [0.01 * u for u in stream(2_000, seed=1)])
+    low, high = histogram.calibrated_range
+    assert (high - low) / 12 == pytest.approx(0.001, rel=0.35)
+
+
+def test_weights_are_weights() -> None:
+    histogram = EnergyHistogram()
+    assert histogram.weights.tolist() == pytest.approx([1 / 48] * 48)
+    nus_of(histogram, stream(600))
+    assert float(histogram.weights.min()) > 0
+    assert float(histogram.weights.sum()) == pytest.approx(1.0)
+    assert 20 <= int(histogram.weights.argmax()) <= 27  # near the middle of 48
+
+
+def test_nu_is_one_in_the_warm_up() -> None:
+    nus = nus_of(histogram := EnergyHistogram(warmup=40), stream(200))
+    assert set(nus[:40]) == {1.0}
+    assert len(set(nus[40:])) > 150
+    assert float(histogram.mean_multiplier) == pytest.approx(nus[40:].mean(), rel=1e-9)
+    assert float(histogram.multiplier_std) == pytest.approx(nus[40:].std(), rel=1e-9)
+
+
+def test_the_fixed_range_counts_after_the_warm_up_only_too() -> None:
+    options: dict[str, Any] = {**FIXED, "num_partitions": 8, "warmup": 3}
+    histogram = EnergyHistogram(**options)
+    nus = nus_of(histogram, [0.1 + 0.09 * (k % 9) for k in range(200)])
+    assert float(histogram.mean_multiplier) == pytest.approx(nus[3:].mean(), rel=1e-9)
+    assert float(histogram.multiplier_std) == pytest.approx(nus[3:].std(), rel=1e-9)
+
+
+# -- as a part -------------------------------------------------------------------------------------
+
+
+class Operators(TorchDispatchMode):
+    """Counts what torch dispatches."""
+
+    count = 0
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        self.count += 1
+        return func(*args, **(kwargs or {}))
+
+
+def test_few_operators() -> None:
+    course = Course([histogram := EnergyHistogram(warmup=8)])
+    nus_of(histogram, stream(20))
+    energy = torch.tensor(0.4)
+    with Operators() as operators:
+        histogram.observe(energy, True, course)
+        for _ in range(6):
+            histogram.factor({}, course)
+    assert operators.count <= 18
+
+
+def test_a_part_of_a_course() -> None:
+    course = Course([histogram := EnergyHistogram(warmup=8)], total_steps=100)
+    assert histogram.factor({}, course) is None
+    alone, nu = EnergyHistogram(warmup=8), 1.0
+    for k, energy in enumerate(stream(30)):
+        course.current = k
+        course.take(torch.tensor(energy))
+        nu = float(alone.observe(torch.tensor(energy)))
+        assert histogram.factor({}, course) == nu
+        assert ("nu" in course.numbers()) == (k >= 8)
+    shown = {name: float(value) for name, value in course.numbers().items()}
+    low, high = histogram.calibrated_range
+    assert shown == {
+        "nu": nu,
+        "energy_mean": pytest.approx((low + high) / 2),
+        "energy_deviation": pytest.approx((high - low) / 12),
+    }
+    before = histogram.state_dict()
+    course.take(torch.tensor(math.nan))
+    assert course.valid is False
+    assert {**histogram.state_dict(), "num_observed": 30} == before
+
+
+def test_a_device_that_says_later_whether_an_energy_is_finite() -> None:
+    """There `valid` is a tensor: what is not valid is taken with the weight 0."""
+    here, there = EnergyHistogram(warmup=8), EnergyHistogram(warmup=8)
+    for k, energy in enumerate(stream(200)):
+        broken = k in (20, 50, 51, 120)
+        value = torch.tensor(math.nan if broken else energy, dtype=torch.float64)
+        there._take(value, torch.tensor(not broken), on_host=False)
+        if not broken:
+            here.observe(value)
+        else:
+            here._taken += 1  # so that the weights of the first hundred are the same
+        if not broken:
+            # The weight of a step is float32's there.
+            assert float(there.multiplier) == pytest.approx(float(here.multiplier), abs=1e-5)
+    assert there.calibrated_range == pytest.approx(here.calibrated_range, rel=1e-6)
+    assert there._sums.tolist() == pytest.approx(here._moments().tolist(), rel=1e-6)
+
+
+def test_what_is_constant_is_left_out() -> None:
+    course = Course([], total_steps=1_000)
+    two_levels = EnergyHistogram(20, (0.0, 1.0), temperature=1e-4, warmup=0)
+    reasons = []
+    for k, energy in enumerate(stream(1_000)):
+        two_levels.observe(energy)
+        if k % 100 == 99:
+            seen = two_levels.evidence(course)
+            assert seen is not None
+            reasons.append(two_levels.useless(seen.tolist(), course))
+    assert reasons[:3] == [None, None, None]
+    assert reasons[3] is not None
+    assert re.fullmatch(r"nu was 1\.0\d+: off; its deviation was .* over 300 energies", reasons[3])
+    assert two_levels.instead() is None
+    moving = EnergyHistogram(warmup=8)
+    for k, energy in enumerate(stream(1_000)):
+        moving.observe(energy)
+        if k % 100 == 99:
+            seen = moving.evidence(course)
+            assert seen is not None
+            assert moving.useless(seen.tolist(), course) is None
+
+
+def test_a_constant_other_than_one_becomes_that_constant() -> None:
+    weights = torch.softmax(0.5 * torch.arange(20, dtype=torch.float64), 0)
+    histogram = having(weights, temperature=0.05)
+    course = Course([], total_steps=1_000)
+    why = None
+    fixed = histogram.weights
+    for k in range(500):
+        histogram.observe(0.5)
+        histogram._law.weights.copy_(fixed)
+        if k % 100 == 99:
+            seen = histogram.evidence(course)
+            assert seen is not None
+            why = why or histogram.useless(seen.tolist(), course)
+    nu = 1 + 0.75 * 0.05 * 0.5 * 20
+    assert why is not None
+    assert f"a constant {nu:.3g} from now on" in why
+    part: Any = histogram.instead()
+    assert part.value == pytest.approx(nu)
+    resumed = having(weights, temperature=0.05)
+    resumed.load_state_dict(histogram.state_dict())
+    assert resumed.instead() == part
+    seen = resumed.evidence(course)
+    assert seen is not None
+    assert "a constant" in str(resumed.useless(seen.tolist(), course))
+
+
+# -- state -----------------------------------------------------------------------------------------
+
+BOTH = pytest.mark.parametrize("options", [{"warmup": 50}, FIXED], ids=["moving", "fixed"])
+
+
+@BOTH
+def test_resume_is_exact(options: dict[str, Any]) -> None:
+    whole, first, second = (EnergyHistogram(**options) for _ in range(3))
+    for k, energy in enumerate(stream(300)):
+        whole.observe(energy)
+        (first if k < 120 else second).observe(energy)
+        if k == 119:
+            second.load_state_dict(first.state_dict())
+            assert second.factor({}) == first.factor({})
+    assert whole.state_dict() == second.state_dict()
+    assert float(whole.multiplier) == float(second.multiplier)
+
+
+@BOTH
+def test_state_is_updated_in_place(options: dict[str, Any]) -> None:
+    """A CUDA graph that has captured observe() and a step reads and writes the same memory."""
+    histogram = EnergyHistogram(**options)
+    live, kept = histogram.multiplier, []
+    for energy in stream(120):
+        kept.append(histogram.observe(energy))
+    assert live is histogram.multiplier
+    assert float(live) == float(kept[-1])
+    assert len({float(nu) for nu in kept}) > 3  # what observe returned does not change later
+
+
+@BOTH
+def test_state_dict_is_plain_and_checked(options: dict[str, Any]) -> None:
+    histogram = EnergyHistogram(**{"num_partitions": 32, **options})
+    nus_of(histogram, stream(80))
+    state = histogram.state_dict()
+    torch.save(state, buffer := io.BytesIO())
+    buffer.seek(0)
+    assert torch.load(buffer, weights_only=True) == state
+    with pytest.raises(ValueError, match="num_partitions=40"):
+        EnergyHistogram(**{"num_partitions": 40, **options}).load_state_dict(state)
+    with pytest.raises(ValueError, match="missing"):
+        histogram.load_state_dict({"weights": []})
+    key = "weights" if "weights" in state else "recent"
+    for bad in ([math.nan] * len(state[key]), [0.0] * len(state[key]), "x", None):
+        with pytest.raises(ValueError, match="load_state_dict"):
+            histogram.load_state_dict({**state, key: bad})
+    assert histogram.state_dict() == state
+
+
+class Elsewhere(Tensor):
+    """A tensor on another device, as far as it says."""
+
+    @property
+    def device(self) -> torch.device:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return torch.device("cpu", 0)  # torch's own say "cpu" without a number
+
+
+@BOTH
+def test_what_has_been_learnt_moves_to_where_the_energy_is(options: dict[str, Any]) -> None:
+    here, moved = (EnergyHistogram(**options) for _ in "ab")
+    for k, energy in enumerate(stream(120)):
+        value = torch.tensor(energy)
+        there = value.as_subclass(Elsewhere) if k in (0, 10, 60, 61) else value
+        assert float(here.observe(value)) == float(moved.observe(there))
+    assert here.state_dict() == moved.state_dict()
+
+
+# -- options ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {**FIXED, "num_partitions": 3},
+        {**FIXED, "zeta": 0.0},
+        {**FIXED, "zeta": 1.0},
+        {**FIXED, "temperature": 0.0},
+        {"num_partitions": 24},
+        {"warmup": 4},
+        {"zeta": 0.01},
+    ],
+    ids=str,
+)
+def test_the_ends_of_what_is_allowed_work(options: dict[str, Any]) -> None:
+    histogram = EnergyHistogram(**options)
+    assert np.isfinite(nus_of(histogram, stream(30))).all()
+    assert float(histogram.weights.sum()) == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"num_partitions": 23}, "num_partitions=23"),
+        ({**FIXED, "num_partitions": 2}, "num_partitions=2"),
+        ({**FIXED, "num_partitions": 8.0}, "num_partitions=8.0"),
+        ({**FIXED, "energy_range": (1.0, 0.0)}, "low < high"),
+        ({**FIXED, "energy_range": (0.0, math.inf)}, "energy_range"),
+        ({"energy_range": "automatic"}, "'automatic'"),
+        ({"energy_range": (0.0, 1.0)}, "both are numbers"),
+        ({"temperature": 0.1}, "both are 'auto'"),
+        ({"temperature": "hot"}, "'hot'"),
+        ({**FIXED, "zeta": 1.5}, "zeta=1.5"),
+        ({"zeta": 0.0}, "zeta=0.0"),
+        ({"zeta": 1.0}, "zeta=1.0"),
+        ({**FIXED, "temperature": -1.0}, "temperature=-1.0"),
+        ({"warmup": 3}, "warmup=3"),
+        ({**FIXED, "warmup": -1}, "warmup=-1"),
+        ({"clamp": (5.0, -5.0)}, "clamp"),
+        ({"clamp": "narrow"}, "clamp"),
+    ],
+)
+def test_bad_options(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)) as error:
+        EnergyHistogram(**options)
+    assert "EnergyHistogram" in str(error.value)
+
+
+def test_energy_must_be_one_number() -> None:
+    with pytest.raises(ValueError, match=re.escape("(2,)")):
+        EnergyHistogram().observe(torch.zeros(2))
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (1, 1)])
+@BOTH
+def test_an_energy_of_one_element(options: dict[str, Any], shape: tuple[int, ...]) -> None:
+    assert EnergyHistogram(**options).observe(torch.full(shape, 0.5)).shape == ()
+
+
+@BOTH
+def test_keeps_no_graph(options: dict[str, Any]) -> None:
+    loss = torch.tensor(0.1, requires_grad=True) * 1
+    assert not EnergyHistogram(**options).observe(loss).requires_grad
+
+
+def test_says_what_it_is() -> None:
+    histogram = EnergyHistogram(warmup=10)
+    assert repr(histogram) == (
+        "EnergyHistogram(zeta=0.75, clamp=(-1.0, 3.0)): nu 1, no energy observed yet"
+    )
+    nus_of(histogram, stream(10))
+    assert repr(histogram).endswith(": nu 1, warm-up: 10 of 10 energies")
+    nus_of(histogram, stream(100))
+    assert re.search(r": nu [\d.]+, mean [\d.]+ \+- [\d.]+$", repr(histogram))
+    assert "energy_range=(0.0, 0.2), temperature=0.002" in repr(EnergyHistogram.paper())

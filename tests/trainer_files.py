@@ -1,0 +1,117 @@
+"""Training scripts with the lines that `hosts diff` goes by, and nothing else of the real ones."""
+
+from __future__ import annotations
+
+import re
+
+GSPLAT = """\
+import torch
+import torch.nn.functional as F
+from gsplat.strategy import DefaultStrategy, MCMCStrategy
+
+
+class Runner:
+    def __init__(self, local_rank, world_rank, world_size, cfg):
+        self.splats, self.optimizers = create_splats_with_optimizers(
+            self.parser,
+            batch_size=cfg.batch_size,
+        )
+
+    def train(self):
+        cfg = self.cfg
+        world_size = self.world_size
+        max_steps = cfg.max_steps
+        init_step = 0
+        schedulers = [
+            torch.optim.lr_scheduler.ExponentialLR(
+                self.optimizers["means"], gamma=0.01 ** (1.0 / max_steps)
+            ),
+        ]
+        pbar = tqdm.tqdm(range(init_step, max_steps))
+        for step in pbar:
+            colors, pixels, masks = next(loader)
+            l1loss = F.l1_loss(colors, pixels)
+            loss = l1loss
+            loss.backward()
+            for optimizer in self.optimizers.values():
+                if cfg.visible_adam:
+                    optimizer.step(visibility_mask)
+                else:
+                    optimizer.step()
+            for optimizer in self.pose_optimizers:
+                optimizer.step()
+            for scheduler in schedulers:
+                scheduler.step()
+
+    def eval(self, step):
+        max_steps = 1
+"""
+GSPLAT_16 = GSPLAT.replace(
+    "            l1loss = F.l1_loss(colors, pixels)\n",
+    """\
+            if masks is not None:
+                l1loss = l1_loss(colors[masks], pixels[masks]).mean()
+            else:
+                l1loss = l1_loss(colors, pixels).mean()
+""",
+)
+GSPLAT_2DGS = GSPLAT.replace("        world_size = self.world_size\n", "")
+INRIA = """\
+import torch
+from scene import Scene, GaussianModel
+
+
+def training(dataset, opt, pipe, checkpoint):
+    first_iter = 0
+    gaussians = GaussianModel(dataset.sh_degree)
+    gaussians.training_setup(opt)
+    if checkpoint:
+        (model_params, first_iter) = torch.load(checkpoint)
+        gaussians.restore(model_params, opt)
+
+    bg_color = [1, 1, 1] if dataset.white_background else [0, 0, 0]
+    progress_bar = tqdm(range(first_iter, opt.iterations), desc="Training progress")
+    first_iter += 1
+    for iteration in range(first_iter, opt.iterations + 1):
+        image, gt_image = render(gaussians)
+        Ll1 = l1_loss(image, gt_image)
+        loss = (1.0 - opt.lambda_dssim) * Ll1
+        loss.backward()
+        with torch.no_grad():
+            if iteration < opt.iterations:
+                gaussians.exposure_optimizer.step()
+                gaussians.optimizer.step()
+
+
+def training_report(l1_loss):
+    l1_test += l1_loss(image, gt_image)
+"""
+MINI_SPLATTING = INRIA.replace(
+    "            if iteration < opt.iterations:\n",
+    """\
+            if iteration == simp_iteration1:
+                gaussians.training_setup(opt)
+            if iteration < opt.iterations:
+""",
+)
+TAMING = INRIA.replace(
+    "                gaussians.optimizer.step()\n",
+    """\
+                gaussians.optimizer.step()
+                if iteration % 16 == 0:
+                    gaussians.shoptimizer.step()
+""",
+)
+SYNTHETIC = {
+    "gsplat": GSPLAT,
+    "gsplat 1.6": GSPLAT_16,
+    "gsplat 2DGS": GSPLAT_2DGS,
+    "inria": INRIA,
+    "mini-splatting": MINI_SPLATTING,
+    "taming": TAMING,
+}
+
+
+def added(lines: str) -> list[str]:
+    """The lines that a diff adds, stripped."""
+    return [line[1:].strip() for line in lines.splitlines() if re.match(r"\+(?!\+\+)", line)]
