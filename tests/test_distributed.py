@@ -1,35 +1,20 @@
-"""Several ranks share one nu: gloo, two processes on a CPU. GradScaler, accumulation, compile."""
+"""Several ranks share one nu: gloo, two processes on a CPU; and means over ranks."""
 
 from __future__ import annotations
 
-import contextlib
-import socket
-import warnings
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 import torch.multiprocessing as mp
+from ranks import free_port
 from torch import distributed
-from torch.nn import Parameter
-from trainers import (
-    everything,
-    gsplat_optimizers,
-    make_splats,
-    train,
-    view_loss,
-)
+from trainers import everything, gsplat_optimizers, make_splats, view_loss
 
-from opt3dgs_optim import AWSGLD, EnergyHistogram, PhaseScheduler
+from opt3dgs_optim import EnergyHistogram, PhaseScheduler
+from opt3dgs_optim.ranks import RankMean
 
 WORLD, TOTAL, BAD = 2, 40, 25
-
-
-def free_port() -> int:
-    with contextlib.closing(socket.socket()) as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
 
 
 def rank_main(rank: int, port: int, folder: str) -> None:
@@ -37,8 +22,8 @@ def rank_main(rank: int, port: int, folder: str) -> None:
     torch.set_num_threads(1)
     address = f"tcp://127.0.0.1:{port}"
     distributed.init_process_group("gloo", init_method=address, rank=rank, world_size=WORLD)
-    histogram = EnergyHistogram(warmup=8, step_size=0.1)
-    phases = everything(TOTAL, 30, multiplier=histogram, process_group=distributed.group.WORLD)
+    histogram = EnergyHistogram(warmup=8)
+    phases = everything(TOTAL, 30, nu=histogram, process_group=distributed.group.WORLD)
     splats = make_splats(9 + 5 * rank, seed=rank)  # uneven shards
     optimizers = phases.upgrade(gsplat_optimizers(splats))
     nus, stood_still = [], []
@@ -53,166 +38,49 @@ def rank_main(rank: int, port: int, folder: str) -> None:
             optimizer.step()
             optimizer.zero_grad()
         stood_still.append(torch.equal(before, splats["means"]))
-    alone = EnergyHistogram(warmup=4, process_group=distributed.group.WORLD)
-    nu = [float(alone.observe(float(rank + step))) for step in range(9)]
-    result = {"nus": nus, "theta": histogram.weights, "still": stood_still, "alone": nu}
-    torch.save({**result, "range": histogram.calibrated_range}, f"{folder}/{rank}.pt")
+    torch.save({"nus": nus, "theta": histogram.weights, "still": stood_still}, f"{folder}/{rank}.pt")
     distributed.barrier()
     distributed.destroy_process_group()
 
 
+@pytest.mark.processes
 def test_two_ranks_have_one_nu_and_one_theta(tmp_path: Path) -> None:
     mp.spawn(rank_main, args=(free_port(), str(tmp_path)), nprocs=WORLD)  # pyright: ignore
     a, b = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(WORLD))
     assert a["nus"] == b["nus"]
     assert len(set(a["nus"])) > 3
     assert torch.equal(a["theta"], b["theta"])
-    assert a["range"] == b["range"]
     assert a["still"] == b["still"] == [iteration == BAD for iteration in range(TOTAL)]
-    assert a["alone"] == b["alone"]
 
 
 def test_a_group_without_torch_distributed() -> None:
-    for make in (PhaseScheduler, EnergyHistogram):
-        with pytest.raises(ValueError, match=r"init_process_group first") as error:
-            make(10, process_group="world")  # type: ignore[arg-type]
-        assert make.__name__ in str(error.value)
+    with pytest.raises(ValueError, match=r"init_process_group first") as error:
+        PhaseScheduler(10, process_group="world")
+    assert "PhaseScheduler" in str(error.value)
 
 
-# -- GradScaler -------------------------------------------------------------------------------
+def test_a_process_that_is_not_in_the_group(monkeypatch: pytest.MonkeyPatch) -> None:
+    from torch import distributed
+
+    monkeypatch.setattr(distributed, "is_initialized", lambda: True)
+    monkeypatch.setattr(distributed, "get_rank", lambda group: -1)
+    with pytest.raises(ValueError, match="call: this process does not belong to 'others'"):
+        RankMean("call", "others")
 
 
-def scaled(fused: bool | None) -> tuple[Any, dict, Any, PhaseScheduler, EnergyHistogram]:
-    splats = make_splats()
-    histogram = EnergyHistogram(warmup=4)
-    phases = everything(100, 50, multiplier=histogram)
-    optimizers = phases.upgrade(gsplat_optimizers(splats, fused=fused))
-    # like nerfstudio's Trainer; a first scale at which nothing overflows
-    scaler = torch.amp.GradScaler("cpu", init_scale=8.0)  # pyright: ignore
-    return scaler, splats, optimizers, phases, histogram
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+def test_half_precision_energies_are_summed_in_float32(
+    dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two ranks of 40,000: their sum is beyond float16."""
+    from torch import distributed
 
-
-def scaled_step(scaler: Any, splats: dict, optimizers: Any, phases: Any, factor: float = 1) -> None:
-    for p in splats.values():
-        p.grad = None
-    loss = view_loss(splats, 0, phases) * factor
-    scaler.scale(loss).backward()
-    phases.observe(loss)
-    for optimizer in optimizers.values():
-        scaler.step(optimizer)
-    scaler.update()
-
-
-@pytest.mark.parametrize("fused", [None, True])
-@pytest.mark.parametrize("exploiting", [False, True])
-def test_grad_scaler_skips_non_finite_steps(fused: bool | None, exploiting: bool) -> None:
-    scaler, splats, optimizers, phases, histogram = scaled(fused)
-    steps = 55 if exploiting else 9
-    for _ in range(steps):
-        scaled_step(scaler, splats, optimizers, phases)
-    before = {name: p.detach().clone() for name, p in splats.items()}
-    theta, seen = histogram.weights, histogram.num_observed
-    scaled_step(scaler, splats, optimizers, phases, factor=float("inf"))
-    assert all(torch.equal(before[name], p) for name, p in splats.items())
-    assert torch.equal(histogram.weights, theta)
-    assert histogram.num_observed == seen + (not exploiting)
-    scaled_step(scaler, splats, optimizers, phases)
-    assert not torch.equal(before["means"], splats["means"])
-
-
-@pytest.mark.parametrize("fused", [None, True])
-def test_a_gradient_that_overflows_at_a_finite_loss_is_skipped(fused: bool | None) -> None:
-    scaler, splats, optimizers, phases, _ = scaled(fused)
-    scaled_step(scaler, splats, optimizers, phases)
-    before = {name: p.detach().clone() for name, p in splats.items()}
-    scaler.update(new_scale=3e38)  # the loss is finite, its scaled gradient is not
-    scaled_step(scaler, splats, optimizers, phases, factor=1e3)
-    assert all(torch.equal(before[name], p) for name, p in splats.items())
-
-
-@pytest.mark.parametrize("fused", [None, True])
-def test_grad_scaler_gives_the_unscaled_steps(fused: bool | None) -> None:
-    """A power of two as scale changes no bit, in both phases."""
-    scaler, splats, optimizers, phases, _ = scaled(fused)
-    plain = make_splats()
-    other = everything(100, 50, multiplier=EnergyHistogram(warmup=4))
-    own = other.upgrade(gsplat_optimizers(plain, fused=fused))
-    for _ in range(60):
-        scaled_step(scaler, splats, optimizers, phases)
-        loss = view_loss(plain, 0, other)
-        loss.backward()
-        other.observe(loss)
-        for optimizer in own.values():
-            optimizer.step()
-            optimizer.zero_grad()
-    for name, p in splats.items():
-        torch.testing.assert_close(p, plain[name], rtol=1e-6, atol=1e-7)
-
-
-# -- gradient accumulation, torch.compile -----------------------------------------------------
-
-
-def test_gradient_accumulation_observes_the_mean_once() -> None:
-    """Four views per step: the means of losses and gradients, as of one batch."""
-    results = []
-    for together in (True, False):
-        splats, histogram = make_splats(), EnergyHistogram(warmup=4)
-        phases = everything(20, 12, multiplier=histogram)
-        optimizers = phases.upgrade(gsplat_optimizers(splats))
-        for _ in range(20):
-            if together:
-                energy = torch.stack([view_loss(splats, v, phases) for v in range(4)]).mean()
-                energy.backward()
-                energy = energy.detach()
-            else:
-                energy = torch.zeros(())
-                for view in range(4):
-                    loss = view_loss(splats, view, phases) / 4
-                    loss.backward()
-                    energy = energy + loss.detach()
-            phases.observe(energy)
-            for optimizer in optimizers.values():
-                optimizer.step()
-                optimizer.zero_grad()
-        assert phases.iteration == 20
-        results.append((splats, float(histogram.multiplier)))
-    (a, nu_a), (b, nu_b) = results
-    # Sums in another order. A gradient of nearly 0 has any sign in Adam with eps 1e-15.
-    assert nu_a == pytest.approx(nu_b, rel=2e-2)
-    assert float((a["means"] - b["means"]).detach().abs().median()) < 1e-4
-
-
-def test_compiled_step() -> None:
-    """torch.compile of step() runs it as it is, and computes the same."""
-    x, y = (Parameter(torch.linspace(-1, 1, 12).reshape(4, 3)) for _ in "ab")
-    a, b = (
-        AWSGLD([p], lr=0.05, histogram=EnergyHistogram(num_partitions=20, warmup=4)) for p in (x, y)
-    )
-    compiled = torch.compile(a.step, backend="eager")
-    for _ in range(12):
-        for p, optimizer, step in ((x, a, compiled), (y, b, b.step)):
-            p.grad = p.detach().clone()
-            assert optimizer.histogram is not None
-            optimizer.histogram.observe((p.detach() ** 2).sum())
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                step()
-    torch.testing.assert_close(x, y)
-
-
-def test_compiled_step_in_both_phases() -> None:
-    results = []
-    for compiled in (False, True):
-        splats = make_splats()
-        phases = everything(12, 6, multiplier=EnergyHistogram(num_partitions=20, warmup=4))
-        optimizers: Any = phases.upgrade(gsplat_optimizers(splats))
-        if compiled:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                step = torch.compile(optimizers["means"].step, backend="eager")
-                optimizers["means"].step = step
-                train(splats, optimizers, phases, 0, 12)
-        else:
-            train(splats, optimizers, phases, 0, 12)
-        results.append(splats["means"].detach())
-    torch.testing.assert_close(*results)
+    monkeypatch.setattr(distributed, "is_initialized", lambda: True)
+    monkeypatch.setattr(distributed, "get_rank", lambda group: 0)
+    monkeypatch.setattr(distributed, "get_world_size", lambda group: 2)
+    monkeypatch.setattr(distributed, "all_reduce", lambda total, group: total.mul_(2))
+    energy = torch.tensor(40_000.0, dtype=dtype)
+    mean = RankMean("call", "all")(energy)
+    assert mean.shape == ()
+    assert float(mean) == float(energy)
+    assert mean.dtype == (dtype if dtype.itemsize > 2 else torch.float32)

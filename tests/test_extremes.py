@@ -6,19 +6,11 @@ from typing import Any
 
 import pytest
 import torch
-from opt3dgs_optim.curvature import header
 from problems import MULTIMODAL, SMOOTH, gradient, hessians, quadratic
 from torch import Tensor
-from trainers import (
-    everything,
-    gsplat_optimizers,
-    make_splats,
-    train,
-    view_loss,
-)
 
-from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam
-from opt3dgs_optim.lqnadam import CurvatureOptions
+from opt3dgs_optim import AWSGLD, LQNAdam
+from opt3dgs_optim.lbfgs.history import header
 
 BOTH = [AWSGLD, LQNAdam]
 DTYPES = [torch.float64, torch.float32, torch.bfloat16, torch.float16]
@@ -243,28 +235,6 @@ def test_no_point_and_one_point(rows: int) -> None:
         assert bool(torch.isfinite(x).all())
 
 
-def test_one_view_only() -> None:
-    """`view_centered` energies of one view, epoch pairs of one step: consecutive pairs."""
-    ends = []
-    for curvature in (CurvatureOptions(), CurvatureOptions(pairs="epoch", epoch_steps=1)):
-        splats = make_splats()
-        histogram = EnergyHistogram(warmup=10, energy="view_centered")
-        phases = everything(60, 30, multiplier=histogram, curvature=curvature)
-        optimizers = phases.upgrade(gsplat_optimizers(splats))
-        for _ in range(60):
-            loss = view_loss(splats, 0, phases)
-            loss.backward()
-            phases.observe(loss, view=0)
-            for optimizer in optimizers.values():
-                optimizer.step()
-                optimizer.zero_grad()
-        ends.append(splats)
-        assert all(bool(torch.isfinite(p).all()) for p in splats.values())
-        assert histogram.state_dict()["views"]["views"] == [0]
-    for name in ends[0]:
-        torch.testing.assert_close(ends[0][name], ends[1][name], rtol=1e-5, atol=1e-6)
-
-
 # -- everything at once ----------------------------------------------------------------------------
 
 
@@ -282,20 +252,3 @@ def test_every_problem_in_float32_from_its_start(cls: Any, problem: Any) -> None
     end = problem.value(x.detach().double())
     assert bool(torch.isfinite(end).all())
     assert float(end.median()) < float(start)
-
-
-def test_both_phases_with_a_constant_image() -> None:
-    """Loss 0 and gradient 0 from the first step to the last: nothing moves, nothing is NaN."""
-    splats = make_splats()
-    before = {k: v.detach().clone() for k, v in splats.items()}
-    phases = everything(50, 20, multiplier=EnergyHistogram(warmup=10))
-    optimizers = phases.upgrade(gsplat_optimizers(splats))
-    for _ in range(40):
-        for param in splats.values():
-            param.grad = torch.zeros_like(param)
-        phases.observe(0.0)
-        for optimizer in optimizers.values():
-            optimizer.step()
-    assert all(torch.equal(before[k], splats[k]) for k in splats)
-    train(splats, optimizers, phases, 40, 45)
-    assert all(bool(torch.isfinite(p).all()) for p in splats.values())

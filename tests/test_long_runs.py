@@ -13,7 +13,7 @@ import pytest
 import torch
 from small_training import Training
 
-SCRIPT = Path(__file__).with_name("small_training.py")
+SUPPORT = Path(__file__).parent / "support"
 LENGTHS = [
     pytest.param(300, 3, id="short"),
     pytest.param(100_000, 40, id="long", marks=pytest.mark.slow),
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="re
 
 def launch(folder: Path, steps: int) -> subprocess.Popen[bytes]:
     folder.mkdir(exist_ok=True)
-    command = [sys.executable, str(SCRIPT), str(folder), "--steps", str(steps)]
+    command = [sys.executable, str(SUPPORT / "small_training.py"), str(folder), "--steps", str(steps)]
     return subprocess.Popen([*command, "--every", str(max(20, steps // 500))])
 
 
@@ -39,6 +39,7 @@ def memory(folder: Path) -> list[list[int]]:
     return [[int(word) for word in line.split()] for line in lines]
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize(("steps", "kills"), LENGTHS)
 def test_killed_and_resumed_it_ends_bit_for_bit_where_it_would(
     steps: int, kills: int, tmp_path: Path

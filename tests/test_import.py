@@ -1,23 +1,21 @@
-"""Importing the package is cheap and touches neither CUDA nor a compiler."""
+"""Importing the package touches neither CUDA nor a compiler, and brings nothing of the extras."""
 
 from __future__ import annotations
 
 import json
-import statistics
 import subprocess
 import sys
 
+import pytest
+
 PROGRAM = """
-import json, sys, time
+import json, sys
 import torch, torch.optim
 # torch itself imports cuda.bindings where that is installed, which asks for CUDA's folders.
 before = set(sys.modules)
 CHILDREN.clear()
-begin = time.perf_counter()
 import opt3dgs_optim
-seconds = time.perf_counter() - begin
 print(json.dumps({
-    "seconds": seconds,
     "cuda_started": torch.cuda.is_initialized(),
     "modules": [name for name in set(sys.modules) - before if name.split(".")[0] in FORBIDDEN],
     "children": CHILDREN,
@@ -28,6 +26,8 @@ SPY = """
 CHILDREN = []
 FORBIDDEN = ("cuda", "triton", "matplotlib", "numba", "pynvml")
 import sys
+
+import pytest
 sys.addaudithook(lambda name, args: CHILDREN.append(name)
                  if name in ("subprocess.Popen", "os.posix_spawn", "os.fork") else None)
 """
@@ -43,12 +43,7 @@ def measure() -> dict:
     return json.loads(run.stdout)
 
 
-def test_import_costs_less_than_50_ms_beyond_torch() -> None:
-    runs = [measure() for _ in range(7)]
-    assert min(run["seconds"] for run in runs) < 0.05, runs
-    assert statistics.median(run["seconds"] for run in runs) < 0.15  # a busy machine
-
-
+@pytest.mark.processes
 def test_import_touches_neither_cuda_nor_a_compiler() -> None:
     run = measure()
     assert not run["cuda_started"]

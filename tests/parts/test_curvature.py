@@ -1,0 +1,149 @@
+"""Curvature in a training: which parameters, from when on, and what it says of itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+from trainers import (
+    check_resume,
+    gsplat_optimizers,
+    inria_optimizer,
+    make_splats,
+    only,
+    state_of,
+    train,
+)
+
+from opt3dgs_optim import Course, Curvature, LQNAdam
+
+TOTAL, SWITCH = 60, 40
+
+
+@pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
+@pytest.mark.parametrize("names", [("means",), ("xyz", "scaling"), ("opacities", "quats"), None])
+def test_it_acts_on_its_parameters_from_the_switch_on(make: Any, names: Any) -> None:
+    splats = make_splats()
+    curvature = Curvature(3, names=names)
+    phases = only(TOTAL, curvature, switch=SWITCH)
+    optimizers = phases.upgrade(make(splats))
+    train(splats, optimizers, phases, 0, SWITCH)
+    assert not any("history" in state_of(optimizers, p) for p in splats.values())
+    train(splats, optimizers, phases, SWITCH, SWITCH + 3)
+    holders = {name for name, p in splats.items() if "history" in state_of(optimizers, p)}
+    assert holders == (set(splats) if names is None else set(curvature.names))
+
+
+def test_while_exploiting_the_positions_go_where_lqnadam_takes_them() -> None:
+    ours, theirs = make_splats(), make_splats()
+    phases = only(TOTAL, Curvature(), switch=0)
+    means = phases.upgrade(gsplat_optimizers(ours))["means"]
+    twin = LQNAdam([theirs["means"]], lr=1e-2, eps=1e-15)
+    for step in range(12):
+        phases.observe(0.1)
+        for param, optimizer in ((ours["means"], means), (theirs["means"], twin)):
+            param.grad = param.detach() * torch.tensor([1.0, 5.0, 25.0]) + 0.1 * step
+            optimizer.step()
+    assert torch.equal(ours["means"], theirs["means"])
+
+
+@pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
+@pytest.mark.parametrize("at", [SWITCH - 1, SWITCH, SWITCH + 1, SWITCH + 9])
+def test_resume_is_bit_exact(make: Any, at: int) -> None:
+    check_resume(make, lambda: only(TOTAL, Curvature(), switch=SWITCH), TOTAL, at)
+
+
+@pytest.mark.parametrize("scale", [1.0, 8.0])
+@pytest.mark.parametrize("maximize", [False, True])
+def test_it_sees_the_unscaled_gradient_of_what_is_minimised(maximize: bool, scale: float) -> None:
+    """Whatever GradScaler and `maximize` do to it: the pairs are those of the plain problem."""
+    histories = []
+    for up, factor in ((False, 1.0), (maximize, scale)):
+        x = Parameter(torch.ones(6, 3))
+        phases = only(TOTAL, Curvature(3), switch=0)
+        adam = torch.optim.Adam([x], lr=0.01, maximize=up, fused=True)
+        means: Any = phases.upgrade({"means": adam})["means"]
+        for step in range(5):
+            phases.observe(0.1)
+            gradient = x.detach() * torch.tensor([1.0, 5.0, 25.0]) + 0.1 * step
+            x.grad = gradient * factor * (-1.0 if up else 1.0)
+            means.grad_scale = torch.tensor(factor) if factor != 1.0 else None
+            means.found_inf = torch.zeros(())
+            means.step()
+            assert torch.equal(x.grad, gradient * factor * (-1.0 if up else 1.0))
+        histories.append(means.state[x]["history"])
+    torch.testing.assert_close(histories[0], histories[1])
+
+
+def test_the_share_is_over_all_parameters_of_a_step() -> None:
+    """Of each optimizer's last step: one whose pairs are refused, one whose are taken."""
+    curvature = Curvature(names=("means", "scales"))
+    x, y = Parameter(torch.zeros(3, 3)), Parameter(torch.zeros(5, 3))
+    phases = only(TOTAL, curvature, switch=0)
+    groups = [{"params": [x], "name": "xyz"}, {"params": [y], "name": "scaling"}]
+    optimizer = phases.upgrade(torch.optim.Adam(groups, lr=0.1))
+    for step in range(2):
+        phases.observe(0.1)
+        x.grad = torch.ones(3, 3) + x.detach()  # convex: accepted
+        y.grad = torch.ones(5, 3) - y.detach()  # concave: refused
+        optimizer.step()
+        expected = 0.0 if step == 0 else 3 / 8
+        assert float(curvature.accepted_share or 0.0) == pytest.approx(expected)
+    assert phases.numbers().keys() == {"accepted"}
+
+
+def test_no_number_is_said_before_the_first_step() -> None:
+    assert Curvature().accepted_share is None
+    assert Curvature().numbers(Course()) == {}
+
+
+def test_what_it_has_counted_is_in_checkpoints() -> None:
+    one, other = Curvature(), Curvature()
+    one.load_state_dict({"seen": [3.0, 4.0, 0.5, 2.0], "probes": 6})
+    other.load_state_dict(one.state_dict())
+    assert other.state_dict() == {"seen": [3.0, 4.0, 0.5, 2.0], "probes": 6}
+
+
+@pytest.mark.parametrize(
+    ("evidence", "probes", "said"),
+    [
+        ([0.0, 0.0, 0.0, 0.0], 9, None),  # nothing seen yet
+        ([1.0, 100.0, 50.0, 100.0], 4, None),  # hardly looked
+        ([1.0, 100.0, 50.0, 100.0], 5, "0.010 of the candidate pairs"),
+        ([90.0, 100.0, 2.0, 100.0], 5, "cosine of only 0.020"),
+        ([90.0, 100.0, 20.0, 100.0], 5, None),
+    ],
+)
+def test_when_it_is_useless(evidence: list[float], probes: int, said: str | None) -> None:
+    curvature = Curvature()
+    curvature.load_state_dict({"seen": evidence, "probes": probes})
+    found = curvature.useless(curvature.evidence(Course()).tolist(), Course())
+    assert (found is None) == (said is None)
+    assert said is None or said in (found or "")
+
+
+def test_an_empty_parameter_and_one_without_dimensions() -> None:
+    for start in (torch.zeros(0, 3), torch.ones(())):
+        x = Parameter(start)
+        phases = only(TOTAL, Curvature(), switch=0)
+        means: Any = phases.upgrade({"means": torch.optim.Adam([x], lr=0.1)})["means"]
+        for _ in range(3):
+            phases.observe(0.1)
+            x.grad = 2 * x.detach()
+            means.step()
+        assert x.shape == start.shape
+        assert bool(torch.isfinite(x).all())
+
+
+def test_a_step_that_the_device_drops_leaves_no_pair() -> None:
+    """As zero gradients do: the point was not seen."""
+    curvature, course, state = Curvature(3), Course(), {}
+    x, grad = torch.zeros(4, 3), torch.ones(4, 3)
+    curvature.before({}, x, grad, state, course)
+    before: Tensor = state["history"].clone()
+    course.valid = torch.tensor(False)
+    curvature.before({}, x + 1, 3 * grad, state, course)
+    assert torch.equal(state["history"], before)
