@@ -158,7 +158,9 @@ def test_nothing_but_torch_and_numpy_is_imported_at_the_top() -> None:
 
 
 def test_the_oracles_share_no_code_with_what_they_check() -> None:
-    found = imports(ast.parse((ROOT / "tests" / "support" / "oracles.py").read_text(encoding="utf-8")))
+    found = imports(
+        ast.parse((ROOT / "tests" / "support" / "oracles.py").read_text(encoding="utf-8"))
+    )
     assert found
     assert {name for name in found if name.split(".")[0] == PACKAGE} == set()
 
