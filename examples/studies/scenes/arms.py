@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,7 +59,7 @@ class StudyArm(Arm):
     retired: bool = False  # its code is gone, its records are kept
 
     def make(
-        self, iterations: int, switch: float, nu: float | None, gaussians: dict[str, Tensor]
+        self, iterations: int, switch: float, nu: float | None, gaussians: Mapping[str, Tensor]
     ) -> PhaseScheduler:
         """As `Arm.make`; the switch is the arm's own: trunk and branches share `FitOptions`."""
         return super().make(iterations, self.switch, nu, gaussians)
