@@ -10,6 +10,7 @@ import numpy as np
 
 from opt3dgs_optim.runs.read import Run
 
+NO_NUMBERS = ("iteration", "seconds", "phase")  # of the columns, not of interest
 KNOWN = ("psnr", "ssim", "train_psnr", "lpips")  # listed first
 LOWER_IS_BETTER = ("lpips", "loss", "error", "mse", "mae", "l1", "l2", "energy", "flip")
 
@@ -119,13 +120,13 @@ def metric_names(runs: Sequence[Run]) -> list[str]:
     """Every metric the runs evaluated, PSNR, SSIM and training PSNR first."""
     found = dict.fromkeys(name for run in runs for name in run.evaluations)
     named = [*(name for name in KNOWN if name in found), *found]
-    return [name for name in dict.fromkeys(named) if name not in ("iteration", "seconds")]
+    return [name for name in dict.fromkeys(named) if name not in NO_NUMBERS]
 
 
 def step_names(runs: Sequence[Run]) -> list[str]:
     """The columns of the step lines that are no loss: what the parts say of themselves."""
     found = dict.fromkeys(name for run in runs for name in run.steps if higher_is_better(name))
-    return [name for name in found if name not in ("iteration", "seconds", "phase")]
+    return [name for name in found if name not in NO_NUMBERS]
 
 
 def higher_is_better(metric: str) -> bool:
