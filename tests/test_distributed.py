@@ -38,7 +38,9 @@ def rank_main(rank: int, port: int, folder: str) -> None:
             optimizer.step()
             optimizer.zero_grad()
         stood_still.append(torch.equal(before, splats["means"]))
-    torch.save({"nus": nus, "theta": histogram.weights, "still": stood_still}, f"{folder}/{rank}.pt")
+    torch.save(
+        {"nus": nus, "theta": histogram.weights, "still": stood_still}, f"{folder}/{rank}.pt"
+    )
     distributed.barrier()
     distributed.destroy_process_group()
 

@@ -24,7 +24,13 @@ pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="re
 
 def launch(folder: Path, steps: int) -> subprocess.Popen[bytes]:
     folder.mkdir(exist_ok=True)
-    command = [sys.executable, str(SUPPORT / "small_training.py"), str(folder), "--steps", str(steps)]
+    command = [
+        sys.executable,
+        str(SUPPORT / "small_training.py"),
+        str(folder),
+        "--steps",
+        str(steps),
+    ]
     return subprocess.Popen([*command, "--every", str(max(20, steps // 500))])
 
 
