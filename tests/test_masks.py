@@ -112,7 +112,8 @@ def test_visible_rows_go_where_torchs_adam_takes_them(
         {"min_cosine": 1 - 1e-12} if ours is LQNAdam else {}
     )  # no pair is accepted: Adam
     x, y = points(dtype), points(dtype)
-    optimizer: Any = ours([x], **{"lr": 0.02, **options, **own})
+    given: dict[str, Any] = {"lr": 0.02, **options, **own}
+    optimizer: Any = ours([x], **given)
     twin = Adam([y], **{"lr": 0.02, **options})
     for step, mask in enumerate(masks()):
         x.grad, y.grad = gradients(x, step), gradients(y, step)
