@@ -103,7 +103,7 @@ def test_noise_comes_back_with_the_first_transparent_point() -> None:
     assert training.noise in training.phases.hooks("after")
 
 
-# -- what a stranger's part has to say --------------------------------------------------------------
+# -- what a stranger's part has to say ------------------------------------------------------------
 
 
 class Judged(Part):

@@ -23,7 +23,29 @@ def test_what_a_page_imports_from_the_top_is_there(page: Path) -> None:
 
 
 def test_the_names_that_must_stay() -> None:
-    needed = ["AWSGLD", "LQNAdam", "PhaseScheduler", "Phase", "Part", "Course", "EnergyHistogram", "two_loop", "Annealing", "Fading", "Pooling", "Curvature", "ConstantMultiplier", "FreshMoments", "SquaredLoss", "IsotropicNoise", "PositionNoise", "DEFAULTS", "reset_points", "backend_info", "__version__"]
+    needed = [
+        "AWSGLD",
+        "LQNAdam",
+        "PhaseScheduler",
+        "Phase",
+        "Part",
+        "Course",
+        "EnergyHistogram",
+        "two_loop",
+        "Annealing",
+        "Fading",
+        "Pooling",
+        "Curvature",
+        "ConstantMultiplier",
+        "FreshMoments",
+        "SquaredLoss",
+        "IsotropicNoise",
+        "PositionNoise",
+        "DEFAULTS",
+        "reset_points",
+        "backend_info",
+        "__version__",
+    ]
     assert set(needed) <= set(opt3dgs_optim.__all__)
     assert sorted(opt3dgs_optim.__all__) == sorted(set(opt3dgs_optim.__all__))
     assert all(hasattr(opt3dgs_optim, name) for name in opt3dgs_optim.__all__)

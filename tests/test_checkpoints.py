@@ -183,7 +183,7 @@ def test_a_part_that_fails_halfway_is_put_back(halves: list[Any]) -> None:
     part = Halves()
     phases = PhaseScheduler(10, parts=[Fading(), part])
     state = {**phases.state_dict(), "iteration": 7, "parts": {"Halves": {"halves": halves}}}
-    with pytest.raises(ValueError, match="PhaseScheduler.load_state_dict"):
+    with pytest.raises(ValueError, match=r"PhaseScheduler\.load_state_dict"):
         phases.load_state_dict(state)
     assert part.halves == [1.0, 2.0]
     assert phases.iteration == 0

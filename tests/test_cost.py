@@ -68,10 +68,7 @@ def test_six_fused_adams_are_the_measure() -> None:
 
 
 @pytest.mark.parametrize("case", ["none", "defaults", "exploitation", "histogram"])
-def test_operators_per_iteration(case: str, request: pytest.FixtureRequest) -> None:
-    if case == "histogram":
-        reason = "its update is to become one operator"
-        request.applymarker(pytest.mark.xfail(reason=reason, strict=False))
+def test_operators_per_iteration(case: str) -> None:
     phases = {
         "none": lambda: PhaseScheduler(30_000, parts=[]),
         "defaults": lambda: PhaseScheduler(30_000),
@@ -110,7 +107,6 @@ def test_the_path_of_a_gradient_through_an_exploiting_step_is_short() -> None:
     assert len(exploiting_step()) <= 90
 
 
-@pytest.mark.xfail(reason="14 today: lbfgs/ alone has five", strict=False)
 def test_the_path_of_a_gradient_is_in_few_files() -> None:
     files = {file for file, _ in exploiting_step()}
     assert len(files) <= 10, sorted(files)

@@ -105,8 +105,8 @@ def test_the_house_has_at_most_eight_floors() -> None:
     "chain",
     [
         "phases upgrading stepadam course part names",
-        "presets parts.curvature lbfgs.lqn_direction lbfgs.two_loop lbfgs.history",
-        "awsgld stepadam rows checks",
+        "presets parts.curvature lbfgs.two_loop",
+        "awsgld stepadam rows",
         "lqnadam parts.curvature course",
         "parts.annealing course part",
     ],

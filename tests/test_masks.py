@@ -108,9 +108,12 @@ def test_visible_rows_go_where_torchs_adam_takes_them(
     """Torch's step of the whole parameter, whose other rows are put back."""
     if dtype.is_complex and (ours is LQNAdam or "fused" in options):
         pytest.skip("no curvature pairs, and no fused step, of complex parameters")
-    own = {"min_cosine": 1 - 1e-12} if ours is LQNAdam else {}  # no pair is accepted: Adam
+    own: dict[str, Any] = (
+        {"min_cosine": 1 - 1e-12} if ours is LQNAdam else {}
+    )  # no pair is accepted: Adam
     x, y = points(dtype), points(dtype)
-    optimizer = ours([x], **{"lr": 0.02, **options, **own})
+    given: dict[str, Any] = {"lr": 0.02, **options, **own}
+    optimizer: Any = ours([x], **given)
     twin = Adam([y], **{"lr": 0.02, **options})
     for step, mask in enumerate(masks()):
         x.grad, y.grad = gradients(x, step), gradients(y, step)
@@ -146,7 +149,9 @@ def test_pairs_are_kept_between_two_visible_steps_of_a_point() -> None:
             row.grad = gradients(row, 1)
             twin.step(visible=mask[i : i + 1])
     # the same float32 arithmetic in rows of another number
-    torch.testing.assert_close(x.detach(), torch.cat(alone).detach(), rtol=2e-5, atol=1e-6)
+    torch.testing.assert_close(
+        x.detach(), torch.cat([row.detach() for row in alone]), rtol=2e-5, atol=1e-6
+    )
     assert optimizer.accepted_share is not None
 
 
@@ -198,7 +203,8 @@ def test_a_mask_before_the_first_energy() -> None:
 
 def test_a_mask_of_ones_is_the_step_without() -> None:
     x, y = points(), points()
-    ours, theirs = AWSGLD([x], lr=0.1), Adam([y], lr=0.1)
+    theirs = Adam([y], lr=0.1)
+    ours: Any = AWSGLD([x], lr=0.1)
     for step in range(9):
         x.grad, y.grad = gradients(x, step), gradients(y, step)
         ours.step(*([torch.ones(ROWS)] if step % 3 == 1 else []))
@@ -337,7 +343,7 @@ def test_an_optimizer_with_masked_steps_keeps_its_arithmetic(
     phases = only(STEPS, *chosen, switch=STEPS)
     optimizer: Any = phases.upgrade(mine)
     assert optimizer is mine
-    decay = ExponentialLR(optimizer, 0.99)
+    decay, step = ExponentialLR(optimizer, 0.99), before
     for step, mask in steps[before:]:
         ours.grad, theirs.grad = gradients(ours, step), gradients(theirs, step)
         phases.observe(0.1, iteration=step)

@@ -199,7 +199,7 @@ def pieces(value: Any) -> list[Any]:
 
 def test_unknown_options_are_refused() -> None:
     for make, _, _ in TABLE.values():
-        with pytest.raises(TypeError, match="histroy|takes no arguments"):
+        with pytest.raises(TypeError, match=r"histroy|takes no arguments"):
             make(histroy=1)
 
 

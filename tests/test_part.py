@@ -22,7 +22,7 @@ from trainers import (
 )
 
 import opt3dgs_optim
-from opt3dgs_optim import Annealing, Part, Phase, PhaseScheduler, reset_points
+from opt3dgs_optim import Annealing, Part, Phase, PhaseScheduler, RunLog, reset_points
 
 SOURCE = Path(opt3dgs_optim.__file__).parent
 TOTAL = 40
@@ -149,8 +149,6 @@ def test_it_is_in_the_repr_and_in_the_upgrades_line(caplog: pytest.LogCaptureFix
 
 
 def test_its_numbers_are_columns_of_the_run_log(tmp_path: Path) -> None:
-    from opt3dgs_optim.runlog import RunLog
-
     splats = make_splats()
     with RunLog(tmp_path / "run.jsonl") as log:
         phases = PhaseScheduler(TOTAL, 20, [SignAgreement(), Annealing()], log=log)

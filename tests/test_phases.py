@@ -373,7 +373,7 @@ def test_bad_options(options: dict, message: str) -> None:
 
 @pytest.mark.parametrize("part", ["annealing", Annealing, 4.0, None, torch.optim.Adam])
 def test_what_is_no_part_is_refused(part: Any) -> None:
-    with pytest.raises(TypeError, match="PhaseScheduler: parts has .*, but a Part is needed"):
+    with pytest.raises(TypeError, match=r"PhaseScheduler: parts has .*, but a Part is needed"):
         PhaseScheduler(10, parts=[Annealing(), part])
 
 

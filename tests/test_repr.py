@@ -44,8 +44,8 @@ def test_an_optimizer_says_its_parts_and_groups() -> None:
         ")",
     ]
     assert repr(AWSGLD([points()], 0.5)).splitlines()[1:-1] == ["  group 0 [4, 3]: lr 0.5"]
-    histogram = AWSGLD([points()], histogram=EnergyHistogram(warmup=7))
-    assert "warmup=7" in line(histogram, "EnergyHistogram(")
+    histogram = EnergyHistogram(warmup=7)
+    assert line(AWSGLD([points()], histogram=histogram), "EnergyHistogram(") == str(histogram)
 
 
 def test_noise_does_not_print_the_gaussians() -> None:

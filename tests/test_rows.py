@@ -175,7 +175,7 @@ def test_reset_points_keeps_the_pairs_of_the_others(rows: Tensor) -> None:
 
 
 def test_reset_points_moments_too() -> None:
-    splats, optimizers, phases = exploited()
+    splats, optimizers, _ = exploited()
     reset_points(optimizers, torch.arange(12) == 4, moments=True)
     for name, optimizer in optimizers.items():
         state = optimizer.state[splats[name]]
@@ -192,7 +192,7 @@ def test_reset_points_of_another_number() -> None:
         optimizers["means"].reset_points(torch.zeros(5, dtype=torch.bool))
 
 
-# -- a part's own rows ------------------------------------------------------------------------------
+# -- a part's own rows ----------------------------------------------------------------------------
 
 
 class Age(Part):
