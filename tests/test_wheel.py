@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-import json
+import os
 import subprocess
 import sys
 import tarfile
@@ -88,6 +88,7 @@ def run(python: Path, folder: Path, *words: str) -> subprocess.CompletedProcess[
     return subprocess.run(
         [str(python), "-W", "error", *words],
         cwd=folder,
+        env={key: value for key, value in os.environ.items() if key != "PYTHONPATH"},
         capture_output=True,
         text=True,
         check=False,
@@ -152,9 +153,6 @@ def test_wheel_trains_in_an_empty_environment(installed: Path, tmp_path: Path) -
 
 
 def test_doctor_finds_the_wheel_in_order(installed: Path, tmp_path: Path) -> None:
-    words = ("-m", "opt3dgs_optim", "doctor", "--json", "--device", "cpu")
-    done = run(installed, tmp_path, *words)
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert found["passed"] is True
-    assert found["versions"]["opt3dgs_optim"] == opt3dgs_optim.__version__
+    done = run(installed, tmp_path, "-m", "opt3dgs_optim", "doctor", "--device", "cpu")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert opt3dgs_optim.__version__ in done.stdout
