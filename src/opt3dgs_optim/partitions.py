@@ -18,6 +18,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from opt3dgs_optim import cuda
+from opt3dgs_optim.backend import uses_kernel
+
 FLOOR = 1e-8  # smallest weight of a fixed range before renormalisation; log theta never sees 0
 # Of the moving partitions; lengths are in deviations of the energy.
 MEMORY = 100  # energies that mean, deviation and density remember
@@ -61,9 +64,10 @@ class FixedPartitions:
         scalar = torch.tensor([low, (high - low) / m, self.tau, 0, 1], dtype=dtype, device=device)
         self._low, self._width, self._tau, self._count, self.nu = scalar.unbind()
         self.weights = torch.full((m,), 1.0 / m, dtype=dtype, device=device)
+        self._powers = torch.arange(3, dtype=dtype, device=device)
 
-    def take(self, energy: Tensor, valid: Tensor | bool) -> None:
-        """Nu from the present weights, then their update with `energy`, 0-d."""
+    def take(self, energy: Tensor, valid: Tensor | bool, count: int, sums: Tensor | None) -> None:
+        """Nu from the present weights, then their update; as `MovingPartitions.take`."""
         valid = torch.as_tensor(valid, device=energy.device)
         value = torch.where(valid, energy.to(self.weights.dtype), 0.0)
         # J of eq. 13, counted from 0: u[J-1] < energy <= u[J], the end partitions open.
@@ -74,6 +78,8 @@ class FixedPartitions:
         self.nu.copy_(torch.where(valid, nu, self.nu))
         self._update(index, valid)
         self._count.add_(valid)
+        if sums is not None:
+            sums.addcmul_(torch.pow(self.nu, self._powers), valid)
 
     def _multiplier(self, index: Tensor) -> Tensor:
         """Nu of eq. 14 for partition `index`, before the warm-up is considered."""
@@ -145,7 +151,7 @@ class MovingPartitions:
     absolute one, and an energy counts for at most four deviations: a spike moves them by 4 %.
 
     Few operators: one packed state follows one packed target by one `lerp_`, and all products with
-    q are one `addmv`.
+    q are one `addmv`. Where the CUDA kernels run, all of it is one launch.
     """
 
     def __init__(self, num_partitions: int, zeta: float, clamp: tuple[float, float] | None) -> None:
@@ -175,7 +181,10 @@ class MovingPartitions:
         self._state, self._target = torch.full((2, m + 3), 1.0 / m, **like).unbind()
         self._state[:3] = torch.tensor([0.0, 1.0, 0.0])
         self.nu = torch.ones((), **like)
-        self._tiny = torch.full((), 1e-150 if dtype == torch.float64 else 1e-30, **like)
+        self._powers = torch.arange(3, **like)
+        tiny = 1e-150 if dtype.itemsize == 8 else 1e-30
+        self._tiny = torch.full((), tiny, **like)
+        self._constants = (REACH, BANDWIDTH, EVEN, MEAN_ABS, RESOLUTION, tiny)
         self._views()
 
     def _views(self) -> None:
@@ -186,11 +195,25 @@ class MovingPartitions:
         self._t = self._products[-1]
         self._up, self._below, self._base = self._sums.unbind()
 
-    def take(self, energy: Tensor, valid: Tensor | Literal[True], count: int) -> None:
-        """Nu from the present density, then its update with `energy`, 0-d, the `count`-th."""
+    def take(
+        self, energy: Tensor, valid: Tensor | Literal[True], count: int, sums: Tensor | None
+    ) -> None:
+        """Nu from the present density, then its update with an energy.
+
+        Args:
+            energy: 0-d.
+            valid: whether it is finite.
+            count: its number, from 1 on.
+            sums: [3], to which nu's powers 0, 1 and 2 are added; or None.
+        """
+        limit = LIMIT / MEAN_ABS if count > UNLIMITED else 1 / RESOLUTION
+        rate = max(1 / count, 1 / MEMORY)
+        if uses_kernel("auto", self._state.device, self._state.dtype):
+            numbers = (rate, limit, *self.clamp, *self._constants)
+            cuda.take_energy(energy, valid, self._state, self.nu, sums, *numbers)
+            return
         if count == 1:
             self._mean.copy_(energy if valid is True else torch.where(valid, energy, 0.0))
-        limit = LIMIT / MEAN_ABS if count > UNLIMITED else 1 / RESOLUTION
         # t = z / MEAN_ABS: distance from the mean in mean absolute deviations. Where those have
         # vanished, as after a constant loss, they grow again by the second term.
         distance = torch.sub(energy, self._mean)
@@ -208,8 +231,9 @@ class MovingPartitions:
         step = torch.mul(t, unit)
         torch.add(self._mean, step, out=self._to_mean)
         torch.hypot(step, self._tiny, out=self._to_deviation)
-        rate = max(1 / count, 1 / MEMORY)
         self._state.lerp_(self._target, rate if valid is True else rate * valid)
+        if sums is not None:
+            sums.addcmul_(torch.pow(self.nu, self._powers), torch.as_tensor(valid))
 
     @property
     def weights(self) -> Tensor:

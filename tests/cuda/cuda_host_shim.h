@@ -13,6 +13,7 @@
 
 using std::exp;
 using std::fabs;
+using std::hypot;
 using std::isfinite;
 using std::sqrt;
 

@@ -12,14 +12,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from unittest import mock
 
 import torch
 from torch import Tensor
 
 import opt3dgs_optim
+from opt3dgs_optim import cuda, partitions
 from opt3dgs_optim.covariance import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
 from opt3dgs_optim.cuda import BLOCK, macros
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
+from opt3dgs_optim.partitions import UNLIMITED, MovingPartitions
 
 HERE = Path(__file__).parent
 SOURCES = Path(opt3dgs_optim.__file__).parent / "cuda"
@@ -90,11 +93,12 @@ class HostKernels:
     def load(cls, path: Path, dtype: torch.dtype) -> HostKernels:
         return cls(ctypes.CDLL(str(path)), dtype)
 
-    def _call(self, name: str, tensors: list[Tensor], rows: int, *scalars: object) -> None:
+    def _call(self, name: str, tensors: list[Tensor | None], rows: int, *scalars: object) -> None:
         real = ctypes.c_double if self.dtype == torch.float64 else ctypes.c_float
         values = [real(v) if isinstance(v, float) else v for v in scalars]
-        pointers = [ctypes.c_void_p(t.data_ptr()) for t in tensors]
-        values.insert(0 if name == "run_lqn" else len(values), ctypes.c_longlong(rows))
+        pointers = [ctypes.c_void_p(None if t is None else t.data_ptr()) for t in tensors]
+        first = name in ("run_lqn", "run_take_energy")
+        values.insert(0 if first else len(values), ctypes.c_longlong(rows))
         getattr(self.library, name)(ctypes.c_uint(BLOCK), *pointers, *values)
 
     def lqn(
@@ -143,6 +147,22 @@ class HostKernels:
         for tensor in tensors:
             check_guard(tensor, n)
         return tensors[0][:n]
+
+    def take_energy(
+        self,
+        energy: Tensor,
+        valid: Tensor | bool,
+        state: Tensor,
+        nu: Tensor,
+        sums: Tensor | None,
+        *numbers: float,
+    ) -> None:
+        """As `cuda.take_energy`."""
+        cells, known = guarded(state), None if valid is True else torch.as_tensor(valid)
+        tensors = [energy.to(self.dtype), known, cells, nu, sums]
+        self._call("run_take_energy", tensors, len(state) - 3, *numbers)
+        check_guard(cells, len(state))
+        state.copy_(cells[: len(state)])
 
 
 def guarded(tensor: Tensor) -> Tensor:
@@ -260,3 +280,77 @@ def expected_noise(gaussians: dict[str, Tensor], eta: Tensor) -> Tensor:
     names = ("scales", "quats", "opacities")
     scales, quats, opacities = (gaussians[name] for name in names)
     return covariance_noise(scales, quats, opacities, eta)
+
+
+# -- the histogram ---------------------------------------------------------------------------------
+
+
+def energies(name: str, count: int = 3_000) -> Tensor:
+    """A script of energies, [count] in float64."""
+    g = torch.Generator().manual_seed(3)
+    z, k = torch.randn(count, generator=g, dtype=torch.float64), torch.arange(count)
+    result = {
+        "falling": 10 ** (-4 * k / count) * (0.2 * z).exp(),
+        "two levels": 5 + (z > 0) + 0.02 * z,
+        "spike": 5 + 0.3 * z + 300 * (k == count // 2),
+        "constant": torch.full_like(z, 0.25),
+        "broken": 5 + 0.3 * z,
+    }[name]
+    if name == "broken":
+        for start, value in enumerate((torch.nan, torch.inf, -torch.inf)):
+            result[7 + 5 * start :: 31] = value
+    return result
+
+
+def taken(values: Tensor) -> Tensor:
+    """Which energies change anything: most of those that are finite."""
+    return torch.isfinite(values) & (torch.arange(len(values)) % 40 != 9)
+
+
+def take_all(
+    values: Tensor, dtype: torch.dtype, before: Tensor | None = None, warmup: int = 250
+) -> Tensor:
+    """Nu, sums of its powers and the state after each energy, [T, 4 + 3 + m], of a new law.
+
+    Args:
+        values: [T] energies; those of `taken` False are said not to be finite.
+        dtype: of the law; a CPU's is float64 otherwise.
+        before: the same of another run: every step is one from there.
+        warmup: energies whose nu does not count.
+    """
+    law, sums = MovingPartitions(48, 0.75, (-1.0, 3.0)), torch.zeros(3, dtype=dtype)
+    with mock.patch.object(torch, "float64", dtype):
+        law.allocate(torch.device("cpu"))
+    found = []
+    for count, (energy, valid) in enumerate(zip(values.to(dtype), taken(values), strict=True), 1):
+        if before is not None and count > 1:
+            row = before[count - 2]
+            law.nu.copy_(row[0])
+            sums.copy_(row[1:4])
+            law._state.copy_(row[4:])
+        law.take(energy, True if valid else valid, count, sums if count > warmup else None)
+        found.append(torch.cat([law.nu.reshape(1), sums, law._state]))
+    return torch.stack(found)
+
+
+def take_all_on_host(kernels: HostKernels, values: Tensor, before: Tensor | None = None) -> Tensor:
+    """`take_all` with the kernel in the place of the torch operators."""
+    kernel = mock.patch.object(cuda, "take_energy", kernels.take_energy)
+    with kernel, mock.patch.object(partitions, "uses_kernel", lambda *_: True):
+        return take_all(values, kernels.dtype, before)
+
+
+def compare_energies(kernels: HostKernels, values: Tensor, *, free: bool = True) -> float:
+    """The largest difference from pure torch, free-running or of each single step.
+
+    Relative in what has a unit (mean, deviation) or grows (the sums). The first four energies are
+    left out: up to 1e6 deviations from the mean, pure torch's sums cancel there.
+    """
+    reference = take_all(values, kernels.dtype)
+    result = take_all_on_host(kernels, values, None if free else reference)
+    counts, before = taken(values), result if free else reference
+    assert torch.equal(result[1:][~counts[1:]], before[:-1][~counts[1:]]), "one more was taken"
+    size = torch.ones_like(reference)
+    size[:, 1:6] = reference[:, 1:6].abs()
+    gap = torch.where(result == reference, 0.0, (result - reference).abs() / size)
+    return float(gap[UNLIMITED:][counts[UNLIMITED:]].nan_to_num(nan=torch.inf).max())

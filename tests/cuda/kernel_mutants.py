@@ -18,9 +18,11 @@ import torch
 from kernel_host import (
     SOURCES,
     HostKernels,
+    compare_energies,
     compare_runs,
     compare_two_loops,
     compile_host,
+    energies,
     expected_noise,
     noise_case,
     relative_difference,
@@ -65,6 +67,10 @@ MUTANTS = (
         "length of the grafted step", "two_loop.cuh", "sqrt(dot(unit, unit)) / size", "T(1) / size"
     ),
     Mutant("conjugate quaternion", "noise.cu", "times(axis, T(-1))", "axis"),
+    Mutant("one thread", "histogram.cu", "if (blockIdx.x > 0 || threadIdx.x > 0) return;", ""),
+    Mutant("mean of the slope", "histogram.cu", "slope - state[2]", "slope"),
+    Mutant("energies that do not count", "histogram.cu", "(valid && !*valid)", "false"),
+    Mutant("limit of an energy", "histogram.cu", "/ unit, -limit", "/ unit, Real(-9)"),
 )
 
 
@@ -78,6 +84,9 @@ def complaint(kernels: HostKernels) -> str | None:
         return str(error)
     if not difference < 1e-10:
         return f"lqn_direction or two_loop differs by {difference:.1e}"
+    gap = max(compare_energies(kernels, energies(name, 500)) for name in ("spike", "broken"))
+    if not gap < 1e-10:
+        return f"take_energy differs by {gap:.1e}"
     expected = means + expected_noise(gaussians, eta) * 0.5
     difference = relative_difference(result, expected)
     return None if difference < 1e-12 else f"add_covariance_noise differs by {difference:.1e}"

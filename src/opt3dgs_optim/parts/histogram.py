@@ -123,10 +123,9 @@ class EnergyHistogram(Part):
         self.num_observed = 0  # calls of observe(): says whether anybody calls
         self._taken = 0  # of them, those that count: on a GPU all, on a CPU the finite ones
         self.last_finite: Tensor | bool = True  # whether the last energy was
-        # Powers 0, 1 and 2 of nu, summed over the energies after the warm-up.
-        self._powers = torch.arange(3, dtype=self._law.nu.dtype, device=device)
-        self._sums = torch.zeros_like(self._powers)
-        self._host_sums = [0.0, 0.0, 0.0]  # the same, of energies on a CPU
+        # Powers 0, 1 and 2 of nu, summed over the energies after the warm-up; on a CPU as numbers.
+        self._sums = torch.zeros(3, dtype=self._law.nu.dtype, device=device)
+        self._host_sums = [0.0, 0.0, 0.0]
         self._factor: float | Tensor = 1.0
         self._constancy = Constancy()
 
@@ -168,11 +167,8 @@ class EnergyHistogram(Part):
     def _take(self, value: Tensor, valid: Tensor | Literal[True], on_host: bool) -> None:
         law = self._law
         self._taken += 1
-        if isinstance(law, FixedPartitions):
-            law.take(value, valid)
-        else:
-            law.take(value, valid, self._taken)
         warm = self._taken > self.warmup
+        law.take(value, valid, self._taken, self._sums if warm and not on_host else None)
         if not warm:
             law.nu.fill_(1.0)
         if on_host:
@@ -184,8 +180,6 @@ class EnergyHistogram(Part):
                 self._say_if_constant()
         else:
             self._factor = law.nu
-            if warm:
-                self._sums.addcmul_(torch.pow(law.nu, self._powers), torch.as_tensor(valid))
 
     def _on_device(self, energy: Tensor | float) -> Tensor:
         if not isinstance(energy, Tensor):
