@@ -336,7 +336,7 @@ def take_all(
 def take_all_on_host(kernels: HostKernels, values: Tensor, before: Tensor | None = None) -> Tensor:
     """`take_all` with the kernel in the place of the torch operators."""
     kernel = mock.patch.object(cuda, "take_energy", kernels.take_energy)
-    with kernel, mock.patch.object(partitions, "uses_kernel", lambda *_: True):
+    with kernel, mock.patch.object(partitions, "uses_kernel", return_value=True):
         return take_all(values, kernels.dtype, before)
 
 

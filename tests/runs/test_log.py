@@ -453,7 +453,7 @@ def test_real_clock_runs(tmp_path):
         ({"metadata": {"a": object()}}, TypeError),
         ({"path": None}, TypeError),
     ],
-    ids=str,
+    ids=["metadata", "path"],
 )
 def test_a_wrong_option_is_refused(options, error, tmp_path):
     with pytest.raises(error):
