@@ -31,6 +31,8 @@ LIMIT = 4.0  # an energy further away counts as one at this distance
 UNLIMITED = 4  # energies at the start, whose deviation is not known yet
 MEAN_ABS = math.sqrt(2 / math.pi)  # mean absolute deviation of a Gaussian of deviation 1
 RESOLUTION = 1e-6  # smallest deviation, as a share of the present distance from the mean
+CONSTANT = 1e-9  # smallest deviation of an energy that varies, as a share of its size
+TINY = 1e-100  # smallest deviation of an energy around zero that varies
 
 
 class FixedPartitions:
@@ -107,6 +109,14 @@ class FixedPartitions:
         """Low and high end of the range, and tau. Synchronises."""
         low = float(self._low)
         return low, low + float(self._width) * self.num_partitions, float(self._tau)
+
+    def is_constant(self) -> bool:
+        """Never said: the range is the user's."""
+        return False
+
+    def numbers(self) -> dict[str, Tensor]:
+        """Nothing that is not in the weights."""
+        return {}
 
     def state(self) -> dict[str, Any]:
         """Plain floats and lists. Synchronises."""
@@ -258,9 +268,14 @@ class MovingPartitions:
         if deviation < 0 or min(q) < 0 or abs(math.fsum(q) - 1) > 1e-3:
             raise ValueError(f"{call}: recent={state['recent']!r}, but a density is needed")
 
-    def recent(self) -> tuple[Tensor, Tensor]:
+    def is_constant(self) -> bool:
+        """Whether the energies have not varied lately. Synchronises."""
+        low, high, _ = self.coordinates()
+        return high - low <= max(CONSTANT * REACH * abs(high + low), TINY)
+
+    def numbers(self) -> dict[str, Tensor]:
         """The energy's recent mean and deviation, 0-d, in units of the loss."""
-        return self._mean.clone(), self._deviation / MEAN_ABS
+        return {"energy_mean": self._mean.clone(), "energy_deviation": self._deviation / MEAN_ABS}
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Restore `state()`."""

@@ -8,7 +8,7 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -93,7 +93,9 @@ class HostKernels:
     def load(cls, path: Path, dtype: torch.dtype) -> HostKernels:
         return cls(ctypes.CDLL(str(path)), dtype)
 
-    def _call(self, name: str, tensors: list[Tensor | None], rows: int, *scalars: object) -> None:
+    def _call(
+        self, name: str, tensors: Sequence[Tensor | None], rows: int, *scalars: object
+    ) -> None:
         real = ctypes.c_double if self.dtype == torch.float64 else ctypes.c_float
         values = [real(v) if isinstance(v, float) else v for v in scalars]
         pointers = [ctypes.c_void_p(None if t is None else t.data_ptr()) for t in tensors]

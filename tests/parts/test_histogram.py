@@ -295,10 +295,11 @@ def test_a_part_of_a_course() -> None:
 def test_a_device_that_says_later_whether_an_energy_is_finite() -> None:
     """There `valid` is a tensor: what is not valid is taken with the weight 0."""
     here, there = EnergyHistogram(warmup=8), EnergyHistogram(warmup=8)
+    there._on_host, there._sums = False, torch.zeros(3, dtype=torch.float64)
     for k, energy in enumerate(stream(200)):
         broken = k in (20, 50, 51, 120)
         value = torch.tensor(math.nan if broken else energy, dtype=torch.float64)
-        there._take(value, torch.tensor(not broken), on_host=False)
+        there._take(value, torch.tensor(not broken))
         if not broken:
             here.observe(value)
         else:

@@ -13,17 +13,15 @@ from torch import Tensor
 from opt3dgs_optim.checks import check_count, check_interval, check_keys, check_number
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Group, Part, Phase
-from opt3dgs_optim.partitions import REACH, FixedPartitions, MovingPartitions
+from opt3dgs_optim.partitions import FixedPartitions, MovingPartitions
 from opt3dgs_optim.parts.constant import Constancy
 
-PAPER_RANGE = (0.0, 0.2)
-PAPER_TEMPERATURE = 2e-3  # not given in the paper; zeta * tau / du = 1.5 at its zeta and du
+# The temperature is not given in the paper; zeta * tau / du = 1.5 at its zeta and du.
+PAPER: dict[str, Any] = {"energy_range": (0.0, 0.2), "temperature": 2e-3, "warmup": 2500}
 PAPER_CLAMP = (-5.0, 5.0)  # not given in the paper; the only published one of its family
 CALL = "EnergyHistogram"
 CLAMP = (-1.0, 3.0)  # twice as far from 1 as nu is two deviations out
 LOGGER = logging.getLogger("opt3dgs_optim")
-CONSTANT = 1e-9  # smallest deviation of an energy that varies, as a share of its size
-TINY = 1e-100  # smallest deviation of an energy around zero that varies
 TOP_SHARE = 0.5  # of Theta, in the open partition above the range: the loss may yet fall into it
 
 
@@ -85,9 +83,8 @@ class EnergyHistogram(Part):
         fewest = 24 if automatic else 3  # at most half a deviation wide
         wanted = (48 if automatic else 200) if num_partitions is None else num_partitions
         self.num_partitions = check_count(CALL, "num_partitions", wanted, fewest)
-        self.zeta = check_number(
-            CALL, "zeta", zeta, 0.0, 1.0, open_low=automatic, open_high=automatic
-        )
+        ends = {"open_low": automatic, "open_high": automatic}
+        self.zeta = check_number(CALL, "zeta", zeta, 0.0, 1.0, **ends)
         self.warmup = check_count(CALL, "warmup", warmup, 4 if automatic else 0)
         if clamp == "auto":
             clamp = CLAMP if automatic else PAPER_CLAMP
@@ -109,27 +106,18 @@ class EnergyHistogram(Part):
 
         The temperature (2e-3), the clamp (-5 to 5) and lambda's schedule are not in the paper.
         """
-        settings: dict[str, Any] = {
-            "energy_range": PAPER_RANGE,
-            "temperature": PAPER_TEMPERATURE,
-            "warmup": 2500,
-            **overrides,
-        }
-        return cls(**settings)
+        return cls(**(PAPER | overrides))
 
     def _allocate(self, device: torch.device) -> None:
-        self._device = device
+        self._device, self._on_host = device, device.type == "cpu"
         self._law.allocate(device)
         self.num_observed = 0  # calls of observe(): says whether anybody calls
         self._taken = 0  # of them, those that count: on a GPU all, on a CPU the finite ones
         self.last_finite: Tensor | bool = True  # whether the last energy was
         # Powers 0, 1 and 2 of nu, summed over the energies after the warm-up; on a CPU as numbers.
-        self._sums = torch.zeros(3, dtype=self._law.nu.dtype, device=device)
-        self._host_sums = [0.0, 0.0, 0.0]
+        self._sums: Any = [0.0] * 3 if self._on_host else self._law.nu.new_zeros(3)
         self._factor: float | Tensor = 1.0
         self._constancy = Constancy()
-
-    # -- one energy ----------------------------------------------------------------------------
 
     @torch.no_grad()
     def observe(  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -155,60 +143,45 @@ class EnergyHistogram(Part):
         value = self._on_device(energy)
         if valid is None:
             valid = torch.isfinite(value)
-        on_host = value.device.type == "cpu"
-        if on_host:
+        if self._on_host:
             valid = bool(valid)
         self.num_observed += 1
         self.last_finite = valid
         if valid is not False:
-            self._take(value, valid, on_host)
+            self._take(value, valid)
         return self.multiplier if course is not None else self.multiplier.clone()
 
-    def _take(self, value: Tensor, valid: Tensor | Literal[True], on_host: bool) -> None:
+    def _take(self, value: Tensor, valid: Tensor | Literal[True]) -> None:
         law = self._law
         self._taken += 1
         warm = self._taken > self.warmup
-        law.take(value, valid, self._taken, self._sums if warm and not on_host else None)
+        law.take(value, valid, self._taken, self._sums if warm and not self._on_host else None)
         if not warm:
             law.nu.fill_(1.0)
-        if on_host:
-            self._factor = nu = law.nu.item()
-            if warm:
-                powers = (1.0, nu, nu * nu)
-                self._host_sums = [a + b for a, b in zip(self._host_sums, powers, strict=True)]
-            elif self._taken == self.warmup and isinstance(law, MovingPartitions):
-                self._say_if_constant()
-        else:
-            self._factor = law.nu
+        self._factor = nu = law.nu.item() if self._on_host else law.nu
+        if self._on_host and warm:
+            self._sums = [a + b for a, b in zip(self._sums, (1.0, nu, nu * nu), strict=True)]
+        elif self._on_host and self._taken == self.warmup and law.is_constant():
+            LOGGER.warning(
+                "%s: the first %d energies are all %g, so nu is 1 until they vary; is it the "
+                "loss that is observed?", CALL, self._taken, sum(self.calibrated_range) / 2
+            )  # fmt: skip
 
     def _on_device(self, energy: Tensor | float) -> Tensor:
         if not isinstance(energy, Tensor):
             energy = torch.tensor(float(energy), dtype=torch.float64)
         elif energy.numel() != 1:
-            raise ValueError(
-                f"{CALL}.observe: energy has shape {tuple(energy.shape)}, but one number is needed"
-            )
+            shape = tuple(energy.shape)
+            raise ValueError(f"{CALL}.observe: energy has shape {shape}, but one number is needed")
         if energy.device != self._device:  # e.g. resumed from a checkpoint
-            state = self.state_dict()
-            self._allocate(energy.device)
-            self._restore(state)
+            self._restore(energy.device, self.state_dict())
         if energy.dim():
             energy = energy.reshape(())
         return energy.detach() if energy.requires_grad else energy
 
-    def _say_if_constant(self) -> None:
-        low, high = self.calibrated_range
-        if high - low <= max(CONSTANT * REACH * abs(high + low), TINY):
-            LOGGER.warning(
-                "%s: the first %d energies are all %g, so nu is 1 until they vary; is it the "
-                "loss that is observed?", CALL, self._taken, (high + low) / 2
-            )  # fmt: skip
-
     def factor(self, group: Group, course: Course | None = None) -> float | Tensor | None:
         """Nu, a number where the energies live on a CPU."""
         return self._factor if self.num_observed else None
-
-    # -- reading -------------------------------------------------------------------------------
 
     @property
     def multiplier(self) -> Tensor:
@@ -221,16 +194,11 @@ class EnergyHistogram(Part):
         return self._law.weights.clone()
 
     def _moments(self) -> Tensor:
-        if self._device.type == "cpu":
-            return torch.tensor(self._host_sums, dtype=torch.float64)
-        return self._sums
+        return torch.as_tensor(self._sums, dtype=self._law.nu.dtype)
 
     @property
     def mean_multiplier(self) -> Tensor:
-        """Mean of nu over all energies after the warm-up (1 before it), 0-d.
-
-        It is what an honest control uses: a constant multiplier of this size.
-        """
+        """Mean of nu over all energies after the warm-up (1 before it), 0-d: an honest control."""
         count, total, _ = self._moments()
         return torch.where(count > 0, total / count, 1.0)
 
@@ -254,18 +222,11 @@ class EnergyHistogram(Part):
         """`nu`, after the warm-up; and the energy's recent mean and deviation, where they count."""
         if self._taken <= self.warmup:
             return {}
-        columns: dict[str, float | Tensor] = {"nu": self._law.nu.clone()}
-        if isinstance(self._law, MovingPartitions):
-            mean, deviation = self._law.recent()
-            columns |= {"energy_mean": mean, "energy_deviation": deviation}
-        return columns
-
-    # -- leaving it out ------------------------------------------------------------------------
+        return {"nu": self._law.nu.clone(), **self._law.numbers()}
 
     def evidence(self, course: Course) -> Tensor | None:
         """[4]: sums of nu's powers 0, 1 and 2; Theta's share in the open partition at the top."""
-        moments = self._moments()
-        return torch.cat([moments, self._law.weights[-1:].to(moments.dtype)])
+        return torch.cat([self._moments(), self._law.weights[-1:].to(self._law.nu.dtype)])
 
     def useless(self, evidence: list[float], course: Course) -> str | None:
         """Where nu has been nearly constant for 300 energies, or for a thirtieth of the run."""
@@ -275,8 +236,6 @@ class EnergyHistogram(Part):
     def instead(self) -> Part | None:
         """A constant of nu's mean, unless that is 1."""
         return self._constancy.constant
-
-    # -- state ---------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
         """All that `observe` has learnt, as plain numbers and lists. Synchronises."""
@@ -301,45 +260,38 @@ class EnergyHistogram(Part):
             saved = state[name]
             rows, length = (saved, len(own)) if isinstance(own, list) else ([saved], 1)
             plain = isinstance(rows, list) and all(isinstance(v, (int, float)) for v in rows)
-            known = plain and (len(rows) == length or (name == "constant" and len(rows) <= 1))
-            if not known or not all(map(math.isfinite, rows)):
-                raise ValueError(
-                    f"{call}: {name}={saved!r}, but a histogram with num_partitions="
-                    f"{self.num_partitions} has {length} finite numbers there"
-                )
+            fits = plain and (len(rows) == length or (name == "constant" and len(rows) <= 1))
+            if not fits or not all(map(math.isfinite, rows)):
+                needed = f"num_partitions={self.num_partitions} has {length} finite numbers there"
+                raise ValueError(f"{call}: {name}={saved!r}, but a histogram with {needed}")
         self._law.check(call, state)
-        self._allocate(self._device)
-        self._restore(state)
+        self._restore(self._device, state)
 
-    def _restore(self, state: Mapping[str, Any]) -> None:
+    def _restore(self, device: torch.device, state: Mapping[str, Any]) -> None:
+        self._allocate(device)
         self._law.load(state)
-        if self._device.type == "cpu":
-            self._host_sums = list(state["sums"])
-        else:
-            self._sums.copy_(torch.tensor(state["sums"], dtype=self._sums.dtype))
+        self._sums[:] = state["sums"] if self._on_host else torch.tensor(state["sums"])
         self._constancy.load("nu", state["constant"])
         self.num_observed, self._taken = int(state["num_observed"]), int(state["num_taken"])
-        self._factor = self._law.nu.item() if self._device.type == "cpu" else self._law.nu
+        self._factor = self._law.nu.item() if self._on_host else self._law.nu
 
     def __repr__(self) -> str:
-        where = f"energy_range={self.energy_range!r}, temperature={self.temperature!r}, "
-        if self.energy_range == "auto":
-            where = ""
-        line = f"{CALL}({where}zeta={self.zeta:g}, clamp={self.clamp}): "
+        line = f"{CALL}("
+        if self.energy_range != "auto":
+            line += f"energy_range={self.energy_range!r}, temperature={self.temperature!r}, "
+        line += f"zeta={self.zeta:g}, clamp={self.clamp}): nu "
         if self._taken == 0:
-            return f"{line}nu 1, no energy observed yet"
+            return f"{line}1, no energy observed yet"
         if self._taken <= self.warmup:
-            return f"{line}nu 1, warm-up: {self._taken} of {self.warmup} energies"
+            return f"{line}1, warm-up: {self._taken} of {self.warmup} energies"
         mean, deviation = float(self.mean_multiplier), float(self.multiplier_std)
-        return f"{line}nu {float(self.multiplier):.4g}, mean {mean:.4g} +- {deviation:.2g}"
+        return f"{line}{float(self.multiplier):.4g}, mean {mean:.4g} +- {deviation:.2g}"
 
 
 def _are_automatic(energy_range: Any, temperature: Any) -> bool:
     """Whether both are; ValueError if only one of the two is."""
     words = [each for each in (energy_range, temperature) if isinstance(each, str)]
     if any(word != "auto" for word in words) or len(words) == 1:
-        raise ValueError(
-            f"{CALL}: energy_range={energy_range!r} and temperature={temperature!r}, but either "
-            "both are 'auto', or both are numbers"
-        )
+        given = f"energy_range={energy_range!r} and temperature={temperature!r}"
+        raise ValueError(f"{CALL}: {given}, but either both are 'auto', or both are numbers")
     return bool(words)
