@@ -44,7 +44,7 @@ def backend_info(
 
     The two give the same numbers, up to rounding. The kernels are for points of three coordinates;
     parameters of another shape are stepped by pure torch. A kernel that fails to compile or to
-    launch raises: nothing is replaced after an error.
+    launch raises: nothing is replaced after an error. The histogram's is always "auto".
 
     Raises:
         ValueError: `backend` is none of these.

@@ -210,3 +210,25 @@ def test_phase_scheduler_steps_without_synchronisation() -> None:
         finally:
             torch.cuda.set_sync_debug_mode("default")
     assert all(bool(torch.isfinite(p).all()) for p in splats.values())
+
+
+def test_the_histogram_has_the_cpus_numbers_without_synchronisation() -> None:
+    g = torch.Generator().manual_seed(0)
+    values = (0.1 + 0.01 * torch.randn(600, generator=g)).tolist()
+    values[300] = float("nan")
+    here, there = EnergyHistogram(), EnergyHistogram()
+    there.observe(torch.tensor(values[0], device="cuda"))  # compiles
+    energies = torch.tensor(values, device="cuda").unbind()
+    here.observe(values[0])
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for energy in energies[1:]:
+            there.observe(energy)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    for value in values[1:]:
+        here.observe(value)
+    # float32 over 600 updates that forget
+    assert float(there.multiplier) == pytest.approx(float(here.multiplier), abs=1e-3)
+    assert float(there.mean_multiplier) == pytest.approx(float(here.mean_multiplier), abs=1e-3)
+    assert float(there.multiplier_std) == pytest.approx(float(here.multiplier_std), abs=1e-3)
