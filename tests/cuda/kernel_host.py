@@ -8,12 +8,14 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -93,14 +95,11 @@ class HostKernels:
     def load(cls, path: Path, dtype: torch.dtype) -> HostKernels:
         return cls(ctypes.CDLL(str(path)), dtype)
 
-    def _call(
-        self, name: str, tensors: Sequence[Tensor | None], rows: int, *scalars: object
-    ) -> None:
+    def _call(self, name: str, tensors: list[Tensor], rows: int, *scalars: object) -> None:
         real = ctypes.c_double if self.dtype == torch.float64 else ctypes.c_float
         values = [real(v) if isinstance(v, float) else v for v in scalars]
-        pointers = [ctypes.c_void_p(None if t is None else t.data_ptr()) for t in tensors]
-        first = name in ("run_lqn", "run_take_energy")
-        values.insert(0 if first else len(values), ctypes.c_longlong(rows))
+        pointers = [ctypes.c_void_p(t.data_ptr()) for t in tensors]
+        values.insert(0 if name == "run_lqn" else len(values), ctypes.c_longlong(rows))
         getattr(self.library, name)(ctypes.c_uint(BLOCK), *pointers, *values)
 
     def lqn(
@@ -150,21 +149,21 @@ class HostKernels:
             check_guard(tensor, n)
         return tensors[0][:n]
 
-    def take_energy(
-        self,
-        energy: Tensor,
-        valid: Tensor | bool,
-        state: Tensor,
-        nu: Tensor,
-        sums: Tensor | None,
-        *numbers: float,
-    ) -> None:
-        """As `cuda.take_energy`."""
-        cells, known = guarded(state), None if valid is True else torch.as_tensor(valid)
-        tensors = [energy.to(self.dtype), known, cells, nu, sums]
-        self._call("run_take_energy", tensors, len(state) - 3, *numbers)
-        check_guard(cells, len(state))
-        state.copy_(cells[: len(state)])
+    def launch(self, kernel: str, like: Tensor, threads: int, *arguments: Any) -> None:
+        """As `cuda.launch` of a kernel that takes no rows."""
+        assert (like.dtype, threads) == (self.dtype, 1)
+        types = {
+            np.float32: ctypes.c_float,
+            np.float64: ctypes.c_double,
+            np.int64: ctypes.c_longlong,
+        }
+        values = [
+            ctypes.c_void_p(a.data_ptr() if isinstance(a, Tensor) else None)
+            if isinstance(a, (Tensor, int))
+            else types[type(a)](a.item())
+            for a in arguments
+        ]
+        getattr(self.library, f"run_{kernel}")(ctypes.c_uint(BLOCK), *values)
 
 
 def guarded(tensor: Tensor) -> Tensor:
@@ -337,8 +336,10 @@ def take_all(
 
 def take_all_on_host(kernels: HostKernels, values: Tensor, before: Tensor | None = None) -> Tensor:
     """`take_all` with the kernel in the place of the torch operators."""
-    kernel = mock.patch.object(cuda, "take_energy", kernels.take_energy)
-    with kernel, mock.patch.object(partitions, "uses_kernel", return_value=True):
+    with (
+        mock.patch.object(cuda, "launch", kernels.launch),
+        mock.patch.object(partitions, "uses_kernel", return_value=True),
+    ):
         return take_all(values, kernels.dtype, before)
 
 
