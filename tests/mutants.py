@@ -1,7 +1,7 @@
 """Break the arithmetic on purpose, one place at a time, and see the tests notice.
 
     python tests/mutants.py                    # all of TARGETS; half an hour on one core
-    python tests/mutants.py --only energy.py   # one module; the others' last result is kept
+    python tests/mutants.py --only partitions.py  # one module; the others' last result is kept
     python tests/mutants.py --again            # the survivors of the last result, after new tests
     python tests/mutants.py --share 0.1        # a random tenth; writes nothing
 
@@ -39,26 +39,24 @@ from mutations import Mutant, mutants  # noqa: E402
 PACKAGE = ROOT / "src/opt3dgs_optim"
 EQUIVALENT = ROOT / "tests/mutants_equivalent.json"
 RESULT = ROOT / "docs/results/stability/mutants.json"
-ENERGY = ["test_energy_exact.py", "test_running.py", "test_energy.py", "test_options.py"]
+ENERGY = ["parts/test_histogram.py", "parts/test_histogram_extremes.py"]
 CURVATURE = [
     f"lbfgs/test_{name}.py" for name in ("history", "two_loop", "lqn_direction", "foresight")
 ]
 # Of these tests: those that compile C++, a law that the loop oracle sees sooner, other classes.
 LEFT_OUT = "not sanitizers and not mutants and not kernel and not compiles and not power_four"
 LEFT_OUT += (
-    " and not (test_options and not EnergyHistogram and not IsotropicNoise and not CovarianceNoise)"
+    " and not (test_options and not EnergyHistogram and not IsotropicNoise and not PositionNoise)"
 )
 # Module: the tests that are meant to notice. What energy, curvature and noise are made of included.
 TARGETS = {
-    "energy.py": ENERGY,
-    "_running.py": ENERGY,
+    "partitions.py": ENERGY,
+    "parts/histogram.py": ENERGY,
     "lbfgs/two_loop.py": CURVATURE,
     "lbfgs/pairs.py": CURVATURE,
     "lbfgs/history.py": CURVATURE,
-    "lbfgs/columns.py": CURVATURE,
-    "lbfgs/lqn_direction.py": CURVATURE,
     "lbfgs/foresight.py": CURVATURE,
-    "noise.py": ["test_noise.py", "test_options.py"],
+    "parts/noise.py": ["parts/test_noise.py", "test_options.py"],
     "covariance.py": ["test_covariance.py"],
 }
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import io
 from typing import Any
 
@@ -18,9 +17,9 @@ from trainers import (
 )
 
 from opt3dgs_optim import EnergyHistogram, PhaseScheduler
+from opt3dgs_optim.hosts.gsplat_scene import follow_scene
 
 TOTAL, SWITCH, POINTS = 60, 30, 40
-OFF = {"multiplier": None, "curvature": None, "squared_loss": False, "reset_moments": False}
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 
@@ -49,9 +48,8 @@ def start(seed: int = 0) -> Any:
     return splats
 
 
-def phased(**options: Any) -> PhaseScheduler:
-    options = {"multiplier": EnergyHistogram(warmup=8, step_size=0.1), **options}
-    return everything(TOTAL, SWITCH, **options)
+def phased() -> PhaseScheduler:
+    return everything(TOTAL, SWITCH, nu=EnergyHistogram(warmup=8))
 
 
 def build(version: str, kind: str, order: str, phases: PhaseScheduler | None) -> Trainer:
@@ -59,7 +57,7 @@ def build(version: str, kind: str, order: str, phases: PhaseScheduler | None) ->
     splats = start()
     optimizers: Any = gsplat_optimizers(dict(splats))
     if phases is not None:
-        optimizers = phases.upgrade(optimizers, strategy=strategy)
+        optimizers = phases.upgrade(optimizers)
     return Trainer(splats, optimizers, strategy, total=TOTAL, phases=phases, order=order)
 
 
@@ -67,7 +65,7 @@ def build(version: str, kind: str, order: str, phases: PhaseScheduler | None) ->
 @pytest.mark.parametrize("kind", ["mcmc", "default"])
 @pytest.mark.parametrize("order", ORDERS)
 def test_off_is_bit_identical_to_the_trainer_with_adam(version: str, kind: str, order: str) -> None:
-    ours = build(version, kind, order, phased(**OFF))
+    ours = build(version, kind, order, PhaseScheduler(TOTAL, SWITCH, []))
     theirs = build(version, kind, order, None)
     ours.run(0, TOTAL)
     theirs.run(0, TOTAL)
@@ -100,8 +98,9 @@ def test_a_whole_run_with_the_switch_in_the_middle(version: str, kind: str, orde
     assert len(sizes) > 3
     assert all(bool(torch.isfinite(p).all()) for p in trainer.splats.values())
     assert held
-    assert isinstance(phases.multiplier, EnergyHistogram)
-    assert phases.multiplier.num_observed == SWITCH
+    histogram = phases.part(EnergyHistogram)
+    assert histogram is not None
+    assert histogram.num_observed == SWITCH
 
 
 @pytest.mark.parametrize("kind", ["mcmc", "default"])
@@ -197,9 +196,9 @@ def test_scene_of_main_keeps_the_pairs_of_unmoved_points(kind: str) -> None:
         strategy = make_strategy(package, kind)
         splats = start()
         scene = scene_of_main(splats)
-        optimizers = phases.upgrade(gsplat_optimizers(dict(scene.splats)), strategy=strategy)
+        optimizers = phases.upgrade(gsplat_optimizers(dict(scene.splats)))
         if follows:
-            phases.follow_scene(scene)
+            follow_scene(scene, optimizers)
         trainer = Trainer(
             scene.splats, optimizers, strategy, total=TOTAL, phases=phases, scene=scene
         )
@@ -211,36 +210,3 @@ def test_scene_of_main_keeps_the_pairs_of_unmoved_points(kind: str) -> None:
         trainer.run(43, TOTAL)
         assert all(bool(torch.isfinite(p).all()) for p in trainer.splats.values())
     assert kept[1] > kept[0]
-
-
-def test_selective_adam_of_gsplat_is_upgraded() -> None:
-    strategies("1.5.3")
-    SelectiveAdam: Any = importlib.import_module("gsplat.optimizers").SelectiveAdam
-
-    splats = start()
-    optimizers: Any = {
-        name: SelectiveAdam([{"params": p, "lr": RATES[name], "name": name}], 1e-15, (0.9, 0.999))
-        for name, p in splats.items()
-    }
-    phases = phased()
-    upgraded: Any = phases.upgrade(optimizers)
-    mask = torch.arange(POINTS) % 2 == 0
-    before = {name: p.detach().clone() for name, p in splats.items()}
-    for _ in range(TOTAL):
-        for p in splats.values():
-            p.grad = p.detach().clone()
-        phases.observe(0.1)
-        for optimizer in upgraded.values():
-            optimizer.step(mask)
-    for name, p in splats.items():
-        assert torch.equal(p[~mask], before[name][~mask])
-        assert not torch.equal(p[mask], before[name][mask])
-
-
-def test_noise_of_the_strategy_and_ours_is_refused() -> None:
-    strategy = make_strategy(strategies("1.5.3"), "mcmc")
-    splats = start()
-    with pytest.raises(ValueError, match="noise twice"):
-        phased(noise_scale=5e5).upgrade(gsplat_optimizers(dict(splats)), splats, strategy)
-    strategy.noise_lr = 0.0
-    phased(noise_scale=5e5).upgrade(gsplat_optimizers(dict(splats)), splats, strategy)

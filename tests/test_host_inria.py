@@ -15,10 +15,16 @@ from trainers import (
     make_splats,
 )
 
-from opt3dgs_optim import EnergyHistogram, PhaseScheduler
+from opt3dgs_optim import (
+    ConstantMultiplier,
+    Curvature,
+    EnergyHistogram,
+    Part,
+    PhaseScheduler,
+    reset_points,
+)
 
 TOTAL, SWITCH, POINTS = 60, 30, 40
-OFF = {"multiplier": None, "curvature": None, "squared_loss": False, "reset_moments": False}
 MODELS = ["simulated", "3dgs-mcmc"]
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*non-writable:UserWarning")
@@ -33,13 +39,11 @@ def make_model(kind: str) -> Any:
     return model
 
 
-def phased(**options: Any) -> PhaseScheduler:
-    options = {"multiplier": EnergyHistogram(warmup=8, step_size=0.1), **options}
-    return everything(TOTAL, SWITCH, **options)
-
-
-def upgrade(model: Any, **options: Any) -> PhaseScheduler:
-    phases = phased(**options)
+def upgrade(model: Any, parts: list[Part] | None = None) -> PhaseScheduler:
+    if parts is None:
+        phases = everything(TOTAL, SWITCH, nu=EnergyHistogram(warmup=8))
+    else:
+        phases = PhaseScheduler(TOTAL, SWITCH, parts)
     model.optimizer = phases.upgrade(model.optimizer)
     return phases
 
@@ -86,7 +90,7 @@ def same(a: Any, b: Any) -> bool:
 @pytest.mark.parametrize("kind", MODELS)
 def test_off_is_bit_identical_to_the_trainer_with_adam(kind: str) -> None:
     ours, theirs = make_model(kind), make_model(kind)
-    phases = upgrade(ours, **OFF)
+    phases = upgrade(ours, [])
     run(ours, phases, 0, TOTAL)
     run(theirs, None, 0, TOTAL)
     assert len(ours._xyz) > POINTS
@@ -187,11 +191,11 @@ def test_exposures_and_poses_ride_along(when: str) -> None:
     model, plain = make_model("simulated"), []
     extra = {"exposure": Parameter(torch.eye(3, 4)[None]), "pose": Parameter(torch.ones(5))}
     twins = {name: Parameter(p.detach().clone()) for name, p in extra.items()}
-    phases = upgrade(model, multiplier=3.0, reset_moments=False) if when == "after" else None
+    phases = upgrade(model, [ConstantMultiplier(3.0), Curvature()]) if when == "after" else None
     for name, p in extra.items():
         model.optimizer.add_param_group({"params": [p], "lr": 0.01, "name": name})
         plain.append(torch.optim.Adam([twins[name]], lr=0.01, eps=1e-15))
-    phases = phases or upgrade(model, multiplier=3.0, reset_moments=False)
+    phases = phases or upgrade(model, [ConstantMultiplier(3.0), Curvature()])
     for iteration in range(TOTAL):
         for p in (*extra.values(), *twins.values()):
             p.grad = torch.full_like(p, 0.1 * iteration)
@@ -235,7 +239,7 @@ def test_reset_points_after_an_edit_that_left_the_pairs_behind(grown: int) -> No
     assert bool(model.optimizer.state[model._xyz]["history"].any())
     model.prune_points(torch.arange(POINTS) < 2)
     model.append(torch.arange(2 + grown))
-    phases.reset_points(torch.arange(POINTS + grown) >= POINTS - 2)
+    reset_points(model.optimizer, torch.arange(POINTS + grown) >= POINTS - 2)
     assert "history" not in model.optimizer.state[model._xyz]
     run(model, phases, SWITCH + 8, SWITCH + 10, edits=False)
 
@@ -247,7 +251,7 @@ def test_reset_points_after_a_relocation_keeps_the_other_pairs() -> None:
     held = model.optimizer.state[model._xyz]["history"].clone()
     dead = torch.arange(POINTS) == 4
     model.relocate_gs(dead)
-    phases.reset_points(dead)
+    reset_points(model.optimizer, dead)
     history = model.optimizer.state[model._xyz]["history"]
     assert not bool(history[4].any())
     assert torch.equal(history[~dead], held[~dead])

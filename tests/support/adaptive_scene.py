@@ -20,10 +20,10 @@ CHECK, PROBE = 20, 3  # shortened: the same decisions after a fifth of the itera
 
 def shorten(monkeypatch: Any) -> None:
     """Look at the evidence more often."""
-    from opt3dgs_optim import phases
+    from opt3dgs_optim import course
     from opt3dgs_optim.parts import curvature
 
-    monkeypatch.setattr(phases, "CHECK_STEPS", CHECK)
+    monkeypatch.setattr(course, "CHECK_STEPS", CHECK)
     monkeypatch.setattr(curvature, "PROBE_STEPS", PROBE)
 
 

@@ -127,7 +127,7 @@ def mutants_block(result: dict[str, Any]) -> str:
             f"`{name}` {one['function'].rpartition('.')[2]}",
             _code(one["before"]),
             _code(one["after"]),
-            why.get((name, *survivor_key(one)), "a gap"),
+            one.get("why") or why.get((name, *survivor_key(one)), "a gap"),
         )
         for name, entry in modules.items()
         for one in entry["survivors"]

@@ -135,7 +135,7 @@ def test_bad_sources_and_options(tmp_path):
     (tmp_path / "sparse").mkdir()
     with pytest.raises(FileNotFoundError, match="expected cameras, images and points3D"):
         load_scene(tmp_path)
-    with pytest.raises(ValueError, match=r"size='big', allowed are \('small', 'large'\)"):
+    with pytest.raises(ValueError, match=r"size='big', allowed are \('images', 'images_2',"):
         load_scene(tmp_path, "big")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="layout='nerf', allowed are"):
         load_scene(tmp_path, layout="nerf")  # pyright: ignore[reportArgumentType]
