@@ -202,10 +202,10 @@ class StepAdam(Adam):
         fed, state = cast(Tensor, param.grad), self.state[param]
         if not state:  # torch makes its moments only where there is nothing else yet
             self._init_group({**group, "params": [param]}, [], [], [], [], [], [])
+        self._ledger.drop_strangers(param, state, self.course.keys)
         if moving is not None:
             lent.frozen.append(Frozen(moving, param, state))
             fed = torch.where(shaped(moving, fed), fed, 0.0)
-        self._ledger.drop_strangers(param, state, self.course.keys)
         if parts:
             scale = getattr(self, "grad_scale", None)
             fed = feed(parts, group, param, fed, state, self.course, scale)
