@@ -26,35 +26,6 @@ def gaussians(n: int, seed: int = 0) -> dict[str, torch.Tensor]:
     return draw
 
 
-def test_is_gate_times_covariance_times_eta() -> None:
-    g = gaussians(40)
-    eta = torch.randn(40, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
-    noise = covariance_noise(g["scales"], g["quats"], g["opacities"], eta).numpy()
-    for i in range(40):
-        opacity = 1 / (1 + np.exp(-g["opacities"][i].item()))
-        gate = 1 / (1 + np.exp(100 * (opacity - 0.005)))
-        sigma = covariance(g["scales"][i].numpy(), g["quats"][i].numpy())
-        np.testing.assert_allclose(noise[i], gate * sigma @ eta[i].numpy(), rtol=1e-9, atol=1e-13)
-
-
-def test_gate_is_the_trainers_op_sigmoid() -> None:
-    """op_sigmoid(1 - o, k=100, x0=0.995) of 3dgs-mcmc."""
-    opacity = torch.tensor([0.0005, 0.005, 0.05, 0.9], dtype=torch.float64)
-    ones = torch.ones(4, 3, dtype=torch.float64)
-    quats = torch.tensor([[1.0, 0, 0, 0]] * 4, dtype=torch.float64)
-    noise = covariance_noise(0 * ones, quats, opacity.logit(), ones)[:, 0]
-    expected = 1 / (1 + torch.exp(-100 * ((1 - opacity) - 0.995)))
-    torch.testing.assert_close(noise, expected, rtol=1e-9, atol=1e-15)
-
-
-def test_nerfstudio_opacities_have_a_second_dimension() -> None:
-    g = gaussians(5)
-    eta = torch.ones(5, 3, dtype=torch.float64)
-    flat = covariance_noise(g["scales"], g["quats"], g["opacities"], eta)
-    column = covariance_noise(g["scales"], g["quats"], g["opacities"].unsqueeze(1), eta)
-    assert torch.equal(flat, column)
-
-
 def test_added_noise_has_the_covariance_squared() -> None:
     """Cov(gate Sigma eta) = gate^2 Sigma^2, times (lr scale)^2."""
     n = 40_000
@@ -108,21 +79,6 @@ def test_the_constants_are_the_trainers() -> None:
     """noise_lr, k and 1 - x0 of 3dgs-mcmc."""
     assert PositionNoise({}).scale == 5e5
     assert (GATE_SHARPNESS, GATE_OPACITY) == (100.0, 0.005)
-
-
-def test_quaternions_of_any_length_and_of_none() -> None:
-    """As torch.nn.functional.normalize: below 1e-12 there is no direction, and no NaN."""
-    g = gaussians(5)
-    eta = torch.ones(5, 3, dtype=torch.float64)
-    sizes = torch.tensor([1e-6, 0.1, 1.0, 1e6, 1.0], dtype=torch.float64)[:, None]
-    unit = torch.nn.functional.normalize(g["quats"])
-    found = covariance_noise(g["scales"], unit * sizes, g["opacities"], eta)
-    expected = covariance_noise(g["scales"], unit, g["opacities"], eta)
-    torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)
-    none = covariance_noise(g["scales"], 0 * unit, g["opacities"], eta)
-    # R = 1 where there is no quaternion: the variances along the axes
-    upright = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(5, 4)
-    assert torch.equal(none, covariance_noise(g["scales"], upright, g["opacities"], eta))
 
 
 @pytest.mark.parametrize(
