@@ -81,8 +81,8 @@ def test_added_noise_is_scale_times_learning_rate_times_the_draw(lr: float | tor
     g = gaussians(7)
     start, eta = torch.randn(2, 7, 3, generator=torch.Generator().manual_seed(1)).double()
     means = start.clone()
-    add_covariance_noise(means, *tensors_of(g), eta, lr, noise_scale=0.25)
-    drawn = covariance_noise(*tensors_of(g), eta)
+    add_covariance_noise(means, *tensors_of(g), eta=eta, lr=lr, noise_scale=0.25)
+    drawn = covariance_noise(*tensors_of(g), eta=eta)
     torch.testing.assert_close(means, start + 0.25 * lr * drawn, rtol=1e-12, atol=1e-15)
 
 
@@ -90,11 +90,11 @@ def test_chunks_of_rows_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     g, eta = gaussians(40), torch.ones(40, 3, dtype=torch.float64)
     whole = torch.zeros(40, 3, dtype=torch.float64)
     parts = whole.clone()
-    add_covariance_noise(whole, *tensors_of(g), eta, 0.5, noise_scale=2.0)
+    add_covariance_noise(whole, *tensors_of(g), eta=eta, lr=0.5, noise_scale=2.0)
     monkeypatch.setattr(pairs, "CHUNK", 8)
-    add_covariance_noise(parts, *tensors_of(g), eta, 0.5, noise_scale=2.0)
+    add_covariance_noise(parts, *tensors_of(g), eta=eta, lr=0.5, noise_scale=2.0)
     assert torch.equal(parts, whole)
-    assert torch.equal(covariance_noise(*tensors_of(g), eta), whole)
+    assert torch.equal(covariance_noise(*tensors_of(g), eta=eta), whole)
 
 
 def test_largest_noise_is_that_of_the_longest_axis() -> None:
@@ -109,7 +109,7 @@ def test_cuda_on_a_cpu_is_an_error() -> None:
     means = torch.zeros(4, 3, dtype=torch.float64)
     with pytest.raises(RuntimeError, match="backend='cuda' was asked for on cpu"):
         add_covariance_noise(
-            means, *tensors_of(gaussians(4)), means + 1, 1.0, noise_scale=1.0, backend="cuda"
+            means, *tensors_of(gaussians(4)), eta=means + 1, lr=1.0, noise_scale=1.0, backend="cuda"
         )
 
 
@@ -124,12 +124,12 @@ def test_the_kernel_gets_what_it_can_read(
     tensors = {**gaussians(4), "eta": means + 1}
     tensors["opacities"] = tensors["opacities"].unsqueeze(1)
     if spoiled is None:
-        add_covariance_noise(means, *tensors_of(tensors), 0.5, noise_scale=2.0)
+        add_covariance_noise(means, *tensors_of(tensors), lr=0.5, noise_scale=2.0)
         assert called[0][-4:] == (0.5, 2.0, 100.0, 0.005)
         return
     for wrong in (tensors[spoiled][:3], tensors[spoiled].float()):
         with pytest.raises(ValueError, match=f"add_covariance_noise: {spoiled} is"):
             add_covariance_noise(
-                means, *tensors_of({**tensors, spoiled: wrong}), 0.5, noise_scale=2.0
+                means, *tensors_of({**tensors, spoiled: wrong}), lr=0.5, noise_scale=2.0
             )
     assert not called

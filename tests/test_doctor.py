@@ -65,7 +65,7 @@ def no_warm_up(self: Any, *args: Any, **options: Any) -> None:
 RECURSION = LBFGS.recursion
 STEP = AWSGLD.step
 WEIGHTS = EnergyHistogram.weights
-NOISE = doctor_checks.covariance_noise
+NOISE = doctor_checks.covariance_noise  # pyright: ignore[reportPrivateImportUsage]
 INIT = EnergyHistogram.__init__
 
 

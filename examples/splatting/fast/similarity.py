@@ -4,7 +4,8 @@ The twin of `metrics.ssim` for training: one pass over the rows takes the five l
 the similarity, a second one the gradient, so that no image-sized moment is ever stored.
 """
 
-# pyright: reportCallIssue=false  (numba passes intrinsics their typing context itself)
+# numba passes intrinsics their typing context itself
+# pyright: reportCallIssue=false
 from __future__ import annotations
 
 from typing import Any

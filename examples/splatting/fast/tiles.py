@@ -11,7 +11,8 @@ cancels. Its logarithm of base 2 with the opacity is lo - C dy^2 - v^2, where v 
 row. What depends on the row is computed in float64, what depends on the pixel in float32.
 """
 
-# pyright: reportCallIssue=false  (numba passes intrinsics their typing context itself)
+# numba passes intrinsics their typing context itself
+# pyright: reportCallIssue=false
 from __future__ import annotations
 
 import math
