@@ -12,7 +12,10 @@ import pytest
 from mutants import EQUIVALENT, PACKAGE, TARGETS, reasons
 from mutations import mutants
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the runner forks")
+pytestmark = [
+    pytest.mark.skipif(sys.platform == "win32", reason="the runner forks"),
+    pytest.mark.processes,
+]
 TESTS = Path(__file__).parent
 
 SOURCE = '''

@@ -51,9 +51,12 @@ assert not {{"matplotlib", "numba", "tqdm", "gsplat"}} & (set(sys.modules) - bef
 print(backend_info("cpu"))
 """
 
-pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("hatchling") is None, reason="hatchling is not installed"
-)
+pytestmark = [
+    pytest.mark.skipif(
+        importlib.util.find_spec("hatchling") is None, reason="hatchling is not installed"
+    ),
+    pytest.mark.processes,
+]
 
 
 def build(root: Path, kind: str, folder: Path) -> Path:

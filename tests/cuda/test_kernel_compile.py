@@ -15,6 +15,8 @@ import torch
 
 from opt3dgs_optim import cuda
 
+pytestmark = pytest.mark.compiles
+
 ARCHITECTURES = ("75", "80", "86", "89", "90", "100", "120")
 MAX_REGISTERS = 96
 # The short history in registers at both ends of its range, the long one that is read twice.

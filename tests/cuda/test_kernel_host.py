@@ -32,7 +32,10 @@ from opt3dgs_optim import cuda
 from opt3dgs_optim.lbfgs import lqn_direction, new_history, two_loop
 from opt3dgs_optim.partitions import LIMIT, MEAN_ABS, MEMORY, MovingPartitions
 
-pytestmark = pytest.mark.skipif(compiler() is None, reason="g++ is not installed")
+pytestmark = [
+    pytest.mark.skipif(compiler() is None, reason="g++ is not installed"),
+    pytest.mark.compiles,
+]
 
 SIZES = (1, 3, 5, 8, 16)
 ROWS = (0, 1, 255, 256, 257, 1000, 4096)

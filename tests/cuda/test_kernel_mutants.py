@@ -8,7 +8,10 @@ import pytest
 from kernel_host import compiler
 from kernel_mutants import MUTANTS, Mutant, complaint, mutated
 
-pytestmark = pytest.mark.skipif(compiler() is None, reason="g++ is not installed")
+pytestmark = [
+    pytest.mark.skipif(compiler() is None, reason="g++ is not installed"),
+    pytest.mark.compiles,
+]
 
 
 def test_unchanged_kernels_pass(tmp_path: Path) -> None:

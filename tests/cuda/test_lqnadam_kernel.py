@@ -15,6 +15,8 @@ from torch import Tensor
 
 from opt3dgs_optim import LQNAdam, cuda
 
+pytestmark = pytest.mark.compiles
+
 ROWS = 2_000
 CONDITIONS = (1.0, 1e3, 1e6, 1e12)
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="g++ is not installed")

@@ -20,6 +20,8 @@ from torch import Tensor
 from opt3dgs_optim.lbfgs import lqn_direction, new_history
 from opt3dgs_optim.lbfgs.history import header
 
+pytestmark = pytest.mark.compiles
+
 ROWS, SIZE = 2_000, 5
 CONDITIONS = (1.0, 1e3, 1e6, 1e12)
 GRADIENTS = (1e-44, 1e-38, 1e-30, 1e-10, 1.0, 1e10, 1e30, 3e37)

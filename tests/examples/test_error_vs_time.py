@@ -14,6 +14,8 @@ from PIL import Image
 
 from opt3dgs_optim.runs import read_run, stats
 
+pytestmark = pytest.mark.processes
+
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 TINY = ["--iterations", "40", "--points", "120", "--seeds", "1", "--switch", "0.75"]
 

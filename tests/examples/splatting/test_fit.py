@@ -108,6 +108,7 @@ def test_run_logs_what_the_report_needs(scene: Scene, tmp_path: Path) -> None:
     assert len(read_run(tmp_path / "log.jsonl").records) == len(log.records)  # not run again
 
 
+@pytest.mark.processes
 def test_ctrl_c_leaves_a_checkpoint_and_a_readable_log(tmp_path: Path) -> None:
     """A real signal to a real process; the second start ends like a run without it."""
     out = tmp_path / "cut"

@@ -27,6 +27,8 @@ from studies.landscapes.energies import (
 
 from opt3dgs_optim import AWSGLD, Course, EnergyHistogram, IsotropicNoise, Part
 
+pytestmark = pytest.mark.processes
+
 STEPS = 150
 DYNAMICS = {
     "plain": Dynamics("nine", 1e-3, partitions=100, energy_range=(-7.667, 17.333)),
