@@ -249,7 +249,7 @@ class PhaseScheduler(Course):
             self.observe(closure_value)
         self._stepped = True
         self._unheard += 1
-        if self._unheard > SILENCE * max(self._num_optimizers, 1) and not self._told:
+        if self._unheard > SILENCE * max(self._num_optimizers, 1) and self.parts and not self._told:
             self._told = True
             since = "" if self.num_observed else " at all"
             warn_user(
@@ -263,7 +263,7 @@ class PhaseScheduler(Course):
         self._silence = 0 if self._stepped else self._silence + 1
         steps, self._adam_steps = self._adam_steps, None
         patience = PAUSE if self.steps else SILENCE
-        if self._silence > patience and not self._told:
+        if self._silence > patience and self.parts and not self._told:
             self._told = True
             warn_user(
                 f"{CALL}: {patience} losses were observed and no upgraded optimizer has stepped: "
