@@ -166,8 +166,8 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
     text += [
         "",
         f"{len(trials['rows'])} of the {len(TRIALS)} trials in `examples/hosts/trials.py` have "
-        "been run for this table; the others are waiting for `--run`. gsplat's scripts evaluate a "
-        "checkpoint and do not go on from one.",
+        "been run for this table (`--run`). gsplat's scripts evaluate a checkpoint and do not go "
+        "on from one.",
         "",
         "## `hosts diff` over public trainers",
         "",

@@ -58,7 +58,7 @@ class Course:
     def _plan(self) -> None:
         """Which parts have which hooks in which phase; a hook that nobody has is never called."""
         acting = []
-        for name, part in zip(self.part_names(), self.parts, strict=True):
+        for name, part in self._named():
             standing = part.instead() if name in self.switched_off else part
             acting += [] if standing is None else [standing]
         self._acting: dict[Phase | None, list[Part]] = {None: acting}
@@ -171,8 +171,7 @@ class Course:
         Returns:
             (event, part's name, reason) of each change.
         """
-        named = zip(self.part_names(), self.parts, strict=True)
-        shown = [(name, part, part.evidence(self)) for name, part in named]
+        shown = [(name, part, part.evidence(self)) for name, part in self._named()]
         known = [(name, part, seen) for name, part, seen in shown if seen is not None]
         if not known:
             return []
@@ -205,11 +204,7 @@ class Course:
             "iteration": self.iteration,
             "num_observed": self.num_observed,
             "switched_off": dict(self.switched_off),
-            "parts": {
-                name: state
-                for name, part in zip(self.part_names(), self.parts, strict=True)
-                if (state := part.state_dict())
-            },
+            "parts": {name: state for name, part in self._named() if (state := part.state_dict())},
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import logging
 import math
+from collections.abc import Callable
 from typing import Any, TypedDict
 
 import torch
 from torch import Tensor
+from torch.optim import Adam
 
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Group, Part
@@ -151,3 +155,10 @@ def times(factor: float | Tensor | None, other: float | Tensor | None) -> float 
     if factor is None or other is None:
         return other if factor is None else factor
     return factor * other
+
+
+@functools.cache
+def own_step(base: type[Adam]) -> tuple[Callable[..., Any], bool]:
+    """The step of an Adam with arithmetic of its own; whether it is INRIA's `step(mask, N)`."""
+    step = inspect.unwrap(base.step)
+    return step, len(inspect.signature(step).parameters) > 2

@@ -294,7 +294,7 @@ class PhaseScheduler(Course):
         if self.switch_step >= self.total_steps:
             switch = "no switch"
         lines = [f"iteration {self.iteration} of {self.total_steps}, {self.phase.value}, {switch}"]
-        for name, part in zip(self.part_names(), self.parts, strict=True):
+        for name, part in self._named():
             off = self.switched_off.get(name)
             lines.append(str(part) + ("" if off is None else f": switched off, {off}"))
         return block(CALL, lines)

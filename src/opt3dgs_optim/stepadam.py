@@ -14,7 +14,7 @@ from torch.optim import Adam
 from opt3dgs_optim.checkpoint import STATE_KEY, check_rows, loading
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.describe import block, group_lines
-from opt3dgs_optim.lending import Lent, feed, guard, refuse_capture, times, use_fused
+from opt3dgs_optim.lending import Lent, feed, guard, own_step, refuse_capture, times, use_fused
 from opt3dgs_optim.names import SLOT, canonical_name
 from opt3dgs_optim.part import Group, Part
 from opt3dgs_optim.rows import (
@@ -186,13 +186,12 @@ class StepAdam(Adam):
         if self.base is Adam:
             ADAM_STEP(self)
             return
-        step = inspect.unwrap(self.base.step)
+        step, takes_number = own_step(self.base)
         if mask is None:
             step(self)
             return
         if isinstance(self.course.valid, Tensor):
             mask = mask & self.course.valid.to(mask.device)
-        takes_number = len(inspect.signature(step).parameters) > 2  # INRIA's: step(mask, N)
         step(self, mask, mask.numel()) if takes_number else step(self, mask)
 
     def _lend_gradient(
