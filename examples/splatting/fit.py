@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from opt3dgs_optim import EnergyHistogram, Phase, PhaseScheduler, PositionNoise
+from opt3dgs_optim import Phase, PhaseScheduler, PositionNoise
 from opt3dgs_optim.runs import RunLog
 from splatting.arms import NOISE_LR, Arm
 from splatting.density import MCMCDensityControl, regularisers
@@ -93,6 +93,7 @@ class Fit:
             self.noise = PositionNoise(self.gaussians, NOISE_LR)
         self.density = self._density_control() if arm.mcmc else None
         self.iteration = 0
+        self.relocated = 0  # Gaussians that density control has moved so far
         self.views: list[int] = []  # what is left of this epoch
 
     def _initial_gaussians(self) -> dict[str, Parameter]:
@@ -122,7 +123,8 @@ class Fit:
 
     def step(self) -> Tensor:
         """One iteration; returns the detached loss."""
-        view = self.scene.train[self._next_view()]
+        index = self._next_view()
+        view = self.scene.train[index]
         image = self._render(view).image
         pixel_loss = None if self.phases is None else self.phases.pixel_loss
         loss = photometric_loss(image, view.image, pixel_loss)
@@ -130,11 +132,15 @@ class Fit:
             loss = loss + self._regularisers()
         loss.backward()
         if self.phases is not None:
+            for part in self.phases.parts:
+                if hasattr(part, "view"):  # a study's own
+                    part.view = index  # pyright: ignore[reportAttributeAccessIssue]
             self.phases.observe(loss, iteration=self.iteration)
         self._step_optimizers()
         self._inject_noise()
         if self.density is not None:
-            self.density.step(self.iteration, self.gaussians, self.optimizers)
+            report = self.density.step(self.iteration, self.gaussians, self.optimizers)
+            self.relocated += report.relocated
         self.iteration += 1
         decay = LR_DECAY ** (self.iteration / self.options.iterations)
         self.optimizers["means"].param_groups[0]["lr"] = self.rates["means"] * decay
@@ -168,8 +174,9 @@ class Fit:
     @property
     def mean_nu(self) -> float | None:
         """Mean of nu since the warm-up, or None where nu is off."""
-        histogram = None if self.phases is None else self.phases.part(EnergyHistogram)
-        return None if histogram is None else float(histogram.mean_multiplier)
+        parts = [] if self.phases is None else self.phases.parts
+        means = [part.mean_multiplier for part in parts if hasattr(part, "mean_multiplier")]  # pyright: ignore
+        return float(means[0]) if means else None
 
     # -- looking at it -------------------------------------------------------------------------
 
@@ -216,6 +223,7 @@ class Fit:
             "scene": self.scene.name,
             "options": asdict(self.options),
             "iteration": self.iteration,
+            "relocated": self.relocated,
             "gaussians": {name: param.detach() for name, param in self.gaussians.items()},
             "optimizers": {name: opt.state_dict() for name, opt in self.optimizers.items()},
             "views": self.views,
@@ -252,6 +260,7 @@ class Fit:
             self.optimizers[name].load_state_dict(state["optimizers"][name])
             self.gaussians[name] = fresh
         self.iteration, self.views = state["iteration"], state["views"]
+        self.relocated = state.get("relocated", 0)
         torch.set_rng_state(state["random"][0])
         self.order.set_state(state["random"][1])
         self.density_draws.set_state(state["random"][2])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from splatting.arms import Arm, MakeParts, constant, fixed, histogram
@@ -23,7 +24,9 @@ from opt3dgs_optim import (
     SquaredLoss,
     paper_parts,
 )
+from opt3dgs_optim.presets import PAPER_WARMUP
 from studies.scenes.parts.chosen_fading import ChosenFading
+from studies.scenes.parts.exploring import NuOfNoise, NuPerPoint, RestartedHistogram, ViewHistogram
 from studies.scenes.parts.own_step import OwnStep
 
 BASELINE = "mcmc"
@@ -149,6 +152,11 @@ def last_phases() -> list[StudyArm]:
             "l1+reset",
             fixed(FreshMoments, Curvature),
         ),
+        "l1+reset+lqn-all": (
+            "L1, moments reset, L-BFGS directions for all parameters",
+            "l1+reset",
+            fixed(FreshMoments, partial(Curvature, names=None)),
+        ),
         "noise-off": ("no noise", None, fixed()),
     }
     return [
@@ -161,7 +169,7 @@ def last_phases() -> list[StudyArm]:
             trunk=BASELINE,
             noise_during=Phase.EXPLORATION if name == "noise-off" else None,
         )
-        for share in (30, 10, 4)
+        for share in (30, 10, 4, 2)
         for name, (what, control, parts) in kinds.items()
     ]
 
@@ -245,6 +253,49 @@ def long_runs() -> list[StudyArm]:
     ]
 
 
+def detail() -> list[StudyArm]:
+    """Which parameters' annealing costs fine detail, on top of fading."""
+    alone = {
+        "means": ("means",),
+        "shapes": ("scales", "quats"),
+        "colours": ("sh0", "shN"),
+        "opacities": ("opacities",),
+    }
+    return [
+        StudyArm(
+            f"annealed-{name}+faded",
+            f"faded, and {' and '.join(names)} alone annealed",
+            of(Annealing({n: 1.0 if n == "opacities" else 4.0 for n in names}, 0.4), FADING),
+            control="faded",
+        )
+        for name, names in alone.items()
+    ]
+
+
+def explorations() -> list[StudyArm]:
+    """What could make nu exploration rather than a weight of the view that happens to be drawn."""
+    kinds: dict[str, tuple[str, MakeParts]] = {
+        "per-view": (
+            "nu from the energy over that view's own recent mean",
+            lambda iterations, _nu: [ViewHistogram(_warmup(iterations))],
+        ),
+        "per-point": ("nu per Gaussian, from its gradient", fixed(NuPerPoint)),
+        "restarted": (
+            "Theta anew at every refinement",
+            lambda iterations, _nu: [RestartedHistogram(_warmup(iterations))],
+        ),
+        "of-noise": (
+            "nu on the noise instead of the step",
+            lambda iterations, _nu: [NuOfNoise(_warmup(iterations))],
+        ),
+    }
+    return [StudyArm(f"nu-{name}", what, parts) for name, (what, parts) in kinds.items()]
+
+
+def _warmup(iterations: int) -> int:
+    return max(4, round(iterations * PAPER_WARMUP))
+
+
 def _often(iterations: int) -> Fading:
     return Fading(events=max(iterations // EVENT_STEPS, 1))
 
@@ -266,6 +317,8 @@ GROUPS: dict[str, list[StudyArm]] = {
     "tails": [*last_phases(), *retired("tails")],
     "on-top": on_top(),
     "leads": [*leads(), *retired("leads")],
+    "detail": detail(),
+    "explorations": explorations(),
 }
 STUDY_ARMS = {arm.name: arm for arms in GROUPS.values() for arm in arms}
 

@@ -149,5 +149,7 @@ def folder_of(spec: Spec, out: Path) -> Path:
     if spec.size != "images_4":
         kind += f"-{spec.size}"
     kind += "-rotated" * spec.rotated
+    if spec.views:
+        kind += f"-{spec.views}-views"
     arm = spec.arm.replace("/", "_")
     return out / Path(spec.scene).name / kind / arm / f"seed-{spec.seed}"

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-COLUMNS = ("iteration", "seconds", "psnr", "ssim", "train_psnr", "num_points", "lpips")
+MEASURED = ("iteration", "seconds", "psnr", "ssim", "train_psnr", "num_points")  # in all records
+COLUMNS = (*MEASURED, "lpips", "relocated", "median_scale", "median_opacity")
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,7 @@ class Setting:
     sh_degree: int = 0
     rotated: bool = False  # the seed says which views are held out
     size: str = "images_4"
+    views: int = 0  # trained on; 0: all
 
 
 @dataclass(frozen=True)
@@ -104,8 +106,8 @@ def read(path: Path) -> list[Record]:
     """The records of a committed file."""
     data = json.loads(path.read_text(encoding="utf-8"))
     columns = data.get("columns", [])
-    if not set(COLUMNS) - {"lpips"} <= set(columns):
-        raise ValueError(f"{path}: columns {columns}, but {list(COLUMNS)} are needed")
+    if not set(MEASURED) <= set(columns):
+        raise ValueError(f"{path}: columns {columns}, but {list(MEASURED)} are needed")
     return [_record(entry, columns) for entry in data["records"]]
 
 

@@ -13,7 +13,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -28,8 +28,9 @@ from splatting.scenes import Background, Scene, Size, load_scene
 from studies.scenes.arms import find_study_arm
 from studies.scenes.perceptual import NET, load_tool, mean_lpips
 
+DIGITS = {"median_scale": 6}
 BACKGROUNDS: dict[str, Background] = {"lego": "white"}
-BRANCH_SHARES = (0.75, 0.9, 29 / 30)  # where the arms of the last phase branch off
+BRANCH_SHARES = (0.5, 0.75, 0.9, 29 / 30)  # where the arms of the last phase branch off
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,7 @@ class Spec:
     sh_degree: int = 0
     size: Size = "images_4"
     rotated: bool = False  # the seed says which views are held out: index = seed modulo 8
+    views: int = 0  # evenly spaced ones of those to train on; 0: all
 
     def options(self) -> FitOptions:
         """For `Fit`; a trunk and its branches share them."""
@@ -62,10 +64,10 @@ def train(
     """Train to the end; return the record that is also in `folder/record.json`."""
 
     def evaluate() -> dict[str, float]:
-        metrics = fit.evaluate()
+        metrics = fit.evaluate() | _population(fit)
         if lpips is not None:
             metrics["lpips"] = lpips(scene, renders(fit))
-        return {name: round(value, 4) for name, value in metrics.items()}
+        return {name: round(value, DIGITS.get(name, 4)) for name, value in metrics.items()}
 
     torch.set_num_threads(1)
     scene, arm = scene_of(spec), find_study_arm(spec.arm)
@@ -116,6 +118,16 @@ def train(
     return record
 
 
+def _population(fit: Fit) -> dict[str, float]:
+    """What the Gaussians are like: moved so far, median scale in extents, median opacity."""
+    scales, logits = fit.gaussians["scales"].detach(), fit.gaussians["opacities"].detach()
+    return {
+        "relocated": float(fit.relocated),
+        "median_scale": float(scales.mean(1).median().exp()) / fit.scene.extent,
+        "median_opacity": float(torch.sigmoid(logits).median()),
+    }
+
+
 def renders(fit: Fit) -> list[np.ndarray]:
     """The test views as they are now, [H, W, 3] uint8 each."""
     return [(255 * fit.image(view)).round().to(torch.uint8).numpy() for view in fit.scene.test]
@@ -136,7 +148,13 @@ def machine() -> str:
 
 def scene_of(spec: Spec) -> Scene:
     """The scene with the views that this training holds out."""
-    return _scene(spec.scene, spec.size, spec.seed % 8 if spec.rotated else None)
+    scene = _scene(spec.scene, spec.size, spec.seed % 8 if spec.rotated else None)
+    if not spec.views:
+        return scene
+    count = len(scene.train)
+    if not 2 <= spec.views <= count:
+        raise ValueError(f"views={spec.views}, but 2 to {count} are allowed, or 0 for all")
+    return replace(scene, train=[scene.train[i * count // spec.views] for i in range(spec.views)])
 
 
 @cache
