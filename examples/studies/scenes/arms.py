@@ -253,6 +253,19 @@ def long_runs() -> list[StudyArm]:
     ]
 
 
+def schedules() -> list[StudyArm]:
+    """Fading with other peaks and ends of the annealing than the defaults'."""
+    return [
+        StudyArm(
+            f"settled-{peak:g}-{final:g}",
+            f"faded, all steps times {peak:g} falling to {final:g}, opacities from 1",
+            of(Annealing(peak, final, opacity_peak=1.0), FADING),
+            control="faded",
+        )
+        for peak, final in ((1.0, 0.2), (1.0, 0.1), (2.0, 0.2), (2.0, 0.1), (4.0, 0.1))
+    ]
+
+
 def detail() -> list[StudyArm]:
     """Which parameters' annealing costs fine detail, on top of fading."""
     alone = {
@@ -317,6 +330,7 @@ GROUPS: dict[str, list[StudyArm]] = {
     "tails": [*last_phases(), *retired("tails")],
     "on-top": on_top(),
     "leads": [*leads(), *retired("leads")],
+    "schedules": schedules(),
     "detail": detail(),
     "explorations": explorations(),
 }
