@@ -27,6 +27,7 @@ from opt3dgs_optim import (
 from opt3dgs_optim.presets import PAPER_WARMUP
 from studies.scenes.parts.chosen_fading import ChosenFading
 from studies.scenes.parts.exploring import NuOfNoise, NuPerPoint, RestartedHistogram, ViewHistogram
+from studies.scenes.parts.keep_unseen import KeepUnseen
 from studies.scenes.parts.own_step import OwnStep
 
 BASELINE = "mcmc"
@@ -285,6 +286,15 @@ def detail() -> list[StudyArm]:
     ]
 
 
+def unseen() -> list[StudyArm]:
+    """Points out of view, which 3DGS-MCMC's regularisers melt where views are many."""
+    kept = "second moments of points out of view kept"
+    return [
+        StudyArm("kept", kept, of(KeepUnseen())),
+        StudyArm("kept+faded", f"faded, {kept}", of(FADING, KeepUnseen()), control="faded"),
+    ]
+
+
 def explorations() -> list[StudyArm]:
     """What could make nu exploration rather than a weight of the view that happens to be drawn."""
     kinds: dict[str, tuple[str, MakeParts]] = {
@@ -332,6 +342,7 @@ GROUPS: dict[str, list[StudyArm]] = {
     "leads": [*leads(), *retired("leads")],
     "schedules": schedules(),
     "detail": detail(),
+    "unseen": unseen(),
     "explorations": explorations(),
 }
 STUDY_ARMS = {arm.name: arm for arms in GROUPS.values() for arm in arms}

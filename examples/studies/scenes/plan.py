@@ -151,5 +151,6 @@ def folder_of(spec: Spec, out: Path) -> Path:
     kind += "-rotated" * spec.rotated
     if spec.views:
         kind += f"-{spec.views}-views"
+    kind += "-tiled" * spec.tiled
     arm = spec.arm.replace("/", "_")
     return out / Path(spec.scene).name / kind / arm / f"seed-{spec.seed}"

@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import numpy as np
 import torch
 from splatting.fit import Fit, FitOptions
-from splatting.scenes import Background, Scene, Size, load_scene
+from splatting.scenes import Background, Scene, Size, View, load_scene
 
 from studies.scenes.arms import find_study_arm
 from studies.scenes.perceptual import NET, load_tool, mean_lpips
 
+TILES = (5, 4)
 DIGITS = {"median_scale": 6}
 BACKGROUNDS: dict[str, Background] = {"lego": "white"}
 BRANCH_SHARES = (0.5, 0.75, 0.9, 29 / 30)  # where the arms of the last phase branch off
@@ -47,6 +49,7 @@ class Spec:
     size: Size = "images_4"
     rotated: bool = False  # the seed says which views are held out: index = seed modulo 8
     views: int = 0  # evenly spaced ones of those to train on; 0: all
+    tiled: bool = False  # every view to train on is cut into 5 x 4 views of a twentieth
 
     def options(self) -> FitOptions:
         """For `Fit`; a trunk and its branches share them."""
@@ -149,12 +152,33 @@ def machine() -> str:
 def scene_of(spec: Spec) -> Scene:
     """The scene with the views that this training holds out."""
     scene = _scene(spec.scene, spec.size, spec.seed % 8 if spec.rotated else None)
-    if not spec.views:
-        return scene
-    count = len(scene.train)
-    if not 2 <= spec.views <= count:
-        raise ValueError(f"views={spec.views}, but 2 to {count} are allowed, or 0 for all")
-    return replace(scene, train=[scene.train[i * count // spec.views] for i in range(spec.views)])
+    train, count = scene.train, len(scene.train)
+    if spec.views:
+        if not 2 <= spec.views <= count:
+            raise ValueError(f"views={spec.views}, but 2 to {count} are allowed, or 0 for all")
+        train = [train[i * count // spec.views] for i in range(spec.views)]
+    if spec.tiled:
+        train = [tile for view in train for tile in tiles(view)]
+    return replace(scene, train=train)
+
+
+def tiles(view: View) -> list[View]:
+    """The view cut into `TILES` columns and rows, each a view of its own: a scene of many views."""
+    (columns, rows), camera = TILES, view.camera
+    across = [camera.width * i // columns for i in range(columns + 1)]
+    down = [camera.height * i // rows for i in range(rows + 1)]
+    return [
+        View(
+            f"{view.name}, tile {left} {top}",
+            replace(
+                camera, cx=camera.cx - left, cy=camera.cy - top,
+                width=right - left, height=bottom - top,
+            ),
+            view.image[top:bottom, left:right],
+        )
+        for top, bottom in pairwise(down)
+        for left, right in pairwise(across)
+    ]  # fmt: skip
 
 
 @cache
