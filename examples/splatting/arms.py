@@ -57,8 +57,9 @@ class Arm:
         if self.needs is not None and nu is None:
             raise ValueError(f"arm {self.name}: needs the mean nu of {self.needs}; run it first")
         parts = [] if self.parts is None else self.parts(iterations, nu)
-        noise = PositionNoise(gaussians, NOISE_LR, during=self.noise_during)
-        return PhaseScheduler(iterations, switch, [*parts, noise])
+        if self.mcmc:
+            parts.append(PositionNoise(gaussians, NOISE_LR, during=self.noise_during))
+        return PhaseScheduler(iterations, switch, parts)
 
 
 def fixed(*parts: Callable[[], Part]) -> MakeParts:

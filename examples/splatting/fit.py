@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from torch.nn import Parameter
 from opt3dgs_optim import Phase, PhaseScheduler, PositionNoise
 from opt3dgs_optim.runs import RunLog
 from splatting.arms import NOISE_LR, Arm
-from splatting.density import MCMCDensityControl, regularisers
+from splatting.density import DensityReport, MCMCDensityControl, regularisers
 from splatting.gaussians import (
     DEFAULT_PRESET,
     MCMC_PRESET,
@@ -56,6 +56,20 @@ class FitOptions:
             raise ValueError(f"FitOptions: switch={self.switch}, must be in (0, 1]")
 
 
+class DensityControl(Protocol):
+    """What moves, adds and removes Gaussians between the steps."""
+
+    def step(
+        self,
+        iteration: int,
+        gaussians: dict[str, Parameter],
+        optimizers: Mapping[str, torch.optim.Optimizer],
+        /,
+    ) -> DensityReport:
+        """Called after the optimizers' step, with the iteration from 0."""
+        ...
+
+
 @dataclass(frozen=True)
 class Progress:
     """Where a fit is, for a progress bar."""
@@ -91,7 +105,7 @@ class Fit:
             self.phases.upgrade(self.optimizers)
         elif arm.mcmc:
             self.noise = PositionNoise(self.gaussians, NOISE_LR)
-        self.density = self._density_control() if arm.mcmc else None
+        self.density = self._density_control()
         self.iteration = 0
         self.relocated = 0  # Gaussians that density control has moved so far
         self.views: list[int] = []  # what is left of this epoch
@@ -111,7 +125,9 @@ class Fit:
         spread = float((scene.points - center).abs().quantile(0.9)) / scene.extent
         return random_gaussians(scene.extent, count, center=center, spread=spread, **common)
 
-    def _density_control(self) -> MCMCDensityControl:
+    def _density_control(self) -> DensityControl | None:
+        if not self.arm.mcmc:
+            return None
         return MCMCDensityControl.for_run(
             self.options.iterations,
             self.options.points,
@@ -125,7 +141,7 @@ class Fit:
         """One iteration; returns the detached loss."""
         index = self._next_view()
         view = self.scene.train[index]
-        image = self._render(view).image
+        image = self._train_image(view)
         pixel_loss = None if self.phases is None else self.phases.pixel_loss
         loss = photometric_loss(image, view.image, pixel_loss)
         if self.arm.mcmc:
@@ -185,6 +201,9 @@ class Fit:
         """The render of a view, [H, W, 3] in 0..1."""
         return self._render(view).image.clamp(0, 1)
 
+    def _train_image(self, view: View) -> Tensor:
+        return self._render(view).image
+
     def _render(self, view: View) -> Rendering:
         degree, background = self.active_sh_degree, self.scene.background
         return render(self.gaussians, view.camera, sh_degree=degree, background=background)
@@ -224,6 +243,7 @@ class Fit:
             "options": asdict(self.options),
             "iteration": self.iteration,
             "relocated": self.relocated,
+            "density": getattr(self.density, "state", None),
             "gaussians": {name: param.detach() for name, param in self.gaussians.items()},
             "optimizers": {name: opt.state_dict() for name, opt in self.optimizers.items()},
             "views": self.views,
@@ -261,6 +281,8 @@ class Fit:
             self.gaussians[name] = fresh
         self.iteration, self.views = state["iteration"], state["views"]
         self.relocated = state.get("relocated", 0)
+        if state.get("density") is not None:
+            vars(self.density).update(state=state["density"])
         torch.set_rng_state(state["random"][0])
         self.order.set_state(state["random"][1])
         self.density_draws.set_state(state["random"][2])

@@ -60,6 +60,7 @@ class StudyArm(Arm):
     control: str = BASELINE
     switch: float = 1.0  # where exploitation starts
     trunk: str | None = None  # branch off this arm's run at the switch
+    adaptive: bool = False  # gsplat's DefaultStrategy in the place of 3DGS-MCMC's
     retired: bool = False  # its code is gone, its records are kept
 
     def make(
@@ -295,6 +296,19 @@ def unseen() -> list[StudyArm]:
     ]
 
 
+def adaptive() -> list[StudyArm]:
+    """Clone, split and reset instead of 3DGS-MCMC."""
+    kinds: dict[str, tuple[str, MakeParts | None]] = {
+        "adc": ("stock 3DGS with adaptive density control, torch's Adam", None),
+        "adc+faded": ("the same, faded", of(FADING)),
+        "adc+defaults": ("the same, with the defaults", of(*TRUNKS[DEFAULTS])),
+    }
+    return [
+        StudyArm(name, what, parts, mcmc=False, control="adc", adaptive=True)
+        for name, (what, parts) in kinds.items()
+    ]
+
+
 def explorations() -> list[StudyArm]:
     """What could make nu exploration rather than a weight of the view that happens to be drawn."""
     kinds: dict[str, tuple[str, MakeParts]] = {
@@ -343,6 +357,7 @@ GROUPS: dict[str, list[StudyArm]] = {
     "schedules": schedules(),
     "detail": detail(),
     "unseen": unseen(),
+    "adaptive": adaptive(),
     "explorations": explorations(),
 }
 STUDY_ARMS = {arm.name: arm for arms in GROUPS.values() for arm in arms}

@@ -26,7 +26,7 @@ import torch
 from splatting.fit import Fit, FitOptions
 from splatting.scenes import Background, Scene, Size, View, load_scene
 
-from studies.scenes.arms import find_study_arm
+from studies.scenes.arms import StudyArm, find_study_arm
 from studies.scenes.perceptual import NET, load_tool, mean_lpips
 
 TILES = (5, 4)
@@ -74,7 +74,7 @@ def train(
 
     torch.set_num_threads(1)
     scene, arm = scene_of(spec), find_study_arm(spec.arm)
-    fit = Fit(scene, arm, spec.options(), mean_nu)
+    fit = _kind(arm)(scene, arm, spec.options(), mean_nu)
     checkpoint, path = folder / "checkpoint.pt", folder / "record.json"
     total, marks = spec.iterations, _marks(spec.iterations)
     record: dict[str, Any] = {**asdict(spec), "scene": scene.name, "curve": [], "seconds": 0.0}
@@ -121,12 +121,20 @@ def train(
     return record
 
 
+def _kind(arm: StudyArm) -> type[Fit]:
+    if not arm.adaptive:
+        return Fit
+    from studies.scenes.adaptive import AdaptiveFit  # gsplat stays optional
+
+    return AdaptiveFit
+
+
 def _population(fit: Fit) -> dict[str, float]:
-    """What the Gaussians are like: moved so far, median scale in extents, median opacity."""
+    """What the Gaussians are like: moved so far, medians of longest axis (in extents) and opacity."""
     scales, logits = fit.gaussians["scales"].detach(), fit.gaussians["opacities"].detach()
     return {
         "relocated": float(fit.relocated),
-        "median_scale": float(scales.mean(1).median().exp()) / fit.scene.extent,
+        "median_scale": float(scales.amax(1).median().exp()) / fit.scene.extent,
         "median_opacity": float(torch.sigmoid(logits).median()),
     }
 
