@@ -1,0 +1,77 @@
+"""Training with clone, split, prune and reset: gsplat's own DefaultStrategy, on a CPU."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from hosts.cpu_host import gsplat_modules
+from splatting.density import DensityReport
+from splatting.fit import Fit
+from splatting.scenes import View
+from torch import Tensor
+from torch.nn import Parameter
+
+
+class DefaultDensityControl:
+    """gsplat's DefaultStrategy with its defaults, as `Fit` calls density control.
+
+    Attributes:
+        state: the strategy's, part of a checkpoint.
+        info: of the last rendering; the strategy reads the projected means' gradient from it.
+    """
+
+    def __init__(self, extent: float) -> None:
+        gsplat_modules.install()
+        self.strategy = importlib.import_module("gsplat").DefaultStrategy()
+        self.state: dict[str, Any] = self.strategy.initialize_state(scene_scale=extent)
+        self.info: dict[str, Any] = {}
+
+    def step(
+        self,
+        iteration: int,
+        gaussians: dict[str, Parameter],
+        optimizers: Mapping[str, torch.optim.Optimizer],
+    ) -> DensityReport:
+        """What the strategy does after the optimizers' step."""
+        before = len(gaussians["means"])
+        self.strategy.step_post_backward(
+            gaussians, optimizers, self.state, iteration, self.info, packed=False
+        )
+        total = len(gaussians["means"])
+        return DensityReport(total != before, 0, total - before, total)
+
+
+class AdaptiveFit(Fit):
+    """`Fit` with adaptive density control; it starts from `points` points and has no cap."""
+
+    def _density_control(self) -> DefaultDensityControl:
+        return DefaultDensityControl(self.scene.extent)
+
+    def _train_image(self, view: View) -> Tensor:
+        gaussians, camera, density = self.gaussians, view.camera, self.density
+        assert isinstance(density, DefaultDensityControl)
+        lens = torch.tensor(
+            [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
+        )
+        parts = [gaussians[name] for name in ("sh0", "shN") if name in gaussians]
+        images, _, density.info = gsplat_modules.rasterize(
+            gaussians["means"],
+            gaussians["quats"],
+            gaussians["scales"].exp(),
+            torch.sigmoid(gaussians["opacities"]),
+            torch.cat(parts, 1),
+            camera.viewmat[None],
+            lens[None],
+            camera.width,
+            camera.height,
+            sh_degree=self.active_sh_degree,
+            packed=False,
+            backgrounds=self.scene.background[None],
+        )
+        density.strategy.step_pre_backward(
+            gaussians, self.optimizers, density.state, self.iteration, density.info
+        )
+        return images[0]
