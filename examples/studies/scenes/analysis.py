@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from statistics import fmean, stdev
 from typing import Literal
 
@@ -55,6 +55,10 @@ class Study:
     def records(self) -> list[Record]:
         """All of them."""
         return [record for runs in self._of.values() for record in runs.values()]
+
+    def all_settings(self) -> list[Setting]:
+        """In the order of their fields."""
+        return sorted({setting for setting, _ in self._of}, key=astuple)
 
     def settings(
         self, iterations: int, init: str = "sfm", share: float = 1.0, sh_degree: int = 0

@@ -53,9 +53,9 @@ class Record:
         """Test PSNR after the last iteration, dB."""
         return float(self.curve["psnr"][-1])
 
-    def at_seconds(self, seconds: float) -> float:
-        """Test PSNR at that time, dB, linear between evaluations; the last one beyond the end."""
-        return float(np.interp(seconds, self.curve["seconds"], self.curve["psnr"]))
+    def at_seconds(self, seconds: float, metric: str = "psnr") -> float:
+        """A metric at that time, linear between evaluations; the last one beyond the end."""
+        return float(np.interp(seconds, self.curve["seconds"], self.curve[metric]))
 
     def at_iteration(self, iteration: float) -> float:
         """Test PSNR at that iteration, dB."""

@@ -130,7 +130,7 @@ def _kind(arm: StudyArm) -> type[Fit]:
 
 
 def _population(fit: Fit) -> dict[str, float]:
-    """What the Gaussians are like: moved so far, medians of longest axis (in extents) and opacity."""
+    """Gaussians moved so far, and the median of their longest axis (in extents) and opacity."""
     scales, logits = fit.gaussians["scales"].detach(), fit.gaussians["opacities"].detach()
     return {
         "relocated": float(fit.relocated),

@@ -1,0 +1,202 @@
+"""The study's own parts, cut-up scenes and adaptive density control."""
+
+from __future__ import annotations
+
+import copy
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from splatting.fit import Fit, FitOptions
+from splatting.scenes import Scene, load_scene
+from studies.scenes.arms import find_study_arm
+from studies.scenes.parts.exploring import (
+    CLAMP,
+    RESTART,
+    NuOfNoise,
+    RestartedHistogram,
+    ViewHistogram,
+    nu_per_point,
+)
+from studies.scenes.parts.keep_unseen import KeepUnseen
+from studies.scenes.training import TILES, Spec, scene_of, tiles
+
+from opt3dgs_optim import EnergyHistogram, PhaseScheduler, PositionNoise
+
+
+@cache
+def embedded() -> Scene:
+    return load_scene("embedded")
+
+
+def fit_with(arm: str, kind: type[Fit] = Fit, iterations: int = 60) -> Fit:
+    return kind(embedded(), find_study_arm(arm), FitOptions(iterations, 120))
+
+
+def same_after_resuming(make: Any, path: Path, before: int, after: int) -> bool:
+    """Whether a training that was saved and loaded goes on as the one that was not."""
+    whole = make()
+    for _ in range(before):
+        whole.step()
+    whole.save(path)
+    for _ in range(after):
+        whole.step()
+    resumed = make()
+    resumed.load(path)  # the noise's random numbers, too
+    for _ in range(after):
+        resumed.step()
+    return all(torch.equal(p, resumed.gaussians[n]) for n, p in whole.gaussians.items())
+
+
+@pytest.mark.parametrize(
+    "arm", ["nu-per-view", "nu-per-point", "nu-restarted", "nu-of-noise", "kept+faded"]
+)
+def test_a_study_part_resumes(tmp_path: Path, arm: str) -> None:
+    assert same_after_resuming(lambda: fit_with(arm), tmp_path / "at.pt", 35, 8)
+
+
+class Steps:
+    """A training of one parameter: what the parts do to it shows in themselves."""
+
+    def __init__(self, *parts: Any) -> None:
+        self.param = torch.nn.Parameter(torch.zeros(4, 3))
+        self.optimizer = torch.optim.Adam([{"params": [self.param], "name": "shN"}])
+        self.phases = PhaseScheduler(10_000, 1.0, list(parts))
+        self.phases.upgrade({"shN": self.optimizer})
+
+    def step(self, energy: float) -> None:
+        self.param.grad = torch.ones_like(self.param)
+        self.phases.observe(torch.tensor(energy))
+        self.optimizer.step()
+
+
+def test_a_views_energy_is_relative_to_its_own_mean() -> None:
+    part = ViewHistogram(warmup=50)
+    steps, draw = Steps(part), torch.Generator().manual_seed(0)
+    plain, seen, own = EnergyHistogram(warmup=50), [], []
+    for i in range(1_500):
+        part.view = i % 10
+        # A view's level is ten times its noise: the plain histogram sees nothing else.
+        noise = float(torch.randn((), generator=draw))
+        energy = 0.1 + 0.01 * part.view + 1e-3 * noise
+        steps.step(energy)
+        plain.observe(energy)
+        if i > 500:
+            seen.append((noise, float(part.histogram.multiplier)))
+            own.append(float(plain.multiplier))
+    noise, nu = torch.tensor(seen).T
+    assert torch.corrcoef(torch.stack([noise, nu]))[0, 1] < -0.5
+    assert abs(torch.corrcoef(torch.stack([noise, torch.tensor(own)]))[0, 1]) < 0.2
+
+
+def test_theta_starts_anew_and_the_mean_goes_on() -> None:
+    part = RestartedHistogram(warmup=50)
+    steps, draw = Steps(part), torch.Generator().manual_seed(0)
+    for _ in range(RESTART + 1):
+        steps.step(0.1 + 0.01 * float(torch.randn((), generator=draw)))
+    assert part.histogram.num_observed == 1
+    assert part.mean_multiplier != 1.0
+
+
+def test_nu_is_on_the_noise() -> None:
+    noise = PositionNoise({}, 5e5)
+    part = NuOfNoise(warmup=50)
+    steps = Steps(part, noise)
+    draw = torch.Generator().manual_seed(0)
+    scales = []
+    for _ in range(300):
+        steps.step(0.1 + 0.01 * float(torch.randn((), generator=draw)))
+        assert noise.scale == pytest.approx(5e5 * max(float(part.histogram.multiplier), 0.0))
+        scales.append(noise.scale)
+    assert len(set(scales[100:])) > 100
+    assert part.factor({}, steps.phases) is None
+
+
+def test_nu_per_point_has_mean_one_and_falls_with_the_gradient() -> None:
+    draw = torch.Generator().manual_seed(0)
+    grad = torch.randn(5_000, 3, generator=draw) * torch.randn(5_000, 1, generator=draw).exp()
+    grad[:1_000] = 0
+    nu = nu_per_point(grad)
+    assert (nu[:1_000] == 1).all()
+    seen, logs = nu[1_000:], grad[1_000:].norm(dim=1).log()
+    assert float(seen.mean()) == pytest.approx(1.0, abs=0.05)
+    assert float(torch.corrcoef(torch.stack([seen, logs]))[0, 1]) < -0.8
+    assert CLAMP[0] <= float(nu.min()) < float(nu.max()) <= CLAMP[1]
+    assert (nu_per_point(grad[:50]) == 1).all()
+
+
+def test_the_second_moment_of_points_out_of_view_is_kept() -> None:
+    params = {
+        "means": torch.nn.Parameter(torch.zeros(2, 3)),
+        "opacities": torch.nn.Parameter(torch.zeros(2)),
+    }
+    runs = {}
+    for parts in ((), (KeepUnseen(0.05),)):
+        own = copy.deepcopy(params)
+        optimizers = {
+            name: torch.optim.Adam([{"params": [p], "name": name}], lr=0.1, betas=(0.9, 0.99))
+            for name, p in own.items()
+        }
+        phases = PhaseScheduler(10_000, 1.0, list(parts))
+        phases.upgrade(optimizers)
+        for i in range(2_000):
+            seen = i < 300
+            own["means"].grad = torch.tensor([[1.0] * 3, [float(seen)] * 3])
+            # The image's gradient is 1; the regulariser's, which every point gets, a thousandth.
+            own["opacities"].grad = torch.tensor([1.0, 1.0 if seen else 1e-3])
+            phases.observe(torch.tensor(0.1))
+            for optimizer in optimizers.values():
+                optimizer.step()
+            if i == 400:  # the momentum is gone
+                start = own["opacities"].detach().clone()
+        moved = (own["opacities"].detach() - start).abs()
+        runs[bool(parts)] = moved.tolist()
+    assert runs[True][0] == runs[False][0]  # in view: Adam's own, bit for bit
+    assert runs[True][1] < 0.2 * runs[False][1]
+
+
+def test_tiles_make_up_the_view() -> None:
+    view = embedded().train[0]
+    made = tiles(view)
+    assert len(made) == TILES[0] * TILES[1]
+    rows = [
+        torch.cat([tile.image for tile in made[i : i + TILES[0]]], 1)
+        for i in range(0, len(made), TILES[0])
+    ]
+    assert torch.equal(torch.cat(rows, 0), view.image)
+    fit = fit_with("mcmc")
+    whole = fit.image(view)
+    parts = [
+        torch.cat([fit.image(tile) for tile in made[i : i + TILES[0]]], 1)
+        for i in range(0, len(made), TILES[0])
+    ]
+    # Beside the image the projection is linearised at other places, as in every rasterizer.
+    assert float((torch.cat(parts, 0) - whole).abs().mean()) < 0.01 * float(whole.mean())
+
+
+def test_fewer_views_are_evenly_spaced() -> None:
+    every = scene_of(Spec("embedded", "mcmc", 0, 10, 10)).train
+    few = scene_of(Spec("embedded", "mcmc", 0, 10, 10, views=4)).train
+    assert [view.name for view in few] == [every[i * len(every) // 4].name for i in range(4)]
+    with pytest.raises(ValueError, match="views=1, but 2 to"):
+        scene_of(Spec("embedded", "mcmc", 0, 10, 10, views=1))
+
+
+def test_adaptive_density_control_grows_and_resumes(tmp_path: Path) -> None:
+    pytest.importorskip("gsplat")
+    from studies.scenes.adaptive import AdaptiveFit
+
+    def make() -> Fit:
+        fit = fit_with("adc+faded", AdaptiveFit, 120)
+        strategy: Any = vars(fit.density)["strategy"]
+        strategy.refine_start_iter, strategy.refine_every = 20, 30
+        return fit
+
+    assert same_after_resuming(make, tmp_path / "at.pt", 45, 20)
+    fit = make()
+    for _ in range(65):
+        fit.step()
+    assert len(fit.gaussians["means"]) > 120
+    assert fit.relocated == 0
