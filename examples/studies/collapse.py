@@ -39,6 +39,7 @@ COLORS = {"stock": "0.6", "frozen": "#d55e00", "default": "#0072b2"}
 LOOKS = 60
 WARMUP = 1 / 12
 EVERY = 4  # iterations between two that the picture shows
+SHOWN = ("lund_door", 0)  # scene and seed of the picture
 
 
 class Frozen(Part):
@@ -70,7 +71,7 @@ class Frozen(Part):
         return self.histogram.factor(group, course)
 
 
-def train(folder: Path, arm: str, seed: int, iterations: int, points: int) -> dict[str, Any]:
+def train(folder: Path | str, arm: str, seed: int, iterations: int, points: int) -> dict[str, Any]:
     """Train; return what is recorded, the curve and the trace included."""
     from splatting.arms import Arm
     from splatting.fit import Fit, FitOptions
@@ -81,7 +82,12 @@ def train(folder: Path, arm: str, seed: int, iterations: int, points: int) -> di
     part = {"stock": None, "frozen": Frozen(warmup), "default": EnergyHistogram(warmup=warmup)}[arm]
     parts: list[Part] = [] if part is None else [part]
     made = Arm(arm, arm, lambda *_: parts)
-    fit = Fit(load_scene(folder), made, FitOptions(iterations, points, seed, switch=1.0))
+    background = "white" if Path(folder).name == "lego" else "black"
+    fit = Fit(
+        load_scene(folder, background=background),
+        made,
+        FitOptions(iterations, points, seed, switch=1.0),
+    )
     histogram = part.histogram if isinstance(part, Frozen) else part
     curve, trace = [], []
     while fit.iteration < iterations:
@@ -92,7 +98,7 @@ def train(folder: Path, arm: str, seed: int, iterations: int, points: int) -> di
         if fit.iteration % (iterations // LOOKS) == 0:
             curve.append({"iteration": fit.iteration, **fit.evaluate()})
     clamp = None if histogram is None else histogram.clamp
-    return recorded(folder.name, arm, seed, iterations, curve, trace, clamp)
+    return recorded(Path(folder).name, arm, seed, iterations, curve, trace, clamp)
 
 
 def recorded(
@@ -120,8 +126,9 @@ def recorded(
         record["nu_deviation"] = round(float(nu.std()), 3)
         low, high = clamp
         record["at_clamp"] = round(float(((nu <= low) | (nu >= high)).mean()), 5)
-        shown = [[float(f"{value:.4g}") for value in line[:4]] for line in trace[::EVERY]]
-        record["trace"] = shown  # loss, nu, low and high end of the partitions
+        if (scene, seed) == SHOWN and iterations == 3_000:
+            shown = [[float(f"{value:.4g}") for value in line[:4]] for line in trace[::EVERY]]
+            record["trace"] = shown  # loss, nu, low and high end of the partitions
     return record
 
 
@@ -149,7 +156,9 @@ def draw(records: list[dict[str, Any]], path: Path) -> None:
     """Training PSNR, and energy, range and nu of one training before and after."""
     import matplotlib.pyplot as plt
 
-    one = {r["arm"]: r for r in records if (r["scene"], r["seed"]) == ("lund_door", 0)}
+    one = {
+        r["arm"]: r for r in records if (r["scene"], r["seed"], r["iterations"]) == (*SHOWN, 3_000)
+    }
     fig, axes = plt.subplots(3, 2, figsize=(10, 7), sharex=True, layout="constrained")
     for column, arm in enumerate(("frozen", "default")):
         top, middle, bottom = axes[:, column]
@@ -183,7 +192,7 @@ def draw(records: list[dict[str, Any]], path: Path) -> None:
 def main() -> None:
     """Train and record, or write table and picture."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scene", type=Path, nargs="?", help="a scene's folder; none: table only")
+    parser.add_argument("scene", nargs="?", help="folder, or 'embedded'; none: table only")
     parser.add_argument("--arm", choices=ARMS, default="default")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--iterations", type=int, default=3_000)
