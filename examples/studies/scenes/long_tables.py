@@ -93,7 +93,7 @@ def differences_table(study: Study, settings: Sequence[Setting], arms: Iterable[
     ]
     for arm in arms:
         found = difference(study, settings, arm)
-        if not found.count:
+        if not found.count or found.arm == found.control:
             continue
         cells = [_signed(*found.of(metric), digits) for metric, (_, digits) in METRICS.items()]
         lines.append(

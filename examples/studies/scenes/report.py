@@ -1,8 +1,9 @@
 """Tables, plots and decisions: python examples/studies/scenes/report.py [--runs runs/study]
 
-With `--runs`, first adds the finished trainings to docs/results/study/records.json. Then
-everything is made from that file alone: the plots beside it, `decisions.json`, and the tables
-between the markers of docs/evidence.md, docs/results/study/tables.md and the README.
+With `--runs`, first adds the finished trainings to docs/results/study/records.json, those whose
+held-out views rotate with the seed to rotated.json. Then everything is made from these files
+alone: the plots beside them, `decisions.json`, and the tables between the markers of
+docs/evidence.md, docs/results/study/tables.md and the README.
 """
 
 from __future__ import annotations
@@ -23,12 +24,14 @@ from studies.scenes.arms import (
     DEFAULTS,
     GROUPS,
     POOLED,
+    STUDY_ARMS,
     UNFADED_OPACITIES,
     label,
 )
 from studies.scenes.decisions import decide
+from studies.scenes.long_tables import differences_table, metrics_table, reach_table
 from studies.scenes.plots import plot_curves, plot_gains
-from studies.scenes.records import gather, merge, read, write
+from studies.scenes.records import Setting, gather, merge, read, write
 from studies.scenes.tables import (
     front_table,
     gains_table,
@@ -61,6 +64,10 @@ FEW_VIEWS_ARMS = (
     *(UNFADED_OPACITIES, BEST, POOLED),
 )
 CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4", BEST)
+ROTATED = "rotated.json"  # records whose held-out views rotate with the seed
+LONG, BRIEF, DETAIL = 30_000, 7_500, 2_000
+SCENE_SIZE = "images_4"
+REACH_ARMS = ("faded", DEFAULTS)
 MARKER = re.compile(r"(<!-- study:([a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -100,6 +107,34 @@ def tables(study: Study) -> dict[str, str]:
         found = study.gain(settings, BEST, BASELINE)
         kinds = {"3,000 iterations": settings}
         made[stage] = goals_table(study, kinds, BEST, BASELINE) if found else _missing(stage)
+    return made
+
+
+def rotated_tables(study: Study) -> dict[str, str]:
+    """The pieces that are made from the trainings with rotating views."""
+
+    def settings(
+        iterations: int, size: str = SCENE_SIZE, tiled: bool = False, views: bool = False
+    ) -> list[Setting]:
+        kind = (iterations, size, tiled, views)
+        return [
+            s
+            for s in study.all_settings()
+            if (s.iterations, s.size, s.tiled, bool(s.views)) == kind
+        ]
+
+    made = {"rotated-machines": machines_line(study.records())}
+    kinds = {
+        "rotated-30000": settings(LONG),
+        "rotated-7500": settings(BRIEF),
+        "rotated-detail": settings(DETAIL, "images_2"),
+        "rotated-tiled": settings(BRIEF, tiled=True),
+    }
+    for name, found in kinds.items():
+        made[name] = _missing("rotated") if not found else metrics_table(study, found, STUDY_ARMS)
+        gains = differences_table(study, found, STUDY_ARMS)
+        made[f"{name}-gains"] = _missing("rotated") if not found else gains
+    made["reach"] = reach_table(study, kinds["rotated-30000"], REACH_ARMS, BRIEF)
     return made
 
 
@@ -188,10 +223,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if not found:
                 raise ValueError(f"--runs {args.runs}: holds no finished training")
             FOLDER.mkdir(parents=True, exist_ok=True)
-            old = json.loads(records.read_text(encoding="utf-8")) if records.exists() else {}
-            write(merge(old.get("records", []), found), records)
+            for path, rotated in ((records, False), (FOLDER / ROTATED, True)):
+                old = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+                new = [record for record in found if record.get("rotated", False) == rotated]
+                write(merge(old.get("records", []), new), path)
         study = Study(read(records))
-        made = tables(study)
+        made = tables(study) | rotated_tables(Study(read(FOLDER / ROTATED)))
         for page in PAGES:
             page.write_text(fill(page.read_text(encoding="utf-8"), made), encoding="utf-8")
         decisions = {part: decision.on for part, decision in decide(study).items()}

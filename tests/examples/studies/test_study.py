@@ -47,6 +47,7 @@ def record(arm: str, scene: str, seed: int, psnr: float, seconds: float = 10.0) 
 
 def test_the_pages_are_made_from_the_records() -> None:
     made = report.tables(Study(read(RECORDS)))
+    made |= report.rotated_tables(Study(read(report.FOLDER / report.ROTATED)))
     for path in report.PAGES:
         page = path.read_text(encoding="utf-8")
         assert "<!-- study:" in page
