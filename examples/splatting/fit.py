@@ -45,6 +45,7 @@ class FitOptions:
     switch: float = 29 / 30
     evaluations: int = 20
     sh_degree_interval: int = 1000  # iterations until one degree more is used, as trainers do
+    rates: float = 1.0  # factor on all learning rates of the trainer
 
     def __post_init__(self) -> None:
         for name in ("iterations", "points", "evaluations", "sh_degree_interval"):
@@ -52,6 +53,8 @@ class FitOptions:
                 raise ValueError(f"FitOptions: {name}={getattr(self, name)}, must be at least 1")
         if self.init not in ("sfm", "random"):
             raise ValueError(f"FitOptions: init={self.init!r}, must be 'sfm' or 'random'")
+        if not self.rates > 0:
+            raise ValueError(f"FitOptions: rates={self.rates}, must be above 0")
         if not 0 < self.switch <= 1:
             raise ValueError(f"FitOptions: switch={self.switch}, must be in (0, 1]")
 
@@ -91,7 +94,8 @@ class Fit:
         self.order = torch.Generator().manual_seed(options.seed + 1)
         self.density_draws = torch.Generator().manual_seed(options.seed + 2)
         self.gaussians = self._initial_gaussians()
-        self.rates = stock_learning_rates(scene.extent)
+        stock = stock_learning_rates(scene.extent)
+        self.rates = {name: rate * options.rates for name, rate in stock.items()}
         self.optimizers = {
             name: torch.optim.Adam(
                 [{"params": param, "lr": self.rates[name], "name": name}], eps=1e-15

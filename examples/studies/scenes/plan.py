@@ -152,5 +152,7 @@ def folder_of(spec: Spec, out: Path) -> Path:
     if spec.views:
         kind += f"-{spec.views}-views"
     kind += "-tiled" * spec.tiled
+    if spec.rates != 1.0:
+        kind += f"-rates-{spec.rates:g}"
     arm = spec.arm.replace("/", "_")
     return out / Path(spec.scene).name / kind / arm / f"seed-{spec.seed}"

@@ -25,6 +25,7 @@ class Setting:
     rotated: bool = False  # the seed says which views are held out
     size: str = "images_4"
     views: int = 0  # trained on; 0: all
+    rates: float = 1.0  # factor on the trainer's learning rates
     tiled: bool = False  # every view was cut into twenty
 
 

@@ -49,12 +49,14 @@ class Spec:
     size: Size = "images_4"
     rotated: bool = False  # the seed says which views are held out: index = seed modulo 8
     views: int = 0  # evenly spaced ones of those to train on; 0: all
+    rates: float = 1.0  # factor on all learning rates of the trainer
     tiled: bool = False  # every view to train on is cut into 5 x 4 views of a twentieth
 
     def options(self) -> FitOptions:
         """For `Fit`; a trunk and its branches share them."""
         init: Any = self.init
-        return FitOptions(self.iterations, self.points, self.seed, init, self.sh_degree, 1.0)
+        options = (self.iterations, self.points, self.seed, init, self.sh_degree, 1.0)
+        return FitOptions(*options, rates=self.rates)
 
 
 def train(

@@ -200,3 +200,17 @@ def test_adaptive_density_control_grows_and_resumes(tmp_path: Path) -> None:
         fit.step()
     assert len(fit.gaussians["means"]) > 120
     assert fit.relocated == 0
+
+
+def test_a_trainer_with_other_rates_makes_other_steps() -> None:
+    usual, doubled = (
+        Fit(embedded(), find_study_arm("faded"), FitOptions(60, 120, rates=rates))
+        for rates in (1.0, 2.0)
+    )
+    start = usual.gaussians["sh0"].detach().clone()
+    for fit in (usual, doubled):
+        fit.step()
+    ratio = (doubled.gaussians["sh0"] - start) / (usual.gaussians["sh0"] - start)
+    assert ratio.nanmedian().item() == pytest.approx(2.0, rel=1e-3)
+    with pytest.raises(ValueError, match="rates=0.0, must be above 0"):
+        FitOptions(rates=0.0)
