@@ -275,11 +275,12 @@ def detail() -> list[StudyArm]:
         "shapes": ("scales", "quats"),
         "colours": ("sh0", "shN"),
         "opacities": ("opacities",),
+        "all-but-means": ("scales", "quats", "sh0", "shN", "opacities"),
     }
     return [
         StudyArm(
             f"annealed-{name}+faded",
-            f"faded, and {' and '.join(names)} alone annealed",
+            f"faded, and {', '.join(names)} alone annealed",
             of(Annealing({n: 1.0 if n == "opacities" else 4.0 for n in names}, 0.4), FADING),
             control="faded",
         )
