@@ -27,7 +27,7 @@ TOTAL = 60
     [(0.0, 8.0), (1.0, 0.5), (0.5, 2.0), (0.25, 4.0), (-1.0, 8.0), (3.0, 0.5)],
 )
 def test_factor_falls_geometrically(progress: float, factor: float) -> None:
-    assert Annealing(8.0, 0.5).at("means", progress) == pytest.approx(factor)
+    assert Annealing(8.0, 0.5).at("scales", progress) == pytest.approx(factor)
 
 
 def test_peaks_by_parameter_take_every_trainers_names() -> None:
@@ -41,9 +41,18 @@ def test_peaks_by_parameter_take_every_trainers_names() -> None:
 def test_opacities_have_a_peak_of_their_own() -> None:
     annealing = Annealing(8.0, 0.5)
     assert annealing.at("opacities", 0.0) == annealing.at("opacity", 0.0) == 1.0
-    assert annealing.at("opacities", 1.0) == annealing.at("means", 1.0) == 0.5
+    assert annealing.at("opacities", 1.0) == annealing.at("scales", 1.0) == 0.5
     assert Annealing(8.0, 0.5, opacity_peak=2.0).at("opacities", 0.5) == pytest.approx(1.0)
     assert Annealing({"means": 8.0}, 0.5, opacity_peak=2.0).at("opacities", 0.5) == 1.0
+
+
+def test_the_positions_are_left_alone_unless_they_are_named() -> None:
+    annealing = Annealing(8.0, 0.5)
+    assert annealing.at("means", 0.0) == annealing.at("xyz", 0.0) == 1.0
+    assert annealing.names == ("scales", "quats", "opacities", "sh0", "shN")
+    every = Annealing(8.0, 0.5, names=(*annealing.names, "xyz"))
+    assert every.at("means", 0.0) == 8.0
+    assert every.at("scales", 1.0) == 0.5
 
 
 def test_every_step_is_adams_times_the_factor() -> None:
@@ -69,14 +78,14 @@ def test_annealing_multiplies_nu_and_goes_on_after_the_switch() -> None:
     for iteration, factor in ((15, 1.5 * 4.0), (30, 2.0)):
         ours, theirs = make_splats(), make_splats()
         phases = only(TOTAL, nu, Annealing(8.0, 0.5), switch=30)
-        means = phases.upgrade(gsplat_optimizers(ours))["means"]
-        stock = gsplat_optimizers(theirs)["means"]
+        scales = phases.upgrade(gsplat_optimizers(ours))["scales"]
+        stock = gsplat_optimizers(theirs)["scales"]
         stock.param_groups[0]["lr"] *= factor
         phases.observe(0.1, iteration=iteration)
-        ours["means"].grad, theirs["means"].grad = (torch.ones(12, 3) for _ in "ab")
-        means.step()
+        ours["scales"].grad, theirs["scales"].grad = (torch.ones(12, 3) for _ in "ab")
+        scales.step()
         stock.step()
-        torch.testing.assert_close(ours["means"], theirs["means"], rtol=1e-6, atol=1e-7)
+        torch.testing.assert_close(ours["scales"], theirs["scales"], rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
@@ -122,7 +131,7 @@ def test_peaks_by_parameter_can_be_copied(copied: Any) -> None:
 
 
 @pytest.mark.parametrize("peak", [4.0, {"means": 4.0}])
-def test_the_log_gets_the_factor_of_the_positions(peak: Any) -> None:
+def test_the_log_gets_the_factor(peak: Any) -> None:
     phases = only(TOTAL, Annealing(peak, 1.0))
     phases.observe(0.1, iteration=TOTAL // 2)
     assert phases.numbers() == {"annealing": pytest.approx(2.0)}
@@ -136,6 +145,8 @@ def test_the_log_gets_the_factor_of_the_positions(peak: Any) -> None:
         (lambda: Annealing({"means": -1.0}), r"Annealing: peak\['means'\]=-1.0"),
         (lambda: Annealing({"pose": 2.0}), r"'pose', which is no Gaussian.*means, scales"),
         (lambda: Annealing(float("nan")), r"Annealing: peak=nan"),
+        (lambda: Annealing(names=("pose",)), r"Annealing: names=\('pose',\), but a tuple"),
+        (lambda: Annealing(names=()), r"Annealing: names=\(\), but a tuple"),
     ],
 )
 def test_bad_options_are_named(call: Any, said: str) -> None:

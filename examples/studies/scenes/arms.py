@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -24,6 +25,7 @@ from opt3dgs_optim import (
     SquaredLoss,
     paper_parts,
 )
+from opt3dgs_optim.names import GAUSSIAN
 from opt3dgs_optim.presets import PAPER_WARMUP
 from studies.scenes.parts.chosen_fading import ChosenFading
 from studies.scenes.parts.exploring import NuOfNoise, NuPerPoint, RestartedHistogram, ViewHistogram
@@ -31,26 +33,36 @@ from studies.scenes.parts.keep_unseen import KeepUnseen
 from studies.scenes.parts.own_step import OwnStep
 
 BASELINE = "mcmc"
+DEFAULTS = "annealed-all-but-means+faded"  # what `PhaseScheduler(total_steps)` is
 ALL_ANNEALED = "annealed-4-0.4+faded"
-DEFAULTS = "annealed-4-opacities-1+faded"  # what `PhaseScheduler(total_steps)` is
-POOLED = f"{DEFAULTS}+pooled"
+ANNEALED = "annealed-4-opacities-1+faded"  # the defaults until the views rotated
+SHORT_LABEL = "annealed+faded"
+POOLED = f"{ANNEALED}+pooled"
 STABLE = "awsgld-stable"  # its histogram follows the energy; that of the arms before it did not
-UNFADED_OPACITIES = f"{DEFAULTS}-opacities-unfaded"
-V_ONLY = f"{DEFAULTS}-v-only"
+UNFADED_OPACITIES = f"{ANNEALED}-opacities-unfaded"
+V_ONLY = f"{ANNEALED}-v-only"
 EVENT_STEPS = 10  # iterations for one event of fading in a run of 3,000, where it was chosen
+
+
+def annealing(peak: float, final: float, opacity_peak: float = 1.0) -> Annealing:
+    """Of all parameters: that the positions are left alone came later."""
+    return Annealing(peak, final, opacity_peak, GAUSSIAN)
+
+
 # As measured, so that a change of the package's defaults does not change what an arm was.
-ANNEALING = Annealing(4.0, 0.4, opacity_peak=1.0)
+ANNEALING = annealing(4.0, 0.4)
+MEANS_LEFT = Annealing(4.0, 0.4, 1.0, names=("scales", "quats", "opacities", "sh0", "shN"))
 FADING = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=300)
 # What the arms beyond the paper are made of, by the arm's name; what a table calls them; and the
 # names of the arms that add a last phase.
 TRUNKS: dict[str, list[Part]] = {
-    "annealed-8-0.4": [Annealing(8.0, 0.4, opacity_peak=8.0)],
+    "annealed-8-0.4": [annealing(8.0, 0.4, opacity_peak=8.0)],
     "faded": [FADING],
-    DEFAULTS: [ANNEALING, FADING],
+    ANNEALED: [ANNEALING, FADING],
     POOLED: [ANNEALING, FADING, Pooling()],
 }
-WORDS = {"annealed-8-0.4": "annealed", "faded": "faded", DEFAULTS: "the defaults", POOLED: "pooled"}
-LABELS = {"annealed": "annealed-8-0.4", "defaults": DEFAULTS, "pooled": POOLED}
+WORDS = {"annealed-8-0.4": "annealed", "faded": "faded", ANNEALED: "both", POOLED: "pooled"}
+LABELS = {"annealed": "annealed-8-0.4", "defaults": ANNEALED, "pooled": POOLED}
 
 
 @dataclass(frozen=True)
@@ -85,11 +97,11 @@ def core() -> list[StudyArm]:
         StudyArm(
             f"annealed-{peak:g}-{final:g}",
             f"all steps times {peak:g} falling to {final:g}",
-            of(Annealing(peak, final, opacity_peak=peak)),
+            of(annealing(peak, final, opacity_peak=peak)),
         )
         for peak, final in ((4.0, 0.4), (8.0, 0.4), (8.0, 0.1), (16.0, 0.4))
     ]
-    both = of(Annealing(4.0, 0.4, opacity_peak=4.0), FADING)
+    both = of(annealing(4.0, 0.4, opacity_peak=4.0), FADING)
     paper = "a constant multiplier, the paper's mean nu"
     return [
         StudyArm(BASELINE, "stock 3DGS-MCMC, torch's Adam"),
@@ -104,13 +116,16 @@ def core() -> list[StudyArm]:
         StudyArm("faded", "moments of random points faded", of(FADING)),
         StudyArm(ALL_ANNEALED, "annealed from 4, and faded", both, control="annealed-8-0.4"),
         StudyArm(
-            DEFAULTS,
+            ANNEALED,
             "the same, but opacities annealed from 1",
-            of(*TRUNKS[DEFAULTS]),
+            of(*TRUNKS[ANNEALED]),
             control=ALL_ANNEALED,
         ),
         StudyArm(
-            POOLED, "the defaults, second moments pooled", of(*TRUNKS[POOLED]), control=DEFAULTS
+            POOLED,
+            "annealed and faded, second moments pooled",
+            of(*TRUNKS[POOLED]),
+            control=ANNEALED,
         ),
         StudyArm(
             "paper",
@@ -209,15 +224,15 @@ def leads() -> list[StudyArm]:
         StudyArm("faded-v-only", "exp_avg_sq faded, exp_avg kept", of(v_only), control="faded"),
         StudyArm(
             V_ONLY,
-            "the defaults, exp_avg_sq faded, exp_avg kept",
+            "annealed, exp_avg_sq faded, exp_avg kept",
             of(ANNEALING, v_only),
-            control=DEFAULTS,
+            control=ANNEALED,
         ),
         StudyArm(
             UNFADED_OPACITIES,
-            "the defaults, opacities not faded",
+            "annealed and faded, opacities not faded",
             of(ANNEALING, no_opacities),
-            control=DEFAULTS,
+            control=ANNEALED,
         ),
         StudyArm("faded-stale", f"{ratio} smallest", of(ChosenFading("stale")), control="faded"),
         StudyArm("faded-fresh", f"{ratio} largest", of(ChosenFading("fresh")), control="faded"),
@@ -235,33 +250,27 @@ def long_runs() -> list[StudyArm]:
             control="faded",
         ),
         StudyArm(
-            "defaults-3000",
-            "the defaults, faded every tenth iteration",
-            lambda iterations, _nu: [ANNEALING, _often(iterations)],
-            control=DEFAULTS,
-        ),
-        StudyArm(
             "annealed-2",
-            "the defaults, annealed from 2",
-            of(Annealing(2.0, 0.4, opacity_peak=1.0), FADING),
-            control=DEFAULTS,
+            "annealed from 2, and faded",
+            of(annealing(2.0, 0.4), FADING),
+            control=ANNEALED,
         ),
         StudyArm(
             "own-step",
             "root mean square of the steps on a schedule, whatever the learning rates",
             lambda _iterations, _nu: [OwnStep()],
-            control=DEFAULTS,
+            control=ANNEALED,
         ),
     ]
 
 
 def schedules() -> list[StudyArm]:
-    """Fading with other peaks and ends of the annealing than the defaults'."""
+    """Fading with other peaks and ends of the annealing."""
     return [
         StudyArm(
             f"settled-{peak:g}-{final:g}",
             f"faded, all steps times {peak:g} falling to {final:g}, opacities from 1",
-            of(Annealing(peak, final, opacity_peak=1.0), FADING),
+            of(annealing(peak, final), FADING),
             control="faded",
         )
         for peak, final in ((1.0, 0.2), (1.0, 0.1), (2.0, 0.2), (2.0, 0.1), (4.0, 0.1))
@@ -275,16 +284,23 @@ def detail() -> list[StudyArm]:
         "shapes": ("scales", "quats"),
         "colours": ("sh0", "shN"),
         "opacities": ("opacities",),
-        "all-but-means": ("scales", "quats", "sh0", "shN", "opacities"),
     }
     return [
         StudyArm(
-            f"annealed-{name}+faded",
-            f"faded, and {', '.join(names)} alone annealed",
-            of(Annealing({n: 1.0 if n == "opacities" else 4.0 for n in names}, 0.4), FADING),
+            DEFAULTS,
+            "faded, and all but the positions annealed",
+            of(MEANS_LEFT, FADING),
             control="faded",
-        )
-        for name, names in alone.items()
+        ),
+        *(
+            StudyArm(
+                f"annealed-{name}+faded",
+                f"faded, and {', '.join(names)} alone annealed",
+                of(Annealing({n: 1.0 if n == "opacities" else 4.0 for n in names}, 0.4), FADING),
+                control="faded",
+            )
+            for name, names in alone.items()
+        ),
     ]
 
 
@@ -302,7 +318,7 @@ def adaptive() -> list[StudyArm]:
     kinds: dict[str, tuple[str, MakeParts | None]] = {
         "adc": ("stock 3DGS with adaptive density control, torch's Adam", None),
         "adc+faded": ("the same, faded", of(FADING)),
-        "adc+defaults": ("the same, with the defaults", of(*TRUNKS[DEFAULTS])),
+        "adc+annealed+faded": ("the same, annealed and faded", of(*TRUNKS[ANNEALED])),
     }
     return [
         StudyArm(name, what, parts, mcmc=False, control="adc", adaptive=True)
@@ -375,5 +391,7 @@ def find_study_arm(name: str) -> StudyArm:
 
 
 def label(arm: str) -> str:
-    """An arm's name in tables and plots, where the defaults' is long."""
-    return arm.replace(DEFAULTS, "defaults")
+    """An arm's name in tables and plots, where the one in the records is long or out of date."""
+    if arm == DEFAULTS:
+        return "defaults"
+    return re.sub("^defaults", SHORT_LABEL, arm.replace(ANNEALED, SHORT_LABEL))

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from studies.scenes.analysis import Gain, Study
-from studies.scenes.arms import ALL_ANNEALED, DEFAULTS, POOLED
+from studies.scenes.analysis import Study
+from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, POOLED, STABLE
+from studies.scenes.long_tables import Difference, difference
+from studies.scenes.records import Setting
 
-SHORT, LONG = 3_000, 7_500
-# part, or an option of it -> (the arm with it, the arm without it, iterations)
+LENGTHS = (30_000, 7_500)
+MIN_SCENES = 3  # with forty training views or more
+# part -> (the arm with it, the arm without it)
 COMPARISONS = {
-    "Annealing": (ALL_ANNEALED, "faded", SHORT),
-    "Annealing.opacity_peak": (DEFAULTS, ALL_ANNEALED, LONG),
-    "Fading": (ALL_ANNEALED, "annealed-8-0.4", SHORT),
-    "Pooling": (POOLED, DEFAULTS, LONG),
-    "EnergyHistogram": ("awsgld", "constant", SHORT),
-    "SquaredLoss": ("l2@1/30", "mcmc", SHORT),
-    "FreshMoments": ("l1+reset@1/30", "mcmc", SHORT),
-    "Curvature": ("l2+reset+lqn@1/30", "l2+reset@1/30", SHORT),
+    "Fading": ("faded", BASELINE),
+    "Annealing": (DEFAULTS, "faded"),
+    "Annealing of the positions": (ANNEALED, DEFAULTS),
+    "Pooling": (POOLED, ANNEALED),
+    "EnergyHistogram": (STABLE, f"{STABLE}-constant"),
+    "SquaredLoss": ("l2@1/30", BASELINE),
+    "FreshMoments": ("l1+reset@1/30", BASELINE),
+    "Curvature": ("l2+reset+lqn@1/30", "l2+reset@1/30"),
 }
 
 
@@ -27,24 +30,43 @@ class Decision:
 
     arm: str
     control: str
-    iterations: int
-    gain: Gain | None  # None: not measured
+    iterations: int | None  # None: not measured on enough scenes
+    found: Difference | None
+
+    @property
+    def verdict(self) -> str:
+        """The rule's, or that there are too few trainings."""
+        return "too few" if self.found is None else self.found.verdict
 
     @property
     def on(self) -> bool:
         """A part that was not shown to pay is off."""
-        return self.gain is not None and self.gain.verdict == "pays"
+        return self.verdict == "pays"
+
+
+def settings_of(study: Study, iterations: int) -> list[Setting]:
+    """The scenes of the rotated trainings at a quarter of their size, all views, stock rates."""
+    plain = Setting("", 0, iterations, "sfm", rotated=True)
+    return [
+        setting
+        for setting in study.all_settings()
+        if (setting.iterations, setting.size, setting.views, setting.tiled, setting.rates)
+        == (plain.iterations, plain.size, plain.views, plain.tiled, plain.rates)
+    ]
 
 
 def decide(study: Study) -> dict[str, Decision]:
-    """The decision on every part.
+    """The decision on every part, at the longest trainings that three scenes have.
 
-    Annealing and fading are judged against each other alone, fading against the annealing that did
-    best by itself, since both lengthen steps; the multiplier against a constant of its mean,
-    curvature against the same phase without it. A peak of the opacities' own is judged in longer
-    trainings, since what it prevents takes time: points that few views see are relocated.
+    Each part is judged against the same training without it: the multiplier against a constant of
+    its mean, curvature against the same phase without it, annealing on top of fading.
     """
-    return {
-        part: Decision(arm, control, count, study.gain(study.settings(count), arm, control))
-        for part, (arm, control, count) in COMPARISONS.items()
-    }
+    made = {}
+    for part, (arm, control) in COMPARISONS.items():
+        made[part] = Decision(arm, control, None, None)
+        for iterations in LENGTHS:
+            found = difference(study, settings_of(study, iterations), arm, control)
+            if len(found.pairs) >= MIN_SCENES:
+                made[part] = Decision(arm, control, iterations, found)
+                break
+    return made

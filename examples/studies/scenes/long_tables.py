@@ -88,19 +88,23 @@ def difference(
 def differences_table(study: Study, settings: Sequence[Setting], arms: Iterable[str]) -> str:
     """One line per arm that has been trained: what it gains over its control."""
     lines = [
-        "| arm | against | scenes, trainings | PSNR, dB | SSIM | LPIPS | seconds | by the rule |",
+        "| arm | against | scenes, trainings | PSNR | SSIM | LPIPS | seconds | by the rule |",
         "|---|---|---|---:|---:|---:|---:|---|",
     ]
     for arm in arms:
         found = difference(study, settings, arm)
         if not found.count or found.arm == found.control:
             continue
-        cells = [_signed(*found.of(metric), digits) for metric, (_, digits) in METRICS.items()]
         lines.append(
             f"| `{label(arm)}` | `{label(found.control)}` | {len(found.pairs)}, {found.count} "
-            f"| {' | '.join(cells)} | x{found.seconds:.2f} | {found.verdict} |"
+            f"| {' | '.join(cells_of(found))} | x{found.seconds:.2f} | {found.verdict} |"
         )
     return "\n".join(lines)
+
+
+def cells_of(found: Difference) -> list[str]:
+    """What is gained in the three metrics when the first of the two has finished."""
+    return [_signed(*found.of(metric), digits) for metric, (_, digits) in METRICS.items()]
 
 
 def metrics_table(study: Study, settings: Sequence[Setting], arms: Iterable[str]) -> str:

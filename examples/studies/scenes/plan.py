@@ -9,7 +9,7 @@ from typing import Any
 
 from studies.scenes.arms import (
     ALL_ANNEALED,
-    DEFAULTS,
+    ANNEALED,
     GROUPS,
     POOLED,
     STABLE,
@@ -25,7 +25,7 @@ QUICK_SCENES = ("banana", "embedded")  # for the options of a part
 MANY_VIEWS_SCENES = ("bonsai", "lego", "plush")
 ROTATED_SCENES = (*MANY_VIEWS_SCENES, "embedded", "banana", "lund_door", "brighton_beach")
 ROTATED_ARMS = (
-    *("mcmc", DEFAULTS, "defaults-3000", "faded", "paper", "paper-constant"),
+    *("mcmc", "faded", ANNEALED, "paper", "paper-constant"),
     *("faded-3000", "rates-x2", POOLED, "annealed-2", "own-step"),
     *(STABLE, f"{STABLE}-constant"),
 )
@@ -72,13 +72,13 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
             for arm in arms
         ]
 
-    two = ["mcmc", DEFAULTS]
+    two = ["mcmc", ANNEALED]
     longer = ["annealed-8-0.4", "annealed-4-0.4", "faded"]
     return {
         "core": cross(SCENES, FIRST_ARMS, seeds, 3_000),
         "tails": cross(SCENES, tails, seeds, 3_000),
         "long": cross(SCENES, [*two, ALL_ANNEALED, POOLED], seeds, 7_500),
-        "defaults": cross(SCENES, [ALL_ANNEALED, DEFAULTS, POOLED], seeds, 3_000),
+        "defaults": cross(SCENES, [ALL_ANNEALED, ANNEALED, POOLED], seeds, 3_000),
         "long-parts": cross(SCENES, [*longer, UNFADED_OPACITIES], 1, 7_500),
         "full": cross(SCENES, [*two, POOLED], 1, 30_000),
         "rotated-first": cross(MANY_VIEWS_SCENES, two, 1, 30_000, rotated=True),

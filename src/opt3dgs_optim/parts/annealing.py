@@ -1,4 +1,4 @@
-"""Annealing: all learning rates start above the trainer's own and end below them."""
+"""Annealing: learning rates start above the trainer's own and end below them."""
 
 from __future__ import annotations
 
@@ -7,22 +7,25 @@ from dataclasses import dataclass
 
 from opt3dgs_optim.checks import check_number
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.names import GAUSSIAN_NAMES, canonical_name, slot
+from opt3dgs_optim.names import GAUSSIAN, GAUSSIAN_NAMES, canonical_name, check_names, slot
 from opt3dgs_optim.part import Group, Part
 
 CALL = "Annealing"
+ANNEALED = tuple(name for name in GAUSSIAN if name != "means")
 
 
 @dataclass(frozen=True, repr=False)
 class Annealing(Part):
-    """Multiply the step of every Gaussian parameter by a factor that falls geometrically.
+    """Multiply the steps of shapes, opacities and colours by a factor that falls geometrically.
 
         factor(t) = peak^(1 - t) * final^t,    t = iteration / total_steps in 0..1
 
-    3DGS lets the positions' learning rate decay to 1 % and keeps the others constant: too small
-    to get far in the first iterations, too large to settle in the last. The factor comes on top
-    of the trainer's own schedule; the learning rates in `param_groups`, which 3DGS-MCMC's noise is
-    proportional to, stay as they are. It costs no memory.
+    3DGS keeps all learning rates but the positions' constant: too small to get far in the first
+    iterations, too large to settle in the last. The factor comes on top of the trainer's own
+    schedule; the learning rates in `param_groups` stay as they are. It costs no memory.
+
+    The positions are left alone: their rate falls to 1 % already, and at four times the rate many
+    points lose the detail that the sparse points had placed (docs/evidence.md).
 
     The opacities have a peak of their own. 3DGS-MCMC's regularisers pull at every point, and Adam
     makes a full step of that where a view does not reach: at four times the rate, points which few
@@ -35,20 +38,23 @@ class Annealing(Part):
             annealed).
         final: factor at the last iteration, above 0.
         opacity_peak: `peak` of the opacities, where that is a number.
+        names: the Gaussian parameters, where the peak is a number.
 
     Raises:
-        ValueError: an option is outside what is allowed.
+        ValueError: an option is outside what is allowed, or a name is no Gaussian parameter's.
     """
 
     peak: float | Mapping[str, float] = 4.0
     final: float = 0.4
     opacity_peak: float = 1.0
+    names: tuple[str, ...] = ANNEALED
 
     def __post_init__(self) -> None:
         check_number(CALL, "final", self.final, 0.0, open_low=True)
         check_number(CALL, "opacity_peak", self.opacity_peak, 0.0, open_low=True)
         if not isinstance(self.peak, Mapping):
             check_number(CALL, "peak", self.peak, 0.0, open_low=True)
+            object.__setattr__(self, "names", check_names(CALL, self.names))
             return
         peaks: dict[str, float] = {}
         for name, value in self.peak.items():
@@ -66,16 +72,16 @@ class Annealing(Part):
         """The factor on a parameter's step.
 
         Args:
-            name: its name, gsplat's or INRIA's; 1 where it is no Gaussian parameter.
+            name: its name, gsplat's or INRIA's; 1 where it is none of those that are annealed.
             progress: share of the run that is over; taken as 0..1.
         """
         known = canonical_name(name)
+        if known not in self.names:
+            return 1.0
         if isinstance(self.peak, Mapping):
-            peak = self.peak.get(known or "")
+            peak = self.peak[known]
         else:
             peak = self.opacity_peak if known == "opacities" else self.peak
-        if known is None or peak is None:
-            return 1.0
         t = min(max(progress, 0.0), 1.0)
         return peak ** (1.0 - t) * self.final**t
 
@@ -84,6 +90,5 @@ class Annealing(Part):
         return self.at(slot(group), course.progress)
 
     def numbers(self, course: Course) -> Mapping[str, float]:
-        """`annealing`: the factor on the steps of the positions, or of the first parameter."""
-        first = next(iter(self.peak)) if isinstance(self.peak, Mapping) else "means"
-        return {"annealing": self.at(first, course.progress)}
+        """`annealing`: the factor on the steps of the first of its parameters."""
+        return {"annealing": self.at(self.names[0], course.progress)}

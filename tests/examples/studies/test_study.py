@@ -19,7 +19,9 @@ from splatting.scenes import load_scene
 from studies.scenes import report, steps
 from studies.scenes.analysis import Study
 from studies.scenes.arms import BASELINE, STUDY_ARMS, find_study_arm
-from studies.scenes.decisions import COMPARISONS, decide
+from studies.scenes.arms import DEFAULTS as DEFAULT_ARM
+from studies.scenes.decisions import decide
+from studies.scenes.long_tables import reach_table
 from studies.scenes.parts.chosen_fading import chosen_rows
 from studies.scenes.parts.own_step import OwnStep
 from studies.scenes.parts.step_lengths import StepLengths
@@ -31,7 +33,7 @@ from studies.scenes.training import Spec, machine, train
 from studies.scenes.view_angles import nearest_angles
 from torch import Tensor
 
-from opt3dgs_optim import DEFAULTS, Annealing, Fading
+from opt3dgs_optim import DEFAULTS, Fading
 
 RECORDS = report.FOLDER / "records.json"
 
@@ -47,31 +49,89 @@ def record(arm: str, scene: str, seed: int, psnr: float, seconds: float = 10.0) 
 
 def test_the_pages_are_made_from_the_records() -> None:
     made = report.tables(Study(read(RECORDS)))
-    made |= report.rotated_tables(Study(read(report.FOLDER / report.ROTATED)))
+    made |= report.rotated_tables(rotating())
     for path in report.PAGES:
         page = path.read_text(encoding="utf-8")
         assert "<!-- study:" in page
         assert report.fill(page, made) == page, path
 
 
+def rotating() -> Study:
+    return Study(read(report.FOLDER / report.ROTATED))
+
+
 def test_the_defaults_are_what_the_page_concludes() -> None:
-    decided = {part: decision.on for part, decision in decide(Study(read(RECORDS))).items()}
+    decided = {part: decision.on for part, decision in decide(rotating()).items()}
     committed = json.loads((report.FOLDER / "decisions.json").read_text(encoding="utf-8"))
     assert committed == decided
-    on = {part for part, is_on in decided.items() if is_on and "." not in part}
-    assert {type(part).__name__ for part in DEFAULTS} == on
-    annealing = Annealing()
-    assert (annealing.opacity_peak != annealing.peak) == decided["Annealing.opacity_peak"]
+    assert {type(part).__name__ for part in DEFAULTS} == {
+        part for part, on in decided.items() if on
+    }
 
 
 def test_the_defaults_are_the_measured_arm() -> None:
-    measured = find_study_arm(report.BEST).parts
+    measured = find_study_arm(DEFAULT_ARM).parts
     assert measured is not None
     assert measured(300, None) == list(DEFAULTS)
-    peak, opacities = Annealing().peak, Annealing().opacity_peak
-    unpooled = f"annealed-{peak:g}-opacities-{opacities:g}+faded"
-    assert COMPARISONS["Annealing.opacity_peak"][0] == unpooled
-    assert COMPARISONS["Pooling"][1] == report.BEST
+
+
+def rotated_record(arm: str, scene: str, seed: int, **metrics: float) -> Record:
+    """As `record`; the metrics are those after the last iteration."""
+    made = record(arm, scene, seed, metrics.pop("psnr", 20.0), metrics.pop("seconds", 10.0))
+    for name, value in ({"ssim": 0.7, "lpips": 0.2} | metrics).items():
+        made.curve[name] = np.array([0.0, value])
+    return replace(made, setting=replace(made.setting, iterations=7_500, rotated=True))
+
+
+@pytest.mark.parametrize(
+    ("better", "verdict"),
+    [
+        ({"psnr": 20.5}, "pays"),
+        ({"psnr": 20.5, "ssim": 0.69}, "loses SSIM"),
+        ({"psnr": 20.5, "lpips": 0.21}, "loses LPIPS"),
+        ({"lpips": 0.19}, "pays"),
+        ({"psnr": 20.5, "seconds": 20.0}, "loses PSNR, SSIM"),
+        ({}, "no difference"),
+    ],
+)
+def test_a_part_is_on_if_one_metric_gains_and_none_loses(
+    better: dict[str, float], verdict: str
+) -> None:
+    records = [
+        rotated_record(arm, scene, 0, **(better if arm != BASELINE else {}))
+        for scene in "abc"
+        for arm in (BASELINE, "faded")
+    ]
+    decision = decide(Study(records))["Fading"]
+    assert (decision.iterations, decision.verdict) == (7_500, verdict)
+    assert decision.on == (verdict == "pays")
+    two = decide(Study(records[:4]))["Fading"]
+    assert (two.iterations, two.verdict, two.on) == (None, "too few", False)
+
+
+def test_the_longest_trainings_decide() -> None:
+    records = [
+        rotated_record(arm, scene, 0, psnr=20.0 + (arm != BASELINE))
+        for scene in "abc"
+        for arm in (BASELINE, "faded")
+    ]
+    longer = [
+        replace(r, setting=replace(r.setting, iterations=30_000), arm=arm)
+        for r, arm in zip(records, 3 * ["faded", BASELINE], strict=True)
+    ]
+    decision = decide(Study([*records, *longer]))["Fading"]
+    assert (decision.iterations, decision.verdict) == (30_000, "loses PSNR")
+
+
+def test_when_stocks_quality_is_reached() -> None:
+    stock, ours = (
+        rotated_record(arm, "a", 0, psnr=psnr)
+        for arm, psnr in ((BASELINE, 20.0), (DEFAULT_ARM, 30.0))
+    )
+    study = Study([stock, ours])
+    said = reach_table(study, study.all_settings(), [BASELINE, DEFAULT_ARM], 3_000)
+    assert "| `defaults` | x0.50 of its seconds | - |" in said
+    assert "20.00 dB" in said
 
 
 def test_gain_at_equal_seconds_and_its_spread() -> None:
@@ -172,7 +232,7 @@ def _iterations(made: dict[str, object]) -> list[int]:
     return [row["iteration"] for row in curve]
 
 
-@pytest.mark.parametrize("name", ["own-step", "annealed-2", "defaults-3000", "faded-fresh"])
+@pytest.mark.parametrize("name", ["own-step", "annealed-2", "settled-2-0.1", "faded-fresh"])
 def test_arms_train(tmp_path: Path, name: str) -> None:
     made = train(Spec("embedded", name, 0, 60, 80), tmp_path, None, None)
     assert np.isfinite(_psnr(made)).all()
@@ -334,8 +394,8 @@ def test_a_retired_arm_is_drawn_but_not_trained() -> None:
 
 
 def test_fading_follows_the_length_of_the_run() -> None:
-    for name in ("faded-3000", "defaults-3000"):
-        make = find_study_arm(name).parts
-        assert make is not None
-        fading = next(part for part in make(30_000, None) if isinstance(part, Fading))
-        assert fading.events == 3_000
+    make = find_study_arm("faded-3000").parts
+    assert make is not None
+    (fading,) = make(30_000, None)
+    assert isinstance(fading, Fading)
+    assert fading.events == 3_000

@@ -212,5 +212,5 @@ def test_a_trainer_with_other_rates_makes_other_steps() -> None:
         fit.step()
     ratio = (doubled.gaussians["sh0"] - start) / (usual.gaussians["sh0"] - start)
     assert ratio.nanmedian().item() == pytest.approx(2.0, rel=1e-3)
-    with pytest.raises(ValueError, match="rates=0.0, must be above 0"):
+    with pytest.raises(ValueError, match=r"rates=0\.0, must be above 0"):
         FitOptions(rates=0.0)
