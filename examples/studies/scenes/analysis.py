@@ -9,7 +9,7 @@ from statistics import fmean, stdev
 from typing import Literal
 
 from studies.scenes.arms import BASELINE, STUDY_ARMS
-from studies.scenes.records import Record, Setting
+from studies.scenes.records import Costs, Record, Setting
 
 Verdict = Literal["pays", "does not pay", "undecided"]
 MIN_SEEDS = 3
@@ -45,9 +45,10 @@ class Gain:
 
 
 class Study:
-    """The records, by setting, arm and seed."""
+    """The records, by setting, arm and seed; and what an iteration costs, where measured."""
 
-    def __init__(self, records: Iterable[Record]) -> None:
+    def __init__(self, records: Iterable[Record], costs: Costs | None = None) -> None:
+        self.costs = costs or {}
         self._of: dict[tuple[Setting, str], dict[int, Record]] = defaultdict(dict)
         for record in records:
             self._of[record.setting, record.arm][record.seed] = record

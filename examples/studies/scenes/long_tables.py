@@ -17,28 +17,29 @@ MIN_PAIRS = 3  # of scene and seed, for a spread that means something
 
 @dataclass(frozen=True)
 class Difference:
-    """An arm less its control, training by training: the same scene, seed and held-out views."""
+    """An arm less its control, training by training: the same scene, seed and held-out views.
+
+    Equal seconds are equal costs: of an iteration's cost, measured in turns (`costs.py`), since
+    the trainings' own clocks ran at different hours beside different work. An arm whose
+    iterations cost 5 % more is looked at after 1/1.05 of them. Where the cost was not measured it
+    counts as the control's.
+    """
 
     arm: str
     control: str
-    pairs: dict[str, list[tuple[Record, Record]]]  # scene -> by seed
+    pairs: dict[str, list[tuple[Record, Record, float]]]  # scene -> by seed; and the arm's cost
 
     @property
     def count(self) -> int:
         """Pairs of trainings."""
         return sum(map(len, self.pairs.values()))
 
-    def of(self, metric: str, equal_seconds: bool = True) -> tuple[float, float]:
-        """Mean over the scenes, and its standard error over all pairs; (nan, nan) without any.
+    def of(self, metric: str) -> tuple[float, float]:
+        """Gain at equal seconds: mean over the scenes, and its standard error over all pairs.
 
-        Args:
-            metric: a key of `METRICS`.
-            equal_seconds: compare when the first of the two has finished, in CPU seconds; else
-                after the last iteration.
+        `metric` is a key of `METRICS`; (nan, nan) without any pair.
         """
-        by_scene = [
-            [_gain(a, b, metric, equal_seconds) for a, b in pairs] for pairs in self.pairs.values()
-        ]
+        by_scene = [[_gain(*pair, metric) for pair in pairs] for pairs in self.pairs.values()]
         every = [value for values in by_scene for value in values]
         if not every:
             return float("nan"), float("nan")
@@ -47,9 +48,9 @@ class Difference:
         return mean, spread
 
     @property
-    def seconds(self) -> float:
-        """The arm's, as a share of the control's."""
-        return fmean(a.seconds / b.seconds for pairs in self.pairs.values() for a, b in pairs)
+    def cost(self) -> float:
+        """Seconds of an iteration, as a share of the control's."""
+        return fmean(cost for pairs in self.pairs.values() for _, _, cost in pairs)
 
     @property
     def verdict(self) -> str:
@@ -66,9 +67,10 @@ class Difference:
         return "pays" if better else "no difference"
 
 
-def _gain(arm: Record, control: Record, metric: str, equal_seconds: bool) -> float:
-    at = min(arm.seconds, control.seconds) if equal_seconds else float("inf")
-    return arm.at_seconds(at, metric) - control.at_seconds(at, metric)
+def _gain(arm: Record, control: Record, cost: float, metric: str) -> float:
+    total = arm.setting.iterations
+    ours = arm.at_iteration(total * min(1.0, 1.0 / cost), metric)
+    return ours - control.at_iteration(total * min(1.0, cost), metric)
 
 
 def difference(
@@ -76,19 +78,21 @@ def difference(
 ) -> Difference:
     """The arm against its control on all scenes and seeds that have both."""
     control = control or STUDY_ARMS[arm].control
-    pairs = {}
+    costs, pairs = study.costs, {}
     for setting in settings:
         ours, theirs = study.runs(setting, arm), study.runs(setting, control)
         shared = sorted(ours.keys() & theirs.keys())
         if shared:
-            pairs[setting.scene] = [(ours[seed], theirs[seed]) for seed in shared]
+            key = (setting.scene, setting.size, setting.iterations)
+            cost = costs.get((*key, arm), 1.0) / costs.get((*key, control), 1.0)
+            pairs[setting.scene] = [(ours[seed], theirs[seed], cost) for seed in shared]
     return Difference(arm, control, pairs)
 
 
 def differences_table(study: Study, settings: Sequence[Setting], arms: Iterable[str]) -> str:
     """One line per arm that has been trained: what it gains over its control."""
     lines = [
-        "| arm | against | scenes, trainings | PSNR | SSIM | LPIPS | seconds | by the rule |",
+        "| arm | against | scenes, trainings | PSNR | SSIM | LPIPS | cost | by the rule |",
         "|---|---|---|---:|---:|---:|---:|---|",
     ]
     for arm in arms:
@@ -97,7 +101,7 @@ def differences_table(study: Study, settings: Sequence[Setting], arms: Iterable[
             continue
         lines.append(
             f"| `{label(arm)}` | `{label(found.control)}` | {len(found.pairs)}, {found.count} "
-            f"| {' | '.join(cells_of(found))} | x{found.seconds:.2f} | {found.verdict} |"
+            f"| {' | '.join(cells_of(found))} | x{found.cost:.2f} | {found.verdict} |"
         )
     return "\n".join(lines)
 
@@ -127,43 +131,40 @@ def reach_table(study: Study, long: Sequence[Setting], arms: Sequence[str], shor
         short: iterations of the trainings that were that long from their start, whose last PSNR
             stands beside.
     """
+    total = long[0].iterations if long else 0
     lines = [
-        f"| scene | stock, {long[0].iterations:,} iterations | arm | reaches stock's PSNR after "
+        f"| scene | stock, {total:,} iterations | arm | reaches stock's PSNR after "
         f"| trained for {short:,} iterations only |",
         "|---|---|---|---|---|",
     ]
     for setting in long:
-        stock = study.runs(setting, BASELINE)
-        quick = [s for s in study.all_settings() if s == _of_length(setting, short)]
+        stock, brief = study.runs(setting, BASELINE), replace(setting, iterations=short)
         for arm in arms:
-            ours = study.runs(setting, arm)
-            seeds = sorted(stock.keys() & ours.keys())
-            if not seeds:
-                continue
-            shares = [ours[s].seconds_to(stock[s].final) for s in seeds]
-            reached = [
-                share / stock[s].seconds
-                for s, share in zip(seeds, shares, strict=True)
-                if share is not None
+            found = difference(study, [setting], arm, BASELINE)
+            shares = [
+                reached * found.cost / total if reached is not None else None
+                for pairs in found.pairs.values()
+                for ours, theirs, _ in pairs
+                for reached in [ours.iteration_of(theirs.final)]
             ]
-            said = (
-                f"x{fmean(reached):.2f} of its seconds" if len(reached) == len(seeds) else "never"
-            )
+            quick = study.runs(brief, arm)
+            both = sorted(quick.keys() & stock.keys())
+            if not shares and not both:
+                continue
+            known = [share for share in shares if share is not None]
+            said = "never" if shares else "-"
+            if shares and len(known) == len(shares):
+                said = f"x{fmean(known):.2f} of its seconds"
             beside = "-"
-            brief = study.runs(quick[0], arm) if quick else {}
-            both = sorted(brief.keys() & stock.keys())
             if both:
-                gain = fmean(brief[s].final - stock[s].final for s in both)
-                share = fmean(brief[s].seconds / stock[s].seconds for s in both)
+                gain = fmean(quick[s].final - stock[s].final for s in both)
+                key = (setting.scene, setting.size, short, arm)
+                share = short / total * study.costs.get(key, 1.0)
                 beside = f"{gain:+.2f} dB in x{share:.2f} of its seconds"
-            final = fmean(stock[s].final for s in seeds)
-            row = f"| {setting.scene} | {final:.2f} dB, {len(seeds)} seeds | `{label(arm)}`"
+            final = fmean(record.final for record in stock.values())
+            row = f"| {setting.scene} | {final:.2f} dB ({len(stock)}) | `{label(arm)}`"
             lines.append(f"{row} | {said} | {beside} |")
     return "\n".join(lines)
-
-
-def _of_length(setting: Setting, iterations: int) -> Setting:
-    return replace(setting, iterations=iterations)
 
 
 def _cell(records: Sequence[Record]) -> str:

@@ -12,6 +12,8 @@ import numpy as np
 MEASURED = ("iteration", "seconds", "psnr", "ssim", "train_psnr", "num_points")  # in all records
 COLUMNS = (*MEASURED, "lpips", "relocated", "median_scale", "median_opacity")
 
+Costs = dict[tuple[str, str, int, str], float]  # scene, size, iterations, arm -> share of stock's
+
 
 @dataclass(frozen=True)
 class Setting:
@@ -54,17 +56,24 @@ class Record:
         """Test PSNR after the last iteration, dB."""
         return float(self.curve["psnr"][-1])
 
-    def at_seconds(self, seconds: float, metric: str = "psnr") -> float:
-        """A metric at that time, linear between evaluations; the last one beyond the end."""
-        return float(np.interp(seconds, self.curve["seconds"], self.curve[metric]))
+    def at_seconds(self, seconds: float) -> float:
+        """Test PSNR at that time, dB, linear between evaluations; the last one beyond the end."""
+        return float(np.interp(seconds, self.curve["seconds"], self.curve["psnr"]))
 
-    def at_iteration(self, iteration: float) -> float:
-        """Test PSNR at that iteration, dB."""
-        return float(np.interp(iteration, self.curve["iteration"], self.curve["psnr"]))
+    def at_iteration(self, iteration: float, metric: str = "psnr") -> float:
+        """A metric at that iteration, linear between evaluations."""
+        return float(np.interp(iteration, self.curve["iteration"], self.curve[metric]))
+
+    def iteration_of(self, psnr: float) -> float | None:
+        """When the test PSNR first reaches that value, interpolated; None if it never does."""
+        return self._first("iteration", psnr)
 
     def seconds_to(self, psnr: float) -> float | None:
-        """When the test PSNR first reaches that value, interpolated; None if it never does."""
-        values, times = self.curve["psnr"], self.curve["seconds"]
+        """As `iteration_of`, in CPU seconds."""
+        return self._first("seconds", psnr)
+
+    def _first(self, column: str, psnr: float) -> float | None:
+        values, times = self.curve["psnr"], self.curve[column]
         reached = np.flatnonzero(values >= psnr)
         if not len(reached):
             return None
@@ -127,3 +136,13 @@ def _record(entry: dict[str, Any], columns: list[str]) -> Record:
         entry["machine"],
         entry["date"],
     )
+
+
+def read_costs(path: Path) -> Costs:
+    """What an iteration costs, as `costs.py` measured it; empty where it was not."""
+    entries = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
+    return {
+        (e["scene"], e["size"], e["iterations"], arm): share
+        for e in entries
+        for arm, share in e["shares"].items()
+    }

@@ -34,7 +34,7 @@ from studies.scenes.arms import (
 from studies.scenes.decisions import decide, settings_of
 from studies.scenes.long_tables import cells_of, differences_table, metrics_table, reach_table
 from studies.scenes.plots import plot_curves, plot_gains
-from studies.scenes.records import Setting, gather, merge, read, write
+from studies.scenes.records import Setting, gather, merge, read, read_costs, write
 from studies.scenes.tables import (
     front_table,
     gains_table,
@@ -67,6 +67,7 @@ FEW_VIEWS_ARMS = (
     *(UNFADED_OPACITIES, BEST, POOLED),
 )
 CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4", BEST)
+COSTS = "costs.json"
 ROTATED = "rotated.json"  # records whose held-out views rotate with the seed
 LONG, BRIEF, DETAIL = 30_000, 7_500, 2_000
 SCENE_SIZE: Size = "images_4"
@@ -110,6 +111,11 @@ def tables(study: Study) -> dict[str, str]:
         kinds = {"3,000 iterations": settings}
         made[stage] = goals_table(study, kinds, BEST, BASELINE) if found else _missing(stage)
     return made
+
+
+def rotating_study() -> Study:
+    """The trainings with rotating views, and what their iterations cost."""
+    return Study(read(FOLDER / ROTATED), read_costs(FOLDER / COSTS))
 
 
 def rotated_tables(study: Study) -> dict[str, str]:
@@ -224,7 +230,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 old = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
                 new = [record for record in found if record.get("rotated", False) == rotated]
                 write(merge(old.get("records", []), new), path)
-        study, rotating = Study(read(records)), Study(read(FOLDER / ROTATED))
+        study, rotating = Study(read(records)), rotating_study()
         made = tables(study) | rotated_tables(rotating)
         for page in PAGES:
             page.write_text(fill(page.read_text(encoding="utf-8"), made), encoding="utf-8")

@@ -76,7 +76,7 @@ def train(
 
     torch.set_num_threads(1)
     scene, arm = scene_of(spec), find_study_arm(spec.arm)
-    fit = _kind(arm)(scene, arm, spec.options(), mean_nu)
+    fit = fit_of(arm)(scene, arm, spec.options(), mean_nu)
     checkpoint, path = folder / "checkpoint.pt", folder / "record.json"
     total, marks = spec.iterations, _marks(spec.iterations)
     record: dict[str, Any] = {**asdict(spec), "scene": scene.name, "curve": [], "seconds": 0.0}
@@ -123,7 +123,8 @@ def train(
     return record
 
 
-def _kind(arm: StudyArm) -> type[Fit]:
+def fit_of(arm: StudyArm) -> type[Fit]:
+    """The trainer of an arm."""
     if not arm.adaptive:
         return Fit
     from studies.scenes.adaptive import AdaptiveFit  # gsplat stays optional

@@ -41,6 +41,7 @@ RECORDS = report.FOLDER / "records.json"
 def record(arm: str, scene: str, seed: int, psnr: float, seconds: float = 10.0) -> Record:
     """A straight curve from 10 dB at 0 s."""
     curve = {name: np.array([0.0, 1.0]) for name in COLUMNS}
+    curve["iteration"] = np.array([0.0, 3000.0])
     curve["seconds"] = np.array([0.0, seconds])
     curve["psnr"] = np.array([10.0, psnr])
     setting = Setting(scene, 100, 3000, "sfm")
@@ -49,19 +50,15 @@ def record(arm: str, scene: str, seed: int, psnr: float, seconds: float = 10.0) 
 
 def test_the_pages_are_made_from_the_records() -> None:
     made = report.tables(Study(read(RECORDS)))
-    made |= report.rotated_tables(rotating())
+    made |= report.rotated_tables(report.rotating_study())
     for path in report.PAGES:
         page = path.read_text(encoding="utf-8")
         assert "<!-- study:" in page
         assert report.fill(page, made) == page, path
 
 
-def rotating() -> Study:
-    return Study(read(report.FOLDER / report.ROTATED))
-
-
 def test_the_defaults_are_what_the_page_concludes() -> None:
-    decided = {part: decision.on for part, decision in decide(rotating()).items()}
+    decided = {part: decision.on for part, decision in decide(report.rotating_study()).items()}
     committed = json.loads((report.FOLDER / "decisions.json").read_text(encoding="utf-8"))
     assert committed == decided
     assert {type(part).__name__ for part in DEFAULTS} == {
@@ -77,9 +74,10 @@ def test_the_defaults_are_the_measured_arm() -> None:
 
 def rotated_record(arm: str, scene: str, seed: int, **metrics: float) -> Record:
     """As `record`; the metrics are those after the last iteration."""
-    made = record(arm, scene, seed, metrics.pop("psnr", 20.0), metrics.pop("seconds", 10.0))
+    made = record(arm, scene, seed, metrics.pop("psnr", 20.0))
     for name, value in ({"ssim": 0.7, "lpips": 0.2} | metrics).items():
         made.curve[name] = np.array([0.0, value])
+    made.curve["iteration"][1] = 7_500
     return replace(made, setting=replace(made.setting, iterations=7_500, rotated=True))
 
 
@@ -90,19 +88,21 @@ def rotated_record(arm: str, scene: str, seed: int, **metrics: float) -> Record:
         ({"psnr": 20.5, "ssim": 0.69}, "loses SSIM"),
         ({"psnr": 20.5, "lpips": 0.21}, "loses LPIPS"),
         ({"lpips": 0.19}, "pays"),
-        ({"psnr": 20.5, "seconds": 20.0}, "loses PSNR, SSIM"),
+        ({"psnr": 20.5, "cost": 2.0}, "loses PSNR, SSIM"),
         ({}, "no difference"),
     ],
 )
 def test_a_part_is_on_if_one_metric_gains_and_none_loses(
     better: dict[str, float], verdict: str
 ) -> None:
+    costs = {(scene, "images_4", 7_500, "faded"): better.get("cost", 1.0) for scene in "abc"}
+    better = {name: value for name, value in better.items() if name != "cost"}
     records = [
         rotated_record(arm, scene, 0, **(better if arm != BASELINE else {}))
         for scene in "abc"
         for arm in (BASELINE, "faded")
     ]
-    decision = decide(Study(records))["Fading"]
+    decision = decide(Study(records, costs))["Fading"]
     assert (decision.iterations, decision.verdict) == (7_500, verdict)
     assert decision.on == (verdict == "pays")
     two = decide(Study(records[:4]))["Fading"]

@@ -1,0 +1,117 @@
+"""What an iteration of each arm costs: python examples/studies/scenes/costs.py --runs runs/study
+
+Trainings that ran at different hours, beside other work, cannot be compared by their clocks. This
+loads the checkpoints that they left at the same iterations, lets them step in turns, and writes the
+seconds of an iteration of each arm, as a share of stock's, to docs/results/study/costs.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import fmean, median
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+import torch
+from splatting.fit import Fit
+
+from studies.scenes.arms import BASELINE, STUDY_ARMS, find_study_arm
+from studies.scenes.training import Spec, fit_of, machine, scene_of
+
+ROUNDS, STEPS, FIRST = 7, 10, 5  # rounds of so many iterations in turns, after the first few
+PATH = Path(__file__).resolve().parents[3] / "docs" / "results" / "study" / "costs.json"
+
+
+def measure(fits: dict[str, Fit]) -> dict[str, float]:
+    """CPU seconds of an iteration, as a share of the baseline's: medians of rounds in turns."""
+    for fit in fits.values():
+        for _ in range(FIRST):
+            fit.step()
+    seconds: dict[str, list[float]] = defaultdict(list)
+    for _ in range(ROUNDS):
+        for name, fit in fits.items():
+            start = time.process_time()
+            for _ in range(STEPS):
+                fit.step()
+            seconds[name].append(time.process_time() - start)
+    return {
+        name: median(a / b for a, b in zip(own, seconds[BASELINE], strict=True))
+        for name, own in seconds.items()
+    }
+
+
+def measure_all(runs: Path, iterations: Sequence[int]) -> list[dict[str, Any]]:
+    """One entry per scene, size and length whose first seed has stock and another arm."""
+    found: dict[tuple[Any, ...], dict[str, Path]] = defaultdict(dict)
+    for path in sorted(runs.rglob("record.json")):
+        record = json.loads(path.read_text(encoding="utf-8"))
+        plain = not (record.get("views") or record.get("tiled") or record["seed"])
+        arm = STUDY_ARMS.get(record["arm"])
+        whole = arm is not None and not arm.retired and arm.trunk is None and arm.needs is None
+        if plain and whole and record.get("finished") and record["iterations"] in iterations:
+            key = (record["scene"], record["size"], record["iterations"])
+            found[key][record["arm"]] = path.parent
+    made = []
+    for (scene, size, count), folders in found.items():
+        if BASELINE not in folders or len(folders) < 2:
+            continue
+        shares: dict[str, list[float]] = defaultdict(list)
+        marks = [
+            name
+            for name in (f"at-{count // 2}.pt", f"at-{3 * count // 4}.pt", "checkpoint.pt")
+            if all((folder / name).exists() for folder in folders.values())
+        ]
+        for mark in marks:
+            fits = {}
+            for arm, folder in folders.items():
+                call = json.loads((folder / "call.json").read_text(encoding="utf-8"))
+                spec = Spec(**call["spec"])
+                made_arm = find_study_arm(arm)
+                fit = fit_of(made_arm)(scene_of(spec), made_arm, spec.options(), call["mean_nu"])
+                fit.load(folder / mark)
+                fits[arm] = fit
+            for arm, share in measure(fits).items():
+                shares[arm].append(share)
+            print(scene, count, mark, {arm: round(s[-1], 3) for arm, s in shares.items()})
+        made.append(
+            {
+                "scene": scene,
+                "size": size,
+                "iterations": count,
+                "checkpoints": marks,
+                "shares": {arm: round(fmean(each), 3) for arm, each in shares.items()},
+                "machine": machine(),
+                "date": time.strftime("%Y-%m-%d", time.gmtime()),
+            }
+        )
+    return made
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line; 0, or 2 after one line that says what is wrong."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--runs", type=Path, required=True, metavar="DIR", help="of run.py")
+    parser.add_argument("--iterations", type=int, nargs="+", default=[7_500, 30_000])
+    args = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    try:
+        made = measure_all(args.runs, args.iterations)
+        if not made:
+            raise ValueError(f"--runs {args.runs}: holds no scene with {BASELINE} and another arm")
+        PATH.write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
+    except (OSError, ValueError) as error:
+        print(f"costs: {error}", file=sys.stderr)
+        return 2
+    print(PATH)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
