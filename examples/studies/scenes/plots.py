@@ -13,7 +13,7 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 
 from studies.scenes.analysis import Gain, Study
-from studies.scenes.arms import ANNEALED, BASELINE, POOLED, label
+from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, POOLED, label
 from studies.scenes.records import Record, Setting
 
 # Okabe and Ito's colours: told apart with any kind of colour vision.
@@ -23,8 +23,9 @@ COLOURS = {
     "constant": "#e69f00",
     "rates-x2": "#f0e442",
     "faded": "#cc79a7",
-    "annealed-8-0.4": "#56b4e9",
-    ANNEALED: "#0072b2",
+    "annealed-8-0.4": "#999999",
+    ANNEALED: "#56b4e9",
+    DEFAULTS: "#0072b2",
     POOLED: "#009e73",
 }
 SHOWN_FROM = 0.25  # of an arm's seconds: what it falls to before may be out of the picture
@@ -70,6 +71,35 @@ def plot_curves(study: Study, settings: Sequence[Setting], arms: Sequence[str], 
         ncols=min(len(handles), 4),
         frameon=False,
     )
+    figure.savefig(path, dpi=DPI)
+    plt.close(figure)
+
+
+def plot_metrics(
+    study: Study, settings: Sequence[Setting], arms: Sequence[str], path: Path
+) -> None:
+    """PSNR and LPIPS of the held-out views over stock's seconds, a column per scene."""
+    figure, axes = plt.subplots(
+        2, len(settings), figsize=(3.6 * len(settings), 5.0), squeeze=False, layout="constrained"
+    )
+    for column, setting in zip(axes.T, settings, strict=True):
+        for arm in arms:
+            cost = study.costs.get((setting.scene, setting.size, setting.iterations, arm), 1.0)
+            for axis, metric in zip(column, ("psnr", "lpips"), strict=True):
+                records = list(study.runs(setting, arm).values())
+                if not records:
+                    continue
+                shares = records[0].curve["iteration"] * cost / setting.iterations
+                mean = np.mean([record.curve[metric] for record in records], axis=0)
+                # The first looks are off the scale of what is compared.
+                axis.plot(shares[2:], mean[2:], color=COLOURS[arm], label=label(arm))
+                axis.grid(alpha=0.3)
+        column[0].set_title(f"{setting.scene}, {setting.points:,} points", fontsize=10)
+        column[1].set_xlabel("seconds, as a share of stock's")
+    axes[0, 0].set_ylabel("test PSNR (dB)")
+    axes[1, 0].set_ylabel("test LPIPS")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(arms), frameon=False)
     figure.savefig(path, dpi=DPI)
     plt.close(figure)
 

@@ -108,6 +108,8 @@ def merge(old: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[str
 
 def write(records: list[dict[str, Any]], path: Path) -> None:
     """One line per training, so that a change shows as the trainings that changed."""
+    for record in records:  # older ones have fewer columns
+        record["curve"] = [row + [None] * (len(COLUMNS) - len(row)) for row in record["curve"]]
     lines = ",\n".join(json.dumps(record) for record in records)
     columns = json.dumps(COLUMNS)
     path.write_text(f'{{"columns": {columns},\n"records": [\n{lines}\n]}}\n', encoding="utf-8")

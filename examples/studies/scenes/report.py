@@ -33,7 +33,7 @@ from studies.scenes.arms import (
 )
 from studies.scenes.decisions import decide, settings_of
 from studies.scenes.long_tables import cells_of, differences_table, metrics_table, reach_table
-from studies.scenes.plots import plot_curves, plot_gains
+from studies.scenes.plots import plot_curves, plot_gains, plot_metrics
 from studies.scenes.records import Setting, gather, merge, read, read_costs, write
 from studies.scenes.tables import (
     front_table,
@@ -72,7 +72,7 @@ ROTATED = "rotated.json"  # records whose held-out views rotate with the seed
 LONG, BRIEF, DETAIL = 30_000, 7_500, 2_000
 SCENE_SIZE: Size = "images_4"
 REACH_ARMS = ("faded", DEFAULTS)
-MARKER = re.compile(r"(<!-- study:([a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+MARKER = re.compile(r"(<!-- study:([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def tables(study: Study) -> dict[str, str]:
@@ -229,7 +229,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for path, rotated in ((records, False), (FOLDER / ROTATED, True)):
                 old = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
                 new = [record for record in found if record.get("rotated", False) == rotated]
-                write(merge(old.get("records", []), new), path)
+                if new:
+                    write(merge(old.get("records", []), new), path)
         study, rotating = Study(read(records)), rotating_study()
         made = tables(study) | rotated_tables(rotating)
         for page in PAGES:
@@ -238,6 +239,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         text = json.dumps(decisions, indent=1) + "\n"
         (FOLDER / "decisions.json").write_text(text, encoding="utf-8")
         drawn = plots(study, FOLDER)
+        if many := settings_of(rotating, LONG):
+            arms = (BASELINE, "faded", DEFAULTS)
+            plot_metrics(rotating, many, arms, FOLDER / "rotated.png")
+            drawn.append(FOLDER / "rotated.png")
     except (OSError, ValueError) as error:
         print(f"report: {error}", file=sys.stderr)
         return 2
