@@ -32,7 +32,7 @@ from train import SHARED_OPTIONS, add_fit_options, fit_options, recorded_command
 from opt3dgs_optim.runs import Run, read_run
 from opt3dgs_optim.runs.report import write_report
 
-DEFAULT_ARMS = "adam,mcmc,mcmc+awsgld,mcmc+constant-multiplier,mcmc+l2+reset,opt3dgs,annealed+faded"
+DEFAULT_ARMS = "adam,mcmc,mcmc+awsgld,mcmc+constant-multiplier,mcmc+l2+reset,opt3dgs,defaults"
 POLL_SECONDS = 0.2
 
 
