@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from statistics import fmean, stdev
 
 from studies.scenes.analysis import Study
-from studies.scenes.arms import BASELINE, STUDY_ARMS, label
+from studies.scenes.arms import BASELINE, DEFAULTS, STUDY_ARMS, label
 from studies.scenes.records import Record, Setting
 
 METRICS = {"psnr": (1.0, 2), "ssim": (1.0, 4), "lpips": (-1.0, 4)}  # sign of better, digits
@@ -121,6 +121,24 @@ def metrics_table(study: Study, settings: Sequence[Setting], arms: Iterable[str]
         cells = [_cell(list(study.runs(setting, arm).values())) for setting in settings]
         if any(cell != "-" for cell in cells):
             lines.append(f"| `{label(arm)}` | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def headline_table(study: Study, long: Sequence[Setting], short: int) -> str:
+    """Stock beside the defaults at both lengths: what a reader sees first."""
+    rows = [
+        (f"{what}, {count:,} iterations", arm, count)
+        for count in ((long[0].iterations, short) if long else ())
+        for what, arm in (("stock 3DGS-MCMC", BASELINE), ("**with the defaults**", DEFAULTS))
+    ]
+    lines = [
+        f"| PSNR / SSIM / LPIPS | {' | '.join(setting.scene for setting in long)} |",
+        f"|---|{'---|' * len(long)}",
+    ]
+    for what, arm, count in rows:
+        found = [study.runs(replace(s, iterations=count), arm) for s in long]
+        cells = [_cell(list(records.values())) for records in found]
+        lines.append(f"| {what} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

@@ -32,7 +32,13 @@ from studies.scenes.arms import (
     label,
 )
 from studies.scenes.decisions import decide, settings_of
-from studies.scenes.long_tables import cells_of, differences_table, metrics_table, reach_table
+from studies.scenes.long_tables import (
+    cells_of,
+    differences_table,
+    headline_table,
+    metrics_table,
+    reach_table,
+)
 from studies.scenes.plots import plot_curves, plot_gains, plot_metrics
 from studies.scenes.records import Setting, gather, merge, read, read_costs, write
 from studies.scenes.tables import (
@@ -139,6 +145,7 @@ def rotated_tables(study: Study) -> dict[str, str]:
         made[name] = _missing("rotated") if not found else metrics_table(study, found, STUDY_ARMS)
         gains = differences_table(study, found, STUDY_ARMS)
         made[f"{name}-gains"] = _missing("rotated") if not found else gains
+    made["headline"] = headline_table(study, kinds["rotated-30000"], BRIEF)
     made["reach"] = reach_table(study, kinds["rotated-30000"], REACH_ARMS, BRIEF)
     return made
 
