@@ -83,6 +83,14 @@ def test_the_declared_torch_is_the_oldest_tested() -> None:
     assert max(tested) > min(tested)
 
 
+def test_the_install_line_has_the_address_of_the_project() -> None:
+    """REPOSITORY_URL, as long as there is no public one."""
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    source = re.search(r'^Source = "(.+)"', project, re.M)
+    address = source[1] if source else "REPOSITORY_URL"
+    assert f"\npip install git+{address}\n" in README
+
+
 def test_public_names() -> None:
     for name in (
         "AWSGLD",
