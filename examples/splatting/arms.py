@@ -26,7 +26,7 @@ from opt3dgs_optim.presets import PAPER_WARMUP
 NOISE_LR = 5e5  # 3DGS-MCMC
 SETTLING = 100  # iterations after which restarted moments are of use
 HISTOGRAM_ARM = "mcmc+awsgld"
-DEFAULT_ARM = "annealed+faded"
+DEFAULT_ARM = "defaults"
 
 # (iterations, mean nu of the arm in `needs` or None) -> what the steps have
 MakeParts = Callable[[int, float | None], list[Part]]
@@ -112,7 +112,7 @@ _ARMS = (
     ),
     Arm(
         DEFAULT_ARM,
-        "annealed steps, faded moments: the package's defaults",
+        "the package's: annealed steps, faded moments",
         lambda _iterations, _nu: [*DEFAULTS],
     ),
 )

@@ -74,7 +74,7 @@ def test_without_parts_it_is_the_trainers_own_adam(scene: Scene) -> None:
 
 def test_a_branch_starts_where_its_trunk_was(scene: Scene, tmp_path: Path) -> None:
     """Clock and phase are the trunk's, whether its checkpoint has a clock or is a stock one's."""
-    for trunk in ("mcmc", "annealed+faded"):
+    for trunk in ("mcmc", "defaults"):
         whole, branch = (Fit(scene, ARMS[name], OPTIONS) for name in (trunk, "mcmc+l2+reset"))
         for _ in range(60):
             whole.step()
