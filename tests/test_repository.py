@@ -115,10 +115,10 @@ def test_readme_is_short() -> None:
     assert len(README.split()) <= 600
 
 
-def test_readme_says_the_limits_before_how_to_try_it() -> None:
+def test_readme_says_the_limits_before_the_install_line() -> None:
     """Its table is compared with the records in the study's own tests."""
     assert "<!-- study:front -->" in README
-    assert README.index("run on a GPU yet") < README.index("## Try it")
+    assert README.index("run on a GPU yet") < README.index("pip install")
 
 
 def test_readme_picture_is_that_of_its_record() -> None:
