@@ -18,7 +18,7 @@ DOCS = Path(__file__).resolve().parent
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.+?)\\[)\]]</\1>', re.S)
 TABLE = re.compile(r"<table>\n<thead>.*?</table>", re.S)
 RULE = re.compile(r"^ *\|[-: |]+\|$", re.M)  # below a table's header
-COLUMNS = 6  # that have room beside a table of contents
+COLUMNS = 5  # that have room beside a table of contents
 PICTURE = re.compile(r'<img [^>]*\bsrc="([^":]+)"[^>]*>')
 FETCHES = (
     re.compile(r"<(?:script|img|iframe|source|video|embed)\b[^>]*\bsrc=[\"']?(?:https?:)?//", re.I),
