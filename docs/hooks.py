@@ -1,8 +1,9 @@
 """What mkdocs does to these pages besides Markdown; see `hooks` in mkdocs.yml.
 
 Formulas become MathML (no script, no font), `<!-- step costs -->` becomes a table of the committed
-JSON, the cells of tables get their column's name, so that a phone can show a row as a card. A built
-page that would fetch anything from the net fails the build.
+JSON, the cells of tables get their column's name, so that a phone can show a row as a card, and a
+page with a wide table gives it the room of its table of contents. A built page that would fetch
+anything from the net fails the build.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from typing import Any
 
 DOCS = Path(__file__).resolve().parent
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.+?)\\[)\]]</\1>', re.S)
-PRINTED = '<div class="highlight"><span class="filename">prints</span>'
 TABLE = re.compile(r"<table>\n<thead>.*?</table>", re.S)
+RULE = re.compile(r"^ *\|[-: |]+\|$", re.M)  # below a table's header
+COLUMNS = 5  # that have room beside a table of contents
 PICTURE = re.compile(r'<img [^>]*\bsrc="([^":]+)"[^>]*>')
 FETCHES = (
     re.compile(r"<(?:script|img|iframe|source|video|embed)\b[^>]*\bsrc=[\"']?(?:https?:)?//", re.I),
@@ -26,16 +28,22 @@ FETCHES = (
 )  # fmt: skip
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Fill in the table."""
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Fill in the table of step costs; make room for wide tables."""
+    if widest(markdown) > COLUMNS:
+        page.meta["hide"] = [*page.meta.get("hide", []), "toc"]
     return markdown.replace("<!-- step costs -->", step_costs())
 
 
+def widest(markdown: str) -> int:
+    """The most columns that a table of the page has."""
+    return max((line.count("|") - 1 for line in RULE.findall(markdown)), default=0)
+
+
 def on_page_content(html: str, **_: Any) -> str:
-    """Turn the formulas into MathML, mark what is printed, let a picture open by itself."""
+    """Turn the formulas into MathML, let a picture open by itself."""
     html = FORMULA.sub(lambda m: mathml(m[2], block=m[1] == "div"), html)
     html = TABLE.sub(lambda m: labelled(m[0]), html)
-    html = html.replace(PRINTED, PRINTED.replace('"highlight"', '"highlight printed"'))
     return PICTURE.sub(r'<a class="picture" href="\1">\g<0></a>', html)
 
 
@@ -50,6 +58,8 @@ def labelled(table: str) -> str:
         put = r'<td data-label="{}"\1><span>\2</span></td>'
         return re.sub(cell, lambda m: m.expand(put.format(next(left, ""))), match[0], flags=re.S)
 
+    if len(names) > 2 * COLUMNS:
+        head = head.replace("<table>", "<table data-wide>")
     return f"{head}</thead>{re.sub(r'<tr>.*?</tr>', row, body, flags=re.S)}"
 
 

@@ -72,13 +72,16 @@ class Training:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        description=(__doc__ or "").splitlines()[0],
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
     add_fit_options(parser)
     add = parser.add_argument
-    add("--arms", default=DEFAULT_ARMS, help=f"comma-separated (default: {DEFAULT_ARMS})")
+    add("--arms", default=DEFAULT_ARMS, help="comma-separated")
     add("--seeds", type=int, default=2, help="seeds per arm")
     add("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="trainings at a time")
-    add("-o", "--out", type=Path, metavar="DIR", help="folder (default: runs/SCENE-SIZE)")
+    add("-o", "--out", type=Path, metavar="DIR", help="folder; None: runs/SCENE-SIZE")
     return parser
 
 

@@ -96,6 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     torch.set_num_threads(1)
     scene = embedded_scene()
+    print("preparing the renderer; the first time it is compiled, some 20 s", file=sys.stderr)
     trainings = [train(name, arm, scene, options.seed, ITERATIONS) for name, arm in ARMS.items()]
     for training in trainings:
         print(f"{training.name}: {training.psnr[-1]:.1f} dB after {training.seconds[-1]:.0f} s")

@@ -32,11 +32,13 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--scene", default="embedded", metavar="DIR", help="scene folder, or 'embedded'")
     add("--size", default="images_4", choices=get_args(Size), help="folder of the photos")
-    add("--background", default="black", choices=get_args(Background))
+    add("--background", default="black", choices=get_args(Background), help="behind the scene")
     add("--points", type=int, default=defaults.points, help="the most Gaussians")
-    add("--iterations", type=int, default=defaults.iterations)
+    add("--iterations", type=int, default=defaults.iterations, help="length of a training")
     add("--init", default=defaults.init, choices=("sfm", "random"), help="first Gaussians")
-    add("--sh-degree", type=int, default=defaults.sh_degree, choices=range(4))
+    add(
+        "--sh-degree", type=int, default=defaults.sh_degree, choices=range(4), help="of the colours"
+    )
     add("--sh-degree-interval", type=int, default=defaults.sh_degree_interval, help="iterations")
     add("--switch", type=float, default=defaults.switch, help="where exploitation starts, 0..1")
 
@@ -69,13 +71,18 @@ def recorded_command(
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        description=(__doc__ or "").splitlines()[0],
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
     add_fit_options(parser)
     arms = "; ".join(f"{arm.name}: {arm.what}" for arm in ARMS.values())
     parser.add_argument("--arm", default=DEFAULT_ARM, choices=ARMS, metavar="ARM", help=arms)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="of the training")
     parser.add_argument("--mean-nu", type=float, help="for mcmc+constant-multiplier")
-    parser.add_argument("-o", "--out", type=Path, default=Path("runs/train"), metavar="DIR")
+    parser.add_argument(
+        "-o", "--out", type=Path, default=Path("runs/train"), metavar="DIR", help="folder"
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.add_argument("--command", help="the command to record in the log")
     return parser

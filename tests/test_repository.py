@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import re
 from pathlib import Path
@@ -14,20 +15,21 @@ ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-def test_version_is_the_same_everywhere() -> None:
-    version = re.escape(opt3dgs_optim.__version__)
+def test_last_release_is_the_same_everywhere() -> None:
+    """Of the changelog, the citation, and what a build without git's tags counts from."""
+    releases = re.findall(r"^## (\d\S+) - \d{4}-", (ROOT / "CHANGELOG.md").read_text(), re.M)
+    version = re.escape(releases[0])
     assert re.search(rf"^version: {version}$", (ROOT / "CITATION.cff").read_text(), re.M)
-    newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.M)
-    assert newest is not None
-    assert newest[1] in ("Unreleased", opt3dgs_optim.__version__)
-    assert f"\n## {opt3dgs_optim.__version__} - " in (ROOT / "CHANGELOG.md").read_text()
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    assert re.search(rf'^fallback-version = "{version}"', project, re.M)
 
 
-def test_version_is_written_once() -> None:
-    version = f'"{opt3dgs_optim.__version__}"'
-    files = [*(ROOT / "src").rglob("*.py"), ROOT / "pyproject.toml"]
-    holding = [path.name for path in files if version in path.read_text(encoding="utf-8")]
-    assert holding == ["version.py"]
+def test_version_is_what_is_installed() -> None:
+    """No file of the package says a version: it comes from git's tags by way of the build."""
+    assert opt3dgs_optim.__version__ == importlib.metadata.version("opt3dgs_optim")
+    for path in (ROOT / "src").rglob("*.py"):
+        found = re.search(r'__version__ = "(\d.*)"', path.read_text(encoding="utf-8"))
+        assert found is None or found[1] == "0+unknown", path.name
 
 
 def test_citation_is_complete() -> None:
@@ -58,7 +60,7 @@ def test_citation_is_complete() -> None:
 def test_citation_parses_as_yaml() -> None:
     yaml = pytest.importorskip("yaml", reason="PyYAML is not installed")
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
-    assert str(cited["version"]) == opt3dgs_optim.__version__
+    assert str(cited["version"]) in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert cited["authors"]
     (paper,) = cited["references"]
     assert [author["family-names"] for author in paper["authors"]] == ["Huang", "Chen", "Liu", "Ji"]
@@ -79,6 +81,14 @@ def test_the_declared_torch_is_the_oldest_tested() -> None:
     assert declared is not None
     assert min(tested) == (int(declared[1]), int(declared[2]))
     assert max(tested) > min(tested)
+
+
+def test_the_install_line_has_the_address_of_the_project() -> None:
+    """REPOSITORY_URL, as long as there is no public one."""
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    source = re.search(r'^Source = "(.+)"', project, re.M)
+    address = source[1] if source else "REPOSITORY_URL"
+    assert f"\npip install git+{address}\n" in README
 
 
 def test_public_names() -> None:
@@ -105,10 +115,10 @@ def test_readme_is_short() -> None:
     assert len(README.split()) <= 600
 
 
-def test_readme_says_the_limits_before_how_to_try_it() -> None:
+def test_readme_says_the_limits_before_the_install_line() -> None:
     """Its table is compared with the records in the study's own tests."""
     assert "<!-- study:front -->" in README
-    assert README.index("run on a GPU yet") < README.index("## Try it")
+    assert README.index("run on a GPU yet") < README.index("pip install")
 
 
 def test_readme_picture_is_that_of_its_record() -> None:

@@ -1,3 +1,8 @@
-"""The one place the version is written."""
+"""The installed version, which the build takes from git's tags."""
 
-__version__ = "0.1.0"
+from importlib.metadata import PackageNotFoundError, version
+
+try:
+    __version__ = version("opt3dgs_optim")
+except PackageNotFoundError:  # a checkout on the path that was never installed
+    __version__ = "0+unknown"
