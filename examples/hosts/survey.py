@@ -24,7 +24,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torch
-from hosts.trials import ITERATIONS, TRIALS, Done, Trial, copy_scene, edited_copy, run
+from hosts.trials import ITERATIONS, TRIALS, Done, Trial, copy_scene
 
 from opt3dgs_optim import __version__
 from opt3dgs_optim.hosts import diff
@@ -90,25 +90,21 @@ def survey(trainers: Path) -> list[Script]:
 
 def outcome(trial: Trial, trainers: Path, scene: Path, work: Path) -> dict[str, Any]:
     """Stock, edited, and going on from both checkpoints."""
-    stock_script = trainers / trial.trainer / trial.script
-    script = edited_copy(trial, trainers, work / "edited" / trial.trainer)
-    folder = work / re.sub(r"\W+", "_", trial.name)
+    folder = re.sub(r"\W+", "_", trial.name)
     row: dict[str, Any] = {"name": trial.name, "commit": commit_of(trainers / trial.trainer)}
 
-    def train(file: Path, out: str, *more: str) -> Done:
-        command = trial.command(scene, folder / out, ITERATIONS)
-        return run(file, [*command, *more], folder / "cwd", trusted=True)
+    def train(out: str, *more: str, ours: bool = True) -> Done:
+        return trial.start(trainers, scene, work, f"{folder}/{out}", *more, ours=ours)
 
-    stock, ours = train(stock_script, "stock"), train(script, "ours")
-    row["stock"], row["ours"] = _shown(stock), _shown(ours)
-    checkpoint = trial.checkpoint(folder / "ours", ITERATIONS)
-    row["checkpoint"] = "yes" if checkpoint.is_file() else "-"
+    row["stock"], row["ours"] = _shown(train("stock", ours=False)), _shown(train("ours"))
+    own = trial.checkpoint(work / folder / "ours", ITERATIONS)
+    row["checkpoint"] = "yes" if own.is_file() else "-"
     row["resume"] = "-"
-    if checkpoint.is_file() and not trial.gsplat:
-        own = train(script, "again", *trial.going_on(checkpoint))
-        theirs = trial.checkpoint(folder / "stock", ITERATIONS)
-        other = train(script, "taken", *trial.going_on(theirs)) if theirs.is_file() else own
-        row["resume"] = f"own: {_shown(own)}; stock's: {_shown(other)}"
+    if own.is_file() and not trial.gsplat:
+        theirs = trial.checkpoint(work / folder / "stock", ITERATIONS)
+        again = _shown(train("again", *trial.going_on(own)))
+        taken = _shown(train("taken", *trial.going_on(theirs)))
+        row["resume"] = f"own: {again}; stock's: {taken}"
     return row
 
 

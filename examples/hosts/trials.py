@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -30,7 +31,11 @@ SHORT_GSPLAT = (
     *("--disable_viewer", "--data_factor", "4"),
     *("--strategy.refine_start_iter", "10", "--strategy.refine_every", "10"),
 )
+SHORT_SPLATFACTO = (
+    *("--pipeline.model.warmup-length", "10", "--pipeline.model.refine-every", "10"),
+)
 NO_VIDEO = ("--disable_video",)
+SHORTER = {*INRIA_OPTIONS, *SHORT_GSPLAT, *SHORT_SPLATFACTO, *NO_VIDEO}
 
 
 @dataclass(frozen=True)
@@ -54,7 +59,7 @@ class Trial:
     @property
     def name(self) -> str:
         """For tests and tables."""
-        own = [o for o in self.options if o not in (*INRIA_OPTIONS, *SHORT_GSPLAT, *NO_VIDEO)]
+        own = [o for o in self.options if o not in SHORTER]
         return " ".join([self.trainer, *own])
 
     @property
@@ -62,8 +67,8 @@ class Trial:
         """Whether it is one of gsplat's scripts."""
         return self.trainer.startswith("gsplat")
 
-    def command(self, scene: Path, out: Path, iterations: int) -> list[str]:
-        """The script's arguments."""
+    def command(self, scene: Path, out: Path, iterations: int, *, ours: bool) -> list[str]:
+        """The script's arguments; the same for both but where the method has another name."""
         n = str(iterations)
         if self.gsplat:
             where = ["--data_dir", str(scene), "--result_dir", str(out)]
@@ -82,6 +87,69 @@ class Trial:
         """The options to go on from a checkpoint; gsplat only evaluates one."""
         return ["--ckpt" if self.gsplat else "--start_checkpoint", str(checkpoint)]
 
+    def start(
+        self, trainers: Path, scene: Path, work: Path, out: str, *more: str, ours: bool
+    ) -> Done:
+        """Train, stock or ours.
+
+        Args:
+            trainers: the folder of all trainers' sources.
+            scene: that of `copy_scene`.
+            work: where copies of the trainers go, and the results.
+            out: the run's folder there.
+            more: options beside the trial's.
+            ours: with our lines.
+        """
+        script = trainers / self.trainer / self.script
+        if ours:
+            script = edited_copy(self, trainers, work / "edited" / self.trainer)
+        command = self.command(scene, work / out, ITERATIONS, ours=ours)
+        return run(script, [*command, *more], work / out / "cwd", trusted=True)
+
+
+class Nerfstudio(Trial):
+    """`ns-train`, then `ns-eval`: nothing is edited, the method has another name."""
+
+    def command(self, scene: Path, out: Path, iterations: int, *, ours: bool) -> list[str]:
+        """The script's arguments."""
+        method, *options = self.options
+        return [
+            *(f"{method}-opt3dgs" if ours else method, "--vis", "tensorboard"),
+            *("--output-dir", str(out), "--experiment-name", "run", "--timestamp", "one"),
+            *("--max-num-iterations", str(iterations), "--steps-per-save", str(iterations // 2)),
+            *("--save-only-latest-checkpoint", "False", *options),
+            *("--steps-per-eval-image", "0", "--steps-per-eval-all-images", "0"),
+            *("colmap", "--data", str(scene), "--colmap-path", "sparse/0"),
+            *("--downscale-factor", "1"),  # splatfacto itself starts at a quarter
+        ]
+
+    def checkpoint(self, out: Path, iterations: int) -> Path:
+        """The file that a run leaves behind."""
+        name = f"step-{iterations // 2:09d}.ckpt"
+        return next(out.glob(f"run/*/one/nerfstudio_models/{name}"), out / name)
+
+    def going_on(self, checkpoint: Path) -> list[str]:
+        """The options to go on from a checkpoint."""
+        return ["--load-dir", str(checkpoint.parent), "--load-step", str(int(checkpoint.stem[5:]))]
+
+    def start(
+        self, trainers: Path, scene: Path, work: Path, out: str, *more: str, ours: bool
+    ) -> Done:
+        """Train and evaluate, stock or ours."""
+        scripts = trainers / self.trainer / "nerfstudio" / "scripts"
+        method, *rest = self.command(scene, work / out, ITERATIONS, ours=ours)
+        here = work / out / "cwd"
+        trained = run(scripts / "train.py", [method, *more, *rest], here, trusted=True)
+        if trained.code != 0:
+            return trained
+        config = work / out / "run" / method / "one" / "config.yml"
+        result = here / "psnr.json"
+        options = ["--load-config", str(config), "--output-path", str(result)]
+        done = run(scripts / "eval.py", options, here, trusted=True)
+        psnr = json.loads(result.read_text())["results"]["psnr"] if done.code == 0 else None
+        output = f"{trained.output}\n{done.output}\nPSNR: {psnr}"
+        return Done(done.code, output, trained.seconds + done.seconds)
+
 
 def _gsplat(version: str, *options: str, **said: str) -> Trial:
     video = () if version == "gsplat-1.4.0" else NO_VIDEO
@@ -90,6 +158,10 @@ def _gsplat(version: str, *options: str, **said: str) -> Trial:
 
 def _inria(trainer: str, *options: str, script: str = "train.py") -> Trial:
     return Trial(trainer, script, (*INRIA_OPTIONS, *options))
+
+
+def _splatfacto(method: str) -> Trial:
+    return Nerfstudio("nerfstudio", "nerfstudio/scripts/train.py", (method, *SHORT_SPLATFACTO))
 
 
 _MINI = "--densify_until_iter 40 --simp_iteration1 40 --simp_iteration2 70 --imp_metric indoor"
@@ -121,6 +193,8 @@ TRIALS = (
         *_MINI.split(),
         script="ms/train.py",
     ),
+    _splatfacto("splatfacto"),
+    _splatfacto("splatfacto-mcmc"),
 )
 
 
