@@ -68,6 +68,7 @@ def test_the_lines_of_gsplat(tmp_path: Path) -> None:
         "phases.observe(loss)",
     ]
     assert added(diff(path).diff) == lines
+    assert diff(path).notes == ["left alone: self.pose_optimizers"]
     write(path)
     text = path.read_text()  # above the learning-rate schedulers
     assert text.index("max_steps = cfg") < text.index(lines[1]) < text.index("schedulers = [")

@@ -105,9 +105,6 @@ def write(path: Path) -> Path:
     return backup
 
 
-# -- where the lines go ------------------------------------------------------------------------
-
-
 def _edited_lines(lines: list[bytes], tree: ast.Module, trainer: Trainer) -> list[bytes]:
     """The file's lines with ours among them."""
     used = {getattr(n, "id", getattr(n, "arg", "")) for n in ast.walk(trainer.function)}
@@ -159,10 +156,7 @@ def _insert(lines: list[bytes], node: ast.stmt, new: list[str], *, above: bool =
 
 
 def _upgrade_point(trainer: Trainer) -> ast.stmt:
-    """The statement above which the optimizers are upgraded.
-
-    After the last set-up or restore, and above the learning-rate schedulers, if there are any.
-    """
+    """Where to upgrade: above the first rate scheduler after the last set-up, else the loop."""
     body, point = trainer.function.body, trainer.loop
     if point not in body:
         return point
@@ -202,6 +196,6 @@ def _bound(nodes: Iterable[ast.AST]) -> set[str]:
         match node:
             case ast.Name(name, ast.Store()) | ast.arg(name) | ast.FunctionDef(name):
                 found.add(name)
-            case ast.alias(name, other):
-                found.add((other or name).split(".")[0])
+            case ast.alias(_, str(name)) | ast.alias(name):
+                found.add(name.split(".")[0])
     return found

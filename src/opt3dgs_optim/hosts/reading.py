@@ -10,10 +10,10 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
 
-Function = ast.FunctionDef | ast.AsyncFunctionDef
 # A second optimizer of Gaussians; any other, as of exposures or networks, is left alone.
 SECOND = ("shoptimizer",)
 USUAL_L1 = ("ll1", "l1loss", "l1_loss", "ll1_render")
@@ -30,19 +30,16 @@ def spots(tree: ast.AST, *above: ast.AST) -> Iterator[Spot]:
     """Every node below this one, in the file's order; nested functions are not looked into."""
     for child in ast.iter_child_nodes(tree):
         yield Spot(child, (*above, tree))
-        if not isinstance(child, (*Function.__args__, ast.ClassDef, ast.Lambda)):
+        if not isinstance(child, (ast.FunctionDef, ast.ClassDef, ast.Lambda)):
             yield from spots(child, *above, tree)
 
 
-def values(own: list[Spot], name: str) -> list[tuple[int, ast.expr | None]]:
+def values(own: list[Spot], name: str) -> Iterator[tuple[int, ast.expr | None]]:
     """The lines in which a name gets a value, and the value, where it is written there."""
-    found: list[tuple[int, ast.expr | None]] = []
-    for node, above in own:
-        match node, above[-1]:
-            case ast.Name(id, ast.Store()), around if id == name:
-                value = around.value if isinstance(around, ast.Assign) else None
-                found.append((node.lineno, value))
-    return found
+    for spot in own:
+        match spot:
+            case (ast.Name(id, ast.Store()) as node, (*_, around)) if id == name:
+                yield node.lineno, around.value if isinstance(around, ast.Assign) else None
 
 
 @dataclass
@@ -63,7 +60,7 @@ class Trainer:
         notes: what a user should know of this file.
     """
 
-    function: Function
+    function: ast.FunctionDef
     spots: list[Spot]
     loop: ast.For
     loss: str
@@ -86,12 +83,12 @@ def read_trainer(tree: ast.Module, folder: Path | None = None) -> Trainer:
     Raises:
         ValueError: there is no such loop, or it is not one that can be read with certainty.
     """
-    loops: dict[ast.For, Function] = {}
-    for function in ast.walk(tree):
-        for spot in spots(function) if isinstance(function, Function) else ():
-            around = [n for n in spot.above if isinstance(n, ast.For)]
-            if _loss(spot.node) and around:
-                loops[around[0]] = function  # type: ignore[assignment]
+    loops: dict[ast.For, ast.FunctionDef] = {}
+    for function in [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]:
+        for node, above in spots(function):
+            around = [n for n in above if isinstance(n, ast.For)]
+            if _loss(node) and around:
+                loops[around[0]] = function
     if len(loops) != 1:
         lines = ", ".join(str(loop.lineno) for loop in loops) or "none"
         raise ValueError(f"one `for` loop with a loss.backward() in it is needed (lines: {lines})")
@@ -99,15 +96,12 @@ def read_trainer(tree: ast.Module, folder: Path | None = None) -> Trainer:
     own = list(spots(function))
     inside = [spot for spot in own if loop in spot.above]
     backwards = [spot for spot in inside if _loss(spot.node)]
-    losses = {_loss(spot.node): None for spot in backwards}
-    pairs = [(a, b) for a in backwards for b in backwards if a is not b]
-    if len(losses) != 1 or not all(_either(a, b) for a, b in pairs):
-        lines = ", ".join(str(spot.node.lineno) for spot in backwards)  # type: ignore[attr-defined]
+    statements = [spot.node for spot in backwards if isinstance(spot.node, ast.stmt)]
+    losses = {loss for statement in statements if (loss := _loss(statement))}
+    if len(losses) != 1 or not all(_either(a, b) for a, b in combinations(backwards, 2)):
+        lines = ", ".join(str(statement.lineno) for statement in statements)
         raise ValueError(f"one loss.backward() an iteration is needed (lines: {lines})")
-    statements = [spot.node for spot in backwards]
-    (loss,) = losses
-    total, count = _range(loop, own)
-    trainer = Trainer(function, own, loop, loss, statements, total, count)  # type: ignore[arg-type]
+    trainer = Trainer(function, own, loop, losses.pop(), statements, *_range(loop, own))
     _find_optimizers(trainer, inside, folder)
     _find_pixel_loss(trainer, inside)
     return trainer
@@ -146,18 +140,15 @@ def _range(loop: ast.For, own: list[Spot]) -> tuple[ast.expr, str]:
             "iterations cannot be read from it, only from a range(...)"
         )
     start, end = [ast.Constant(0), *ranges[0]][-2:]
-    if isinstance(start, ast.Name) and len(once := values(own, start.id)) == 1:
+    if isinstance(start, ast.Name) and len(once := [*values(own, start.id)]) == 1:
         start = once[0][1]
     count = ast.unparse(loop.target)
-    if len(values([spot for spot in own if loop in spot.above], count)) != 1:
+    if len([*values([spot for spot in own if loop in spot.above], count)]) != 1:
         count = ""  # the loop gives it other values
     match end:
         case ast.BinOp(total, ast.Add(), ast.Constant(1)) if len(ranges[0]) == 2:
             return total, count and f"{count} - 1"
     return end, "" if isinstance(start, ast.Constant) else count
-
-
-# -- optimizers ------------------------------------------------------------------------------------
 
 
 def _find_optimizers(trainer: Trainer, inside: list[Spot], folder: Path | None) -> None:
@@ -243,9 +234,6 @@ def _model(folder: Path | None) -> tuple[set[str], set[str]]:
     return groups, made
 
 
-# -- the L1 term -----------------------------------------------------------------------------------
-
-
 def _find_pixel_loss(trainer: Trainer, inside: list[Spot]) -> None:
     """Set `pixel`: `L1 = l1_loss(a, b)`, `F.l1_loss(a, b)` or `l1_loss(a, b).mean()`."""
     last = max(statement.lineno for statement in trainer.backwards)
@@ -258,8 +246,7 @@ def _find_pixel_loss(trainer: Trainer, inside: list[Spot]) -> None:
                 | ast.Call(called, [_, _] as pair, []),
             ) if ast.unparse(called).split(".")[-1] == "l1_loss" and node.lineno < last:
                 found.setdefault(ast.unparse(target), []).append((node.value, pair))
-    usual = [name for name in found if name.lower() in USUAL_L1]
-    names = usual or list(found)
+    names = [name for name in found if name.lower() in USUAL_L1] or list(found)
     if len(names) == 1:
         trainer.pixel = found[names[0]]
     else:
