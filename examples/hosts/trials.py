@@ -129,8 +129,8 @@ class Nerfstudio(Trial):
         return next(out.glob(f"run/*/one/nerfstudio_models/{name}"), out / name)
 
     def going_on(self, checkpoint: Path) -> list[str]:
-        """The options to go on from a checkpoint."""
-        return ["--load-dir", str(checkpoint.parent), "--load-step", str(int(checkpoint.stem[5:]))]
+        """The options to go on from a checkpoint; after `--load-step` ns-eval would look for it."""
+        return ["--load-checkpoint", str(checkpoint)]
 
     def start(
         self, trainers: Path, scene: Path, work: Path, out: str, *more: str, ours: bool
