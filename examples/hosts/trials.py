@@ -48,6 +48,7 @@ class Trial:
         options: beside scene, iterations and output, which `command` adds.
         refused: what a refusal says, where the edited trainer must refuse to start.
         stock_fails: what the stock trainer stops with, where it does not run itself.
+        different: from the stock run, for the table.
     """
 
     trainer: str
@@ -55,6 +56,7 @@ class Trial:
     options: tuple[str, ...]
     refused: str | None = None
     stock_fails: str | None = None
+    different: str = ""
 
     @property
     def name(self) -> str:
@@ -156,42 +158,56 @@ def _gsplat(version: str, *options: str, **said: str) -> Trial:
     return Trial(version, GSPLAT, (*options[:1], *SHORT_GSPLAT, *video, *options[1:]), **said)
 
 
-def _inria(trainer: str, *options: str, script: str = "train.py") -> Trial:
-    return Trial(trainer, script, (*INRIA_OPTIONS, *options))
+def _inria(trainer: str, *options: str, different: str = "", script: str = "train.py") -> Trial:
+    return Trial(trainer, script, (*INRIA_OPTIONS, *options), different=different)
 
 
 def _splatfacto(method: str) -> Trial:
-    return Nerfstudio("nerfstudio", "nerfstudio/scripts/train.py", (method, *SHORT_SPLATFACTO))
+    different = "a method of another name; after a resume the Gaussians go on being stepped"
+    options = (method, *SHORT_SPLATFACTO)
+    return Nerfstudio("nerfstudio", "nerfstudio/scripts/train.py", options, different=different)
 
 
 _MINI = "--densify_until_iter 40 --simp_iteration1 40 --simp_iteration2 70 --imp_metric indoor"
 # taming cannot clone none or split none: a budget for few refinements, and points of both kinds.
 _TAMING = "--mode final_count --budget 6000 --cams 2 --densify_until_iter 60 --percent_dense 0.03"
 _TAMING += " --opacity_reset_interval 1000"  # afterwards no gradient is large enough to split
+_OWN_STEP = "steps keep its own arithmetic, without bias correction"
 _NO_FUSED = "unexpected keyword argument 'fused'"
 TRIALS = (
     _gsplat("gsplat-1.4.0", "mcmc"),
     _gsplat("gsplat-1.4.0", "default", "--packed"),
     _gsplat("gsplat-1.5.3", "mcmc"),
     _gsplat("gsplat-1.5.3", "default"),
-    _gsplat("gsplat-1.5.3", "default", "--visible_adam"),
+    _gsplat("gsplat-1.5.3", "default", "--visible_adam", different=f"SelectiveAdam: {_OWN_STEP}"),
     _gsplat("gsplat-1.5.3", "default", "--packed"),
-    _gsplat("gsplat-1.5.3", "default", "--packed", "--sparse_grad", refused="SparseAdam"),
-    _gsplat("gsplat-1.5.3", "mcmc", "--app_opt"),
-    _gsplat("gsplat-1.5.3", "mcmc", "--pose_opt"),
-    _gsplat("gsplat-1.5.3", "mcmc", "--use_bilateral_grid"),
+    _gsplat(
+        *("gsplat-1.5.3", "default", "--packed", "--sparse_grad"),
+        refused="SparseAdam",
+        different="refused: torch's SparseAdam is no Adam",
+    ),
+    _gsplat("gsplat-1.5.3", "mcmc", "--app_opt", different="its networks stay plain"),
+    _gsplat("gsplat-1.5.3", "mcmc", "--pose_opt", different="the poses stay plain"),
+    _gsplat("gsplat-1.5.3", "mcmc", "--use_bilateral_grid", different="the grids stay plain"),
     _gsplat("gsplat-1.5.3", "mcmc", "--batch_size", "2"),
     _gsplat("gsplat-main", "mcmc"),
     _gsplat("gsplat-main", "default"),
-    _gsplat("gsplat-main", "default", "--visible_adam", stock_fails=_NO_FUSED),
-    _inria("gaussian-splatting", "--disable_viewer"),
-    _inria("gaussian-splatting", "--disable_viewer", "--optimizer_type", "sparse_adam"),
-    _inria("3dgs-mcmc", "--cap_max", "2500", "--init_type", "sfm"),
-    _inria("taming-3dgs", *_TAMING.split()),
+    _gsplat(
+        *("gsplat-main", "default", "--visible_adam"),
+        stock_fails=_NO_FUSED,
+        different="none: the stock trainer stops too",
+    ),
+    _inria("gaussian-splatting", "--disable_viewer", different="exposures stay plain"),
     _inria(
-        "mini-splatting",
-        *_MINI.split(),
+        *("gaussian-splatting", "--disable_viewer", "--optimizer_type", "sparse_adam"),
+        different=f"SparseGaussianAdam: {_OWN_STEP}",
+    ),
+    _inria("3dgs-mcmc", "--cap_max", "2500", "--init_type", "sfm"),
+    _inria("taming-3dgs", *_TAMING.split(), different="its second optimizer is upgraded too"),
+    _inria(
+        *("mini-splatting", *_MINI.split()),
         script="ms/train.py",
+        different="upgraded again where the loop sets up anew; prints no PSNR",
     ),
     _splatfacto("splatfacto"),
     _splatfacto("splatfacto-mcmc"),

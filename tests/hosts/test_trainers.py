@@ -8,13 +8,19 @@ photos in `images` and `images_4`.
 from __future__ import annotations
 
 import importlib.util
+import json
 import math
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import torch
+from hosts.survey import scripts_of
 from hosts.trials import ITERATIONS, TRIALS, Trial, copy_scene, edited_copy, run
+
+from opt3dgs_optim.hosts import diff
 
 TRAINERS = Path(os.environ.get("OPT3DGS_TRAINERS", "/no/trainers"))
 BESIDE = Path(__file__).resolve().parents[3] / "shared" / "scenes" / "banana"
@@ -100,6 +106,30 @@ def test_resume(trial: Trial, first: str, scene: Path, work: Path) -> None:
         (last,) = (work / out / "second").glob(f"run/*/one/*/step-{ITERATIONS - 1:09d}.ckpt")
         saved = torch.load(last, weights_only=False)["optimizers"]
         assert {float(saved[name]["state"][0]["step"]) for name in GAUSSIANS} == {ITERATIONS}
+
+
+def test_edited_scripts_use_no_unknown_name(tmp_path: Path) -> None:
+    """ruff, which knows nothing of ours, finds no undefined name that the stock script had not."""
+    if not TRAINERS.is_dir():
+        pytest.skip("no trainers: set OPT3DGS_TRAINERS")
+    found: list[Path] = []
+    for folder in sorted(path for path in TRAINERS.iterdir() if path.is_dir()):
+        for path in scripts_of(folder):
+            try:
+                new = diff(path).new
+            except ValueError:
+                continue
+            found.append(path)
+            (tmp_path / f"{len(found)}_old.py").write_bytes(path.read_bytes())
+            (tmp_path / f"{len(found)}_new.py").write_bytes(new)
+    assert found
+    command = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F82"]
+    command += ["--output-format", "json", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    said = [(Path(e["filename"]).stem, e["message"]) for e in json.loads(done.stdout)]
+    old = sorted((name[:-4], message) for name, message in said if name.endswith("_old"))
+    new_ones = sorted((name[:-4], message) for name, message in said if name.endswith("_new"))
+    assert old == new_ones
 
 
 def test_a_sign_of_life(scene: Path, work: Path, tmp_path: Path) -> None:
