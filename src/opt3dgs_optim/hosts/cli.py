@@ -27,7 +27,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         backup = write(options.path) if options.write else None
     except ValueError as error:
         print(f"opt3dgs hosts: {options.path}: {error}", file=sys.stderr)
-        print("\n".join(["The lines to add by hand:", *LINES_BY_HAND]), file=sys.stderr)
+        if options.path.is_file() and options.path.suffix == ".py":
+            print("\n".join(["The lines to add by hand:", *LINES_BY_HAND]), file=sys.stderr)
         return 1
     print(done.diff, end="")
     for note in done.notes:
