@@ -93,6 +93,15 @@ def test_other_names_of_loss_options_and_ours(tmp_path: Path) -> None:
     assert "opt3dgs_phases = PhaseScheduler(opt.iterations)" in lines_for(tmp_path, text)
 
 
+def test_names_of_a_function_around_it(tmp_path: Path) -> None:
+    head, body = INRIA.split("def training(dataset, opt, pipe, checkpoint):\n")
+    inner = "".join(f"    {line}\n" for line in body.split("\n\n\ndef")[0].splitlines())
+    text = f"{head}def main(opt):\n    def training(dataset, pipe, checkpoint):\n{inner}"
+    assert lines_for(tmp_path, text) == [IMPORT, *OURS]
+    with pytest.raises(ValueError, match="the name opt is not defined"):
+        diff(saved(tmp_path, text.replace("main(opt)", "main(options)")))
+
+
 @pytest.mark.parametrize(
     ("loop", "observe"),
     [

@@ -185,7 +185,9 @@ def _known(tree: ast.Module, trainer: Trainer, point: ast.stmt) -> set[str]:
     """The names that have a value where a statement of the training function begins."""
     own = [spot.node for spot in trainer.spots]
     before = [node for node in own if getattr(node, "lineno", point.lineno) < point.lineno]
-    outside = _bound(spot.node for spot in spots(tree)) | set(dir(builtins))
+    scopes = [n for n in ast.walk(tree) if isinstance(n, (ast.Module, ast.FunctionDef))]
+    around = [scope for scope in scopes if trainer.function in ast.walk(scope)]
+    outside = _bound(spot.node for scope in around for spot in spots(scope)) | set(dir(builtins))
     return _bound(before) | (outside - _bound(own))
 
 
