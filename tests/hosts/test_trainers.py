@@ -25,7 +25,10 @@ from opt3dgs_optim.hosts import diff
 TRAINERS = Path(os.environ.get("OPT3DGS_TRAINERS", "/no/trainers"))
 BESIDE = Path(__file__).resolve().parents[3] / "shared" / "scenes" / "banana"
 SCENE = Path(os.environ.get("OPT3DGS_SCENE", BESIDE))
-NEEDED = ("torchmetrics", "tyro", "cv2", "sklearn", "yaml", "imageio")
+NEEDED = {
+    "gsplat": "torchmetrics tyro cv2 sklearn yaml imageio",
+    "nerfstudio": "torchmetrics tyro cv2 sklearn yaml imageio nerfacc pytorch_msssim rawpy mediapy",
+}
 GAUSSIANS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
 OURS = 1.5  # dB that an edited run of 100 iterations may be worse than the stock one
 
@@ -51,9 +54,10 @@ def of_trials(trials: tuple[Trial, ...]) -> list:
 def need(trial: Trial) -> None:
     if not (TRAINERS / trial.trainer / trial.script).is_file():
         pytest.skip(f"no {TRAINERS / trial.trainer}: put its sources there, set OPT3DGS_TRAINERS")
-    missing = [name for name in NEEDED if trial.gsplat and not importlib.util.find_spec(name)]
-    if missing:
-        pytest.skip(f"gsplat's examples need {', '.join(missing)}: pip install them")
+    for host, names in NEEDED.items():
+        missing = [name for name in names.split() if not importlib.util.find_spec(name)]
+        if trial.trainer.startswith(host) and missing:
+            pytest.skip(f"{host} needs {', '.join(missing)}: pip install them")
 
 
 @pytest.mark.parametrize("trial", of_trials(TRIALS))
