@@ -163,7 +163,7 @@ def _inria(trainer: str, *options: str, different: str = "", script: str = "trai
 
 
 def _splatfacto(method: str) -> Trial:
-    different = "a method of another name; after a resume the Gaussians go on being stepped"
+    different = "a method, no edit; a resume steps and saves (stock's own stops with a KeyError)"
     options = (method, *SHORT_SPLATFACTO)
     return Nerfstudio("nerfstudio", "nerfstudio/scripts/train.py", options, different=different)
 
