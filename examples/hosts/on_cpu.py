@@ -2,6 +2,8 @@
 
     python examples/hosts/on_cpu.py simple_trainer.py mcmc --data_dir SCENE --max_steps 100
     python examples/hosts/on_cpu.py train.py -s SCENE --iterations 100
+    python examples/hosts/on_cpu.py nerfstudio/scripts/train.py splatfacto-opt3dgs \
+        --vis tensorboard --max-num-iterations 100 colmap --data SCENE --colmap-path sparse/0
 
 Everything after the script's path is the script's own. CUDA is mapped to the CPU, the CUDA
 rasterizers are replaced by the examples' own (`pip install "opt3dgs_optim[examples]"`), viewers and
@@ -16,6 +18,7 @@ mini-splatting and taming-3dgs are estimates; LPIPS is NaN; one process loads th
 
 from __future__ import annotations
 
+import os
 import runpy
 import sys
 from pathlib import Path
@@ -29,7 +32,11 @@ def prepare(script: Path) -> None:
     from hosts.cpu_host import cuda, gsplat_modules, inria_modules, stand_ins
 
     folder = script.resolve().parent
-    sys.path.insert(0, str(folder))
+    package = folder
+    while (package / "__init__.py").is_file():  # a script in a package: imported from its root
+        package = package.parent
+    sys.path.insert(0, str(package))
+    os.environ.setdefault("TORCHDYNAMO_DISABLE", "1")  # a hundred iterations compile nothing
     if (folder.parent / "gsplat" / "__init__.py").is_file():  # its own gsplat, not another version
         sys.path.insert(1, str(folder.parent))
     stand_ins.install()

@@ -24,7 +24,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torch
-from hosts.trials import ITERATIONS, TRIALS, Done, Trial, copy_scene, edited_copy, run
+from hosts.trials import ITERATIONS, TRIALS, Done, Nerfstudio, Trial, copy_scene
 
 from opt3dgs_optim import __version__
 from opt3dgs_optim.hosts import diff
@@ -90,25 +90,22 @@ def survey(trainers: Path) -> list[Script]:
 
 def outcome(trial: Trial, trainers: Path, scene: Path, work: Path) -> dict[str, Any]:
     """Stock, edited, and going on from both checkpoints."""
-    stock_script = trainers / trial.trainer / trial.script
-    script = edited_copy(trial, trainers, work / "edited" / trial.trainer)
-    folder = work / re.sub(r"\W+", "_", trial.name)
+    folder = re.sub(r"\W+", "_", trial.name)
     row: dict[str, Any] = {"name": trial.name, "commit": commit_of(trainers / trial.trainer)}
+    row |= {"date": datetime.date.today().isoformat(), "torch": torch.__version__}
 
-    def train(file: Path, out: str, *more: str) -> Done:
-        command = trial.command(scene, folder / out, ITERATIONS)
-        return run(file, [*command, *more], folder / "cwd", trusted=True)
+    def train(out: str, *more: str, ours: bool = True) -> Done:
+        return trial.start(trainers, scene, work, f"{folder}/{out}", *more, ours=ours)
 
-    stock, ours = train(stock_script, "stock"), train(script, "ours")
-    row["stock"], row["ours"] = _shown(stock), _shown(ours)
-    checkpoint = trial.checkpoint(folder / "ours", ITERATIONS)
-    row["checkpoint"] = "yes" if checkpoint.is_file() else "-"
+    row["stock"], row["ours"] = _shown(train("stock", ours=False)), _shown(train("ours"))
+    own = trial.checkpoint(work / folder / "ours", ITERATIONS)
+    row["checkpoint"] = "yes" if own.is_file() else "-"
     row["resume"] = "-"
-    if checkpoint.is_file() and not trial.gsplat:
-        own = train(script, "again", *trial.going_on(checkpoint))
-        theirs = trial.checkpoint(folder / "stock", ITERATIONS)
-        other = train(script, "taken", *trial.going_on(theirs)) if theirs.is_file() else own
-        row["resume"] = f"own: {_shown(own)}; stock's: {_shown(other)}"
+    if own.is_file() and not trial.gsplat:
+        theirs = trial.checkpoint(work / folder / "stock", ITERATIONS)
+        again = _shown(train("again", *trial.going_on(own)))
+        taken = _shown(train("taken", *trial.going_on(theirs)))
+        row["resume"] = f"own: {again}; stock's: {taken}"
     return row
 
 
@@ -119,8 +116,6 @@ def _kept(rows: list[dict[str, Any]], new: dict[str, Any], scene: str) -> dict[s
     return {
         "iterations": ITERATIONS,
         "scene": scene,
-        "date": datetime.date.today().isoformat(),
-        "torch": torch.__version__,
         "machine": f"{platform.machine()}, Python {platform.python_version()}",
         "rows": sorted(every.values(), key=lambda row: known.index(row["name"])),
     }
@@ -139,35 +134,34 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
     """The page's text."""
     edited = [row for row in rows if row.edited]
     names = {row.trainer for row in rows}
-    trainings = []
-    if trials["rows"]:
-        trainings = [
-            f"{trials['iterations']} iterations of the real script on a CPU through `on_cpu.py`, "
-            f"on {trials['scene']}, stock and with the lines; PSNR of the test views at the end. "
-            "So short a run shows that the lines work, not what they gain. "
-            f"{trials['date']}, torch {trials['torch']}, {trials['machine']}."
-        ]
+    lines = {(row.trainer, row.path): str(row.lines) for row in edited}
     text = [
         "# Which trainers were tried",
         "",
         "`python examples/hosts/survey.py --trainers DIR --write` makes this page"
         f" (opt3dgs_optim {__version__}, {datetime.date.today().isoformat()}).",
         "",
-        "## Trainings",
+        f"{trials['iterations']} iterations of the real script on a CPU through `on_cpu.py`, "
+        f"on {trials['scene']}, stock and with the lines; PSNR of the test views at the end. "
+        "So short a run shows that the lines work, not what they gain. "
+        f"{_span(trials, 'date')}, torch {_span(trials, 'torch')}, {trials['machine']}.",
         "",
-        *trainings,
-        "",
-        "| trainer and options | commit | stock | edited | checkpoint | resume |",
-        "|---|---|---|---|---|---|",
+        "| trainer and options | commit | lines of `diff` | stock | edited | checkpoint | resume "
+        "| what is different |",
+        "|---|---|---|---|---|---|---|---|",
     ]
-    for row in trials["rows"]:
-        cells = (row[key] for key in ("name", "commit", "stock", "ours", "checkpoint", "resume"))
-        text.append("| " + " | ".join(_cell(c) for c in cells) + " |")
+    trained = {row["name"]: row for row in trials["rows"]}
+    for trial in TRIALS:
+        if row := trained.get(trial.name):
+            none = "none needed" if isinstance(trial, Nerfstudio) else "-"
+            count = lines.get((trial.trainer, trial.script), none)
+            done = (row[key] for key in ("stock", "ours", "checkpoint", "resume"))
+            text.append(_row(trial.name, row["commit"], count, *done, trial.different))
     text += [
         "",
         f"{len(trials['rows'])} of the {len(TRIALS)} trials in `examples/hosts/trials.py` have "
-        "been run for this table (`--run`). gsplat's scripts evaluate a checkpoint and do not go "
-        "on from one.",
+        "been run for this table (`--run`). Resume: from the edited trainer's own checkpoint, and "
+        "from the stock one's; gsplat's scripts evaluate a checkpoint and do not go on from one.",
         "",
         "## `hosts diff` over public trainers",
         "",
@@ -175,14 +169,25 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
         "(each result compiles and defines every name it uses), the others are refused; "
         f"for these {NEVER}.",
         "",
+        "<details markdown><summary>All scripts</summary>",
+        "",
         "| trainer | script | commit | lines | notes, or why it is refused |",
         "|---|---|---|---|---|",
     ]
     for row in rows:
         said = row.said if row.edited else f"**refused**: {row.said}"
-        cells = (row.trainer, row.path, row.commit, str(row.lines or "-"), said)
-        text.append("| " + " | ".join(_cell(c) for c in cells) + " |")
-    return "\n".join(text) + "\n"
+        text.append(_row(row.trainer, row.path, row.commit, str(row.lines or "-"), said))
+    return "\n".join([*text, "", "</details>", ""])
+
+
+def _span(trials: dict[str, Any], key: str) -> str:
+    """What the trainings have in common, or the first and the last."""
+    seen = sorted({row[key] for row in trials["rows"]})
+    return " to ".join(dict.fromkeys([seen[0], seen[-1]])) if seen else "none"
+
+
+def _row(*cells: str) -> str:
+    return "| " + " | ".join(_cell(cell) for cell in cells) + " |"
 
 
 def _cell(text: str) -> str:
@@ -199,7 +204,7 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help=f"write {PAGE.name}")
     options = parser.parse_args()
     kept = PAGE.with_suffix(".json")
-    trials = json.loads(kept.read_text()) if kept.is_file() else {"rows": []}
+    trials = json.loads(kept.read_text())
     if options.run:
         if options.scene is None:
             parser.error("--run needs --scene")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -30,7 +31,11 @@ SHORT_GSPLAT = (
     *("--disable_viewer", "--data_factor", "4"),
     *("--strategy.refine_start_iter", "10", "--strategy.refine_every", "10"),
 )
+SHORT_SPLATFACTO = (
+    *("--pipeline.model.warmup-length", "10", "--pipeline.model.refine-every", "10"),
+)
 NO_VIDEO = ("--disable_video",)
+SHORTER = {*INRIA_OPTIONS, *SHORT_GSPLAT, *SHORT_SPLATFACTO, *NO_VIDEO}
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,7 @@ class Trial:
         options: beside scene, iterations and output, which `command` adds.
         refused: what a refusal says, where the edited trainer must refuse to start.
         stock_fails: what the stock trainer stops with, where it does not run itself.
+        different: from the stock run, for the table.
     """
 
     trainer: str
@@ -50,11 +56,12 @@ class Trial:
     options: tuple[str, ...]
     refused: str | None = None
     stock_fails: str | None = None
+    different: str = ""
 
     @property
     def name(self) -> str:
         """For tests and tables."""
-        own = [o for o in self.options if o not in (*INRIA_OPTIONS, *SHORT_GSPLAT, *NO_VIDEO)]
+        own = [o for o in self.options if o not in SHORTER]
         return " ".join([self.trainer, *own])
 
     @property
@@ -62,8 +69,8 @@ class Trial:
         """Whether it is one of gsplat's scripts."""
         return self.trainer.startswith("gsplat")
 
-    def command(self, scene: Path, out: Path, iterations: int) -> list[str]:
-        """The script's arguments."""
+    def command(self, scene: Path, out: Path, iterations: int, *, ours: bool) -> list[str]:
+        """The script's arguments; the same for both but where the method has another name."""
         n = str(iterations)
         if self.gsplat:
             where = ["--data_dir", str(scene), "--result_dir", str(out)]
@@ -82,45 +89,127 @@ class Trial:
         """The options to go on from a checkpoint; gsplat only evaluates one."""
         return ["--ckpt" if self.gsplat else "--start_checkpoint", str(checkpoint)]
 
+    def start(
+        self, trainers: Path, scene: Path, work: Path, out: str, *more: str, ours: bool
+    ) -> Done:
+        """Train, stock or ours.
+
+        Args:
+            trainers: the folder of all trainers' sources.
+            scene: that of `copy_scene`.
+            work: where copies of the trainers go, and the results.
+            out: the run's folder there.
+            more: options beside the trial's.
+            ours: with our lines.
+        """
+        script = trainers / self.trainer / self.script
+        if ours:
+            script = edited_copy(self, trainers, work / "edited" / self.trainer)
+        command = self.command(scene, work / out, ITERATIONS, ours=ours)
+        return run(script, [*command, *more], work / out / "cwd", trusted=True)
+
+
+class Nerfstudio(Trial):
+    """`ns-train`, then `ns-eval`: nothing is edited, the method has another name."""
+
+    def command(self, scene: Path, out: Path, iterations: int, *, ours: bool) -> list[str]:
+        """The script's arguments."""
+        method, *options = self.options
+        return [
+            *(f"{method}-opt3dgs" if ours else method, "--vis", "tensorboard"),
+            *("--output-dir", str(out), "--experiment-name", "run", "--timestamp", "one"),
+            *("--max-num-iterations", str(iterations), "--steps-per-save", str(iterations // 2)),
+            *("--save-only-latest-checkpoint", "False", *options),
+            *("--steps-per-eval-image", "0", "--steps-per-eval-all-images", "0"),
+            *("colmap", "--data", str(scene), "--colmap-path", "sparse/0"),
+            *("--downscale-factor", "1"),  # splatfacto itself starts at a quarter
+        ]
+
+    def checkpoint(self, out: Path, iterations: int) -> Path:
+        """The file that a run leaves behind."""
+        name = f"step-{iterations // 2:09d}.ckpt"
+        return next(out.glob(f"run/*/one/nerfstudio_models/{name}"), out / name)
+
+    def going_on(self, checkpoint: Path) -> list[str]:
+        """The options to go on from a checkpoint; after `--load-step` ns-eval would look for it."""
+        return ["--load-checkpoint", str(checkpoint)]
+
+    def start(
+        self, trainers: Path, scene: Path, work: Path, out: str, *more: str, ours: bool
+    ) -> Done:
+        """Train and evaluate, stock or ours."""
+        scripts = trainers / self.trainer / "nerfstudio" / "scripts"
+        method, *rest = self.command(scene, work / out, ITERATIONS, ours=ours)
+        here = work / out / "cwd"
+        trained = run(scripts / "train.py", [method, *more, *rest], here, trusted=True)
+        if trained.code != 0:
+            return trained
+        (config,) = (work / out).glob("run/*/one/config.yml")  # splatfacto-mcmc's is in splatfacto
+        result = here / "psnr.json"
+        options = ["--load-config", str(config), "--output-path", str(result)]
+        done = run(scripts / "eval.py", options, here, trusted=True)
+        psnr = json.loads(result.read_text())["results"]["psnr"] if done.code == 0 else None
+        output = f"{trained.output}\n{done.output}\nPSNR: {psnr}"
+        return Done(done.code, output, trained.seconds + done.seconds)
+
 
 def _gsplat(version: str, *options: str, **said: str) -> Trial:
     video = () if version == "gsplat-1.4.0" else NO_VIDEO
     return Trial(version, GSPLAT, (*options[:1], *SHORT_GSPLAT, *video, *options[1:]), **said)
 
 
-def _inria(trainer: str, *options: str, script: str = "train.py") -> Trial:
-    return Trial(trainer, script, (*INRIA_OPTIONS, *options))
+def _inria(trainer: str, *options: str, different: str = "", script: str = "train.py") -> Trial:
+    return Trial(trainer, script, (*INRIA_OPTIONS, *options), different=different)
+
+
+def _splatfacto(method: str) -> Trial:
+    different = "a method, no edit; a resume steps and saves (stock's own stops with a KeyError)"
+    options = (method, *SHORT_SPLATFACTO)
+    return Nerfstudio("nerfstudio", "nerfstudio/scripts/train.py", options, different=different)
 
 
 _MINI = "--densify_until_iter 40 --simp_iteration1 40 --simp_iteration2 70 --imp_metric indoor"
 # taming cannot clone none or split none: a budget for few refinements, and points of both kinds.
 _TAMING = "--mode final_count --budget 6000 --cams 2 --densify_until_iter 60 --percent_dense 0.03"
-_TAMING += " --opacity_reset_interval 1000"  # afterwards no gradient is large enough to split
+_TAMING += " --opacity_reset_interval=1000"  # afterwards no gradient is large enough to split
+_OWN_STEP = "steps keep its own arithmetic, without bias correction"
 _NO_FUSED = "unexpected keyword argument 'fused'"
 TRIALS = (
     _gsplat("gsplat-1.4.0", "mcmc"),
     _gsplat("gsplat-1.4.0", "default", "--packed"),
     _gsplat("gsplat-1.5.3", "mcmc"),
     _gsplat("gsplat-1.5.3", "default"),
-    _gsplat("gsplat-1.5.3", "default", "--visible_adam"),
+    _gsplat("gsplat-1.5.3", "default", "--visible_adam", different=f"SelectiveAdam: {_OWN_STEP}"),
     _gsplat("gsplat-1.5.3", "default", "--packed"),
-    _gsplat("gsplat-1.5.3", "default", "--packed", "--sparse_grad", refused="SparseAdam"),
-    _gsplat("gsplat-1.5.3", "mcmc", "--app_opt"),
-    _gsplat("gsplat-1.5.3", "mcmc", "--pose_opt"),
-    _gsplat("gsplat-1.5.3", "mcmc", "--use_bilateral_grid"),
+    _gsplat(
+        *("gsplat-1.5.3", "default", "--packed", "--sparse_grad"),
+        refused="SparseAdam",
+        different="refused: torch's SparseAdam is no Adam",
+    ),
+    _gsplat("gsplat-1.5.3", "mcmc", "--app_opt", different="its networks stay plain"),
+    _gsplat("gsplat-1.5.3", "mcmc", "--pose_opt", different="the poses stay plain"),
+    _gsplat("gsplat-1.5.3", "mcmc", "--use_bilateral_grid", different="the grids stay plain"),
     _gsplat("gsplat-1.5.3", "mcmc", "--batch_size", "2"),
     _gsplat("gsplat-main", "mcmc"),
     _gsplat("gsplat-main", "default"),
-    _gsplat("gsplat-main", "default", "--visible_adam", stock_fails=_NO_FUSED),
-    _inria("gaussian-splatting", "--disable_viewer"),
-    _inria("gaussian-splatting", "--disable_viewer", "--optimizer_type", "sparse_adam"),
-    _inria("3dgs-mcmc", "--cap_max", "2500", "--init_type", "sfm"),
-    _inria("taming-3dgs", *_TAMING.split()),
-    _inria(
-        "mini-splatting",
-        *_MINI.split(),
-        script="ms/train.py",
+    _gsplat(
+        *("gsplat-main", "default", "--visible_adam"),
+        stock_fails=_NO_FUSED,
+        different="none: the stock trainer stops too",
     ),
+    _inria("gaussian-splatting", "--disable_viewer", different="exposures stay plain"),
+    _inria(
+        *("gaussian-splatting", "--disable_viewer", "--optimizer_type", "sparse_adam"),
+        different=f"SparseGaussianAdam: {_OWN_STEP}",
+    ),
+    _inria("3dgs-mcmc", "--cap_max", "2500", "--init_type", "sfm"),
+    _inria("taming-3dgs", *_TAMING.split(), different="its second optimizer is upgraded too"),
+    _inria(
+        *("mini-splatting", *_MINI.split()),
+        script="ms/train.py",
+        different="upgraded again where the loop sets up anew; prints no PSNR",
+    ),
+    _splatfacto("splatfacto"),
 )
 
 

@@ -68,6 +68,7 @@ def test_the_lines_of_gsplat(tmp_path: Path) -> None:
         "phases.observe(loss)",
     ]
     assert added(diff(path).diff) == lines
+    assert diff(path).notes == ["left alone: self.pose_optimizers"]
     write(path)
     text = path.read_text()  # above the learning-rate schedulers
     assert text.index("max_steps = cfg") < text.index(lines[1]) < text.index("schedulers = [")
@@ -90,6 +91,15 @@ def test_other_names_of_loss_options_and_ours(tmp_path: Path) -> None:
     assert "phases = PhaseScheduler(final_iter)" in lines_for(tmp_path, text)
     text = INRIA.replace("first_iter = 0\n", "phases = first_iter = 0\n")
     assert "opt3dgs_phases = PhaseScheduler(opt.iterations)" in lines_for(tmp_path, text)
+
+
+def test_names_of_a_function_around_it(tmp_path: Path) -> None:
+    head, body = INRIA.split("def training(dataset, opt, pipe, checkpoint):\n")
+    inner = "".join(f"    {line}\n" for line in body.split("\n\n\ndef")[0].splitlines())
+    text = f"{head}def main(opt):\n    def training(dataset, pipe, checkpoint):\n{inner}"
+    assert lines_for(tmp_path, text) == [IMPORT, *OURS]
+    with pytest.raises(ValueError, match="the name opt is not defined"):
+        diff(saved(tmp_path, text.replace("main(opt)", "main(options)")))
 
 
 @pytest.mark.parametrize(
@@ -201,14 +211,20 @@ def test_what_is_not_certain_is_refused(
 
 
 def test_other_files_and_folders(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    for name in ("trainer.cpp", "train.rs"):
-        assert main(["diff", str(saved(tmp_path, "", name))]) == 1
-        assert "LichtFeld Studio (C++) and Brush (Rust)" in capsys.readouterr().err
+    """Where there is no script there are no lines to add by hand either."""
     saved(tmp_path, INRIA)
-    assert main(["diff", str(tmp_path)]) == 1
-    assert "name the training script (train.py)" in capsys.readouterr().err
-    assert main(["diff", str(tmp_path / "none.py")]) == 1
-    assert "cannot be read" in capsys.readouterr().err
+    saved(tmp_path, "", "trainer.cpp")
+    saved(tmp_path, "", "train.rs")
+    for name, said in {
+        "trainer.cpp": "LichtFeld Studio (C++) and Brush (Rust)",
+        "train.rs": "LichtFeld Studio (C++) and Brush (Rust)",
+        ".": "name the training script (train.py)",
+        "none.py": "cannot be read",
+    }.items():
+        assert main(["diff", str(tmp_path / name)]) == 1
+        errors = capsys.readouterr().err
+        assert said in errors
+        assert "by hand" not in errors
 
 
 def test_a_second_time_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -4,6 +4,6 @@
 """
 
 from opt3dgs_optim.hosts.cli import main
-from opt3dgs_optim.hosts.edits import Edited, diff, edited, write
+from opt3dgs_optim.hosts.edits import Edited, diff, write
 
-__all__ = ["Edited", "diff", "edited", "main", "write"]
+__all__ = ["Edited", "diff", "main", "write"]

@@ -1,4 +1,8 @@
-"""The command `opt3dgs hosts diff PATH [--write]`."""
+"""Print the lines to change in a training script as a diff; `--write` applies them.
+
+gsplat's simple_trainer.py, the train.py of INRIA's gaussian-splatting, 3dgs-mcmc and derivatives. A
+file whose names cannot be read with certainty is refused, with the lines to add by hand.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +13,10 @@ from pathlib import Path
 
 from opt3dgs_optim.hosts.edits import LINES_BY_HAND, diff, write
 
-DESCRIPTION = """Prints the lines to change in a training script (gsplat's simple_trainer.py, the
-train.py of INRIA's gaussian-splatting, 3dgs-mcmc and their derivatives) as a diff; --write applies
-them. A file whose names cannot be read with certainty is refused, with the lines to add by hand."""
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; 0 where the file was edited, else 1."""
-    parser = argparse.ArgumentParser("opt3dgs hosts", description=DESCRIPTION)
+    parser = argparse.ArgumentParser("opt3dgs hosts", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser("diff", help="print the changed lines for a trainer's file")
     command.add_argument("path", type=Path, help="simple_trainer.py or train.py")
@@ -27,7 +27,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         backup = write(options.path) if options.write else None
     except ValueError as error:
         print(f"opt3dgs hosts: {options.path}: {error}", file=sys.stderr)
-        print("\n".join(["The lines to add by hand:", *LINES_BY_HAND]), file=sys.stderr)
+        if options.path.is_file() and options.path.suffix == ".py":
+            print("\n".join(["The lines to add by hand:", *LINES_BY_HAND]), file=sys.stderr)
         return 1
     print(done.diff, end="")
     for note in done.notes:

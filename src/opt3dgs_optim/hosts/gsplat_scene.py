@@ -17,10 +17,9 @@ FOLLOWED = ("on_duplicate", "on_split", "on_remove", "on_sample_add", "on_permut
 def follow_scene(scene: Any, optimizers: Any) -> None:
     """Let a scene of gsplat 1.6 tell which rows its density control moved.
 
-    Without it every edit drops all curvature pairs; with it only those of moved points: after each
-    of the scene's row edits `reset_points` is called with the rows that moved. The scene's `on_*`
-    methods are wrapped on this instance. Relocation moves the dead rows onto live ones but leaves
-    their state: those are the ones that are reset.
+    Without it every edit drops all curvature pairs; with it only those of moved points: the scene's
+    `on_*` methods, wrapped on this instance, call `reset_points`. Relocation moves dead rows onto
+    live ones but leaves their state: those are the ones that are reset.
 
     Args:
         scene: gsplat's.

@@ -5,10 +5,8 @@ nerfstudio finds them through the entry point `nerfstudio.method_configs`, so th
 
     ns-train splatfacto-opt3dgs --data DATA
 
-just works. In a config of your own: `Opt3DGSSplatfactoModelConfig` in place of
-`SplatfactoModelConfig`. Leave gradient accumulation at 1.
-
-Importing this module needs nerfstudio; nothing else in the package does.
+just works. Leave gradient accumulation at 1. Importing this module needs nerfstudio; nothing else
+in the package does.
 """
 
 from __future__ import annotations
@@ -20,7 +18,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.names import canonical_name
 from opt3dgs_optim.phases import PhaseScheduler
 from opt3dgs_optim.presets import PAPER_SWITCH
 
@@ -35,7 +32,7 @@ except ImportError as error:
         f"(the import said: {error})"
     ) from error
 
-_DESCRIPTION = "Gaussian Splatting with Opt3DGS's two-phase optimizer"
+METHODS = {"splatfacto_opt3dgs": "splatfacto", "splatfacto_mcmc_opt3dgs": "splatfacto-mcmc"}
 
 
 @dataclass
@@ -55,13 +52,7 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
     """Splatfacto that tells the optimizers its loss; its noise, if any, stays the strategy's."""
 
     config: Opt3DGSSplatfactoModelConfig
-
-    _phases: tuple[PhaseScheduler, ...] = ()  # a Module must not take it for one of its parts
-
-    @property
-    def phases(self) -> PhaseScheduler:
-        """The phase scheduler of this training; it exists once the trainer is set up."""
-        return self._phases[0]
+    phases: PhaseScheduler | None = None  # of this training, once the trainer is set up
 
     def get_training_callbacks(self, training_callback_attributes: Any) -> Any:
         """As splatfacto's; upgrades the trainer's optimizers.
@@ -81,16 +72,12 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
                 "iterations is needed; set pipeline.model.total_steps"
             )
         make = PhaseScheduler.paper if config.paper else PhaseScheduler
-        phases = make(total, switch=config.switch)
+        self.phases = make(total, switch=config.switch)
         optimizers = attributes.optimizers
         for name, (param,) in self.get_gaussian_param_groups().items():
             _hold(optimizers.optimizers[name], param)
             optimizers.parameters[name] = [param]
-        names = [n for n in optimizers.optimizers if canonical_name(n) is not None]
-        optimizers.optimizers.update(
-            phases.upgrade({name: optimizers.optimizers[name] for name in names})
-        )
-        self._phases = (phases,)
+        self.phases.upgrade(optimizers.optimizers)
         return super().get_training_callbacks(attributes)
 
     def get_loss_dict(
@@ -98,14 +85,15 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
     ) -> dict[str, Tensor]:
         """As splatfacto's, squared while exploiting; observes the sum of all terms."""
         losses = super().get_loss_dict(outputs, batch, metrics_dict)
-        if not self.training or not self._phases:
+        phases = self.phases if self.training else None
+        if phases is None:
             return losses
-        if self.phases.pixel_part() is not None:
+        if phases.pixel_part() is not None:
             render, target = self._images(outputs, batch)
-            change = self.phases.pixel_loss(render, target) - (render - target).abs().mean()
+            change = phases.pixel_loss(render, target) - (render - target).abs().mean()
             losses["main_loss"] = losses["main_loss"] + (1 - self.config.ssim_lambda) * change
         energy = torch.stack([term.detach().reshape(()) for term in losses.values()]).sum()
-        self.phases.observe(energy, iteration=int(self.step))
+        phases.observe(energy, iteration=int(self.step))
         return losses
 
     def _images(self, outputs: Any, batch: Any) -> tuple[Tensor, Tensor]:
@@ -126,29 +114,24 @@ def _hold(optimizer: torch.optim.Optimizer, param: torch.nn.Parameter) -> None:
     """
     (group,) = optimizer.param_groups
     (old,) = group["params"]
-    if old is not param:
-        group["params"] = [param]
-        if old in optimizer.state:
-            optimizer.state[param] = optimizer.state.pop(old)
+    group["params"] = [param]
+    if old in optimizer.state:
+        optimizer.state[param] = optimizer.state.pop(old)
 
 
-def _method(base: str) -> Any:
-    """nerfstudio's method `base` with our model, under the name `base`-opt3dgs."""
+def __getattr__(name: str) -> Any:
+    # Made when asked for: nerfstudio loads entry points in the middle of its own configs' import.
+    if name not in METHODS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from nerfstudio.configs.method_configs import method_configs  # pyright: ignore
     from nerfstudio.plugins.types import MethodSpecification  # pyright: ignore
 
+    base = METHODS[name]
     if base not in method_configs:  # splatfacto-mcmc came after nerfstudio 1.1.5
         return f"{base}-opt3dgs, which needs a nerfstudio that has {base}"
     config = copy.deepcopy(method_configs[base])
     config.method_name = f"{base}-opt3dgs"
     options = {k: v for k, v in vars(config.pipeline.model).items() if k != "_target"}
     config.pipeline.model = Opt3DGSSplatfactoModelConfig(**options)
-    return MethodSpecification(config=config, description=f"{_DESCRIPTION} ({base})")
-
-
-def __getattr__(name: str) -> Any:
-    # Made when asked for: nerfstudio loads entry points in the middle of its own configs' import.
-    bases = {"splatfacto_opt3dgs": "splatfacto", "splatfacto_mcmc_opt3dgs": "splatfacto-mcmc"}
-    if name not in bases:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return _method(bases[name])
+    description = f"Gaussian Splatting with Opt3DGS's two-phase optimizer ({base})"
+    return MethodSpecification(config=config, description=description)

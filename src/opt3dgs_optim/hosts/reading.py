@@ -10,11 +10,36 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
+from typing import NamedTuple
 
-Function = ast.FunctionDef | ast.AsyncFunctionDef
 # A second optimizer of Gaussians; any other, as of exposures or networks, is left alone.
 SECOND = ("shoptimizer",)
+USUAL_L1 = ("ll1", "l1loss", "l1_loss", "ll1_render")
+
+
+class Spot(NamedTuple):
+    """A node of a function, and the nodes around it, from the function on."""
+
+    node: ast.AST
+    above: tuple[ast.AST, ...]
+
+
+def spots(tree: ast.AST, *above: ast.AST) -> Iterator[Spot]:
+    """Every node below this one, in the file's order; nested functions are not looked into."""
+    for child in ast.iter_child_nodes(tree):
+        yield Spot(child, (*above, tree))
+        if not isinstance(child, (ast.FunctionDef, ast.ClassDef, ast.Lambda)):
+            yield from spots(child, *above, tree)
+
+
+def values(own: list[Spot], name: str) -> Iterator[tuple[int, ast.expr | None]]:
+    """The lines in which a name gets a value, and the value, where it is written there."""
+    for spot in own:
+        match spot:
+            case (ast.Name(id, ast.Store()) as node, (*_, around)) if id == name:
+                yield node.lineno, around.value if isinstance(around, ast.Assign) else None
 
 
 @dataclass
@@ -23,28 +48,28 @@ class Trainer:
 
     Args:
         function: the one that holds the loop.
+        spots: every node of it.
         loop: the training loop.
-        total: how many iterations, as the file writes it.
-        shift: what the loop's variable is at its start: 0 or 1; None where it is assigned to.
-        resumes: whether the loop may start later.
-        backwards: the statements `loss.backward()`; several only in branches of an `if`.
         loss: the name of the loss.
+        backwards: the statements `loss.backward()`; several only in branches of an `if`.
+        total: how many iterations.
+        count: the iteration, from 0, where the loop may start later; else empty.
         optimizers: the expressions of the optimizers, the positions' first.
-        pixel: the L1 terms: the call to replace and its two arguments.
         setups: statements in the loop that make the model's optimizers anew.
+        pixel: the L1 terms: what to replace, and its two arguments.
         notes: what a user should know of this file.
     """
 
-    function: Function
+    function: ast.FunctionDef
+    spots: list[Spot]
     loop: ast.For
-    total: str
-    shift: int | None
-    resumes: bool
-    backwards: list[ast.stmt]
     loss: str
-    optimizers: list[str]
-    pixel: list[tuple[ast.expr, list[ast.expr]]] = field(default_factory=list)
+    backwards: list[ast.stmt]
+    total: ast.expr
+    count: str
+    optimizers: list[str] = field(default_factory=list)
     setups: list[ast.stmt] = field(default_factory=list)
+    pixel: list[tuple[ast.expr, list[ast.expr]]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
@@ -58,176 +83,89 @@ def read_trainer(tree: ast.Module, folder: Path | None = None) -> Trainer:
     Raises:
         ValueError: there is no such loop, or it is not one that can be read with certainty.
     """
-    found = [
-        (function, loop, backwards)
-        for function in ast.walk(tree)
-        if isinstance(function, Function)
-        for loop in within(function.body)
-        if isinstance(loop, ast.For) and (backwards := _backwards(loop))
-    ]
-    # A loop inside the training loop is part of it; one around it is not what is meant.
-    found = [f for f in found if not any(f[1] in within(g[1].body) for g in found)]
-    if len(found) != 1:
-        lines = ", ".join(str(loop.lineno) for _, loop, _ in found) or "none"
+    loops: dict[ast.For, ast.FunctionDef] = {}
+    for function in [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]:
+        for node, above in spots(function):
+            around = [n for n in above if isinstance(n, ast.For)]
+            if _loss(node) and around:
+                loops[around[0]] = function
+    if len(loops) != 1:
+        lines = ", ".join(str(loop.lineno) for loop in loops) or "none"
         raise ValueError(f"one `for` loop with a loss.backward() in it is needed (lines: {lines})")
-    function, loop, backwards = found[0]
-    start, total = _range(function, loop)
-    losses = {ast.unparse(loss) for _, loss in backwards}
-    statements = [statement for statement, _ in backwards]
-    if len(losses) != 1 or not _exclusive(loop, statements):
-        lines = ", ".join(str(s.lineno) for s in statements)
+    ((loop, function),) = loops.items()
+    own = list(spots(function))
+    inside = [spot for spot in own if loop in spot.above]
+    backwards = [spot for spot in inside if _loss(spot.node)]
+    statements = [spot.node for spot in backwards if isinstance(spot.node, ast.stmt)]
+    losses = {loss for statement in statements if (loss := _loss(statement))}
+    if len(losses) != 1 or not all(_either(a, b) for a, b in combinations(backwards, 2)):
+        lines = ", ".join(str(statement.lineno) for statement in statements)
         raise ValueError(f"one loss.backward() an iteration is needed (lines: {lines})")
-    shift, total = _shift(start, total)
-    counts = isinstance(loop.target, ast.Name) and not _assigned(loop, loop.target.id)
-    trainer = Trainer(
-        function=function,
-        loop=loop,
-        total=ast.unparse(total),
-        shift=shift if counts else None,
-        resumes=not _constant(function, start),
-        backwards=statements,
-        loss=losses.pop(),
-        optimizers=[],
-    )
-    _find_optimizers(trainer, tree, folder)
-    _find_pixel_loss(trainer)
+    trainer = Trainer(function, own, loop, losses.pop(), statements, *_range(loop, own))
+    _find_optimizers(trainer, inside, folder)
+    _find_pixel_loss(trainer, inside)
     return trainer
 
 
-def within(body: list[ast.stmt]) -> Iterator[ast.AST]:
-    """Every node below these statements, in the file's order, without nested functions."""
-    for node in body:
-        yield from _below(node)
-
-
-def _below(node: ast.AST) -> Iterator[ast.AST]:
-    if isinstance(node, (*Function.__args__, ast.ClassDef, ast.Lambda)):
-        return
-    yield node
-    for child in ast.iter_child_nodes(node):
-        yield from _below(child)
-
-
-def _method(node: ast.AST, name: str) -> ast.expr | None:
-    """The receiver of a call of that method."""
-    if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-        return node.func.value if node.func.attr == name else None
+def _loss(node: ast.AST) -> str | None:
+    """The loss in a statement `loss.backward()` or `scaler.scale(loss).backward()`."""
+    match node:
+        case ast.Expr(ast.Call(ast.Attribute(receiver, "backward"))):
+            match receiver:
+                case ast.Name(loss) | ast.Call(ast.Attribute(_, "scale"), [ast.Name(loss), *_]):
+                    return loss
     return None
 
 
-def _backwards(loop: ast.For) -> list[tuple[ast.stmt, ast.expr]]:
-    """The statements `loss.backward()` and `scaler.scale(loss).backward()`, and their losses."""
-    found: list[tuple[ast.stmt, ast.expr]] = []
-    for node in within(loop.body):
-        receiver = _method(node.value, "backward") if isinstance(node, ast.Expr) else None
-        if isinstance(receiver, ast.Call) and _method(receiver, "scale") and receiver.args:
-            receiver = receiver.args[0]
-        if isinstance(node, ast.Expr) and isinstance(receiver, ast.Name):
-            found.append((node, receiver))
-    return found
+def _either(first: Spot, second: Spot) -> bool:
+    """Whether the two are in different arms of an `if`."""
+    chains = ((*spot.above[1:], spot.node) for spot in (first, second))
+    for node, one, other in zip(first.above, *chains, strict=False):
+        if one is not other:
+            return isinstance(node, ast.If) and (one in node.orelse) != (other in node.orelse)
+    return False
 
 
-def _range(function: Function, loop: ast.For) -> tuple[ast.expr | None, ast.expr]:
-    """Start and end of the range that the loop counts through."""
-    source: ast.expr | None = loop.iter
+def _range(loop: ast.For, own: list[Spot]) -> tuple[ast.expr, str]:
+    """Of the range that a loop counts through: how many, and the count, if it may start later."""
+    source = loop.iter
     if isinstance(source, ast.Name):
-        source = _bound(function, source.id, loop)
-    calls = [n for n in ast.walk(source) if isinstance(n, ast.Call)] if source else []
-    ranges = [c for c in calls if ast.unparse(c.func) in ("range", "tqdm.trange", "trange")]
-    if len(ranges) != 1 or len(ranges[0].args) not in (1, 2):
+        above = [v for line, v in values(own, source.id) if v and line < loop.lineno]
+        source = above[-1] if above else source
+    calls = [n for n in ast.walk(source) if isinstance(n, ast.Call)]
+    ranges = [c.args for c in calls if ast.unparse(c.func) in ("range", "tqdm.trange", "trange")]
+    if len(ranges) != 1 or len(ranges[0]) not in (1, 2):
         raise ValueError(
             f"the loop in line {loop.lineno} goes over {ast.unparse(loop.iter)}: the number of "
             "iterations cannot be read from it, only from a range(...)"
         )
-    bounds = ranges[0].args
-    return (bounds[0] if len(bounds) == 2 else None), bounds[-1]
+    start, end = [ast.Constant(0), *ranges[0]][-2:]
+    if isinstance(start, ast.Name) and len(once := [*values(own, start.id)]) == 1:
+        start = once[0][1]
+    count = ast.unparse(loop.target)
+    if len([*values([spot for spot in own if loop in spot.above], count)]) != 1:
+        count = ""  # the loop gives it other values
+    match end:
+        case ast.BinOp(total, ast.Add(), ast.Constant(1)) if len(ranges[0]) == 2:
+            return total, count and f"{count} - 1"
+    return end, "" if isinstance(start, ast.Constant) else count
 
 
-def _bound(function: Function, name: str, before: ast.stmt) -> ast.expr | None:
-    """What was assigned to `name` last before a statement."""
-    values = [
-        node.value
-        for node in within(function.body)
-        if isinstance(node, ast.Assign)
-        and node.lineno < before.lineno
-        and any(isinstance(t, ast.Name) and t.id == name for t in node.targets)
-    ]
-    return values[-1] if values else None
-
-
-def _shift(start: ast.expr | None, end: ast.expr) -> tuple[int, ast.expr]:
-    """(1, n) for a range that ends at n + 1, else (0, n)."""
-    if start is None or not isinstance(end, ast.BinOp) or not isinstance(end.op, ast.Add):
-        return 0, end
-    one = isinstance(end.right, ast.Constant) and end.right.value == 1
-    return (1, end.left) if one else (0, end)
-
-
-def _constant(function: Function, start: ast.expr | None) -> bool:
-    """Whether a loop starts where it always starts."""
-    if isinstance(start, ast.Name):
-        stores = [
-            n
-            for n in within(function.body)
-            if isinstance(n, ast.Name) and n.id == start.id and isinstance(n.ctx, ast.Store)
-        ]
-        start = _bound(function, start.id, function.body[-1]) if len(stores) == 1 else start
-    return start is None or isinstance(start, ast.Constant)
-
-
-def _assigned(loop: ast.For, name: str) -> bool:
-    return any(
-        isinstance(n, ast.Name) and n.id == name and isinstance(n.ctx, ast.Store)
-        for n in within(loop.body)
-    )
-
-
-def _exclusive(loop: ast.For, statements: list[ast.stmt]) -> bool:
-    """Whether at most one of these statements runs in an iteration."""
-    for first in statements:
-        for second in statements[: statements.index(first)]:
-            if not any(_in_both_arms(n, first, second) for n in within(loop.body)):
-                return False
-    return True
-
-
-def _in_both_arms(node: ast.AST, first: ast.stmt, second: ast.stmt) -> bool:
-    if not isinstance(node, ast.If):
-        return False
-    arms = [list(within(node.body)), list(within(node.orelse))]
-    return any(first in arm and second in other for arm, other in (arms, arms[::-1]))
-
-
-# -- optimizers ------------------------------------------------------------------------------------
-
-
-def _find_optimizers(trainer: Trainer, tree: ast.Module, folder: Path | None) -> None:
+def _find_optimizers(trainer: Trainer, inside: list[Spot], folder: Path | None) -> None:
     """Set `optimizers`, `setups` and what is to be said of them."""
-    stepped = list(dict.fromkeys(_stepped(trainer.loop)))
+    stepped = list(dict.fromkeys(text for spot in inside if (text := _stepped(spot))))
     dicts = [text for text in stepped if text.split(".")[-1] == "optimizers"]
     owners = [text[: -len(".optimizer")] for text in stepped if text.endswith(".optimizer")]
-    set_up = [
-        ast.unparse(r) for n in within(trainer.function.body) if (r := _method(n, "training_setup"))
-    ]
     if len(owners) > 1:
-        owners = [owner for owner in owners if owner in set_up]
+        owners = [owner for owner in owners if _set_up(trainer.spots, owner)]
     if len(dicts) == 1 and not owners:
         trainer.optimizers = dicts
-        others = [text for text in stepped if text not in dicts]
     elif len(owners) == 1:
-        owner = owners[0]
+        (owner,) = owners
         groups, made = _model(folder)
-        seen = [text.rsplit(".", 1)[-1] for text in stepped if text.startswith(f"{owner}.")]
-        second = [name for name in SECOND if name in seen or name in made]
-        trainer.optimizers = [f"{owner}.{name}" for name in ("optimizer", *second)]
-        others = [text for text in stepped if text not in trainer.optimizers]
-        trainer.setups = [
-            n
-            for n in within(trainer.loop.body)
-            if isinstance(n, ast.Expr)
-            and (receiver := _method(n.value, "training_setup"))
-            and ast.unparse(receiver) == owner
-        ]
+        seconds = [name for name in SECOND if name in made or f"{owner}.{name}" in stepped]
+        trainer.optimizers = [f"{owner}.{name}" for name in ("optimizer", *seconds)]
+        trainer.setups = _set_up(inside, owner)
         if groups and not groups & {"xyz", "means"}:
             trainer.notes.append(
                 "no group of its optimizer is named xyz or means; those with a Gaussian "
@@ -239,52 +177,44 @@ def _find_optimizers(trainer: Trainer, tree: ast.Module, folder: Path | None) ->
             "X.optimizers.values()` or one `X.optimizer.step()` is needed "
             f"(stepped in the loop: {', '.join(stepped) or 'nothing'})"
         )
-    if others:
+    if others := [text for text in stepped if text not in trainer.optimizers]:
         trainer.notes.append(f"left alone: {', '.join(others)}")
 
 
-def _stepped(loop: ast.For) -> Iterator[str]:
-    """Expressions of the optimizers that are stepped in the loop.
+def _set_up(among: list[Spot], owner: str) -> list[ast.stmt]:
+    """The statements that make a model's optimizers."""
+    statements = [spot.node for spot in among if isinstance(spot.node, ast.Expr)]
+    return [s for s in statements if ast.unparse(s).startswith(f"{owner}.training_setup(")]
+
+
+def _stepped(spot: Spot) -> str | None:
+    """The expression of the optimizer, or of the many, that a call steps.
 
     Raises:
-        ValueError: one is stepped in a way that is no Adam's.
+        ValueError: it is stepped in a way that is no Adam's.
     """
-    for node in within(loop.body):
-        receiver = _method(node, "step")
-        if isinstance(node, ast.Call) and _method(node, "optimizer_step"):
-            yield f"{ast.unparse(node.func.value)}.optimizer"  # pyright: ignore
-        if receiver is None or not isinstance(node, ast.Call):
-            continue
-        name = ast.unparse(receiver)
-        if name.endswith("scaler") and node.args:
-            name = ast.unparse(node.args[0])
-        elif not name.endswith("optimizer"):
-            continue
-        elif node.keywords or len(node.args) > 2:
-            raise ValueError(
-                f"line {node.lineno}: {ast.unparse(node)} is no step of an Adam; only step() and "
-                "step(mask, ...) are known"
-            )
-        yield _dict_of(loop, name) or name
-
-
-def _dict_of(loop: ast.For, name: str) -> str | None:
-    """`self.optimizers` for the variable of `for optimizer in self.optimizers.values()`."""
-    if "." in name:
+    match spot.node:
+        case ast.Call(ast.Attribute(owner, "optimizer_step")):
+            return f"{ast.unparse(owner)}.optimizer"
+        case ast.Call(ast.Attribute(owner, "step"), given, options) as call:
+            name = ast.unparse(owner)
+        case _:
+            return None
+    if name.endswith("scaler") and given:
+        name = ast.unparse(given[0])
+    elif not name.endswith("optimizer"):
         return None
-    for node in within(loop.body):
-        if isinstance(node, ast.For) and isinstance(node.target, ast.Name):
-            values = _method(node.iter, "values")
-            steps = [
-                n for n in within(node.body) if (r := _method(n, "step")) and name == ast.unparse(r)
-            ]
-            if values is not None and node.target.id == name and steps:
-                return ast.unparse(values)
-    return None
+    elif options or len(given) > 2:
+        raise ValueError(
+            f"line {call.lineno}: {ast.unparse(call)} is no step of an Adam; only step() and "
+            "step(mask, ...) are known"
+        )
+    loops = [n for n in spot.above if isinstance(n, ast.For) and ast.unparse(n.target) == name]
+    return ast.unparse(loops[-1].iter).removesuffix(".values()") if loops else name
 
 
 def _model(folder: Path | None) -> tuple[set[str], set[str]]:
-    """The names of the parameter groups, and of the optimizers, in the classes of `scene/`."""
+    """The names of the parameter groups, and of all attributes set, in the classes of `scene/`."""
     groups: set[str] = set()
     made: set[str] = set()
     for path in sorted((folder / "scene").glob("*model*.py")) if folder else []:
@@ -293,36 +223,30 @@ def _model(folder: Path | None) -> tuple[set[str], set[str]]:
         except (OSError, SyntaxError, ValueError):
             continue
         for node in ast.walk(tree):
-            if isinstance(node, ast.Dict):
-                pairs = zip(node.keys, node.values, strict=True)
-                keys = {k.value: v for k, v in pairs if isinstance(k, ast.Constant)}
-                name = keys.get("name")
-                if "params" in keys and isinstance(name, ast.Constant):
-                    groups.add(str(name.value))
-            if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
-                made.add(node.attr)
+            match node:
+                case ast.Dict(
+                    [ast.Constant("params"), *_, ast.Constant("name")],
+                    [*_, ast.Constant(str(name))],
+                ):
+                    groups.add(name)
+                case ast.Attribute(_, name, ast.Store()):
+                    made.add(name)
     return groups, made
 
 
-# -- the L1 term -----------------------------------------------------------------------------------
-
-
-def _find_pixel_loss(trainer: Trainer) -> None:
+def _find_pixel_loss(trainer: Trainer, inside: list[Spot]) -> None:
     """Set `pixel`: `L1 = l1_loss(a, b)`, `F.l1_loss(a, b)` or `l1_loss(a, b).mean()`."""
     last = max(statement.lineno for statement in trainer.backwards)
     found: dict[str, list[tuple[ast.expr, list[ast.expr]]]] = {}
-    for node in within(trainer.loop.body):
-        if not isinstance(node, ast.Assign) or node.lineno > last:
-            continue
-        value = node.value
-        inner = _method(value, "mean")
-        call = value if inner is None else inner
-        if not isinstance(call, ast.Call) or len(call.args) != 2 or call.keywords:
-            continue
-        if ast.unparse(call.func).split(".")[-1] == "l1_loss":
-            found.setdefault(ast.unparse(node.targets[0]), []).append((value, call.args))
-    usual = [name for name in found if name.lower() in ("ll1", "l1loss", "l1_loss", "ll1_render")]
-    names = usual or list(found)
+    for node, _ in inside:
+        match node:
+            case ast.Assign(
+                [target, *_],
+                ast.Call(ast.Attribute(ast.Call(called, [_, _] as pair, []), "mean"))
+                | ast.Call(called, [_, _] as pair, []),
+            ) if ast.unparse(called).split(".")[-1] == "l1_loss" and node.lineno < last:
+                found.setdefault(ast.unparse(target), []).append((node.value, pair))
+    names = [name for name in found if name.lower() in USUAL_L1] or list(found)
     if len(names) == 1:
         trainer.pixel = found[names[0]]
     else:
