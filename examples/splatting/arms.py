@@ -113,7 +113,7 @@ _ARMS = (
     ),
     Arm(
         DEFAULT_ARM,
-        "faded moments, annealed shapes, opacities and colours: the package's defaults",
+        "the package's: annealed shapes, opacities and colours, faded moments",
         lambda _iterations, _nu: [*DEFAULTS],
     ),
 )
