@@ -26,6 +26,7 @@ from studies.scenes.arms import BASELINE, STUDY_ARMS, find_study_arm
 from studies.scenes.training import Spec, fit_of, machine, scene_of
 
 ROUNDS, STEPS, FIRST = 7, 10, 5  # rounds of so many iterations in turns, after the first few
+SHARES = (0.5, 0.75, 0.9)  # of a training, where it left checkpoints
 PATH = Path(__file__).resolve().parents[3] / "docs" / "results" / "study" / "costs.json"
 
 
@@ -65,7 +66,7 @@ def measure_all(runs: Path, iterations: Sequence[int]) -> list[dict[str, Any]]:
         shares: dict[str, list[float]] = defaultdict(list)
         marks = [
             name
-            for name in (f"at-{count // 2}.pt", f"at-{3 * count // 4}.pt", "checkpoint.pt")
+            for name in (f"at-{round(share * count)}.pt" for share in SHARES)
             if all((folder / name).exists() for folder in folders.values())
         ]
         for mark in marks:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import json
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ import pytest
 import torch
 from splatting.fit import Fit, FitOptions
 from splatting.scenes import Scene, load_scene
+from studies.scenes import costs
 from studies.scenes.arms import find_study_arm
 from studies.scenes.parts.exploring import (
     CLAMP,
@@ -21,7 +24,8 @@ from studies.scenes.parts.exploring import (
     nu_per_point,
 )
 from studies.scenes.parts.keep_unseen import KeepUnseen
-from studies.scenes.training import TILES, Spec, scene_of, tiles
+from studies.scenes.records import read_costs
+from studies.scenes.training import TILES, Spec, scene_of, tiles, train
 
 from opt3dgs_optim import EnergyHistogram, PhaseScheduler, PositionNoise
 
@@ -214,3 +218,23 @@ def test_a_trainer_with_other_rates_makes_other_steps() -> None:
     assert ratio.nanmedian().item() == pytest.approx(2.0, rel=1e-3)
     with pytest.raises(ValueError, match=r"rates=0\.0, must be above 0"):
         FitOptions(rates=0.0)
+
+
+def test_costs_are_measured_in_turns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("ROUNDS", 2), ("STEPS", 1), ("FIRST", 0)):
+        monkeypatch.setattr(costs, name, value)
+    for arm in ("mcmc", "faded"):
+        folder = tmp_path / arm
+        folder.mkdir()
+        spec = Spec("embedded", arm, 0, 20, 60, rotated=True)
+        call = {"spec": asdict(spec), "mean_nu": None}
+        (folder / "call.json").write_text(json.dumps(call), encoding="utf-8")
+        train(spec, folder, None, None)
+    (made,) = costs.measure_all(tmp_path, [20])
+    assert made["checkpoints"] == ["at-10.pt", "at-15.pt", "at-18.pt"]
+    assert made["shares"]["mcmc"] == 1.0
+    assert made["shares"]["faded"] > 0
+    path = tmp_path / "costs.json"
+    path.write_text(json.dumps([made]), encoding="utf-8")
+    assert read_costs(path)["embedded", "images_4", 20, "mcmc"] == 1.0
+    assert costs.main(["--runs", str(tmp_path), "--iterations", "30"]) == 2
