@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
@@ -10,13 +9,12 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import check_keys
+from opt3dgs_optim.checks import LOGGER, check_keys
 from opt3dgs_optim.part import Part, Phase, overrides
 
 HOOKS = ("observe", "pixel_loss", "factor", "before", "after")
 CHECK_STEPS = 100  # iterations between two looks at the parts' evidence
 FORMAT = 2  # of a checkpoint
-LOGGER = logging.getLogger("opt3dgs_optim")
 P = TypeVar("P", bound=Part)
 
 
@@ -57,10 +55,7 @@ class Course:
 
     def _plan(self) -> None:
         """Which parts have which hooks in which phase; a hook that nobody has is never called."""
-        acting = []
-        for name, part in self._named():
-            standing = part.instead() if name in self.switched_off else part
-            acting += [] if standing is None else [standing]
+        acting = [part for name, part in self._named() if name not in self.switched_off]
         self._acting: dict[Phase | None, list[Part]] = {None: acting}
         for phase in Phase:
             self._acting[phase] = [part for part in acting if part.during in (None, phase)]

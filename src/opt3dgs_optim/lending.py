@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import inspect
-import logging
 import math
 from collections.abc import Callable
 from typing import Any, TypedDict
@@ -13,11 +12,10 @@ import torch
 from torch import Tensor
 from torch.optim import Adam
 
+from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Group, Part
 from opt3dgs_optim.rows import Frozen
-
-LOGGER = logging.getLogger("opt3dgs_optim")
 
 
 class AdamOptions(TypedDict, total=False):

@@ -120,9 +120,6 @@ class Part:
     def useless(self, evidence: list[float], course: Course) -> str | None:
         """Why this training does not need the part, or None; asked while it is off, too."""
 
-    def instead(self) -> Part | None:
-        """What takes its place where it is useless; None: nothing."""
-
 
 def overrides(part: Part, hook: str) -> bool:
     """Whether a part has a hook of its own."""

@@ -31,8 +31,6 @@ LIMIT = 4.0  # an energy further away counts as one at this distance
 UNLIMITED = 4  # energies at the start, whose deviation is not known yet
 MEAN_ABS = math.sqrt(2 / math.pi)  # mean absolute deviation of a Gaussian of deviation 1
 RESOLUTION = 1e-6  # smallest deviation, as a share of the present distance from the mean
-CONSTANT = 1e-9  # smallest deviation of an energy that varies, as a share of its size
-TINY = 1e-100  # smallest deviation of an energy around zero that varies
 
 
 class FixedPartitions:
@@ -110,10 +108,6 @@ class FixedPartitions:
         low = float(self._low)
         return low, low + float(self._width) * self.num_partitions, float(self._tau)
 
-    def is_constant(self) -> bool:
-        """Never said: the range is the user's."""
-        return False
-
     def numbers(self) -> dict[str, Tensor]:
         """Nothing that is not in the weights."""
         return {}
@@ -147,15 +141,12 @@ class MovingPartitions:
 
         Theta ~ q^(1 / (1 - zeta)),    nu = 1 + zeta tau dlog Theta/du = 1 + dlog q/dz / 2
 
-    That Theta is where eq. 16 converges to, too (its field is p_i theta_i^zeta - theta_i times a
-    sum, zero at theta_i^(1 - zeta) ~ p_i), but the gain of a visit does not depend on theta. With
-    tau = (1 - zeta) / (2 zeta) deviations zeta drops out of nu: a Gaussian energy has the slope
-    -z, so |nu - 1| = 1 two deviations out, and nu's deviation is 1/2, whatever zeta. Smoothing by
-    k twice widens a Gaussian's variance to 1 + 2 * 0.4^2, and the slope is corrected by that.
-
-    The mean of dlog q/dz over the visits is 0, for any density that ends somewhere; of a smoothed
-    one it is -.2 for an exponential energy, and while the energy falls. So the slope's own recent
-    mean is taken away: nu's mean is 1, and what nu does is no change of the learning rate.
+    That Theta is where eq. 16 converges to (its field is p_i theta_i^zeta - theta_i times a sum,
+    zero at theta_i^(1 - zeta) ~ p_i). With tau = (1 - zeta) / (2 zeta) deviations zeta drops out:
+    a Gaussian energy has the slope -z, so |nu - 1| = 1 two deviations out, and nu's deviation is
+    1/2. Smoothing by k twice widens a Gaussian's variance to 1 + 2 * 0.4^2, and the slope is
+    corrected by that. Its own recent mean is taken away: a smoothed density's is not 0 for a
+    skewed energy, nor while the energy falls, and nu's mean of 1 is no change of learning rate.
 
     All means are of the last 100 energies, weighed exponentially. The deviation is the mean
     absolute one, and an energy counts for at most four deviations: a spike moves them by 4 %.
@@ -222,12 +213,13 @@ class MovingPartitions:
             numbers = (rate, limit, *self.clamp, *self._constants)
             cuda.take_energy(energy, valid, self._state, self.nu, sums, *numbers)
             return
+        known = valid is True
         if count == 1:
-            self._mean.copy_(energy if valid is True else torch.where(valid, energy, 0.0))
+            self._mean.copy_(energy if known else torch.where(valid, energy, 0.0))
         # t = z / MEAN_ABS: distance from the mean in mean absolute deviations. Where those have
         # vanished, as after a constant loss, they grow again by the second term.
         distance = torch.sub(energy, self._mean)
-        if valid is not True:
+        if not known:
             distance.nan_to_num_(0.0, 0.0, 0.0)
         unit = torch.add(self._deviation, distance.abs(), alpha=RESOLUTION)
         t = torch.clamp(torch.div(distance, unit), -limit, limit, out=self._t)
@@ -236,12 +228,12 @@ class MovingPartitions:
         torch.mul(self._kernel, self._q, out=self._kq)
         torch.addmv(self._offsets, self._rows, self._products, out=self._sums)
         slope = torch.addcdiv(self._base, self._up, self._below, out=self._slope)
-        nu = torch.sub(slope, self._mean_slope).add_(1.0)
-        torch.clamp(nu, *self.clamp, out=self.nu)
+        nu = torch.sub(slope, self._mean_slope).add_(1.0).clamp_(*self.clamp)
+        self.nu.copy_(nu if known else torch.where(valid, nu, self.nu))
         step = torch.mul(t, unit)
         torch.add(self._mean, step, out=self._to_mean)
         torch.hypot(step, self._tiny, out=self._to_deviation)
-        self._state.lerp_(self._target, rate if valid is True else rate * valid)
+        self._state.lerp_(self._target, rate if known else rate * valid.to(self._state.dtype))
         if sums is not None:
             sums.addcmul_(torch.pow(self.nu, self._powers), torch.as_tensor(valid))
 
@@ -267,11 +259,6 @@ class MovingPartitions:
         _, deviation, _, *q = state["recent"]
         if deviation < 0 or min(q) < 0 or abs(math.fsum(q) - 1) > 1e-3:
             raise ValueError(f"{call}: recent={state['recent']!r}, but a density is needed")
-
-    def is_constant(self) -> bool:
-        """Whether the energies have not varied lately. Synchronises."""
-        low, high, _ = self.coordinates()
-        return high - low <= max(CONSTANT * REACH * abs(high + low), TINY)
 
     def numbers(self) -> dict[str, Tensor]:
         """The energy's recent mean and deviation, 0-d, in units of the loss."""

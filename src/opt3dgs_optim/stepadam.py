@@ -158,7 +158,7 @@ class StepAdam(Adam):
                 part.after(group, param, self.state[param], course)
             if course.keys:
                 self._ledger.remember(param, self.state[param], course.keys)
-        for rows in lent.frozen:
+        for rows in reversed(lent.frozen):
             rows.put_back()
 
     def _prepare(
@@ -174,8 +174,8 @@ class StepAdam(Adam):
         for param in params:
             self._told |= guard(cast(Tensor, param.grad), self.course, self._told)
             moving = self._moving(group, param, mask, bool(befores or afters))
-            if moving is not None or befores:
-                self._lend_gradient(group, param, moving, befores, lent)
+            if moving is not None or befores or self._puts_back(mask):
+                self._lend_gradient(group, param, moving, befores, lent, self._puts_back(mask))
         factor = None
         for part in factors:
             factor = times(factor, part.factor(group, self.course))
@@ -195,7 +195,13 @@ class StepAdam(Adam):
         step(self, mask, mask.numel()) if takes_number else step(self, mask)
 
     def _lend_gradient(
-        self, group: Group, param: Tensor, moving: Tensor | None, parts: list[Part], lent: Lent
+        self,
+        group: Group,
+        param: Tensor,
+        moving: Tensor | None,
+        parts: list[Part],
+        lent: Lent,
+        puts_back: bool,
     ) -> None:
         """Put what Adam is to be fed into `param.grad`."""
         fed, state = cast(Tensor, param.grad), self.state[param]
@@ -208,20 +214,23 @@ class StepAdam(Adam):
         if parts:
             scale = getattr(self, "grad_scale", None)
             fed = feed(parts, group, param, fed, state, self.course, scale)
+        if puts_back:  # what Adam does; the parts' doing is not the step's
+            lent.frozen.append(Frozen(cast(Tensor, self.course.valid), param, state))
         if fed is not param.grad:
             lent.attribute(param, "grad", fed)
 
     def _moving(
         self, group: Group, param: Tensor, mask: Tensor | None, with_parts: bool
     ) -> Tensor | None:
-        """The rows that may move, [N] or 0-d bool; None: all, or the base's own step knows."""
-        valid = self.course.valid
-        if mask is not None and self._takes_mask(group, mask.numel()):
-            if self.base is not Adam and not with_parts:
-                return None
-            rows = mask.to(param.device)
-            return rows & valid if isinstance(valid, Tensor) else rows
-        return valid if isinstance(valid, Tensor) and not self._drops_on_device() else None
+        """The rows that may move, [N] bool; None: all, or the base's own step knows."""
+        if mask is None or not self._takes_mask(group, mask.numel()):
+            return None
+        return mask.to(param.device) if self.base is Adam or with_parts else None
+
+    def _puts_back(self, mask: Tensor | None) -> bool:
+        """Whether only the device knows if the step counts, and the step cannot ask it."""
+        own_mask = self.base is not Adam and mask is not None
+        return isinstance(self.course.valid, Tensor) and not (own_mask or self._drops_on_device())
 
     def _drops_on_device(self) -> bool:
         """Whether torch's own step can be told on the device not to be made."""

@@ -121,6 +121,20 @@ def launch(
         core.launch(_TorchStream(device), config, function, *values)
 
 
+def check_alike(call: str, like: Tensor, **others: tuple[Tensor, tuple[int, ...]]) -> None:
+    """ValueError unless each tensor has its shape, and dtype and device of `like`.
+
+    A kernel reads memory by these.
+    """
+    for name, (tensor, shape) in others.items():
+        alike = tensor.dtype == like.dtype and tensor.device == like.device
+        if tuple(tensor.shape) != shape or not alike:
+            raise ValueError(
+                f"{call}: {name} is {tuple(tensor.shape)} {tensor.dtype} on {tensor.device}, but "
+                f"{shape} {like.dtype} on {like.device} is needed"
+            )
+
+
 def _real(dtype: torch.dtype) -> Any:
     return np.float64 if dtype == torch.float64 else np.float32
 
@@ -135,6 +149,8 @@ def lqn_direction(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`lbfgs.lqn_direction` on the GPU, for points of three coordinates. Never synchronises."""
     rows, real = grad.shape[0], _real(grad.dtype)
+    whole = history, tuple(history.shape)
+    check_alike("lqn_direction", grad, position=(position, tuple(grad.shape)), history=whole)
     fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
     accepted = torch.empty(rows, dtype=torch.bool, device=grad.device)
     candidates = torch.empty_like(accepted)
@@ -172,6 +188,9 @@ def add_covariance_noise(
     A learning rate on the GPU is read there, when the kernel runs; one on the CPU is passed on.
     """
     rows, real = means.shape[0], _real(means.dtype)
+    vectors = {"scales": (scales, (rows, 3)), "quats": (quats, (rows, 4)), "eta": (eta, (rows, 3))}
+    logits = opacities.reshape(-1), (rows,)
+    check_alike("add_covariance_noise", means, opacities=logits, **vectors)
     if isinstance(lr, Tensor) and lr.is_cuda:
         rate, factor = lr.to(torch.float32), noise_scale
     else:

@@ -1,8 +1,6 @@
 """The per-point L-BFGS: the two-loop recursion, and one step of it for Adam.
 
-The step is one registered operator, with a CUDA kernel for points of three coordinates and pure
-torch for all else, so that it works under `torch.compile`. `torch.library.custom_op` would cost
-12 us per call; define, impl and register_fake cost 1.4.
+A CUDA kernel for points of three coordinates, and pure torch for all else.
 """
 
 from __future__ import annotations
@@ -14,14 +12,6 @@ from opt3dgs_optim import cuda
 from opt3dgs_optim.backend import uses_kernel
 from opt3dgs_optim.lbfgs.history import Header, check_history, header, push, stored_pairs
 from opt3dgs_optim.lbfgs.pairs import columns, dot, length, normalised_pair, row_chunks
-
-_LIBRARY = torch.library.Library("opt3dgs_optim", "DEF")
-_LIBRARY.define(
-    "lqn_direction(Tensor position, Tensor grad, Tensor(a!) history, int history_size, *, "
-    "float min_cosine, bool graft, str backend) "
-    "-> (Tensor direction, Tensor accepted, Tensor candidates)"
-)
-
 
 def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
     """The pseudo-gradient H g of every point, by the L-BFGS two-loop recursion.
@@ -48,9 +38,10 @@ def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
         ValueError: the shapes do not fit.
     """
     check_history("two_loop", grad, history, history_size)
-    same = history.dtype == grad.dtype and history.device == grad.device and grad.shape[1] == 3
-    if same and not torch.compiler.is_compiling() and uses_kernel("auto", grad.device, grad.dtype):
-        return cuda.two_loop(grad, history, history_size)
+    same = history.dtype == grad.dtype and history.device == grad.device
+    if same and not torch.compiler.is_compiling():
+        if uses_kernel("auto", grad.device, grad.dtype, grad.shape[1], history_size):
+            return cuda.two_loop(grad, history, history_size)
     result = torch.empty_like(grad)
     for rows in row_chunks(grad):
         unit, scale = scaled(columns(grad[rows], history.dtype))
@@ -124,26 +115,8 @@ def lqn_direction(
         RuntimeError: `backend="cuda"` where the kernel cannot run.
         ValueError: the shapes do not fit.
     """
-    return _OPERATOR(
-        position, grad, history, history_size, min_cosine=min_cosine, graft=graft, backend=backend
-    )
-
-
-def step(
-    position: Tensor,
-    grad: Tensor,
-    history: Tensor,
-    history_size: int,
-    *,
-    min_cosine: float,
-    graft: bool,
-    backend: str,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """What the operator does: see `lqn_direction`."""
     check_history("lqn_direction", grad, history, history_size)
-    asked = grad.is_cuda or backend == "cuda"
-    if asked and uses_kernel(backend, grad.device, grad.dtype, grad.shape[1]):
-        check_alike(grad, position, history)
+    if uses_kernel(backend, grad.device, grad.dtype, grad.shape[1], history_size):
         return cuda.lqn_direction(position, grad, history, history_size, min_cosine, graft)
     fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
     accepted = torch.empty(grad.shape[0], dtype=torch.bool, device=grad.device)
@@ -158,21 +131,6 @@ def step(
         accepted[rows], candidates[rows] = taken
         fed[rows] = direction(g, part, head, history_size, graft).T
     return fed, accepted, candidates
-
-
-def check_alike(grad: Tensor, position: Tensor, history: Tensor) -> None:
-    """A kernel reads memory by the shape and dtype of `grad` [N, 3]: be sure of the others'."""
-    for name, tensor in (("position", position), ("history", history)):
-        if tensor.dtype != grad.dtype or tensor.device != grad.device:
-            raise ValueError(
-                f"lqn_direction: {name} is {tensor.dtype} on {tensor.device}, but {grad.dtype} on "
-                f"{grad.device}, as the gradient, is needed"
-            )
-    if position.shape != grad.shape:
-        raise ValueError(
-            f"lqn_direction: position has shape {tuple(position.shape)}, but "
-            f"{tuple(grad.shape)} is needed"
-        )
 
 
 def take_pairs(
@@ -224,16 +182,3 @@ def direction(
     result = result * scale
     usable = usable & (result.abs().amax(0) < torch.inf)
     return torch.where(usable, result, grad)
-
-
-def _fake(
-    position: Tensor, grad: Tensor, history: Tensor, history_size: int, **options: object
-) -> tuple[Tensor, Tensor, Tensor]:
-    flags = [grad.new_empty(grad.shape[0], dtype=torch.bool) for _ in range(2)]
-    fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
-    return fed, flags[0], flags[1]
-
-
-_LIBRARY.impl("lqn_direction", step, "CompositeExplicitAutograd")
-torch.library.register_fake("opt3dgs_optim::lqn_direction", _fake, lib=_LIBRARY)
-_OPERATOR = torch.ops.opt3dgs_optim.lqn_direction.default
