@@ -1,12 +1,9 @@
 """How the visits of the energy's partitions are counted, and the multiplier nu that follows.
 
-Two ways. `FixedPartitions` is the paper's: a fixed range, Theta by stochastic approximation.
-`MovingPartitions` is the default: partitions of the energy's recent deviations, which go where the
-energy goes, and Theta from a smoothed density of the recent visits, whose error is known.
-
-Equation numbers are those of the Opt3DGS paper (every displayed equation counted; 7 partition,
-13 index, 14 multiplier, 16 update of the weights). The paper's text is not implementable word for
-word; where this module differs, the comment at the line says why.
+`FixedPartitions` is the paper's: a fixed range, Theta by stochastic approximation.
+`MovingPartitions` is the default: partitions of the energy's recent deviations, and Theta from a
+smoothed density of the recent visits. Equation numbers are those of the Opt3DGS paper (every
+displayed equation counted; 7 partition, 13 index, 14 multiplier, 16 update of the weights).
 """
 
 from __future__ import annotations
@@ -34,15 +31,7 @@ RESOLUTION = 1e-6  # smallest deviation, as a share of the present distance from
 
 
 class FixedPartitions:
-    """Eq. 7, 13, 14 and 16 as the paper has them; all state stays on the energies' device.
-
-    Args:
-        num_partitions: m.
-        energy_range: (low, high), cut uniformly; the first and the last partition are open.
-        zeta, temperature: of eq. 14.
-        warmup: number of energies during which nu is 1 while Theta is being estimated.
-        clamp: (low, high) bounds of nu, or None.
-    """
+    """Eq. 7, 13, 14 and 16 as the paper has them; options as in `EnergyHistogram`."""
 
     def __init__(
         self,
@@ -107,10 +96,6 @@ class FixedPartitions:
         """Low and high end of the range, and tau. Synchronises."""
         low = float(self._low)
         return low, low + float(self._width) * self.num_partitions, float(self._tau)
-
-    def numbers(self) -> dict[str, Tensor]:
-        """Nothing that is not in the weights."""
-        return {}
 
     def state(self) -> dict[str, Any]:
         """Plain floats and lists. Synchronises."""
@@ -199,13 +184,9 @@ class MovingPartitions:
     def take(
         self, energy: Tensor, valid: Tensor | Literal[True], count: int, sums: Tensor | None
     ) -> None:
-        """Nu from the present density, then its update with an energy.
+        """Nu from the present density, then its update with an energy, 0-d, the `count`-th.
 
-        Args:
-            energy: 0-d.
-            valid: whether it is finite.
-            count: its number, from 1 on.
-            sums: [3], to which nu's powers 0, 1 and 2 are added; or None.
+        `valid` is whether it is finite; nu's powers 0, 1 and 2 are added to `sums`, [3] or None.
         """
         limit = LIMIT / MEAN_ABS if count > UNLIMITED else 1 / RESOLUTION
         rate = max(1 / count, 1 / MEMORY)

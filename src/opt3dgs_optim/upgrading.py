@@ -30,16 +30,10 @@ class Found(NamedTuple):
 
 
 def look_at(optimizer: Any, course: Course, shown: str, key: str | None) -> Found:
-    """What an optimizer holds; it is not changed.
+    """What an optimizer holds; it is not changed. Raises as `PhaseScheduler.upgrade`.
 
-    Args:
-        optimizer: a `torch.optim.Adam`, or one of this course already.
-        course: the training's.
-        shown: how messages call the optimizer.
-        key: what a dict of optimizers says that it holds; None: its groups' names say.
-
-    Raises:
-        TypeError, ValueError: as `PhaseScheduler.upgrade`.
+    `shown` is how messages call it, `key` what a dict of optimizers says that it holds; None: its
+    groups' names say.
     """
     base = None
     if not isinstance(optimizer, StepAdam):

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import functools
 import importlib
-import importlib.util
 from importlib.resources import files
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -53,17 +52,9 @@ def compile_cubin(
     logs: Any = None,
     ptxas_options: list[str] | None = None,
 ) -> Any:
-    """Compile a kernel file for an architecture such as "sm_90"; no GPU is needed.
+    """cuda.core's ObjectCode of a file of `KERNELS`, for an `arch` such as "sm_90"; needs no GPU.
 
-    Args:
-        name: a file of `KERNELS`.
-        dtype: torch.float32 or torch.float64.
-        arch: without one, cuda.core would ask the driver.
-        history_size: K; of "lqn.cu" only.
-        cache, logs, ptxas_options: cuda.core's.
-
-    Returns:
-        cuda.core's ObjectCode.
+    history_size is K, of "lqn.cu" only; cache, logs and ptxas_options are cuda.core's.
     """
     core = importlib.import_module("cuda.core")
     defined = macros(dtype, history_size) or None
@@ -90,14 +81,13 @@ def _kernel(kernel: str, device: int, dtype: torch.dtype, history_size: int | No
     return code.get_kernel(kernel)
 
 
-class _TorchStream:
+class _TorchStream(NamedTuple):
     """torch's current stream, as cuda.core wants to see it."""
 
-    def __init__(self, device: torch.device) -> None:
-        self._handle = torch.cuda.current_stream(device).cuda_stream
+    handle: int
 
     def __cuda_stream__(self) -> tuple[int, int]:
-        return 0, self._handle
+        return 0, self.handle
 
 
 def launch(
@@ -118,7 +108,8 @@ def launch(
     with torch.cuda.device(device):
         function = _kernel(kernel, like.get_device(), like.dtype, history_size)
         config = core.LaunchConfig(grid=(threads + BLOCK - 1) // BLOCK, block=BLOCK)
-        core.launch(_TorchStream(device), config, function, *values)
+        stream = _TorchStream(torch.cuda.current_stream(device).cuda_stream)
+        core.launch(stream, config, function, *values)
 
 
 def check_alike(call: str, like: Tensor, **others: tuple[Tensor, tuple[int, ...]]) -> None:
@@ -225,16 +216,12 @@ def missing() -> str | None:
     if torch.version.hip is not None:
         return "this torch is built for ROCm, and the kernels are CUDA"
     try:
-        found = importlib.util.find_spec("cuda.core") is not None
+        importlib.import_module("cuda.core")
     except ModuleNotFoundError:
-        found = False
-    if not found:
         extra = "cuda12" if (torch.version.cuda or "").startswith("12") else "cuda"
         return f"cuda.core is not installed (pip install 'opt3dgs_optim[{extra}]')"
-    if not torch.cuda.is_available():
-        return "torch sees no CUDA device: no NVIDIA driver, or a build of torch without CUDA"
-    try:
-        importlib.import_module("cuda.core")
     except Exception as error:  # whatever a broken installation raises is the reason to show
         return f"cuda.core cannot be imported: {type(error).__name__}: {error}"
+    if not torch.cuda.is_available():
+        return "torch sees no CUDA device: no NVIDIA driver, or a build of torch without CUDA"
     return None

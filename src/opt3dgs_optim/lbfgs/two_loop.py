@@ -13,6 +13,7 @@ from opt3dgs_optim.backend import uses_kernel
 from opt3dgs_optim.lbfgs.history import Header, check_history, header, push, stored_pairs
 from opt3dgs_optim.lbfgs.pairs import columns, dot, length, normalised_pair, row_chunks
 
+
 def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
     """The pseudo-gradient H g of every point, by the L-BFGS two-loop recursion.
 
@@ -39,9 +40,9 @@ def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
     """
     check_history("two_loop", grad, history, history_size)
     same = history.dtype == grad.dtype and history.device == grad.device
-    if same and not torch.compiler.is_compiling():
-        if uses_kernel("auto", grad.device, grad.dtype, grad.shape[1], history_size):
-            return cuda.two_loop(grad, history, history_size)
+    like = grad.device, grad.dtype, grad.shape[1], history_size
+    if same and not torch.compiler.is_compiling() and uses_kernel("auto", *like):
+        return cuda.two_loop(grad, history, history_size)
     result = torch.empty_like(grad)
     for rows in row_chunks(grad):
         unit, scale = scaled(columns(grad[rows], history.dtype))
@@ -98,7 +99,7 @@ def lqn_direction(
         position: [N, D] before the step.
         grad: [N, D] there; a row that is zero or not finite is not visible: its history stays,
             and it is given back.
-        history: [N, slots, 2 (D + 1)], changed in place; see `opt3dgs_optim.lbfgs.history`.
+        history: [N, slots, 2 (D + 1)], changed in place.
         history_size: K, 1 to 16.
         min_cosine: a pair is accepted if s.y > min_cosine |s| |y|. Relative: an absolute bound
             such as torch LBFGS's 1e-10 would reject practically every pair of a splat.
@@ -142,18 +143,10 @@ def take_pairs(
     visible: Tensor,
     min_cosine: float,
 ) -> tuple[Tensor, Tensor]:
-    """Accept a pair per point and update the header; coordinates first.
+    """Accept a pair between two consecutive *visible* steps of each point; update the header.
 
-    A pair is taken between two consecutive *visible* steps of a point; what happens to a point
-    while it is not visible leaves its history as it is.
-
-    Args:
-        history: [N, slots, 2 (D + 1)], changed in place; `head` are the views of its header.
-        position, gradient: [D, N] before the step.
-        visible: [N] bool.
-
-    Returns:
-        (accepted, candidates), [N] bool each.
+    History and `head`, the views of its header, are changed in place; position and gradient are
+    [D, N] before the step. Returns (accepted, candidates), [N] bool each.
     """
     last_position, last_gradient, counter = head.position.T, head.gradient.T, head.counter
     pair = normalised_pair(position - last_position, gradient - last_gradient)

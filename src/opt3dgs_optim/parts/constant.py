@@ -10,7 +10,6 @@ from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Group, Part, Phase
 
 
-
 @dataclass(frozen=True, repr=False)
 class ConstantMultiplier(Part):
     """nu = `value`, whatever the energy: a plain change of all learning rates while exploring.

@@ -31,12 +31,11 @@ class EnergyHistogram(Part):
 
     Theta is the weight of the energy's partition, by how often the training has been there.
 
-    By default (`energy_range="auto"`, `temperature="auto"`) the partitions follow the energy's
-    recent mean and deviation, tau is (1 - zeta) / (2 zeta) deviations, and the slope of log Theta
-    is that of a smoothed density: an energy two deviations from the mean gets |nu - 1| = 1 at all
-    times, nu's mean is 1 and its deviation 1/2, whatever zeta and however far the energy falls.
-    `MovingPartitions` has the formulas. With a range and a temperature it is the paper's update,
-    to the letter (`FixedPartitions`); `EnergyHistogram.paper()` has its numbers.
+    By default the partitions follow the energy's recent mean and deviation: an energy two
+    deviations from the mean gets |nu - 1| = 1 at all times, nu's mean is 1 and its deviation 1/2,
+    whatever zeta and however far the energy falls. `MovingPartitions` has the formulas. With a
+    range and a temperature it is the paper's update, to the letter (`FixedPartitions`);
+    `EnergyHistogram.paper()` has its numbers.
 
     The state lives on the device of the energies, and `observe` does not wait for a GPU.
 
@@ -128,7 +127,7 @@ class EnergyHistogram(Part):
             energy: the training loss of this iteration, 0-d (or one element). One that is not
                 finite changes nothing.
             valid: whether it is finite, where that is known already.
-            course: not used.
+            course: the training's, which wants no copy of nu.
 
         Returns:
             nu, 0-d, on the energy's device.
@@ -200,20 +199,16 @@ class EnergyHistogram(Part):
         return (squares / count - (total / count) ** 2).nan_to_num(0.0).clamp(min=0).sqrt()
 
     @property
-    def calibrated_range(self) -> tuple[float, float]:
-        """(low, high) of the partitions now, in units of the loss. Synchronises."""
-        return self._law.coordinates()[:2]
-
-    @property
-    def calibrated_temperature(self) -> float:
-        """Tau now, in units of the loss. Synchronises."""
-        return self._law.coordinates()[2]
+    def coordinates(self) -> tuple[float, float, float]:
+        """Low and high end of the partitions, and tau, now, in units of the loss. Synchronises."""
+        return self._law.coordinates()
 
     def numbers(self, course: Course | None = None) -> dict[str, float | Tensor]:
         """`nu`, after the warm-up; and the energy's recent mean and deviation, where they count."""
         if self._taken <= self.warmup:
             return {}
-        return {"nu": self._law.nu.clone(), **self._law.numbers()}
+        known = self._law.numbers() if isinstance(self._law, MovingPartitions) else {}
+        return {"nu": self._law.nu.clone(), **known}
 
     def evidence(self, course: Course) -> Tensor | None:
         """[4]: sums of nu's powers 0, 1 and 2; Theta's share in the open partition at the top."""
@@ -270,8 +265,6 @@ class EnergyHistogram(Part):
         if self.energy_range != "auto":
             line += f"energy_range={self.energy_range!r}, temperature={self.temperature!r}, "
         line += f"zeta={self.zeta:g}, clamp={self.clamp}): nu "
-        if self._taken == 0:
-            return f"{line}1, no energy observed yet"
         if self._taken <= self.warmup:
             return f"{line}1, warm-up: {self._taken} of {self.warmup} energies"
         mean, deviation = float(self.mean_multiplier), float(self.multiplier_std)

@@ -21,9 +21,8 @@ EFFECT = 1e-3  # of the noise's deviation along a Gaussian's longest axis, in le
 class PositionNoise(Part):
     """3DGS-MCMC's position noise: `scale * lr * covariance_noise(...)` after each step (eq. 2).
 
-    For trainers that do not inject it themselves; gsplat's MCMCStrategy and 3dgs-mcmc do, and
-    then this part must be left out (or their noise_lr be 0). lr is the trainer's own present
-    learning rate of the positions, without any factor.
+    For trainers that do not inject it themselves: with gsplat's MCMCStrategy or 3dgs-mcmc leave it
+    out. lr is the trainer's own present learning rate of the positions, without any factor.
 
     Args:
         gaussians: the trainer's dict with `scales` [N, 3] log, `quats` [N, 4] wxyz and

@@ -80,7 +80,9 @@ def number(call: str, name: str, value: Any) -> float | int:
     """A number, or that in a tensor or array of one element, on the host."""
     if hasattr(value, "item"):
         if math.prod(value.shape) != 1:
-            raise ValueError(f"{call}({name}=tensor of {tuple(value.shape)}): must have one element")
+            raise ValueError(
+                f"{call}({name}=tensor of {tuple(value.shape)}): must have one element"
+            )
         value = value.item()
     if not isinstance(value, (int, float)):
         raise TypeError(f"{call}({name}={value!r}): must be a number or a one-element tensor")

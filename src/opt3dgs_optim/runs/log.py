@@ -1,9 +1,7 @@
 """The run log: one JSON object a line, written while a trainer runs, without slowing it down.
 
 Lines are `{"kind": "start" | "step" | "evaluation" | "event", "iteration": ..., "seconds": ...}`
-plus whatever the call adds; `read_run` reads them back. `seconds` are run seconds: wall clock since
-the log was opened, without what `RunLog.paused` enclosed, carried on over a resume. JSON has no NaN
-or infinity: they are written as the strings "nan", "inf" and "-inf" and read back as floats.
+plus whatever the call adds. JSON has no NaN or infinity: they are the strings "nan", "inf", "-inf".
 """
 
 from __future__ import annotations
@@ -55,9 +53,8 @@ class RunLog:
 
     Args:
         path: the log file; missing parent folders are made.
-        metadata: what describes the run (`arm`, `seed`, `scene`, options): strings, numbers,
-            booleans, None, lists and mappings of these. The report groups by `arm` and pairs
-            by `seed`. `command` replaces the command line recorded otherwise (base names only).
+        metadata: what describes the run, as JSON can hold it. The report groups by `scene` and
+            `arm` and pairs by `seed`; `command` replaces the command line recorded otherwise.
 
     Raises:
         ValueError: `path` is no run log.
@@ -77,10 +74,7 @@ class RunLog:
     """
 
     def __init__(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        metadata: Mapping[str, Any] | None = None,
+        self, path: str | os.PathLike[str], *, metadata: Mapping[str, Any] | None = None
     ) -> None:
         described = json.loads(encoded(dict(metadata or {})))
         self.path = Path(path)
@@ -106,10 +100,9 @@ class RunLog:
         iteration: int,
         metadata: Mapping[str, Any] | None = None,
     ) -> RunLog:
-        """Continue the log of a run that goes on from a checkpoint taken at `iteration`.
+        """Continue the log, and its clock, from a checkpoint taken at `iteration`.
 
-        The clock goes on from the last second recorded at an iteration <= `iteration`, and a
-        "resumed" event tells readers to drop what was logged past it. Arguments and errors are
+        A "resumed" event tells readers to drop what was logged past it. Arguments and errors are
         those of the class, and FileNotFoundError if there is no log at `path`.
         """
         if not Path(path).is_file():
@@ -147,8 +140,7 @@ class RunLog:
     ) -> None:
         """Log one optimization step; `columns` are numbers or one-element tensors.
 
-        Any name will do, and a column may begin or end at any step. The report marks where
-        `phase` changes, and shows the means of the columns that are no loss.
+        The report marks where `phase` changes, and shows the means of the columns that are no loss.
 
         Raises:
             ValueError: a negative iteration, a reserved name or a tensor of several elements.
@@ -179,8 +171,7 @@ class RunLog:
     def paused(self) -> Iterator[None]:
         """Let the run's clock stand still, for an evaluation or a checkpoint; may be nested.
 
-        Waits for the GPU on both sides, so that queued training work counts and the work done
-        inside does not.
+        Waits for the GPU on both sides: queued training work counts, the work inside does not.
         """
         if self._pauses == 0:
             _synchronize()

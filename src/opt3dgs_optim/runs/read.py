@@ -104,7 +104,7 @@ def _parse(raw: bytes) -> dict[str, Any]:
     if type(iteration) is not int or not (0 <= iteration < 2**53 and 0 <= seconds < 1e12):
         raise ValueError("iteration must be an integer >= 0, and seconds a number >= 0")
     if kind == "event":
-        line["event"]  # noqa: B018 - a KeyError where there is none
+        line["event"]  # or a KeyError
     if kind in ("step", "evaluation"):
         for name in line.keys() - {"kind", "phase", "iteration"}:
             line[name] = float(line[name])  # of "nan", "inf" and "-inf", too
