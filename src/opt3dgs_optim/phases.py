@@ -103,7 +103,7 @@ class PhaseScheduler(Course):
         self.log = log
         self._over_ranks = None if process_group is None else RankMean(CALL, process_group)
         self._overrun = self._told = False
-        self._silence = self._unheard = 0  # energies without a step, steps without an energy
+        self._silence, self._unheard = 1, 0  # energies without a step, steps without an energy
         self._num_optimizers = 0
         self._adam_steps: int | None = None  # of moments that came without a state of ours
 

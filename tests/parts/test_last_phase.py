@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from devices import on_a_device
 from trainers import (
     edit_rows,
     gsplat_optimizers,
@@ -74,6 +75,32 @@ def test_a_step_that_is_dropped_at_the_switch_does_not_lose_the_fresh_start() ->
     phases.observe(float("nan"))
     for optimizer in optimizers.values():
         optimizer.step()
+    train(splats, optimizers, phases, SWITCH + 1, SWITCH + 2)
+    assert {float(state_of(optimizers, p)["step"]) for p in splats.values()} == {1.0}
+
+
+@pytest.mark.parametrize("options", [{"foreach": False}, {"foreach": True}, {"fused": True}])
+@pytest.mark.parametrize("masked", [False, True])
+def test_nor_does_one_of_which_only_the_device_knows(
+    options: dict[str, bool], masked: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Off the fused path such a step is made and put back: Adam's part of it alone."""
+    on_a_device(monkeypatch)
+    splats = make_splats()
+    phases = only(TOTAL, FreshMoments(), switch=SWITCH)
+    optimizers = phases.upgrade(gsplat_optimizers(splats, **options))
+    train(splats, optimizers, phases, 0, SWITCH)
+    before = {name: param.detach().clone() for name, param in splats.items()}
+    phases.observe(float("nan"))
+    for name, optimizer in optimizers.items():
+        splats[name].grad = torch.ones_like(splats[name])
+        optimizer.step(visible=torch.arange(len(splats[name])) >= 0 if masked else None)
+    for name, param in splats.items():
+        assert torch.equal(param, before[name])
+        state = state_of(optimizers, param)
+        assert [float(state[key].abs().max()) for key in ("step", "exp_avg", "exp_avg_sq")] == [
+            0
+        ] * 3
     train(splats, optimizers, phases, SWITCH + 1, SWITCH + 2)
     assert {float(state_of(optimizers, p)["step"]) for p in splats.values()} == {1.0}
 

@@ -173,7 +173,9 @@ def test_what_a_run_lacks_shows(tmp_path, points, shown, others):
     runs = two_arms(tmp_path) if others else []
     runs += [write_run(tmp_path / "odd.jsonl", "odd", 0, points, steps=steps)]
     report.write_report(runs, tmp_path / "out")
-    (row,) = [line for line in (tmp_path / "out/report.md").read_text().split("\n") if "odd" in line]
+    (row,) = [
+        line for line in (tmp_path / "out/report.md").read_text().split("\n") if "odd" in line
+    ]
     assert shown in row
 
 
