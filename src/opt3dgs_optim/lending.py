@@ -15,7 +15,7 @@ from torch.optim import Adam
 
 from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.part import Group, Part
+from opt3dgs_optim.part import Group
 from opt3dgs_optim.rows import Frozen
 
 
@@ -94,24 +94,6 @@ def use_fused(optimizer: Any) -> None:
             state = optimizer.state.get(param)
             if state:
                 state["step"] = state["step"].to(param.device, torch.float32)
-
-
-def feed(
-    parts: list[Part],
-    group: Group,
-    param: Tensor,
-    grad: Tensor,
-    state: dict[str, Any],
-    course: Course,
-    scale: Tensor | None,
-) -> Tensor:
-    """What parts make of a gradient; they see that of what is minimised, without AMP's scale."""
-    unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
-    plain = scale is None and unit == 1.0
-    fed = grad if plain else grad / unit
-    for part in parts:
-        fed = part.before(group, param, fed, state, course)
-    return fed if plain else fed * unit
 
 
 def guard(grad: Tensor, course: Course, told: bool) -> bool:

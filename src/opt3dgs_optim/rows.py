@@ -129,21 +129,6 @@ def check_mask(call: str, masks: list[Any], num_points: int | None) -> Tensor:
     return mask if mask.dtype == torch.bool else mask != 0
 
 
-def check_mask_rows(call: str, rows: int, params: list[tuple[bool, Tensor]]) -> None:
-    """ValueError unless a mask of `rows` fits the parameters that it is about, and there are any.
-
-    Only those with a gradient: the others are not stepped, and a mask may be older than they are.
-    """
-    present = [(takes, param) for takes, param in params if param.grad is not None]
-    shapes = [tuple(param.shape) for takes, param in present if takes]
-    if present and (not shapes or any(shape[:1] != (rows,) for shape in shapes)):
-        shapes = shapes or [tuple(param.shape) for _, param in present]
-        raise ValueError(
-            f"{call}: the mask has {rows} rows, but the parameters have shapes {shapes}; a mask of "
-            "their first dimension is needed"
-        )
-
-
 def reset_points(optimizers: Any, rows: Tensor, *, moments: bool = False) -> None:
     """Say which points have moved by other means than the optimizers: what parts kept of them goes.
 

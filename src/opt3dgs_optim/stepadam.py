@@ -14,10 +14,10 @@ from torch.optim import Adam
 from opt3dgs_optim.checkpoint import STATE_KEY, check_rows, loading
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.describe import block, group_lines
-from opt3dgs_optim.lending import Lent, feed, guard, own_step, refuse_capture, use_fused
+from opt3dgs_optim.lending import Lent, guard, own_step, refuse_capture, use_fused
 from opt3dgs_optim.names import SLOT, canonical_name
 from opt3dgs_optim.part import Group, Part
-from opt3dgs_optim.rows import Frozen, Ledger, check_mask, check_mask_rows, shaped
+from opt3dgs_optim.rows import Frozen, Ledger, check_mask, shaped
 
 # Unwrapped: torch's step hooks and its profiler are around our step already.
 ADAM_STEP = inspect.unwrap(Adam.step)
@@ -184,9 +184,14 @@ class StepAdam(Adam):
         if moving is not None:
             lent.frozen.append(Frozen(moving, param, state))
             fed = torch.where(shaped(moving, fed), fed, 0.0)
-        if parts:
-            scale = getattr(self, "grad_scale", None)
-            fed = feed(parts, group, param, fed, state, self.course, scale)
+        # Parts see the gradient of what is minimised, without AMP's scale.
+        scale = getattr(self, "grad_scale", None) if parts else None
+        unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
+        plain = not parts or (scale is None and unit == 1.0)
+        fed = fed if plain else fed / unit
+        for part in parts:
+            fed = part.before(group, param, fed, state, self.course)
+        fed = fed if plain else fed * unit
         if self._puts_back(mask):  # what Adam does; the parts' doing is not the step's
             lent.frozen.append(Frozen(cast(Tensor, self.course.valid), param, state))
         if fed is not param.grad:
@@ -216,12 +221,22 @@ class StepAdam(Adam):
         return self.any_group and any(p.shape[:1] == (rows,) for p in group["params"])
 
     def _check_mask(self, mask: Tensor) -> None:
+        """ValueError unless it fits the parameters that it is about, and there are any.
+
+        Only those with a gradient: the others are not stepped, and it may be older than they are.
+        """
         call, rows = f"{type(self).__name__}.step", mask.numel()
-        taking = [self._takes_mask(group, rows) for group in self.param_groups]
-        every = list(zip(taking, self.param_groups, strict=True))
-        check_mask_rows(call, rows, [(takes, p) for takes, g in every for p in g["params"]])
         if self.defaults["differentiable"]:
             raise ValueError(f"{call}: a mask with differentiable=True is not possible")
+        every = [(group, p) for group in self.param_groups for p in group["params"]]
+        present = [(group, p) for group, p in every if p.grad is not None]
+        shapes = [tuple(p.shape) for group, p in present if self._takes_mask(group, rows)]
+        if present and (not shapes or any(shape[:1] != (rows,) for shape in shapes)):
+            shapes = shapes or [tuple(p.shape) for _, p in present]
+            raise ValueError(
+                f"{call}: the mask has {rows} rows, but the parameters have shapes {shapes}; a "
+                "mask of their first dimension is needed"
+            )
 
     def reset_points(self, rows: Tensor, *, moments: bool = False) -> None:
         """See the function `reset_points`."""
