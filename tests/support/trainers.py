@@ -207,9 +207,9 @@ def upgraded(
     total_steps: int,
     *parts: Part,
     make: Any = gsplat_optimizers,
-    switch: Any = PAPER_SWITCH,
-    **kw: Any,
+    switch: float | int = PAPER_SWITCH,
+    **options: Any,
 ) -> tuple[dict[str, Parameter], PhaseScheduler, Any]:
-    """Gaussians, a scheduler with these parts alone, and those that `make` makes."""
+    """Gaussians, a scheduler with these parts alone, and the optimizers that `make` makes."""
     splats, phases = make_splats(), only(total_steps, *parts, switch=switch)
     return splats, phases, phases.upgrade(make(splats, **options))
