@@ -16,12 +16,15 @@ from opt3dgs_optim.backend import uses_kernel
 @pytest.fixture
 def machine(monkeypatch: pytest.MonkeyPatch):
     """A machine with everything there, from which a test takes one thing away."""
-    spec = importlib.machinery.ModuleSpec("cuda.core", None)
+
+    def imported(there: bool) -> object:
+        if not there:
+            raise ModuleNotFoundError("No module named 'cuda'")
+        return object()
 
     def build(*, core: bool = True, hip: str | None = None, gpu: bool = True) -> None:
         cuda.missing.cache_clear()
-        monkeypatch.setattr(importlib.util, "find_spec", lambda name: spec if core else None)
-        monkeypatch.setattr(importlib, "import_module", lambda name: object())
+        monkeypatch.setattr(importlib, "import_module", lambda name: imported(core))
         monkeypatch.setattr(torch.version, "hip", hip)
         monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
 

@@ -119,13 +119,13 @@ def test_the_kernel_gets_what_it_can_read(
 ) -> None:
     called = []
     monkeypatch.setattr(module, "uses_kernel", lambda *_: True)
-    monkeypatch.setattr(cuda, "add_covariance_noise", lambda *given: called.append(given))
+    monkeypatch.setattr(cuda, "launch", lambda *given: called.append(given))
     means = torch.zeros(4, 3, dtype=torch.float64)
     tensors = {**gaussians(4), "eta": means + 1}
     tensors["opacities"] = tensors["opacities"].unsqueeze(1)
     if spoiled is None:
         add_covariance_noise(means, *tensors_of(tensors), lr=0.5, noise_scale=2.0)
-        assert called[0][-4:] == (0.5, 2.0, 100.0, 0.005)
+        assert called[0][-5:] == (0, 1.0, 100.0, 0.005, 4)  # no address of a rate; 0.5 * 2
         return
     for wrong in (tensors[spoiled][:3], tensors[spoiled].float()):
         with pytest.raises(ValueError, match=f"add_covariance_noise: {spoiled} is"):

@@ -39,8 +39,8 @@ SENTENCES += ("PositionNoise.add_to", "Fading.chosen", "Course.phase_of", "Cours
 SENTENCES += ("StepAdam.acts_on", "StepAdam.reset_points", "PhaseScheduler.part")
 SENTENCES += tuple(f"{name}.load_state_dict" for name in ("StepAdam", "EnergyHistogram"))
 HOOKS = ("factor", "before", "after", "pixel_loss", "numbers", "load_state_dict")
-SENTENCES += tuple(f"Part.{hook}" for hook in (*HOOKS, "evidence", "useless"))
-SENTENCES += ("PhaseScheduler.paper",)  # the class's
+SENTENCES += tuple(f"Part.{hook}" for hook in (*HOOKS, "observe", "evidence", "useless"))
+SENTENCES += ("PhaseScheduler.paper", "PhaseScheduler.pixel_loss", "StepAdam.follow")
 ELSEWHERE = ("Phase", "StepAdam", "BackendInfo")  # nothing to pass; torch's own arguments
 
 

@@ -19,6 +19,7 @@ from trainers import (
     only,
     state_of,
     train,
+    upgraded,
 )
 
 import opt3dgs_optim
@@ -74,9 +75,7 @@ def pulled(splats: dict[str, Parameter], optimizers: Any, phases: Any, steps: in
 
 @pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
 def test_it_acts_in_its_phase_only_and_does_what_it_says(make: Any) -> None:
-    splats = make_splats()
-    phases = only(TOTAL, SignAgreement(), switch=20)
-    optimizers = phases.upgrade(make(splats))
+    splats, phases, optimizers = upgraded(TOTAL, SignAgreement(), switch=20, make=make)
     pulled(splats, optimizers, phases, 20)
     assert "disagreed" not in state_of(optimizers, splats["means"])
     before = state_of(optimizers, splats["means"])["exp_avg"].clone()

@@ -94,7 +94,7 @@ def train(folder: Path | str, arm: str, seed: int, iterations: int, points: int)
         loss = fit.step()
         if part is not None:
             histogram = part.histogram if isinstance(part, Frozen) else part
-            trace.append([float(loss), float(histogram.multiplier), *histogram.calibrated_range])
+            trace.append([float(loss), float(histogram.multiplier), *histogram.coordinates[:2]])
         if fit.iteration % (iterations // LOOKS) == 0:
             curve.append({"iteration": fit.iteration, **fit.evaluate()})
     clamp = None if histogram is None else histogram.clamp

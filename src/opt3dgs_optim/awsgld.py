@@ -38,12 +38,10 @@ class AWSGLD(StepAdam):
         preconditioner: `"adam"`, or `"none"` for the plain SGLD drift `lr * nu * grad`, which
             samples exp(-energy / temperature) together with `IsotropicNoise(temperature=...)`.
         adam: `foreach, maximize, capturable, differentiable, fused, decoupled_weight_decay`, as in
-            `torch.optim.Adam`. With CUDA parameters and no path asked for, the fused one is used:
-            it alone takes nu from the device without a synchronisation.
+            `torch.optim.Adam`. On a GPU the fused path is used where none is asked for.
 
     The energy is the closure's value, or comes from `histogram.observe(loss)`, called once per
-    iteration before `step()`. A non-finite energy skips the step. The histogram's state travels
-    inside `state_dict()`.
+    iteration before `step()`. One that is not finite skips the step.
 
     Examples:
         >>> import torch
@@ -126,9 +124,7 @@ class _ObservedCourse(Course):
                 "multiplier is not being adapted. Call histogram.observe(loss) once per "
                 "iteration, before step(), or pass step() a closure that returns the loss."
             )
-        valid = histogram.last_finite
-        on_host = not isinstance(valid, Tensor) or valid.device.type == "cpu"
-        self.valid = bool(valid) if on_host else valid
+        self.valid = histogram.last_finite
         return True
 
 
@@ -139,9 +135,6 @@ class _PlainDrift(Part):
 
     def factor(self, group: Group, course: Course) -> float:
         return group["eps"]
-
-    def __repr__(self) -> str:
-        return "preconditioner='none'"
 
 
 def _check_kind(name: str, value: Any, *kinds: type) -> None:

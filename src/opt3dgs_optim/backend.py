@@ -13,6 +13,7 @@ from opt3dgs_optim.checks import check_choice
 Backend = Literal["auto", "cuda", "torch"]
 BACKENDS = ("auto", "cuda", "torch")
 KERNEL_DTYPES = (torch.float32, torch.float64)
+KERNEL_HISTORY = 5  # curvature pairs that fit into a thread's registers
 
 
 @dataclass(frozen=True)
@@ -39,12 +40,12 @@ def backend_info(
 
     Args:
         device, dtype: of the parameters; None for the GPU, if torch sees one, else the CPU.
-        backend: `"auto"` takes the CUDA kernels where they can run, pure torch otherwise;
-            `"cuda"` and `"torch"` insist.
+        backend: `"auto"` takes the CUDA kernels where they can run; the others insist.
 
-    The two give the same numbers, up to rounding. The kernels are for points of three coordinates;
-    parameters of another shape are stepped by pure torch. A kernel that fails to compile or to
-    launch raises: nothing is replaced after an error. The histogram's is always "auto".
+    The two give the same numbers, up to rounding. The kernels are for points of three coordinates
+    with at most five curvature pairs; others are stepped by pure torch. A kernel that fails to
+    compile or to launch raises: nothing is replaced after an error. The histogram's is always
+    "auto".
 
     Raises:
         ValueError: `backend` is none of these.
@@ -59,9 +60,8 @@ def backend_info(
     if device is None:
         device = "cuda" if torch.cuda.is_available() else "cpu"
     place = torch.device(device)
-    if backend == "torch":
-        return BackendInfo(str(place), dtype, "torch", "backend='torch' was asked for")
-    obstacle = _obstacle(place, dtype)
+    asked = "backend='torch' was asked for" if backend == "torch" else None
+    obstacle = asked or _obstacle(place, dtype)
     if obstacle is None:
         return BackendInfo(str(place), dtype, "cuda", "cuda.core and a CUDA device are present")
     if backend == "cuda":
@@ -72,18 +72,22 @@ def backend_info(
     return BackendInfo(str(place), dtype, "torch", obstacle)
 
 
-def uses_kernel(backend: str, device: torch.device, dtype: torch.dtype, dim: int = 3) -> bool:
-    """Whether the kernels run for points of `dim` coordinates.
+def uses_kernel(
+    backend: str, device: torch.device, dtype: torch.dtype, dim: int = 3, history_size: int = 1
+) -> bool:
+    """Whether the kernels run for points of `dim` coordinates, with so many pairs of each.
 
     Raises:
         RuntimeError: they were asked for and cannot.
     """
-    if backend == "torch" or (backend == "auto" and (device.type != "cuda" or dim != 3)):
+    fits = dim == 3 and history_size <= KERNEL_HISTORY
+    if backend == "torch" or (backend == "auto" and (device.type != "cuda" or not fits)):
         return False
-    if dim != 3:
+    if not fits:
         raise RuntimeError(
-            f"backend='cuda' was asked for with points of {dim} coordinates, but the kernels are "
-            "for 3; backend='auto' takes pure torch then"
+            f"backend='cuda' was asked for with {history_size} pairs of points of {dim} "
+            f"coordinates, but the kernels are for at most {KERNEL_HISTORY} of 3; backend='auto' "
+            "takes pure torch then"
         )
     return backend_info(device, dtype, backend=backend).backend == "cuda"  # pyright: ignore
 

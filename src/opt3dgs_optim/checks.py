@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import sys
@@ -10,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+
+LOGGER = logging.getLogger("opt3dgs_optim")  # what the package says of itself
 
 
 def check_number(

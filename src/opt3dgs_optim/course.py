@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
@@ -10,13 +9,12 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import check_keys
+from opt3dgs_optim.checks import LOGGER, check_keys
 from opt3dgs_optim.part import Part, Phase, overrides
 
 HOOKS = ("observe", "pixel_loss", "factor", "before", "after")
 CHECK_STEPS = 100  # iterations between two looks at the parts' evidence
 FORMAT = 2  # of a checkpoint
-LOGGER = logging.getLogger("opt3dgs_optim")
 P = TypeVar("P", bound=Part)
 
 
@@ -57,10 +55,7 @@ class Course:
 
     def _plan(self) -> None:
         """Which parts have which hooks in which phase; a hook that nobody has is never called."""
-        acting = []
-        for name, part in self._named():
-            standing = part.instead() if name in self.switched_off else part
-            acting += [] if standing is None else [standing]
+        acting = [part for name, part in self._named() if name not in self.switched_off]
         self._acting: dict[Phase | None, list[Part]] = {None: acting}
         for phase in Phase:
             self._acting[phase] = [part for part in acting if part.during in (None, phase)]
@@ -114,9 +109,7 @@ class Course:
         return next((part for part in self.parts if isinstance(part, kind)), None)
 
     def part_names(self) -> list[str]:
-        """The parts' names in `switched_off` and in checkpoints: their classes', with a number
-        from the second of a class on.
-        """
+        """Their classes' names, in `switched_off` and checkpoints; "#2": the second of a class."""
         names: list[str] = []
         for part in self.parts:
             name = type(part).__name__
@@ -137,19 +130,14 @@ class Course:
             part.observe(energy, self.valid, self)
 
     def stepping(self, closure_value: Any) -> bool:
-        """Called at the begin of every step of every optimizer.
+        """Called at the begin of every step of every optimizer: whether the parts act.
 
-        Args:
-            closure_value: the loss that a closure has returned, or None.
-
-        Returns:
-            Whether the parts act; without, the step is plain Adam's.
+        `closure_value` is the loss that a closure has returned, or None.
         """
         self.steps += 1
         if closure_value is not None:
-            loss = torch.as_tensor(closure_value).detach().reshape(())
             self.current += 1
-            self.take(loss)
+            self.take(torch.as_tensor(closure_value).detach().reshape(()))
         return True
 
     def expect(self, steps: int) -> None:
@@ -165,11 +153,8 @@ class Course:
     def judge(self, over_ranks: Any = None) -> list[tuple[str, str, str]]:
         """Switch parts off and on by their evidence: one transfer from the device.
 
-        Args:
-            over_ranks: averages a tensor over the ranks, so that all decide alike; or None.
-
-        Returns:
-            (event, part's name, reason) of each change.
+        `over_ranks` averages a tensor over the ranks, so that all decide alike. Returns (event,
+        part's name, reason) of each change.
         """
         shown = [(name, part, part.evidence(self)) for name, part in self._named()]
         known = [(name, part, seen) for name, part, seen in shown if seen is not None]

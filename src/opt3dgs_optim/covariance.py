@@ -46,14 +46,9 @@ def add_covariance_noise(
     noise_scale: float,
     backend: str = "auto",
 ) -> None:
-    """Add eq. 2's noise, `lr * noise_scale * covariance_noise(...)`, to `means` in place.
+    """Add `lr * noise_scale * covariance_noise(...)` to `means` [N, 3] in place.
 
-    Args:
-        means: [N, 3] world units, changed in place.
-        scales, quats, opacities, eta: as in `covariance_noise`.
-        lr: a number, or 0-d; on a GPU it is read there, when the step runs.
-        noise_scale: noise_lr of 3DGS-MCMC.
-        backend: "auto", "cuda" or "torch".
+    lr is a number, or 0-d; on a GPU it is read there, when the step runs.
 
     Raises:
         RuntimeError: `backend="cuda"` where the kernel cannot run.
@@ -61,27 +56,10 @@ def add_covariance_noise(
     """
     compiling = torch.compiler.is_compiling()
     if not compiling and uses_kernel(backend, means.device, means.dtype, means.shape[1]):
-        _check_gaussians(means, scales=scales, quats=quats, opacities=opacities, eta=eta)
         gate = GATE_SHARPNESS, GATE_OPACITY
         cuda.add_covariance_noise(means, scales, quats, opacities, eta, lr, noise_scale, *gate)
         return
-    factor = lr * noise_scale
-    for rows in row_chunks(means):
-        means[rows] += (_noise(scales[rows], quats[rows], opacities[rows], eta[rows]) * factor).T
-
-
-def _check_gaussians(means: Tensor, **others: Tensor) -> None:
-    """The kernel reads memory by these shapes: be sure of them."""
-    rows = means.shape[0]
-    needed = {"scales": (rows, 3), "quats": (rows, 4), "eta": (rows, 3), "opacities": (rows,)}
-    for name, tensor in others.items():
-        shape = (tensor.numel(),) if name == "opacities" else tuple(tensor.shape)
-        alike = tensor.dtype == means.dtype and tensor.device == means.device
-        if shape != needed[name] or not alike:
-            raise ValueError(
-                f"add_covariance_noise: {name} is {tuple(tensor.shape)} {tensor.dtype} on "
-                f"{tensor.device}, but {needed[name]} {means.dtype} on {means.device} is needed"
-            )
+    means += covariance_noise(scales, quats, opacities, eta) * (lr * noise_scale)
 
 
 def largest_noise(scales: Tensor, opacities: Tensor, noise_scale: float) -> Tensor:
@@ -120,8 +98,4 @@ def _rotate(w: Tensor, q: list[Tensor], v: list[Tensor]) -> list[Tensor]:
 
 
 def _cross(a: list[Tensor], b: list[Tensor]) -> list[Tensor]:
-    return [
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    ]
+    return [a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)]

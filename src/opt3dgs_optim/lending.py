@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 import inspect
-import logging
 import math
+import operator
 from collections.abc import Callable
 from typing import Any, TypedDict
 
@@ -13,11 +13,10 @@ import torch
 from torch import Tensor
 from torch.optim import Adam
 
+from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.part import Group, Part
+from opt3dgs_optim.part import Group
 from opt3dgs_optim.rows import Frozen
-
-LOGGER = logging.getLogger("opt3dgs_optim")
 
 
 class AdamOptions(TypedDict, total=False):
@@ -60,16 +59,15 @@ class Lent:
         for owner, name, value in self._attributes:
             setattr(owner, name, value)
 
-    def rate(self, group: Group, factor: float | Tensor, valid: Tensor | bool) -> None:
-        """lr times the factor, never left in the group: schedulers would compound it.
+    def rate(self, group: Group, factors: list[Any], valid: Tensor | bool) -> None:
+        """lr times the factors, never left in the group: schedulers would compound it.
 
-        Args:
-            group: the group to be stepped.
-            factor: on Adam's step, not on decoupled weight decay, which would grow weights where
-                it is negative.
-            valid: 0-d, whether the step will be made, where only the device knows.
+        Not on decoupled weight decay, which would grow weights where a factor is negative.
+        `valid` is 0-d, whether the step will be made, where only the device knows.
         """
-        rate = group["lr"]
+        if not factors:
+            return
+        rate, factor = group["lr"], functools.reduce(operator.mul, factors)
         if isinstance(factor, Tensor):
             if factor.device.type == "cpu":
                 factor = factor.item()
@@ -85,10 +83,6 @@ class Lent:
             self.item(group, "weight_decay", 0.0)
         self.item(group, "lr", rate * factor)
 
-    def flag(self, optimizer: Any, valid: Tensor) -> None:
-        """Tell torch's step on the device whether it is to be made, as a GradScaler would."""
-        self.attribute(optimizer, "found_inf", (~valid).to(torch.float32))
-
 
 def use_fused(optimizer: Any) -> None:
     """Only torch's fused path takes a factor, and drops a step, on the device."""
@@ -102,29 +96,10 @@ def use_fused(optimizer: Any) -> None:
                 state["step"] = state["step"].to(param.device, torch.float32)
 
 
-def feed(
-    parts: list[Part],
-    group: Group,
-    param: Tensor,
-    grad: Tensor,
-    state: dict[str, Any],
-    course: Course,
-    scale: Tensor | None,
-) -> Tensor:
-    """What parts make of a gradient; they see that of what is minimised, without AMP's scale."""
-    unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
-    plain = scale is None and unit == 1.0
-    fed = grad if plain else grad / unit
-    for part in parts:
-        fed = part.before(group, param, fed, state, course)
-    return fed if plain else fed * unit
-
-
 def guard(grad: Tensor, course: Course, told: bool) -> bool:
-    """Take a gradient that is not finite as zero, number by number, in place.
+    """Take numbers in a gradient that are not finite as zero, in place.
 
-    Returns:
-        Whether there was such a number; False where only the device knows.
+    Returns whether there were any; False where only the device knows.
     """
     on_host = grad.device.type == "cpu"
     # The sum is finite unless a summand is not, or it overflows.
@@ -132,12 +107,8 @@ def guard(grad: Tensor, course: Course, told: bool) -> bool:
         return False
     grad.nan_to_num_(0.0, 0.0, 0.0)
     if on_host and not told:
-        LOGGER.warning(
-            "iteration %d: a gradient of shape %s is not finite; such numbers are taken as zero, "
-            "here and later",
-            course.current,
-            tuple(grad.shape),
-        )
+        said = "iteration %d: a gradient of shape %s is not finite; such numbers count as zero"
+        LOGGER.warning(said, course.current, tuple(grad.shape))
     return on_host
 
 
@@ -148,13 +119,6 @@ def refuse_capture(call: str, course: Course) -> None:
             f"{call}.step: a CUDA graph is being captured, but its replays would repeat this "
             "iteration's factors and phase; leave the optimizers' steps out of it"
         )
-
-
-def times(factor: float | Tensor | None, other: float | Tensor | None) -> float | Tensor | None:
-    """The product of two factors on a step, of which None is 1."""
-    if factor is None or other is None:
-        return other if factor is None else factor
-    return factor * other
 
 
 @functools.cache

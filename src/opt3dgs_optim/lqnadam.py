@@ -17,9 +17,7 @@ if TYPE_CHECKING:
 
 
 class LQNAdam(StepAdam):
-    """Adam fed with the local quasi-Newton direction of every point (eq. 17).
-
-    The part `Curvature` on every parameter, from the first step on; see there.
+    """Adam with the part `Curvature` on every parameter, from the first step on (eq. 17).
 
     Args:
         params, lr, betas, eps, weight_decay, amsgrad: as in `torch.optim.Adam`.
@@ -40,9 +38,8 @@ class LQNAdam(StepAdam):
         True
 
     Raises:
-        ValueError: an option is outside what is allowed, or a parameter is complex (in `step`).
+        ValueError, RuntimeError: as `Curvature`.
         TypeError: `params` is a tensor, or an option is none of Adam's.
-        RuntimeError: `backend="cuda"`, and the kernel cannot run (in `step`).
     """
 
     any_group = True

@@ -27,14 +27,14 @@ class Phase(enum.Enum):
 class Part:
     """One thing that a training's steps can have: a factor, another gradient, noise, ...
 
-    A part overrides the hooks that it needs; one that is not overridden is never called. What it
-    keeps per row lives in `optimizer.state[param]` under its `keys`, as float32 tensors with the
-    points first, where an all-zero row means "nothing": a trainer's density control edits them
-    with the moments. What it keeps per parameter lives in the group, as plain numbers. Both travel
-    in the optimizers' `state_dict()`, and so does `state_dict()` of the part.
+    A part overrides the hooks that it needs; another is never called. What it keeps per row lives
+    in `optimizer.state[param]` under its `keys`, as float32 tensors with the points first, where an
+    all-zero row means "nothing": density control edits them with the moments. What it keeps per
+    parameter lives in the group, as plain numbers. Both travel in the optimizers' `state_dict()`,
+    and so does `state_dict()` of the part.
 
     Parts know nothing of masks, of GradScaler or of `maximize`: they get the gradient of what is
-    minimised, unscaled, zero in rows that are not to move.
+    minimised, unscaled, zero in rows that a mask holds back.
 
     Attributes:
         during: the phase in which the part acts; None: in both.
@@ -65,12 +65,9 @@ class Part:
     # -- once per iteration; nothing here may read a GPU's number back --------------------------
 
     def observe(self, energy: Tensor, valid: Tensor | bool, course: Course) -> None:
-        """Take the loss of an iteration in which the part acts.
+        """Take the loss of an iteration in which the part acts, 0-d, finite where `valid`.
 
-        Args:
-            energy: 0-d, finite where `valid`.
-            valid: whether it is finite; a 0-d bool tensor where the loss lives on a GPU.
-            course: the training.
+        That is a 0-d bool tensor where the loss lives on a GPU.
         """
 
     def pixel_loss(self, error: Tensor) -> Tensor:
@@ -113,15 +110,11 @@ class Part:
     def evidence(self, course: Course) -> Tensor | None:
         """What it did to this training, [k] numbers on the device; None: nothing to judge by.
 
-        The evidence of all parts is read in one transfer every 100 iterations, and averaged over
-        the ranks.
+        Read with that of all parts every 100 iterations, averaged over the ranks.
         """
 
     def useless(self, evidence: list[float], course: Course) -> str | None:
         """Why this training does not need the part, or None; asked while it is off, too."""
-
-    def instead(self) -> Part | None:
-        """What takes its place where it is useless; None: nothing."""
 
 
 def overrides(part: Part, hook: str) -> bool:

@@ -1,12 +1,9 @@
 """How the visits of the energy's partitions are counted, and the multiplier nu that follows.
 
-Two ways. `FixedPartitions` is the paper's: a fixed range, Theta by stochastic approximation.
-`MovingPartitions` is the default: partitions of the energy's recent deviations, which go where the
-energy goes, and Theta from a smoothed density of the recent visits, whose error is known.
-
-Equation numbers are those of the Opt3DGS paper (every displayed equation counted; 7 partition,
-13 index, 14 multiplier, 16 update of the weights). The paper's text is not implementable word for
-word; where this module differs, the comment at the line says why.
+`FixedPartitions` is the paper's: a fixed range, Theta by stochastic approximation.
+`MovingPartitions` is the default: partitions of the energy's recent deviations, and Theta from a
+smoothed density of the recent visits. Equation numbers are those of the Opt3DGS paper (every
+displayed equation counted; 7 partition, 13 index, 14 multiplier, 16 update of the weights).
 """
 
 from __future__ import annotations
@@ -31,20 +28,10 @@ LIMIT = 4.0  # an energy further away counts as one at this distance
 UNLIMITED = 4  # energies at the start, whose deviation is not known yet
 MEAN_ABS = math.sqrt(2 / math.pi)  # mean absolute deviation of a Gaussian of deviation 1
 RESOLUTION = 1e-6  # smallest deviation, as a share of the present distance from the mean
-CONSTANT = 1e-9  # smallest deviation of an energy that varies, as a share of its size
-TINY = 1e-100  # smallest deviation of an energy around zero that varies
 
 
 class FixedPartitions:
-    """Eq. 7, 13, 14 and 16 as the paper has them; all state stays on the energies' device.
-
-    Args:
-        num_partitions: m.
-        energy_range: (low, high), cut uniformly; the first and the last partition are open.
-        zeta, temperature: of eq. 14.
-        warmup: number of energies during which nu is 1 while Theta is being estimated.
-        clamp: (low, high) bounds of nu, or None.
-    """
+    """Eq. 7, 13, 14 and 16 as the paper has them; options as in `EnergyHistogram`."""
 
     def __init__(
         self,
@@ -110,14 +97,6 @@ class FixedPartitions:
         low = float(self._low)
         return low, low + float(self._width) * self.num_partitions, float(self._tau)
 
-    def is_constant(self) -> bool:
-        """Never said: the range is the user's."""
-        return False
-
-    def numbers(self) -> dict[str, Tensor]:
-        """Nothing that is not in the weights."""
-        return {}
-
     def state(self) -> dict[str, Any]:
         """Plain floats and lists. Synchronises."""
         scalars = torch.stack([self._low, self._width, self._tau, self._count, self.nu])
@@ -147,15 +126,12 @@ class MovingPartitions:
 
         Theta ~ q^(1 / (1 - zeta)),    nu = 1 + zeta tau dlog Theta/du = 1 + dlog q/dz / 2
 
-    That Theta is where eq. 16 converges to, too (its field is p_i theta_i^zeta - theta_i times a
-    sum, zero at theta_i^(1 - zeta) ~ p_i), but the gain of a visit does not depend on theta. With
-    tau = (1 - zeta) / (2 zeta) deviations zeta drops out of nu: a Gaussian energy has the slope
-    -z, so |nu - 1| = 1 two deviations out, and nu's deviation is 1/2, whatever zeta. Smoothing by
-    k twice widens a Gaussian's variance to 1 + 2 * 0.4^2, and the slope is corrected by that.
-
-    The mean of dlog q/dz over the visits is 0, for any density that ends somewhere; of a smoothed
-    one it is -.2 for an exponential energy, and while the energy falls. So the slope's own recent
-    mean is taken away: nu's mean is 1, and what nu does is no change of the learning rate.
+    That Theta is where eq. 16 converges to (its field is p_i theta_i^zeta - theta_i times a sum,
+    zero at theta_i^(1 - zeta) ~ p_i). With tau = (1 - zeta) / (2 zeta) deviations zeta drops out:
+    a Gaussian energy has the slope -z, so |nu - 1| = 1 two deviations out, and nu's deviation is
+    1/2. Smoothing by k twice widens a Gaussian's variance to 1 + 2 * 0.4^2, and the slope is
+    corrected by that. Its own recent mean is taken away: a smoothed density's is not 0 for a
+    skewed energy, nor while the energy falls, and nu's mean of 1 is no change of learning rate.
 
     All means are of the last 100 energies, weighed exponentially. The deviation is the mean
     absolute one, and an energy counts for at most four deviations: a spike moves them by 4 %.
@@ -208,13 +184,9 @@ class MovingPartitions:
     def take(
         self, energy: Tensor, valid: Tensor | Literal[True], count: int, sums: Tensor | None
     ) -> None:
-        """Nu from the present density, then its update with an energy.
+        """Nu from the present density, then its update with an energy, 0-d, the `count`-th.
 
-        Args:
-            energy: 0-d.
-            valid: whether it is finite.
-            count: its number, from 1 on.
-            sums: [3], to which nu's powers 0, 1 and 2 are added; or None.
+        `valid` is whether it is finite; nu's powers 0, 1 and 2 are added to `sums`, [3] or None.
         """
         limit = LIMIT / MEAN_ABS if count > UNLIMITED else 1 / RESOLUTION
         rate = max(1 / count, 1 / MEMORY)
@@ -222,12 +194,13 @@ class MovingPartitions:
             numbers = (rate, limit, *self.clamp, *self._constants)
             cuda.take_energy(energy, valid, self._state, self.nu, sums, *numbers)
             return
+        known = valid is True
         if count == 1:
-            self._mean.copy_(energy if valid is True else torch.where(valid, energy, 0.0))
+            self._mean.copy_(energy if known else torch.where(valid, energy, 0.0))
         # t = z / MEAN_ABS: distance from the mean in mean absolute deviations. Where those have
         # vanished, as after a constant loss, they grow again by the second term.
         distance = torch.sub(energy, self._mean)
-        if valid is not True:
+        if not known:
             distance.nan_to_num_(0.0, 0.0, 0.0)
         unit = torch.add(self._deviation, distance.abs(), alpha=RESOLUTION)
         t = torch.clamp(torch.div(distance, unit), -limit, limit, out=self._t)
@@ -237,11 +210,11 @@ class MovingPartitions:
         torch.addmv(self._offsets, self._rows, self._products, out=self._sums)
         slope = torch.addcdiv(self._base, self._up, self._below, out=self._slope)
         nu = torch.sub(slope, self._mean_slope).add_(1.0)
-        torch.clamp(nu, *self.clamp, out=self.nu)
+        torch.clamp(nu if known else torch.where(valid, nu, self.nu), *self.clamp, out=self.nu)
         step = torch.mul(t, unit)
         torch.add(self._mean, step, out=self._to_mean)
         torch.hypot(step, self._tiny, out=self._to_deviation)
-        self._state.lerp_(self._target, rate if valid is True else rate * valid)
+        self._state.lerp_(self._target, rate if known else rate * valid.to(self._state.dtype))
         if sums is not None:
             sums.addcmul_(torch.pow(self.nu, self._powers), torch.as_tensor(valid))
 
@@ -267,11 +240,6 @@ class MovingPartitions:
         _, deviation, _, *q = state["recent"]
         if deviation < 0 or min(q) < 0 or abs(math.fsum(q) - 1) > 1e-3:
             raise ValueError(f"{call}: recent={state['recent']!r}, but a density is needed")
-
-    def is_constant(self) -> bool:
-        """Whether the energies have not varied lately. Synchronises."""
-        low, high, _ = self.coordinates()
-        return high - low <= max(CONSTANT * REACH * abs(high + low), TINY)
 
     def numbers(self) -> dict[str, Tensor]:
         """The energy's recent mean and deviation, 0-d, in units of the loss."""

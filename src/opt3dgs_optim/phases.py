@@ -31,11 +31,8 @@ Optimizers = TypeVar("Optimizers", bound="Optimizer | Mapping[str, Optimizer]")
 class PhaseScheduler(Course):
     """Put parts into the steps of a 3DGS trainer's optimizers, in two phases.
 
-    By default annealing and fading: what paid against a control (docs/evidence.md). With
-    `PhaseScheduler.paper`, Opt3DGS: while exploring, Adam's step on every Gaussian parameter is
-    multiplied by nu; while exploiting, the pixel loss turns from L1 to L2, Adam's moments start
-    anew, and the positions are stepped along a per-point L-BFGS direction. What is left out costs
-    nothing.
+    By default annealing and fading: what paid against a control (docs/evidence.md); with
+    `PhaseScheduler.paper`, Opt3DGS. What is left out costs nothing.
 
     Args:
         total_steps: iterations of the training.
@@ -46,9 +43,8 @@ class PhaseScheduler(Course):
         adaptive: whether parts that this training shows no need of are switched off, see
             `switched_off`. Every 100 iterations that is one synchronisation with the GPU.
         log: a `RunLog` that gets one line per `observe`, with what the parts say of themselves.
-        process_group: a `torch.distributed` process group over whose ranks the energy is averaged,
-            so that the parts do the same on all; every rank must call `observe` as often. A loss
-            that is not finite on one rank skips the step on all.
+        process_group: a `torch.distributed` process group over whose ranks the energy is averaged;
+            every rank must call `observe` as often, and a loss that is not finite skips all steps.
 
     Call order in each iteration: `pixel_loss`, backward, `observe(loss)`, `step()` of every
     optimizer. The state travels inside `param_groups[0]` of every upgraded optimizer's
@@ -107,9 +103,7 @@ class PhaseScheduler(Course):
         self.log = log
         self._over_ranks = None if process_group is None else RankMean(CALL, process_group)
         self._overrun = self._told = False
-        self._silence = 0  # iterations without a step
-        self._unheard = 0  # steps without an energy
-        self._stepped = False  # since the last energy
+        self._silence, self._unheard = 1, 0  # energies without a step, steps without an energy
         self._num_optimizers = 0
         self._adam_steps: int | None = None  # of moments that came without a state of ours
 
@@ -144,9 +138,8 @@ class PhaseScheduler(Course):
     def upgrade(self, optimizers: Optimizers) -> Optimizers:
         """Put the parts into the trainer's optimizer(s), in place; return the argument.
 
-        Learning rates, betas, eps, names and state are kept; rates are never changed. A
-        learning-rate scheduler built before goes on working. May be called again, for another
-        optimizer or one that the trainer has made anew.
+        Options and state are kept, and a learning-rate scheduler built before goes on working. May
+        be called again, for another optimizer or one that the trainer has made anew.
 
         Args:
             optimizers: a dict of `torch.optim.Adam`, one per parameter (gsplat, nerfstudio), whose
@@ -218,10 +211,7 @@ class PhaseScheduler(Course):
                     self.log.event(event, self.current, part=part, reason=reason)
 
     def pixel_loss(self, render: Tensor, target: Tensor) -> Tensor:
-        """The photometric term: mean |error|, unless a part says another.
-
-        Args:
-            render, target: images of one shape, in 0..1.
+        """The photometric term of two images in 0..1: mean |error|, unless a part says another.
 
         Raises:
             ValueError: their shapes differ.
@@ -247,30 +237,30 @@ class PhaseScheduler(Course):
         self.steps += 1
         if closure_value is not None:
             self.observe(closure_value)
-        self._stepped = True
+        self._silence = 0
         self._unheard += 1
-        if self._unheard > SILENCE * max(self._num_optimizers, 1) and self.parts and not self._told:
-            self._told = True
-            since = "" if self.num_observed else " at all"
-            warn_user(
-                f"{CALL}: the optimizers have stepped {SILENCE} times without an energy{since}, so "
-                f"that {', '.join(self.part_names())} stand still; call observe(loss) once per "
-                "iteration, before the steps"
+        if self._unheard > SILENCE * max(self._num_optimizers, 1):
+            self._tell(
+                f"the optimizers have stepped {SILENCE} times without an energy: {{}} stand still; "
+                "call observe(loss) once per iteration, before the steps"
             )
         return self.num_observed > 0
 
+    def _tell(self, mistake: str) -> None:
+        """Say once what keeps the parts from acting."""
+        if self.parts and not self._told:
+            self._told = True
+            warn_user(f"{CALL}: {mistake.format(', '.join(self.part_names()))}")
+
     def _watch_clock(self) -> None:
-        self._silence = 0 if self._stepped else self._silence + 1
         steps, self._adam_steps = self._adam_steps, None
         patience = PAUSE if self.steps else SILENCE
-        if self._silence > patience and self.parts and not self._told:
-            self._told = True
-            warn_user(
-                f"{CALL}: {patience} losses were observed and no upgraded optimizer has stepped: "
-                f"{', '.join(self.part_names())} do nothing; call upgrade(...) again where the "
-                "trainer makes its optimizers anew"
+        if self._silence > patience:
+            self._tell(
+                f"{patience} losses were observed and no upgraded optimizer has stepped: {{}} do "
+                "nothing; call upgrade(...) again where the trainer makes its optimizers anew"
             )
-        self._stepped, self._unheard = False, 0
+        self._silence, self._unheard = self._silence + 1, 0
         # Trainers that count from 1 end at total_steps.
         if self.current > self.total_steps and not self._overrun:
             self._overrun = True

@@ -11,8 +11,7 @@ from torch import Tensor
 class RankMean:
     """Averages tensors over a process group, every rank weighing the same.
 
-    ValueError for `call` if torch.distributed is not initialised, or this process is not in the
-    `torch.distributed.ProcessGroup`.
+    ValueError for `call` where there is none, or this process is not in it.
     """
 
     def __init__(self, call: str, process_group: Any) -> None:
@@ -32,13 +31,9 @@ class RankMean:
         self._size = distributed.get_world_size(process_group)
 
     def __call__(self, values: Tensor) -> Tensor:
-        """The means over the ranks, of the shape of `values`; every rank must call as often.
-
-        A value that is not finite on one rank is not finite on all.
-        """
-        total = values.detach().clone()
-        if total.dtype in (torch.float16, torch.bfloat16):
-            total = total.float()
+        """The means over the ranks, of the shape of `values`; every rank must call as often."""
+        half = values.dtype in (torch.float16, torch.bfloat16)
+        total = values.detach().to(torch.float32 if half else values.dtype, copy=True)
         self._reduce(total, group=self._group)
         return total / self._size
 

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
+MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # torch's names of Adam's, the last amsgrad's
+
 
 class _Seen(NamedTuple):
     """What belonged together after a parameter's last step: an edit of one alone shows."""
@@ -55,9 +57,7 @@ class Ledger:
         """Zero these rows under `keys`, and of the moments too if asked; see `reset_points`."""
         is_mask = rows.dtype == torch.bool
         fitting = [
-            (param, state)
-            for param, state in states
-            if param.dim() > 0 and (not is_mask or rows.shape == param.shape[:1])
+            s for s in states if s[0].dim() and (not is_mask or rows.shape == s[0].shape[:1])
         ]
         if states and not fitting:
             raise ValueError(
@@ -71,12 +71,11 @@ class Ledger:
                 left_behind = seen is not None and seen.moment() is not state["exp_avg"]
                 if left_behind or state[key].shape[0] != rows_of(param):
                     del state[key]
-                else:
-                    state[key][rows.to(param.device)] = 0
-                    self.remember(param, state, (key,))
-            for key in ("exp_avg", "exp_avg_sq", "max_exp_avg_sq") if moments else ():
+            kept = [key for key in keys if key in state]
+            for key in [*kept, *(MOMENTS if moments else ())]:
                 if key in state and state[key].shape[0] == param.shape[0]:
                     state[key][rows.to(param.device)] = 0
+            self.remember(param, state, kept)
 
     def _knows(self, param: Tensor, tensor: Tensor) -> bool:
         seen = self._seen.get(tensor)
@@ -84,13 +83,9 @@ class Ledger:
 
 
 class Frozen:
-    """Rows of a parameter that a step is to leave as they are: saved before, put back after.
+    """Rows of a parameter [N, ..] that a step is to leave as they are: put back after it.
 
-    Args:
-        moving: the other rows, [N] bool, or 0-d: all or none.
-        param: the parameter, [N, ..].
-        state: its state in the optimizer; every tensor in it is saved but `step`, unless nothing
-            moves.
+    `moving` are the others, [N] bool, or 0-d: all or none; `step` is kept only by the latter.
     """
 
     def __init__(self, moving: Tensor, param: Tensor, state: dict[str, Any]) -> None:
@@ -134,29 +129,12 @@ def check_mask(call: str, masks: list[Any], num_points: int | None) -> Tensor:
     return mask if mask.dtype == torch.bool else mask != 0
 
 
-def check_mask_rows(call: str, rows: int, params: list[tuple[bool, Tensor]]) -> None:
-    """ValueError unless a mask of `rows` fits the parameters that it is about, and there are any.
-
-    Only against those with a gradient: a mask may be older than the others' rows, as where a
-    trainer adds points between rendering and step; such parameters are not stepped.
-    """
-    present = [(takes, param) for takes, param in params if param.grad is not None]
-    shapes = [tuple(param.shape) for takes, param in present if takes]
-    if present and (not shapes or any(shape[:1] != (rows,) for shape in shapes)):
-        shapes = shapes or [tuple(param.shape) for _, param in present]
-        raise ValueError(
-            f"{call}: the mask has {rows} rows, but the parameters have shapes {shapes}; a mask of "
-            "their first dimension is needed"
-        )
-
-
 def reset_points(optimizers: Any, rows: Tensor, *, moments: bool = False) -> None:
     """Say which points have moved by other means than the optimizers: what parts kept of them goes.
 
-    For a trainer that knows what its density control did. Call it after each edit of the
-    parameters: curvature pairs of all other points stay in use, where they would otherwise be
-    dropped with the exchanged Parameter object. The state's rows must have been edited along
-    (gsplat does; INRIA's edits leave the pairs behind, and they are dropped).
+    Call it after each edit of the parameters: curvature pairs of all other points stay in use,
+    where they would otherwise be dropped with the exchanged Parameter object. The state's rows must
+    have been edited along (gsplat does; INRIA's edits leave the pairs behind: they are dropped).
 
     Args:
         optimizers: an upgraded optimizer, or a dict of them (others in it are left alone).

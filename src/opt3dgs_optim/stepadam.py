@@ -14,16 +14,10 @@ from torch.optim import Adam
 from opt3dgs_optim.checkpoint import STATE_KEY, check_rows, loading
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.describe import block, group_lines
-from opt3dgs_optim.lending import Lent, feed, guard, own_step, refuse_capture, times, use_fused
+from opt3dgs_optim.lending import Lent, guard, own_step, refuse_capture, use_fused
 from opt3dgs_optim.names import SLOT, canonical_name
 from opt3dgs_optim.part import Group, Part
-from opt3dgs_optim.rows import (
-    Frozen,
-    Ledger,
-    check_mask,
-    check_mask_rows,
-    shaped,
-)
+from opt3dgs_optim.rows import Frozen, Ledger, check_mask, shaped
 
 # Unwrapped: torch's step hooks and its profiler are around our step already.
 ADAM_STEP = inspect.unwrap(Adam.step)
@@ -44,20 +38,16 @@ class StepAdam(Adam):
     _told = False  # of a gradient that is not finite
 
     def follow(self, course: Course, base: type[Adam] = Adam) -> None:
-        """Have the parts of `course` from now on.
+        """Have the parts of `course` from now on, around the step of `base`.
 
-        Args:
-            course: the training's.
-            base: the class whose step the parts surround: torch's Adam, or one with arithmetic of
-                its own, whose step then gets the mask.
+        Another class than torch's Adam has arithmetic of its own, and its step gets the mask.
         """
         self.course, self.base, self._ledger = course, base, Ledger()
         self._patch_step_function()  # torch's, for a class that was given to a made optimizer
         groups = self.param_groups
-        own_path = any(g[k] is not None for g in groups for k in ("fused", "foreach"))
-        own_path = own_path or any(g["capturable"] for g in groups)
+        asked = any(g["capturable"] or (g["fused"], g["foreach"]) != (None, None) for g in groups)
         tensors = [p for group in groups for p in group["params"]]
-        if base is Adam and not own_path and tensors and all(p.is_cuda for p in tensors):
+        if base is Adam and not asked and tensors and all(p.is_cuda for p in tensors):
             use_fused(self)
         self.trust_rows()
 
@@ -116,40 +106,44 @@ class StepAdam(Adam):
                 loss = closure()
         with torch.set_grad_enabled(self.defaults["differentiable"]):
             acting = self.course.stepping(loss)
-            if self.course.valid is not False:
-                self._step(mask, acting)
+            found, valid = getattr(self, "found_inf", None), self.course.valid
+            if found is not None and isinstance(valid, Tensor):  # a GradScaler's word counts, too
+                self.course.valid = (found.reshape(()) == 0) & valid
+            try:
+                if valid is not False and (isinstance(valid, Tensor) or not found):
+                    self._step(mask, acting)
+            finally:
+                self.course.valid = valid
         return loss
 
     # Learning-rate schedulers, which would wrap `step` on the instance, need not: `step` tells.
     step._wrapped_by_lr_sched = True  # pyright: ignore[reportFunctionMemberAccess]
 
     def _step(self, mask: Tensor | None, acting: bool) -> None:
-        """A step that a GradScaler may tell not to be made, of which parts know nothing."""
-        found, shared = getattr(self, "found_inf", None), Lent()
-        if found is not None and isinstance(self.course.valid, Tensor):
-            shared.attribute(self.course, "valid", (found.reshape(()) == 0) & self.course.valid)
-        elif found is not None and bool(found):
-            return
-        try:
-            self._step_parts(mask, acting)
-        finally:
-            shared.take_back()
-
-    def _step_parts(self, mask: Tensor | None, acting: bool) -> None:
+        """Lend the base's step what the parts say, if they act, and take it back."""
         course, lent = self.course, Lent()
-        names = ("before", "factor", "after")
-        hooks = [course.hooks(name) if acting else [] for name in names]
+        hooks = [course.hooks(name) if acting else [] for name in ("before", "factor", "after")]
         if mask is not None:
             self._check_mask(mask)
         moved: list[tuple[Group, Tensor, list[Part]]] = []
         try:
             for group in self.param_groups:
-                own = [[part for part in parts if self.acts_on(part, group)] for parts in hooks]
-                params = [p for p in group["params"] if p.grad is not None and not p.grad.is_sparse]
-                self._prepare(group, params, mask, own, lent)
-                moved += [(group, param, own[2]) for param in params]
+                befores, factors, afters = (
+                    [part for part in parts if self.acts_on(part, group)] for parts in hooks
+                )
+                for param in group["params"]:
+                    if param.grad is None or param.grad.is_sparse:
+                        continue
+                    self._told |= guard(param.grad, course, self._told)
+                    moving = self._moving(group, param, mask, bool(befores or afters))
+                    if moving is not None or befores or self._puts_back(mask):
+                        self._lend_gradient(group, param, moving, befores, lent, mask)
+                    moved.append((group, param, afters))
+                said = [part.factor(group, course) for part in factors]
+                lent.rate(group, [factor for factor in said if factor is not None], course.valid)
             if isinstance(course.valid, Tensor) and self._drops_on_device():
-                lent.flag(self, course.valid)
+                # As a GradScaler tells torch's step on the device not to be made.
+                lent.attribute(self, "found_inf", (~course.valid).to(torch.float32))
             self._step_base(mask)
         finally:
             lent.take_back()
@@ -158,29 +152,8 @@ class StepAdam(Adam):
                 part.after(group, param, self.state[param], course)
             if course.keys:
                 self._ledger.remember(param, self.state[param], course.keys)
-        for rows in lent.frozen:
+        for rows in reversed(lent.frozen):
             rows.put_back()
-
-    def _prepare(
-        self,
-        group: Group,
-        params: list[Tensor],
-        mask: Tensor | None,
-        own: list[list[Part]],
-        lent: Lent,
-    ) -> None:
-        """Lend the group what its step needs; `own` has the parts before, in and after it."""
-        befores, factors, afters = own
-        for param in params:
-            self._told |= guard(cast(Tensor, param.grad), self.course, self._told)
-            moving = self._moving(group, param, mask, bool(befores or afters))
-            if moving is not None or befores:
-                self._lend_gradient(group, param, moving, befores, lent)
-        factor = None
-        for part in factors:
-            factor = times(factor, part.factor(group, self.course))
-        if factor is not None:
-            lent.rate(group, factor, self.course.valid)
 
     def _step_base(self, mask: Tensor | None) -> None:
         if self.base is Adam:
@@ -195,7 +168,13 @@ class StepAdam(Adam):
         step(self, mask, mask.numel()) if takes_number else step(self, mask)
 
     def _lend_gradient(
-        self, group: Group, param: Tensor, moving: Tensor | None, parts: list[Part], lent: Lent
+        self,
+        group: Group,
+        param: Tensor,
+        moving: Tensor | None,
+        parts: list[Part],
+        lent: Lent,
+        mask: Tensor | None,
     ) -> None:
         """Put what Adam is to be fed into `param.grad`."""
         fed, state = cast(Tensor, param.grad), self.state[param]
@@ -205,23 +184,31 @@ class StepAdam(Adam):
         if moving is not None:
             lent.frozen.append(Frozen(moving, param, state))
             fed = torch.where(shaped(moving, fed), fed, 0.0)
-        if parts:
-            scale = getattr(self, "grad_scale", None)
-            fed = feed(parts, group, param, fed, state, self.course, scale)
+        # Parts see the gradient of what is minimised, without AMP's scale.
+        scale = getattr(self, "grad_scale", None) if parts else None
+        unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
+        plain = not parts or (scale is None and unit == 1.0)
+        fed = fed if plain else fed / unit
+        for part in parts:
+            fed = part.before(group, param, fed, state, self.course)
+        fed = fed if plain else fed * unit
+        if self._puts_back(mask):  # what Adam does; the parts' doing is not the step's
+            lent.frozen.append(Frozen(cast(Tensor, self.course.valid), param, state))
         if fed is not param.grad:
             lent.attribute(param, "grad", fed)
 
     def _moving(
         self, group: Group, param: Tensor, mask: Tensor | None, with_parts: bool
     ) -> Tensor | None:
-        """The rows that may move, [N] or 0-d bool; None: all, or the base's own step knows."""
-        valid = self.course.valid
-        if mask is not None and self._takes_mask(group, mask.numel()):
-            if self.base is not Adam and not with_parts:
-                return None
-            rows = mask.to(param.device)
-            return rows & valid if isinstance(valid, Tensor) else rows
-        return valid if isinstance(valid, Tensor) and not self._drops_on_device() else None
+        """The rows that may move, [N] bool; None: all, or the base's own step knows."""
+        if mask is None or not self._takes_mask(group, mask.numel()):
+            return None
+        return mask.to(param.device) if self.base is Adam or with_parts else None
+
+    def _puts_back(self, mask: Tensor | None) -> bool:
+        """Whether only the device knows if the step counts, and the step cannot ask it."""
+        own_mask = self.base is not Adam and mask is not None
+        return isinstance(self.course.valid, Tensor) and not (own_mask or self._drops_on_device())
 
     def _drops_on_device(self) -> bool:
         """Whether torch's own step can be told on the device not to be made."""
@@ -234,12 +221,22 @@ class StepAdam(Adam):
         return self.any_group and any(p.shape[:1] == (rows,) for p in group["params"])
 
     def _check_mask(self, mask: Tensor) -> None:
+        """ValueError unless it fits the parameters that it is about, and there are any.
+
+        Only those with a gradient: the others are not stepped, and it may be older than they are.
+        """
         call, rows = f"{type(self).__name__}.step", mask.numel()
-        taking = [self._takes_mask(group, rows) for group in self.param_groups]
-        every = list(zip(taking, self.param_groups, strict=True))
-        check_mask_rows(call, rows, [(takes, p) for takes, g in every for p in g["params"]])
         if self.defaults["differentiable"]:
             raise ValueError(f"{call}: a mask with differentiable=True is not possible")
+        every = [(group, p) for group in self.param_groups for p in group["params"]]
+        present = [(group, p) for group, p in every if p.grad is not None]
+        shapes = [tuple(p.shape) for group, p in present if self._takes_mask(group, rows)]
+        if present and (not shapes or any(shape[:1] != (rows,) for shape in shapes)):
+            shapes = shapes or [tuple(p.shape) for _, p in present]
+            raise ValueError(
+                f"{call}: the mask has {rows} rows, but the parameters have shapes {shapes}; a "
+                "mask of their first dimension is needed"
+            )
 
     def reset_points(self, rows: Tensor, *, moments: bool = False) -> None:
         """See the function `reset_points`."""

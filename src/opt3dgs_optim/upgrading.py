@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 from torch.optim import Adam
 
 from opt3dgs_optim.checkpoint import take_loaded
+from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.describe import group_name
 from opt3dgs_optim.names import SLOT, canonical_name
 from opt3dgs_optim.stepadam import StepAdam
 
 CALL = "PhaseScheduler.upgrade"
-LOGGER = logging.getLogger("opt3dgs_optim")
 
 
 class Found(NamedTuple):
@@ -30,16 +30,10 @@ class Found(NamedTuple):
 
 
 def look_at(optimizer: Any, course: Course, shown: str, key: str | None) -> Found:
-    """What an optimizer holds; it is not changed.
+    """What an optimizer holds; it is not changed. Raises as `PhaseScheduler.upgrade`.
 
-    Args:
-        optimizer: a `torch.optim.Adam`, or one of this course already.
-        course: the training's.
-        shown: how messages call the optimizer.
-        key: what a dict of optimizers says that it holds; None: its groups' names say.
-
-    Raises:
-        TypeError, ValueError: as `PhaseScheduler.upgrade`.
+    `shown` is how messages call it, `key` what a dict of optimizers says that it holds; None: its
+    groups' names say.
     """
     base = None
     if not isinstance(optimizer, StepAdam):

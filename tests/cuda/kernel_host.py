@@ -353,6 +353,7 @@ def compare_energies(kernels: HostKernels, values: Tensor, *, free: bool = True)
     result = take_all_on_host(kernels, values, None if free else reference)
     counts, before = taken(values), result if free else reference
     assert torch.equal(result[1:][~counts[1:]], before[:-1][~counts[1:]]), "one more was taken"
+    assert torch.equal(reference[1:][~counts[1:]], reference[:-1][~counts[1:]]), "and by torch"
     size = torch.ones_like(reference)
     size[:, 1:6] = reference[:, 1:6].abs()
     gap = torch.where(result == reference, 0.0, (result - reference).abs() / size)

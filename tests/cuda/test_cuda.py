@@ -45,7 +45,7 @@ def on_gpu(x: Tensor, grad: Tensor, history: Tensor, size: int) -> tuple[Tensor,
     return tuple(part.cpu() for part in result)  # pyright: ignore
 
 
-@pytest.mark.parametrize("size", [1, 3, 5, 8, 16])
+@pytest.mark.parametrize("size", [1, 3, 4, 5])
 @pytest.mark.parametrize("rows", ROWS)
 def test_free_running_in_float64(rows: int, size: int) -> None:
     problem = Problem(rows)
@@ -76,7 +76,7 @@ def test_single_step_in_float32(rows: int) -> None:
     assert relative_difference(result[0].cpu()[same], expected[0][same]) < 1e-5
 
 
-@pytest.mark.parametrize("size", [1, 3, 5, 8, 16])
+@pytest.mark.parametrize("size", [1, 3, 4, 5])
 @pytest.mark.parametrize("rows", ROWS)
 def test_recursion_alone(rows: int, size: int) -> None:
     """`two_loop` of tensors on the GPU is the kernel's, in either layout of the history."""

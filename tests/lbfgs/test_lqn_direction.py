@@ -1,8 +1,7 @@
-"""One operator: under torch's own checks, its routing, its memory and its calls."""
+"""One step of the curvature: its routing, its memory and its calls."""
 
 from __future__ import annotations
 
-import shutil
 import sys
 import weakref
 from pathlib import Path
@@ -16,27 +15,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import opt3dgs_optim
 from opt3dgs_optim import cuda
+from opt3dgs_optim.backend import uses_kernel
 from opt3dgs_optim.lbfgs import foresight, laid_out, lqn_direction, new_history, two_loop
 from opt3dgs_optim.lbfgs import pairs as columns_of
-from opt3dgs_optim.lbfgs.two_loop import step
 
-OPERATOR = torch.ops.opt3dgs_optim.lqn_direction.default
 # inductor imports parts of torch that torch itself has deprecated
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
-
-
-COMPILERS = pytest.mark.parametrize(
-    "compiler",
-    [
-        "aot_eager",
-        pytest.param(
-            "inductor",
-            marks=pytest.mark.skipif(
-                shutil.which("g++") is None, reason="inductor needs g++ on a CPU"
-            ),
-        ),
-    ],
-)
 
 
 def points(
@@ -51,30 +35,6 @@ def points(
     return draws[3], draws[4], history
 
 
-@pytest.mark.parametrize("graft", [True, False])
-@pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("n", [0, 1, 257])
-def test_opcheck(n: int, dim: int, graft: bool) -> None:
-    options = {"min_cosine": 1e-6, "graft": graft, "backend": "auto"}
-    torch.library.opcheck(OPERATOR, (*points(n, dim=dim), 5), options)
-
-
-@COMPILERS
-def test_lqn_direction_compiles_without_a_graph_break(compiler: str) -> None:
-    x, grad, history = points(100)
-    eager_history = history.clone()
-
-    def both(x: Tensor, grad: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
-        fed, accepted, _ = lqn_direction(2 * x, grad, history, 5, min_cosine=1e-6, graft=True)
-        return 2 * fed, accepted.sum()
-
-    expected = both(x, grad, eager_history)
-    compiled = torch.compile(both, fullgraph=True, backend=compiler)(x, grad, history)
-    torch.testing.assert_close(compiled[0], expected[0], rtol=0, atol=0)
-    assert int(compiled[1]) == int(expected[1])
-    assert torch.equal(history, eager_history)
-
-
 @pytest.mark.slow
 def test_pure_torch_compiles_with_inductor() -> None:
     """The path of ROCm, MPS and CPU; slow only because of the compiler."""
@@ -83,7 +43,7 @@ def test_pure_torch_compiles_with_inductor() -> None:
     torch.testing.assert_close(compiled, two_loop(grad, history, 5), rtol=1e-5, atol=1e-6)
 
 
-def test_operator_is_record_then_direction() -> None:
+def test_it_is_record_then_direction() -> None:
     x, grad, history = points(300, torch.float64)
     grad[::5] = 0
     grad[1::5, 1] = torch.nan
@@ -152,7 +112,7 @@ def test_memory_is_that_of_the_results_and_one_chunk(
     x, grad, history = points(n, dim=dim)
     history = laid_out(history, contiguous=contiguous)
     with LiveBytes() as memory:
-        step(x, grad, history, 5, min_cosine=1e-6, graft=True, backend="torch")
+        lqn_direction(x, grad, history, 5, min_cosine=1e-6, graft=True, backend="torch")
     results = n * (4 * dim + 2)
     # of a chunk: less than its history, three times
     assert results <= memory.most < results + 3 * chunk * history[0].numel() * 4
@@ -186,25 +146,11 @@ def test_python_calls(dim: int) -> None:
     assert 10 < calls <= 45
 
 
-def test_it_is_one_operator() -> None:
-    x, grad, history = points(100)
-    names = []
-
-    class Names(TorchDispatchMode):
-        def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None):
-            names.append(str(func))
-            return func(*args, **(kwargs or {}))
-
-    with Names():
-        lqn_direction(x, grad, history, 5, min_cosine=1e-6, graft=True)
-    assert names == ["opt3dgs_optim.lqn_direction.default"]
-
-
 # -- which backend runs ----------------------------------------------------------------------------
 
 
 def test_the_kernel_is_for_three_coordinates() -> None:
-    with pytest.raises(RuntimeError, match=r"points of 2 coordinates, but the kernels are for 3"):
+    with pytest.raises(RuntimeError, match=r"points of 2 coordinates, .* at most 5 of 3"):
         lqn_direction(*points(7, dim=2), 5, min_cosine=0.0, graft=True, backend="cuda")
     with pytest.raises(RuntimeError, match=r"asked for on cpu in torch\.float32"):
         lqn_direction(*points(7), 5, min_cosine=0.0, graft=True, backend="cuda")
@@ -216,7 +162,7 @@ def test_the_kernel_gets_what_it_can_read(spoiled: str, monkeypatch: pytest.Monk
     monkeypatch.setattr("opt3dgs_optim.backend.cuda.missing", lambda: None)
     monkeypatch.setattr("opt3dgs_optim.backend._obstacle", lambda *_: None)
     called = []
-    monkeypatch.setattr(cuda, "lqn_direction", lambda *given: called.append(given))
+    monkeypatch.setattr(cuda, "launch", lambda *given, **_: called.append(given))
     x, grad, history = points(7, torch.float64)
     if spoiled == "shape":
         x = x[:6]
@@ -225,18 +171,25 @@ def test_the_kernel_gets_what_it_can_read(spoiled: str, monkeypatch: pytest.Monk
     else:
         history = history.float()
     with pytest.raises(ValueError, match=r"lqn_direction: (position|history)"):
-        step(x, grad, history, 5, min_cosine=0.0, graft=True, backend="cuda")
+        lqn_direction(x, grad, history, 5, min_cosine=0.0, graft=True, backend="cuda")
     assert not called
+
+
+def test_more_pairs_than_a_thread_holds_are_torchs() -> None:
+    gpu = torch.device("cuda")
+    assert not uses_kernel("auto", gpu, torch.float32, 3, 6)
+    with pytest.raises(RuntimeError, match="asked for with 6 pairs of points of 3 coordinates"):
+        uses_kernel("cuda", gpu, torch.float32, 3, 6)
 
 
 def test_two_loop_is_the_kernels_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     _, grad, history = points(7)
     asked = []
     module = sys.modules["opt3dgs_optim.lbfgs.two_loop"]
-    monkeypatch.setattr(module, "uses_kernel", lambda *given: asked.append(given) or True)
+    monkeypatch.setattr(module, "uses_kernel", lambda *given: asked.append(given) or given[3] == 3)
     monkeypatch.setattr(cuda, "two_loop", lambda *given: given)
     assert two_loop(grad, history, 5) == (grad, history, 5)
-    assert asked == [("auto", grad.device, grad.dtype)]
+    assert asked == [("auto", grad.device, grad.dtype, 3, 5)]
     flat, _, other = points(7, dim=2)
     assert two_loop(flat, other, 5).shape == (7, 2)
     assert two_loop(grad.double(), history, 5).dtype == torch.float64  # not the history's

@@ -15,6 +15,7 @@ from trainers import (
     make_splats,
     only,
     train,
+    upgraded,
 )
 
 from opt3dgs_optim import Annealing, ConstantMultiplier, Fading
@@ -123,9 +124,7 @@ def test_the_factor_is_none_of_decoupled_decays_business(decoupled: str) -> None
 def test_peaks_by_parameter_can_be_copied(copied: Any) -> None:
     annealing = Annealing(peak={"xyz": 4.0, "scales": 2.0})
     assert copied(annealing) == annealing
-    splats = make_splats()
-    phases = only(TOTAL, annealing)
-    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    splats, phases, optimizers = upgraded(TOTAL, annealing)
     train(splats, optimizers, phases, 0, 3)
     assert repr(copied(optimizers["means"])) == repr(optimizers["means"])
 

@@ -16,6 +16,7 @@ from trainers import (
     only,
     state_of,
     train,
+    upgraded,
 )
 
 from opt3dgs_optim import Fading, PhaseScheduler
@@ -103,9 +104,7 @@ def test_a_step_after_fading_is_no_longer_than_before() -> None:
 
 
 def test_fading_survives_density_control() -> None:
-    splats = make_splats()
-    phases = only(TOTAL, Fading(share=1.0, events=60, start=0.0, stop=1.0))
-    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    splats, phases, optimizers = upgraded(TOTAL, Fading(share=1.0, events=60, start=0.0, stop=1.0))
     for i in range(0, TOTAL, 10):
         train(splats, optimizers, phases, i, i + 10)
         edit_rows(splats, optimizers, torch.arange(len(splats["means"])) % 4 != 1, 2)  # pyright: ignore[reportArgumentType]

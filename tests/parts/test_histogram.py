@@ -61,12 +61,12 @@ def test_first_multiplier_is_one_and_not_minus_3973() -> None:
 
 def test_the_papers_settings() -> None:
     histogram = EnergyHistogram.paper()
-    assert histogram.calibrated_range == pytest.approx((0.0, 0.2))
+    assert histogram.coordinates[:2] == pytest.approx((0.0, 0.2))
     assert (histogram.num_partitions, histogram.zeta, histogram.warmup) == (200, 0.75, 2500)
     assert histogram.clamp == (-5.0, 5.0)
-    assert histogram.calibrated_temperature == 2e-3
+    assert histogram.coordinates[2] == 2e-3
     width = 0.2 / 200
-    assert histogram.zeta * histogram.calibrated_temperature / width == pytest.approx(1.5)
+    assert histogram.zeta * histogram.coordinates[2] / width == pytest.approx(1.5)
     assert EnergyHistogram.paper(zeta=0.5).zeta == 0.5
 
 
@@ -166,7 +166,8 @@ def test_the_papers_weights_recover_from_the_floor_after_a_million_updates() -> 
 
 @settings(max_examples=50, deadline=None)
 @given(
-    st.lists(st.floats(-2.0, 3.0), min_size=1, max_size=60),
+    # Not within 1e-100 of zero: a deviation below 1e-150 is that, here.
+    st.lists(st.floats(-2.0, 3.0).map(lambda e: round(e, 100)), min_size=1, max_size=60),
     st.sampled_from([None, (-1.0, 3.0), (0.9, 1.1)]),
 )
 def test_the_default_is_its_loops(energies: list[float], clamp: tuple[float, float] | None) -> None:
@@ -176,7 +177,7 @@ def test_the_default_is_its_loops(energies: list[float], clamp: tuple[float, flo
         nu, expected = float(histogram.observe(energy)), oracle.observe(energy)
         # Rounding, over slopes of up to 1 / 0.4^2 per deviation.
         assert nu == pytest.approx(expected, abs=1e-9)
-    low, high = histogram.calibrated_range
+    low, high = histogram.coordinates[:2]
     assert (high - low) / 12 == pytest.approx(oracle.deviation, rel=1e-9)
     assert (high + low) / 2 == pytest.approx(oracle.mean, rel=1e-9, abs=1e-9 * (high - low))
 
@@ -202,19 +203,19 @@ def test_zeta_is_in_theta_and_not_in_nu() -> None:
     assert nus_of(flat, stream(600)).tolist() == nus_of(steep, stream(600)).tolist()
     q = flat.weights.sqrt()
     assert torch.allclose(steep.weights, q**4 / (q**4).sum(), rtol=1e-9)
-    assert flat.calibrated_temperature == pytest.approx(3 * steep.calibrated_temperature)
+    assert flat.coordinates[2] == pytest.approx(3 * steep.coordinates[2])
 
 
 def test_the_range_follows_the_energy() -> None:
     histogram = EnergyHistogram()
     nus_of(histogram, stream(600))
-    low, high = histogram.calibrated_range
+    low, high = histogram.coordinates[:2]
     # Mean and deviation of about 100 energies: known to 7 and 10 %.
     assert (low + high) / 2 == pytest.approx(0.5, abs=0.05)
     assert (high - low) / 12 == pytest.approx(0.1, rel=0.35)
-    assert histogram.calibrated_temperature == pytest.approx((high - low) / 12 / 6)
+    assert histogram.coordinates[2] == pytest.approx((high - low) / 12 / 6)
     nus_of(histogram, [0.01 * u for u in stream(2_000, seed=1)])
-    low, high = histogram.calibrated_range
+    low, high = histogram.coordinates[:2]
     assert (high - low) / 12 == pytest.approx(0.001, rel=0.35)
 
 
@@ -280,7 +281,7 @@ def test_a_part_of_a_course() -> None:
         assert histogram.factor({}, course) == nu
         assert ("nu" in course.numbers()) == (k >= 8)
     shown = {name: float(value) for name, value in course.numbers().items()}
-    low, high = histogram.calibrated_range
+    low, high = histogram.coordinates[:2]
     assert shown == {
         "nu": nu,
         "energy_mean": pytest.approx((low + high) / 2),
@@ -293,7 +294,7 @@ def test_a_part_of_a_course() -> None:
 
 
 def test_a_device_that_says_later_whether_an_energy_is_finite() -> None:
-    """There `valid` is a tensor: what is not valid is taken with the weight 0."""
+    """There `valid` is a tensor: what is not valid changes nothing, to the last bit."""
     here, there = EnergyHistogram(warmup=8), EnergyHistogram(warmup=8)
     there._on_host, there._sums = False, torch.zeros(3, dtype=torch.float64)
     for k, energy in enumerate(stream(200)):
@@ -304,60 +305,42 @@ def test_a_device_that_says_later_whether_an_energy_is_finite() -> None:
             here.observe(value)
         else:
             here._taken += 1  # so that the weights of the first hundred are the same
-        if not broken:
-            # The weight of a step is float32's there.
-            assert float(there.multiplier) == pytest.approx(float(here.multiplier), abs=1e-5)
-    assert there.calibrated_range == pytest.approx(here.calibrated_range, rel=1e-6)
-    assert there._sums.tolist() == pytest.approx(here._moments().tolist(), rel=1e-6)
+        assert float(there.multiplier) == float(here.multiplier)
+    assert there.coordinates == here.coordinates
+    assert there._sums.tolist() == pytest.approx(here._moments().tolist(), rel=1e-12)
 
 
-def test_what_is_constant_is_left_out() -> None:
+def test_what_is_one_all_the_time_is_left_out() -> None:
     course = Course([], total_steps=1_000)
     two_levels = EnergyHistogram(20, (0.0, 1.0), temperature=1e-4, warmup=0)
-    reasons = []
-    for k, energy in enumerate(stream(1_000)):
-        two_levels.observe(energy)
-        if k % 100 == 99:
-            seen = two_levels.evidence(course)
-            assert seen is not None
-            reasons.append(two_levels.useless(seen.tolist(), course))
-    assert reasons[:3] == [None, None, None]
-    assert reasons[3] is not None
-    assert re.fullmatch(r"nu was 1\.0\d+: off; its deviation was .* over 300 energies", reasons[3])
-    assert two_levels.instead() is None
     moving = EnergyHistogram(warmup=8)
+    reasons: list[list[str | None]] = [[], []]
     for k, energy in enumerate(stream(1_000)):
-        moving.observe(energy)
-        if k % 100 == 99:
-            seen = moving.evidence(course)
-            assert seen is not None
-            assert moving.useless(seen.tolist(), course) is None
+        for said, histogram in zip(reasons, (two_levels, moving), strict=True):
+            histogram.observe(energy)
+            if k % 100 == 99:
+                seen = histogram.evidence(course)
+                assert seen is not None
+                said.append(histogram.useless(seen.tolist(), course))
+    assert reasons[0][:2] == [None, None]
+    assert reasons[0][2] is not None
+    assert re.fullmatch(r"nu was 1\.0\d+; its deviation was .* over 300 energies", reasons[0][2])
+    assert set(reasons[1]) == {None}
 
 
-def test_a_constant_other_than_one_becomes_that_constant() -> None:
+def test_a_constant_other_than_one_stays() -> None:
+    """Without it the training would go on at another learning rate."""
     weights = torch.softmax(0.5 * torch.arange(20, dtype=torch.float64), 0)
     histogram = having(weights, temperature=0.05)
-    course = Course([], total_steps=1_000)
-    why = None
     fixed = histogram.weights
-    for k in range(500):
+    for _ in range(500):
         histogram.observe(0.5)
         histogram._law.weights.copy_(fixed)
-        if k % 100 == 99:
-            seen = histogram.evidence(course)
-            assert seen is not None
-            why = why or histogram.useless(seen.tolist(), course)
-    nu = 1 + 0.75 * 0.05 * 0.5 * 20
-    assert why is not None
-    assert f"a constant {nu:.3g} from now on" in why
-    part: Any = histogram.instead()
-    assert part.value == pytest.approx(nu)
-    resumed = having(weights, temperature=0.05)
-    resumed.load_state_dict(histogram.state_dict())
-    assert resumed.instead() == part
-    seen = resumed.evidence(course)
+    course = Course([], total_steps=1_000)
+    seen = histogram.evidence(course)
     assert seen is not None
-    assert "a constant" in str(resumed.useless(seen.tolist(), course))
+    assert float(histogram.multiplier_std) < 1e-6
+    assert histogram.useless(seen.tolist(), course) is None
 
 
 # -- state -----------------------------------------------------------------------------------------
@@ -497,7 +480,7 @@ def test_keeps_no_graph(options: dict[str, Any]) -> None:
 def test_says_what_it_is() -> None:
     histogram = EnergyHistogram(warmup=10)
     assert repr(histogram) == (
-        "EnergyHistogram(zeta=0.75, clamp=(-1.0, 3.0)): nu 1, no energy observed yet"
+        "EnergyHistogram(zeta=0.75, clamp=(-1.0, 3.0)): nu 1, warm-up: 0 of 10 energies"
     )
     nus_of(histogram, stream(10))
     assert repr(histogram).endswith(": nu 1, warm-up: 10 of 10 energies")

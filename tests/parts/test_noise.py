@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 import re
-import warnings
 
 import numpy as np
 import pytest
 import torch
 from oracles import covariance
-from trainers import edit_rows, gsplat_optimizers, make_splats, only, train, values_of
+from trainers import gsplat_optimizers, make_splats, only, values_of
 
 from opt3dgs_optim import Annealing, Course, IsotropicNoise, Phase, PositionNoise
 from opt3dgs_optim.covariance import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
@@ -175,31 +174,3 @@ def test_its_size_goes_by_the_trainers_rate_without_any_factor() -> None:
         means.step()
         ends.append(splats["means"].detach())
     assert torch.equal(*ends)
-
-
-@pytest.mark.parametrize("host_adds_noise", [True, False])
-def test_noise_of_a_trainer_that_nobody_told_us_of(host_adds_noise: bool) -> None:
-    """The trainer writes noise into the positions after every step, as ours does."""
-    splats = make_splats()
-    phases = only(60, PositionNoise(splats, 1.0))
-    upgraded = phases.upgrade(gsplat_optimizers(splats))
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        for iteration in range(20):
-            train(splats, upgraded, phases, iteration, iteration + 1)
-            if host_adds_noise:
-                with torch.no_grad():
-                    splats["means"].add_(0.01 * torch.randn(splats["means"].shape))
-            if iteration % 7 == 0:
-                edit_rows(splats, upgraded, torch.arange(len(splats["means"])), 1)
-    said = [str(warning.message) for warning in told if "noise_lr to 0" in str(warning.message)]
-    assert len(said) == host_adds_noise
-
-
-def test_a_trainers_noise_is_fine_where_ours_is_off() -> None:
-    splats, phases = make_splats(), only(60, Annealing())
-    upgraded = phases.upgrade(gsplat_optimizers(splats))
-    for iteration in range(10):
-        train(splats, upgraded, phases, iteration, iteration + 1)
-        with torch.no_grad():
-            splats["means"].add_(0.01)

@@ -18,6 +18,7 @@ from trainers import (
     only,
     state_of,
     train,
+    upgraded,
 )
 
 from opt3dgs_optim import Course, Fading, PhaseScheduler, Pooling
@@ -190,9 +191,7 @@ def test_rows_that_do_not_step_keep_their_moments() -> None:
 
 
 def test_a_step_that_is_dropped_leaves_everything() -> None:
-    splats = make_splats()
-    phases = only(TOTAL, Pooling())
-    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    splats, phases, optimizers = upgraded(TOTAL, Pooling())
     train(splats, optimizers, phases, 0, 5)
     before = [
         splats["scales"].detach().clone(),
@@ -206,9 +205,7 @@ def test_a_step_that_is_dropped_leaves_everything() -> None:
 
 
 def test_amsgrads_maxima_are_pooled_too() -> None:
-    splats = make_splats()
-    phases = only(TOTAL, Pooling())
-    optimizers = phases.upgrade(gsplat_optimizers(splats, amsgrad=True))
+    splats, phases, optimizers = upgraded(TOTAL, Pooling(), amsgrad=True)
     train(splats, optimizers, phases, 0, 5)
     state = optimizers["quats"].state[splats["quats"]]
     for key in ("exp_avg_sq", "max_exp_avg_sq"):

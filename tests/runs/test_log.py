@@ -107,31 +107,20 @@ def test_metadata_and_events_round_trip(tmp_path, info):
     assert run.events[0]["event"] == "switch"
 
 
-def test_what_no_page_or_terminal_takes_is_replaced_in_texts_and_refused_in_names(tmp_path):
+def test_texts_come_back_as_they_are_and_numbers_may_be_anything(tmp_path):
     path = tmp_path / "run.jsonl"
-    with RunLog(path, metadata={"arm": "a\0", "\ud800": [Path("b\udcff")]}) as log:
+    with RunLog(path, metadata={"arm": "a\0", "\ud800": [Path("b\udcff")], "x": math.nan}) as log:
         log.step(1, phase="\udfff")
-        log.event("\0", 1, error="c\0d")
+        log.event("\0", 1, error="c\0d", loss=-math.inf)
         with pytest.raises(ValueError, match=r"RunLog\.step\('a\\x00'=.*printable"):
             log.step(1, phase=None, **{"a\0": 1.0})
-        with pytest.raises(ValueError, match=r"nu=.*no float64"):
-            log.step(1, nu=10**400)
-        with pytest.raises(ValueError, match=r"iteration=1\d*\): .* below"):
+        with pytest.raises(ValueError, match=r"iteration=1\d*, but an integer in 0\.\."):
             log.step(10**17)
+    strict_lines(path)
     run = read_run(path)
-    assert run.metadata == {"arm": "a\ufffd", "\ufffd": ["b\ufffd"]}
-    assert run.steps["phase"].tolist() == ["\ufffd"]
-    assert (run.events[0]["event"], run.events[0]["error"]) == ("\ufffd", "c\ufffdd")
-
-
-def test_metadata_is_refused_at_the_depth_that_cannot_be_read(tmp_path):
-    def nested(depth):
-        return [nested(depth - 1)] if depth else 0
-
-    RunLog(tmp_path / "a.jsonl", metadata={"a": nested(31)}).close()
-    assert read_run(tmp_path / "a.jsonl").metadata == {"a": nested(31)}
-    with pytest.raises(ValueError, match="nested deeper than 32"):
-        RunLog(tmp_path / "b.jsonl", metadata={"a": nested(32)})
+    assert run.metadata == {"arm": "a\0", "\ud800": ["b\udcff"], "x": "nan"}
+    assert run.steps["phase"].tolist() == ["\udfff"]
+    assert (run.events[0]["event"], run.events[0]["loss"]) == ("\0", "-inf")
 
 
 def test_columns_begin_and_end_at_any_step_and_a_phase_need_not_be_told(tmp_path):
@@ -194,7 +183,6 @@ def test_torn_twice(tmp_path):
         b'{"kind":"other","iteration":1,"seconds":1}',
         b'{"kind":"step","iteration":1.5,"seconds":1}',
         b'{"kind":"step","iteration":1}',
-        b'{"kind":"step","iteration":1,"seconds":1,"nu":NaN}',
         b'{"kind":"evaluation","iteration":1,"seconds":1,"psnr":"good"}',
         b'{"kind":"event","iteration":1,"seconds":1}',
         b'{"kind":"start","iteration":1,"seconds":1,"metadata":3}',
@@ -209,9 +197,6 @@ def test_torn_twice(tmp_path):
         b'{"kind":"start","iteration":1,"seconds":1,"metadata":%s1%s}'
         % (b'{"a":' * 1000, b"}" * 1000),
         b"[" * 100_000,
-        b'{"kind":"start","iteration":1,"seconds":1,"metadata":{"arm":"a\\u0000b"}}',
-        b'{"kind":"start","iteration":1,"seconds":1,"metadata":{"arm":"\\ud800"}}',
-        b'{"kind":"step","iteration":1,"seconds":1,"\\udfff":1}',
         b'{"kind":"step","iter\0ation":1,"seconds":1}',
     ],
     ids=lambda line: line[:50].decode("ascii", "backslashreplace"),
@@ -419,15 +404,15 @@ def test_cuda_steps_do_not_synchronize(tmp_path):
 
 
 def test_wrong_arguments_name_call_value_and_what_is_allowed(tmp_path):
-    with pytest.raises(TypeError, match=r"metadata.*no string"):
+    with pytest.raises(TypeError, match=r"object.*must be a number"):
         RunLog(tmp_path / "run.jsonl", metadata={"x": object()})
     assert not (tmp_path / "run.jsonl").exists()
     with RunLog(tmp_path / "a" / "run.jsonl") as log:
-        with pytest.raises(ValueError, match=r"RunLog\.step\(iteration=-1\)"):
+        with pytest.raises(ValueError, match=r"RunLog\.step: iteration=-1, but an integer"):
             log.step(-1, phase="exploration")
-        with pytest.raises(TypeError, match=r"RunLog\.evaluation\(iteration=1\.5\)"):
+        with pytest.raises(TypeError, match="cannot be interpreted as an integer"):
             log.evaluation(1.5)  # type: ignore[arg-type]
-        with pytest.raises(ValueError, match=r"energy=tensor of shape \(2,\)"):
+        with pytest.raises(ValueError, match=r"energy=tensor of \(2,\)"):
             log.step(1, phase="exploration", energy=torch.zeros(2))
         with pytest.raises(TypeError, match="psnr='nan'"):
             log.evaluation(1, psnr="nan")  # type: ignore[arg-type]

@@ -164,21 +164,19 @@ def test_picture_opens_and_shows_curves_without_touching_matplotlib(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("points", "note"),
-    [
-        ([], "no evaluation of psnr"),
-        ([(5, 5.0, 20.0)], "a single evaluation of psnr"),
-        ([(5, 5.0, 20.0), (9, 9.0, NAN)], "psnr not finite in 1 evaluations"),
-        ([(5, 5.0, "inf"), (9, 9.0, NAN)], "psnr not finite in 2 evaluations"),
-    ],
+    ("points", "shown"),
+    [([], "– |"), ([(5, 5.0, 20.0)], "20.00"), ([(5, 5.0, 20.0), (9, 9.0, NAN)], "nan")],
 )
 @pytest.mark.parametrize("others", [False, True])
-def test_odd_runs_are_reported_in_words(tmp_path, points, note, others):
+def test_what_a_run_lacks_shows(tmp_path, points, shown, others):
     steps = [(1, 1.0, "exploration")]
     runs = two_arms(tmp_path) if others else []
     runs += [write_run(tmp_path / "odd.jsonl", "odd", 0, points, steps=steps)]
     report.write_report(runs, tmp_path / "out")
-    assert f"odd (odd): {note}" in (tmp_path / "out/report.md").read_text()
+    (row,) = [
+        line for line in (tmp_path / "out/report.md").read_text().split("\n") if "odd" in line
+    ]
+    assert shown in row
 
 
 def test_empty_log_and_mixed_metrics(tmp_path):
@@ -188,8 +186,7 @@ def test_empty_log_and_mixed_metrics(tmp_path):
     runs += [write_run(tmp_path / "b.jsonl", "b", 0, [(1, 1.0, 0.5)], metric="ssim")]
     report.write_report(runs, tmp_path / "out", baseline="a")
     text = (tmp_path / "out/report.md").read_text()
-    assert "empty (empty): empty run, nothing logged" in text
-    assert "b (b): no evaluation of psnr" in text
+    assert "| empty | 1 | – |" in text
     assert "final psnr | final ssim" in text
 
 
@@ -253,13 +250,13 @@ def test_names_with_markup_are_escaped(tmp_path):
     assert len({line.count("|") for line in table}) == 1
     assert len(table) == 4
     assert "snake_case" in text
-    assert html.unescape(text).count(MARKUP) >= 6
+    assert html.unescape(text).count(MARKUP) == 4  # scene, arm, metric, command
     assert "\n# s" not in text
 
 
 def test_names_in_any_script_and_of_any_length_are_drawn(tmp_path):
     pytest.importorskip("matplotlib", reason="needs matplotlib")
-    name = "森林 🌲 \u202e $x^{ " + "long " * 100
+    name = "森林 🌲 \u202e \0 \ud800 $x^{ " + "long " * 100
     steps = [(i, 1.0, name + "ab"[i > 4]) for i in range(10)]
     points = [(1, 1.0, 20.0), (2, 2.0, 21.0)]
     run = write_run(tmp_path / "a.jsonl", name, 0, points, steps=steps, metric=name, scene=name)
@@ -326,10 +323,6 @@ def test_command_line_without_matplotlib(tmp_path, monkeypatch, capsys):
 
 BAD_LINES = {
     "digits": b'{"kind":"evaluation","iteration":1,"seconds":1,"psnr":%s}' % (b"9" * 400),
-    "nesting": b'{"kind":"start","iteration":1,"seconds":1,"metadata":%s1%s}'
-    % (b'{"a":' * 1000, b"}" * 1000),
-    "nul": b'{"kind":"start","iteration":1,"seconds":1,"metadata":{"arm":"\\u0000"}}',
-    "surrogate": b'{"kind":"start","iteration":1,"seconds":1,"metadata":{"arm":"\\ud800"}}',
     "empty": b"{}",
 }
 
@@ -344,7 +337,7 @@ def test_command_line_says_in_one_line_what_is_wrong_and_writes_nothing(tmp_path
         points = [(1, 1.0, 20.0)]
         write_run(tmp_path / f"scenes/{scene}.jsonl", "a", 0, points, metric="ssim", scene=scene)
     logs, out = str(tmp_path / "logs"), str(tmp_path / "out")
-    one_file = "the scenes 'A_b' and 'a b' would both be drawn into report-a_b.png"
+    one_file = "two of the scenes ['A_b', 'a b'] would be drawn into one of"
     for arguments, message in (
         ([str(tmp_path / "nowhere"), "-o", out], "no such file or folder"),
         ([str(tmp_path / "void"), "-o", out], "no *.jsonl file in the folder"),
@@ -360,16 +353,3 @@ def test_command_line_says_in_one_line_what_is_wrong_and_writes_nothing(tmp_path
         assert message in error
         assert error.count("\n") == 1
         assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
-
-
-def test_a_place_that_cannot_be_written_is_found_before_any_log_is_read(
-    tmp_path, monkeypatch, capsys
-):
-    def refuse(**_):
-        raise PermissionError(13, "Permission denied", str(tmp_path))
-
-    two_arms(tmp_path / "logs")
-    monkeypatch.setattr(report, "read_run", pytest.fail)
-    monkeypatch.setattr("tempfile.TemporaryFile", refuse)  # root may write anywhere
-    assert report.main([str(tmp_path / "logs"), "-o", str(tmp_path / "out")]) == 2
-    assert "Permission denied" in capsys.readouterr().err

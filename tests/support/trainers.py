@@ -201,3 +201,15 @@ def edit_rows(
             optimizer.state[fresh] = state
             group["params"] = [fresh]
             splats[name] = fresh
+
+
+def upgraded(
+    total_steps: int,
+    *parts: Part,
+    make: Any = gsplat_optimizers,
+    switch: float | int = PAPER_SWITCH,
+    **options: Any,
+) -> tuple[dict[str, Parameter], PhaseScheduler, Any]:
+    """Gaussians, a scheduler with these parts alone, and the optimizers that `make` makes."""
+    splats, phases = make_splats(), only(total_steps, *parts, switch=switch)
+    return splats, phases, phases.upgrade(make(splats, **options))

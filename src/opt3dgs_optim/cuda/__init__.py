@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import functools
 import importlib
-import importlib.util
 from importlib.resources import files
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -53,17 +52,9 @@ def compile_cubin(
     logs: Any = None,
     ptxas_options: list[str] | None = None,
 ) -> Any:
-    """Compile a kernel file for an architecture such as "sm_90"; no GPU is needed.
+    """cuda.core's ObjectCode of a file of `KERNELS`, for an `arch` such as "sm_90"; needs no GPU.
 
-    Args:
-        name: a file of `KERNELS`.
-        dtype: torch.float32 or torch.float64.
-        arch: without one, cuda.core would ask the driver.
-        history_size: K; of "lqn.cu" only.
-        cache, logs, ptxas_options: cuda.core's.
-
-    Returns:
-        cuda.core's ObjectCode.
+    history_size is K, of "lqn.cu" only; cache, logs and ptxas_options are cuda.core's.
     """
     core = importlib.import_module("cuda.core")
     defined = macros(dtype, history_size) or None
@@ -90,14 +81,13 @@ def _kernel(kernel: str, device: int, dtype: torch.dtype, history_size: int | No
     return code.get_kernel(kernel)
 
 
-class _TorchStream:
+class _TorchStream(NamedTuple):
     """torch's current stream, as cuda.core wants to see it."""
 
-    def __init__(self, device: torch.device) -> None:
-        self._handle = torch.cuda.current_stream(device).cuda_stream
+    handle: int
 
     def __cuda_stream__(self) -> tuple[int, int]:
-        return 0, self._handle
+        return 0, self.handle
 
 
 def launch(
@@ -118,7 +108,22 @@ def launch(
     with torch.cuda.device(device):
         function = _kernel(kernel, like.get_device(), like.dtype, history_size)
         config = core.LaunchConfig(grid=(threads + BLOCK - 1) // BLOCK, block=BLOCK)
-        core.launch(_TorchStream(device), config, function, *values)
+        stream = _TorchStream(torch.cuda.current_stream(device).cuda_stream)
+        core.launch(stream, config, function, *values)
+
+
+def check_alike(call: str, like: Tensor, **others: tuple[Tensor, tuple[int, ...]]) -> None:
+    """ValueError unless each tensor has its shape, and dtype and device of `like`.
+
+    A kernel reads memory by these.
+    """
+    for name, (tensor, shape) in others.items():
+        alike = tensor.dtype == like.dtype and tensor.device == like.device
+        if tuple(tensor.shape) != shape or not alike:
+            raise ValueError(
+                f"{call}: {name} is {tuple(tensor.shape)} {tensor.dtype} on {tensor.device}, but "
+                f"{shape} {like.dtype} on {like.device} is needed"
+            )
 
 
 def _real(dtype: torch.dtype) -> Any:
@@ -135,6 +140,8 @@ def lqn_direction(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`lbfgs.lqn_direction` on the GPU, for points of three coordinates. Never synchronises."""
     rows, real = grad.shape[0], _real(grad.dtype)
+    whole = history, tuple(history.shape)
+    check_alike("lqn_direction", grad, position=(position, tuple(grad.shape)), history=whole)
     fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
     accepted = torch.empty(rows, dtype=torch.bool, device=grad.device)
     candidates = torch.empty_like(accepted)
@@ -172,6 +179,9 @@ def add_covariance_noise(
     A learning rate on the GPU is read there, when the kernel runs; one on the CPU is passed on.
     """
     rows, real = means.shape[0], _real(means.dtype)
+    vectors = {"scales": (scales, (rows, 3)), "quats": (quats, (rows, 4)), "eta": (eta, (rows, 3))}
+    logits = opacities.reshape(-1), (rows,)
+    check_alike("add_covariance_noise", means, opacities=logits, **vectors)
     if isinstance(lr, Tensor) and lr.is_cuda:
         rate, factor = lr.to(torch.float32), noise_scale
     else:
@@ -206,16 +216,12 @@ def missing() -> str | None:
     if torch.version.hip is not None:
         return "this torch is built for ROCm, and the kernels are CUDA"
     try:
-        found = importlib.util.find_spec("cuda.core") is not None
+        importlib.import_module("cuda.core")
     except ModuleNotFoundError:
-        found = False
-    if not found:
         extra = "cuda12" if (torch.version.cuda or "").startswith("12") else "cuda"
         return f"cuda.core is not installed (pip install 'opt3dgs_optim[{extra}]')"
-    if not torch.cuda.is_available():
-        return "torch sees no CUDA device: no NVIDIA driver, or a build of torch without CUDA"
-    try:
-        importlib.import_module("cuda.core")
     except Exception as error:  # whatever a broken installation raises is the reason to show
         return f"cuda.core cannot be imported: {type(error).__name__}: {error}"
+    if not torch.cuda.is_available():
+        return "torch sees no CUDA device: no NVIDIA driver, or a build of torch without CUDA"
     return None

@@ -1,19 +1,14 @@
 // Per-point L-BFGS: the step (store the new pair, then the direction), and the recursion alone.
 // One thread per point. Compiled by NVRTC for one history size, -D HISTORY_SIZE=K; `two_loop.cuh`
 // goes in front.
-#ifndef HISTORY_SIZE
-#error "HISTORY_SIZE, the number of pairs, must be defined"
+#if !defined(HISTORY_SIZE) || HISTORY_SIZE > 5
+#error "HISTORY_SIZE, the number of pairs, must be 1 to 5: more do not fit into registers"
 #endif
 
 static constexpr int LANES = History<Real, HISTORY_SIZE>::lanes;
 
-// A history in registers spills unless ptxas may take as many as it likes; a longer one needs fewer.
-#if HISTORY_SIZE <= 5
-#define LQN_BOUNDS __launch_bounds__(128, 1)
-#else
-#define LQN_BOUNDS __launch_bounds__(128)
-#endif
-extern "C" __global__ void LQN_BOUNDS
+// A history in registers spills unless ptxas may take as many as it likes: the 1.
+extern "C" __global__ void __launch_bounds__(128, 1)
     lqn_direction(const Real* __restrict__ positions, const Real* __restrict__ grads, Real* histories,
                   Real* __restrict__ directions, unsigned char* __restrict__ accepted,
                   unsigned char* __restrict__ candidates, long long rows, Real min_cosine, int graft) {
@@ -27,7 +22,7 @@ extern "C" __global__ void LQN_BOUNDS
   candidates[row] = flags.candidate;
 }
 
-extern "C" __global__ void LQN_BOUNDS
+extern "C" __global__ void __launch_bounds__(128, 1)
     two_loop(const Real* __restrict__ grads, Real* histories, Real* __restrict__ results, long long rows) {
   const long long row = static_cast<long long>(blockIdx.x) * blockDim.x + threadIdx.x;
   if (row >= rows) return;

@@ -88,105 +88,61 @@ template <typename T> POINT Pair<T> normalised(Vec3<T> s, Vec3<T> y) {
   return {s, y, dot(over(s, length(s)), y)};
 }
 
-// Makes the compiler forget what memory holds. Without it, a long history that is read twice would
-// be kept in registers between the two readings: 158 of them, or spills.
-POINT void read_again() { asm volatile("" ::: "memory"); }
-
-// The history of one point, [slots][8]: see opt3dgs_optim/lbfgs/history.py for the layout.
-// K is known to the compiler, so that a short history lives in registers from load to store.
+// The history of one point, [slots][8]: see opt3dgs_optim/lbfgs/history.py for the layout. K, at most 5,
+// is known to the compiler, so that all of it lives in registers from load to store.
 template <typename T, int K> struct History {
-  static constexpr bool kept = K <= 5;  // more pairs than that are read again in the second loop
   static constexpr int slots = K > 3 ? K : K + 1;
-  static constexpr int in_registers = kept ? K : 1;
   static constexpr int lanes = 8 * slots;
 
   T* row;
-  Lanes<T> s[in_registers], y[in_registers];
+  Lanes<T> s[slots], y[slots];
   Vec3<T> position, gradient;  // of the last visible step
   T counter;                   // 0: never visible; c: holds c - 1 pairs
 
   POINT explicit History(T* at) : row(at) {
-    if constexpr (K > 3) {
-      if constexpr (kept) {
 #pragma unroll
-        for (int j = 0; j < K; ++j) {
-          s[j] = load(row + 8 * j);
-          y[j] = load(row + 8 * j + 4);
-        }
-        position = {s[0].spare, s[1].spare, s[2].spare};
-        gradient = {y[0].spare, y[1].spare, y[2].spare};
-        counter = s[3 % in_registers].spare;
-      } else {
-        position = {row[3], row[11], row[19]};
-        gradient = {row[7], row[15], row[23]};
-        counter = row[27];
-      }
-    } else {
-#pragma unroll
-      for (int j = 0; j < K; ++j) {
-        s[j % in_registers] = load(row + 8 * j);
-        y[j % in_registers] = load(row + 8 * j + 4);
-      }
-      const Lanes<T> first = load(row + 8 * K), second = load(row + 8 * K + 4);
-      position = first.v;
-      counter = first.spare;
-      gradient = second.v;
+    for (int j = 0; j < slots; ++j) {
+      s[j] = load(row + 8 * j);
+      y[j] = load(row + 8 * j + 4);
     }
-  }
-
-  POINT Vec3<T> pair_s(int j) const {
-    if constexpr (kept) return s[j].v;
-    return load(row + 8 * j).v;
-  }
-  POINT Vec3<T> pair_y(int j) const {
-    if constexpr (kept) return y[j].v;
-    return load(row + 8 * j + 4).v;
-  }
-
-  // The spare lane of half `half` of slot `slot`, as the header has it now.
-  POINT T spare(int slot, int half, T unused) const {
-    if (K <= 3 || slot > 3 || (slot == 3 && half == 1)) return unused;
-    if (slot == 3) return counter;
-    const Vec3<T> v = half == 0 ? position : gradient;
-    return slot == 0 ? v.x : slot == 1 ? v.y : v.z;
+    if constexpr (K > 3) {
+      position = {s[0].spare, s[1].spare, s[2].spare};
+      gradient = {y[0].spare, y[1].spare, y[2].spare};
+      counter = s[3].spare;
+    } else {
+      position = s[K].v;
+      gradient = y[K].v;
+      counter = s[K].spare;
+    }
   }
 
   // Put the pair in front, if it is accepted, and write pairs and header back.
   POINT void write(Pair<T> pair, bool accepted) {
     if (accepted) {
 #pragma unroll
-      for (int j = K - 1; j >= 0; --j) {
-        if constexpr (!kept) read_again();
-        // The pair before the one that is being overwritten, newest first.
-        Lanes<T> to_s, to_y;
-        if constexpr (kept) {
-          to_s = s[j];
-          to_y = y[j];
-          to_s.v = j > 0 ? s[j > 0 ? j - 1 : 0].v : pair.s;
-          to_y.v = j > 0 ? y[j > 0 ? j - 1 : 0].v : pair.y;
-          s[j] = to_s;
-          y[j] = to_y;
-        } else {
-          to_s.v = j > 0 ? pair_s(j - 1) : pair.s;
-          to_y.v = j > 0 ? pair_y(j - 1) : pair.y;
-          to_s.spare = to_y.spare = T(0);
-        }
-        to_s.spare = spare(j, 0, to_s.spare);
-        to_y.spare = spare(j, 1, to_y.spare);
-        store(row + 8 * j, to_s);
-        store(row + 8 * j + 4, to_y);
+      for (int j = K - 1; j > 0; --j) {
+        s[j].v = s[j - 1].v;
+        y[j].v = y[j - 1].v;
       }
+      s[0].v = pair.s;
+      y[0].v = pair.y;
     }
-    if constexpr (K <= 3) {
-      store(row + 8 * K, Lanes<T>{position, counter});
-      store(row + 8 * K + 4, Lanes<T>{gradient, T(0)});
-    } else if (!accepted) {
+    if constexpr (K > 3) {
+      s[0].spare = position.x;
+      s[1].spare = position.y;
+      s[2].spare = position.z;
+      y[0].spare = gradient.x;
+      y[1].spare = gradient.y;
+      y[2].spare = gradient.z;
+      s[3].spare = counter;
+    } else {
+      s[K] = {position, counter};
+      y[K] = {gradient, T(0)};
+    }
 #pragma unroll
-      for (int j = 0; j < 3; ++j) {
-        row[8 * j + 3] = spare(j, 0, T(0));
-        row[8 * j + 7] = spare(j, 1, T(0));
-      }
-      row[27] = counter;
+    for (int j = 0; j < slots; ++j) {
+      store(row + 8 * j, s[j]);
+      store(row + 8 * j + 4, y[j]);
     }
   }
 };
@@ -199,19 +155,17 @@ template <int K, typename T> POINT Vec3<T> recursion(Vec3<T> q, const History<T,
   T alpha[K];
 #pragma unroll
   for (int j = 0; j < K; ++j) {
-    if constexpr (!History<T, K>::kept) read_again();
-    const Vec3<T> s = history.pair_s(j), y = history.pair_y(j);
+    const Vec3<T> s = history.s[j].v, y = history.y[j].v;
     alpha[j] = dot(s, q) * inverse(dot(s, y));
     q = along(q, -alpha[j], y);
   }
   // |y| = 1, hence gamma = s.y / y.y = s.y of the newest pair. No pair: r stays the gradient.
-  T gamma = dot(history.pair_s(0), history.pair_y(0));
+  T gamma = dot(history.s[0].v, history.y[0].v);
   if (gamma <= T(0)) gamma = T(1);
   Vec3<T> r = times(q, gamma);
 #pragma unroll
   for (int j = K - 1; j >= 0; --j) {
-    if constexpr (!History<T, K>::kept) read_again();
-    const Vec3<T> s = history.pair_s(j), y = history.pair_y(j);
+    const Vec3<T> s = history.s[j].v, y = history.y[j].v;
     const T beta = dot(y, r) * inverse(dot(s, y));
     r = along(r, alpha[j] - beta, s);
   }

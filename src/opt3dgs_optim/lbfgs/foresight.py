@@ -32,21 +32,17 @@ def foresight(history: Tensor, history_size: int, position: Tensor, gradient: Te
     widest = torch.float32 if history.device.type == "mps" else torch.float64
     total = torch.zeros(2, dtype=widest, device=history.device)
     for rows in row_chunks(gradient):
-        total += _foresight(history[rows], history_size, position[rows], gradient[rows])
+        head = header(history[rows], history_size)
+        s = position[rows].to(history.dtype) - head.position
+        y = gradient[rows].to(history.dtype) - head.gradient
+        foretold = two_loop(y, history[rows], history_size)
+        vectors = (s, y, foretold, gradient[rows])
+        s, y, foretold, g = (columns(each, history.dtype) for each in vectors)
+        gain = _cosine(foretold, s) - _cosine(y, s)
+        known = torch.isfinite(g).all(0) & (g != 0).any(0) & (head.counter > 1)
+        known &= torch.isfinite(gain) & (s != 0).any(0) & (y != 0).any(0)
+        total += torch.stack([torch.where(known, gain, 0.0).sum(), known.sum().to(gain.dtype)])
     return total
-
-
-def _foresight(history: Tensor, history_size: int, position: Tensor, gradient: Tensor) -> Tensor:
-    """`foresight` of a chunk of rows, in the history's dtype."""
-    head = header(history, history_size)
-    s = position.to(history.dtype) - head.position
-    y = gradient.to(history.dtype) - head.gradient
-    foretold = two_loop(y, history, history_size)
-    s, y, foretold, g = (columns(each, history.dtype) for each in (s, y, foretold, gradient))
-    gain = _cosine(foretold, s) - _cosine(y, s)
-    known = torch.isfinite(g).all(0) & (g != 0).any(0) & (head.counter > 1)
-    known &= torch.isfinite(gain) & (s != 0).any(0) & (y != 0).any(0)
-    return torch.stack([torch.where(known, gain, 0.0).sum(), known.sum().to(gain.dtype)])
 
 
 def _cosine(a: Tensor, b: Tensor) -> Tensor:

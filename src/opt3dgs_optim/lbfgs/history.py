@@ -1,22 +1,19 @@
 """The history of every point: how curvature pairs lie in memory.
 
-One point is one row. Its history is a row of a single float tensor, because density control
-edits optimizer state by rows (gathers, zeroes, appends zero rows): all zero means "no history".
-
-Layout, [N, slots, 2 (D + 1)] for points of D coordinates and a history of K pairs:
+One point is one row, because density control edits optimizer state by rows; all zero means "no
+history". Layout, [N, slots, 2 (D + 1)] for points of D coordinates and a history of K pairs:
 
     slot j, lanes 0 .. D-1        s, the parameter difference   } of the j-th newest pair, both
     slot j, lanes D+1 .. 2D       y, the gradient difference    } divided by |y|
     lanes D and 2D + 1            spare; the header below lives in them
 
 The header holds the point's last visible position and gradient and a counter. With K > D it fits
-into the spare lanes of slots 0 .. D (slots = K: no further memory, 160 bytes per point in float32
-for K = 5, D = 3); otherwise it gets a slot of its own (slots = K + 1).
+into the spare lanes of slots 0 .. D (slots = K: 160 bytes per point in float32 for K = 5, D = 3);
+otherwise it gets a slot of its own (slots = K + 1).
 
-A new pair moves the older ones down a slot: a ring would write less, but every reader would have to
-gather by row. In memory, a history that torch computes on is transposed (strides of a
-[slots, lanes, N] tensor), one that the CUDA kernel computes on is contiguous; every function here
-takes both.
+A new pair moves the older ones down a slot: readers of a ring would have to gather. In memory, a
+history that torch computes on is transposed (strides of a [slots, lanes, N] tensor), one that the
+CUDA kernel computes on is contiguous; every function here takes both.
 """
 
 from __future__ import annotations
@@ -38,10 +35,7 @@ def history_shape(points: Tensor, history_size: int) -> tuple[int, int, int]:
 
 
 def new_history(points: Tensor, history_size: int, *, contiguous: bool = False) -> Tensor:
-    """An empty history for `points` [N, D]; float32, or float64 for float64 points.
-
-    `contiguous` is for the CUDA kernel; otherwise the memory is laid out for torch.
-    """
+    """An empty history for `points` [N, D], of their float64 or of float32; see `laid_out`."""
     dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
     rows, *cells = history_shape(points, history_size)
     shape = (rows, *cells) if contiguous else (*cells, rows)
@@ -50,7 +44,7 @@ def new_history(points: Tensor, history_size: int, *, contiguous: bool = False) 
 
 
 def laid_out(history: Tensor, *, contiguous: bool) -> Tensor:
-    """`history` itself, or a copy of it if its memory is laid out for the other backend."""
+    """`history` itself, or a copy if it is not laid out for the kernel (contiguous), or torch."""
     if contiguous:
         return history.contiguous()
     cells = history.movedim(0, -1)

@@ -1,8 +1,6 @@
 """The per-point L-BFGS: the two-loop recursion, and one step of it for Adam.
 
-The step is one registered operator, with a CUDA kernel for points of three coordinates and pure
-torch for all else, so that it works under `torch.compile`. `torch.library.custom_op` would cost
-12 us per call; define and impl cost 1.4.
+A CUDA kernel for points of three coordinates, and pure torch for all else.
 """
 
 from __future__ import annotations
@@ -14,13 +12,6 @@ from opt3dgs_optim import cuda
 from opt3dgs_optim.backend import uses_kernel
 from opt3dgs_optim.lbfgs.history import Header, check_history, header, push, stored_pairs
 from opt3dgs_optim.lbfgs.pairs import columns, dot, length, normalised_pair, row_chunks
-
-_LIBRARY = torch.library.Library("opt3dgs_optim", "DEF")
-_LIBRARY.define(
-    "lqn_direction(Tensor position, Tensor grad, Tensor(a!) history, int history_size, *, "
-    "float min_cosine, bool graft, str backend) "
-    "-> (Tensor direction, Tensor accepted, Tensor candidates)"
-)
 
 
 def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
@@ -48,8 +39,9 @@ def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
         ValueError: the shapes do not fit.
     """
     check_history("two_loop", grad, history, history_size)
-    same = history.dtype == grad.dtype and history.device == grad.device and grad.shape[1] == 3
-    if same and not torch.compiler.is_compiling() and uses_kernel("auto", grad.device, grad.dtype):
+    same = history.dtype == grad.dtype and history.device == grad.device
+    like = grad.device, grad.dtype, grad.shape[1], history_size
+    if same and not torch.compiler.is_compiling() and uses_kernel("auto", *like):
         return cuda.two_loop(grad, history, history_size)
     result = torch.empty_like(grad)
     for rows in row_chunks(grad):
@@ -107,7 +99,7 @@ def lqn_direction(
         position: [N, D] before the step.
         grad: [N, D] there; a row that is zero or not finite is not visible: its history stays,
             and it is given back.
-        history: [N, slots, 2 (D + 1)], changed in place; see `opt3dgs_optim.lbfgs.history`.
+        history: [N, slots, 2 (D + 1)], changed in place.
         history_size: K, 1 to 16.
         min_cosine: a pair is accepted if s.y > min_cosine |s| |y|. Relative: an absolute bound
             such as torch LBFGS's 1e-10 would reject practically every pair of a splat.
@@ -124,26 +116,9 @@ def lqn_direction(
         RuntimeError: `backend="cuda"` where the kernel cannot run.
         ValueError: the shapes do not fit.
     """
-    return _OPERATOR(
-        position, grad, history, history_size, min_cosine=min_cosine, graft=graft, backend=backend
-    )
-
-
-def step(
-    position: Tensor,
-    grad: Tensor,
-    history: Tensor,
-    history_size: int,
-    *,
-    min_cosine: float,
-    graft: bool,
-    backend: str,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """What the operator does: see `lqn_direction`."""
     check_history("lqn_direction", grad, history, history_size)
-    asked = grad.is_cuda or backend == "cuda"
-    if asked and uses_kernel(backend, grad.device, grad.dtype, grad.shape[1]):
-        check_alike(grad, position, history)
+    like = grad.device, grad.dtype, grad.shape[1], history_size
+    if (grad.is_cuda or backend == "cuda") and uses_kernel(backend, *like):
         return cuda.lqn_direction(position, grad, history, history_size, min_cosine, graft)
     fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
     accepted = torch.empty(grad.shape[0], dtype=torch.bool, device=grad.device)
@@ -160,21 +135,6 @@ def step(
     return fed, accepted, candidates
 
 
-def check_alike(grad: Tensor, position: Tensor, history: Tensor) -> None:
-    """A kernel reads memory by the shape and dtype of `grad` [N, 3]: be sure of the others'."""
-    for name, tensor in (("position", position), ("history", history)):
-        if tensor.dtype != grad.dtype or tensor.device != grad.device:
-            raise ValueError(
-                f"lqn_direction: {name} is {tensor.dtype} on {tensor.device}, but {grad.dtype} on "
-                f"{grad.device}, as the gradient, is needed"
-            )
-    if position.shape != grad.shape:
-        raise ValueError(
-            f"lqn_direction: position has shape {tuple(position.shape)}, but "
-            f"{tuple(grad.shape)} is needed"
-        )
-
-
 def take_pairs(
     history: Tensor,
     head: Header,
@@ -184,18 +144,10 @@ def take_pairs(
     visible: Tensor,
     min_cosine: float,
 ) -> tuple[Tensor, Tensor]:
-    """Accept a pair per point and update the header; coordinates first.
+    """Accept a pair between two consecutive *visible* steps of each point; update the header.
 
-    A pair is taken between two consecutive *visible* steps of a point; what happens to a point
-    while it is not visible leaves its history as it is.
-
-    Args:
-        history: [N, slots, 2 (D + 1)], changed in place; `head` are the views of its header.
-        position, gradient: [D, N] before the step.
-        visible: [N] bool.
-
-    Returns:
-        (accepted, candidates), [N] bool each.
+    History and `head`, the views of its header, are changed in place; position and gradient are
+    [D, N] before the step. Returns (accepted, candidates), [N] bool each.
     """
     last_position, last_gradient, counter = head.position.T, head.gradient.T, head.counter
     pair = normalised_pair(position - last_position, gradient - last_gradient)
@@ -224,16 +176,3 @@ def direction(
     result = result * scale
     usable = usable & (result.abs().amax(0) < torch.inf)
     return torch.where(usable, result, grad)
-
-
-def _fake(
-    position: Tensor, grad: Tensor, history: Tensor, history_size: int, **options: object
-) -> tuple[Tensor, Tensor, Tensor]:
-    flags = [grad.new_empty(grad.shape[0], dtype=torch.bool) for _ in range(2)]
-    fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
-    return fed, flags[0], flags[1]
-
-
-_LIBRARY.impl("lqn_direction", step, "CompositeExplicitAutograd")
-_LIBRARY.impl("lqn_direction", _fake, "Meta")  # register_fake reads every module: 10 ms at import
-_OPERATOR = torch.ops.opt3dgs_optim.lqn_direction.default

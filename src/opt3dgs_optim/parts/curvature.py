@@ -34,14 +34,10 @@ MIN_FORESIGHT = 0.1
 class Curvature(Part):
     """Feed Adam the local quasi-Newton direction of every point while exploiting (eq. 17).
 
-    Dimension 0 of a parameter is points; the rest of it (3 coordinates, for positions) is one
-    small optimization problem per point. Each keeps its last `history_size` curvature pairs, taken
-    between two consecutive steps in which it was visible, and the L-BFGS two-loop recursion turns
-    its gradient into a pseudo-gradient. There is no line search: Adam takes the step. A point
-    without a usable pair is stepped by plain Adam, bit for bit.
-
-    A point whose gradient is exactly zero is taken as not visible: no pair is stored for it. What
-    density control's edits of rows do to the history: see `reset_points`.
+    Each point keeps its last `history_size` curvature pairs, taken between two consecutive steps in
+    which its gradient was not exactly zero, and the L-BFGS two-loop recursion turns its gradient
+    into a pseudo-gradient. There is no line search: Adam takes the step. A point without a usable
+    pair is stepped by plain Adam, bit for bit. After density control's edits see `reset_points`.
 
     Memory: 32 K bytes per point beyond Adam's (K > 3, D = 3, float32), from the switch on.
 
@@ -119,10 +115,9 @@ class Curvature(Part):
 
     def _history(self, state: dict[str, Any], position: Tensor) -> Tensor:
         shape = history_shape(position, self.history_size)
+        like = position.device, position.dtype, position.shape[1], self.history_size
         asked = position.is_cuda or self.backend == "cuda"
-        kernel = asked and uses_kernel(
-            self.backend, position.device, position.dtype, position.shape[1]
-        )
+        kernel = asked and uses_kernel(self.backend, *like)
         if HISTORY not in state or tuple(state[HISTORY].shape) != shape:
             state.pop(HISTORY, None)  # before the new one, or both would be in memory
             state[HISTORY] = new_history(position, self.history_size, contiguous=kernel)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -14,14 +13,14 @@ from opt3dgs_optim.checks import check_count, check_interval, check_keys, check_
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Group, Part, Phase
 from opt3dgs_optim.partitions import FixedPartitions, MovingPartitions
-from opt3dgs_optim.parts.constant import Constancy
 
 # The temperature is not given in the paper; zeta * tau / du = 1.5 at its zeta and du.
 PAPER: dict[str, Any] = {"energy_range": (0.0, 0.2), "temperature": 2e-3, "warmup": 2500}
 PAPER_CLAMP = (-5.0, 5.0)  # not given in the paper; the only published one of its family
 CALL = "EnergyHistogram"
 CLAMP = (-1.0, 3.0)  # twice as far from 1 as nu is two deviations out
-LOGGER = logging.getLogger("opt3dgs_optim")
+# Where nu does nothing: so little for so many energies, or for this share of the run.
+EFFECT, WINDOW, WINDOW_SHARE = 0.1, 300, 1 / 30
 TOP_SHARE = 0.5  # of Theta, in the open partition above the range: the loss may yet fall into it
 
 
@@ -32,12 +31,11 @@ class EnergyHistogram(Part):
 
     Theta is the weight of the energy's partition, by how often the training has been there.
 
-    By default (`energy_range="auto"`, `temperature="auto"`) the partitions follow the energy's
-    recent mean and deviation, tau is (1 - zeta) / (2 zeta) deviations, and the slope of log Theta
-    is that of a smoothed density: an energy two deviations from the mean gets |nu - 1| = 1 at all
-    times, nu's mean is 1 and its deviation 1/2, whatever zeta and however far the energy falls.
-    `MovingPartitions` has the formulas. With a range and a temperature it is the paper's update,
-    to the letter (`FixedPartitions`); `EnergyHistogram.paper()` has its numbers.
+    By default the partitions follow the energy's recent mean and deviation: an energy two
+    deviations from the mean gets |nu - 1| = 1 at all times, nu's mean is 1 and its deviation 1/2,
+    whatever zeta and however far the energy falls. `MovingPartitions` has the formulas. With a
+    range and a temperature it is the paper's update, to the letter (`FixedPartitions`);
+    `EnergyHistogram.paper()` has its numbers.
 
     The state lives on the device of the energies, and `observe` does not wait for a GPU.
 
@@ -62,8 +60,6 @@ class EnergyHistogram(Part):
         >>> for _ in range(2_000):
         ...     _ = histogram.observe(0.1 + 0.01 * torch.randn((), generator=draw))
         >>> 0.9 < float(histogram.mean_multiplier) < 1.1
-        True
-        >>> 0.4 < float(histogram.multiplier_std) < 0.6
         True
     """
 
@@ -117,7 +113,6 @@ class EnergyHistogram(Part):
         # Powers 0, 1 and 2 of nu, summed over the energies after the warm-up; on a CPU as numbers.
         self._sums: Any = [0.0] * 3 if self._on_host else self._law.nu.new_zeros(3)
         self._factor: float | Tensor = 1.0
-        self._constancy = Constancy()
 
     @torch.no_grad()
     def observe(  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -132,7 +127,7 @@ class EnergyHistogram(Part):
             energy: the training loss of this iteration, 0-d (or one element). One that is not
                 finite changes nothing.
             valid: whether it is finite, where that is known already.
-            course: not used.
+            course: the training's, which wants no copy of nu.
 
         Returns:
             nu, 0-d, on the energy's device.
@@ -161,11 +156,6 @@ class EnergyHistogram(Part):
         self._factor = nu = law.nu.item() if self._on_host else law.nu
         if self._on_host and warm:
             self._sums = [a + b for a, b in zip(self._sums, (1.0, nu, nu * nu), strict=True)]
-        elif self._on_host and self._taken == self.warmup and law.is_constant():
-            LOGGER.warning(
-                "%s: the first %d energies are all %g, so nu is 1 until they vary; is it the "
-                "loss that is observed?", CALL, self._taken, sum(self.calibrated_range) / 2
-            )  # fmt: skip
 
     def _on_device(self, energy: Tensor | float) -> Tensor:
         if not isinstance(energy, Tensor):
@@ -209,33 +199,31 @@ class EnergyHistogram(Part):
         return (squares / count - (total / count) ** 2).nan_to_num(0.0).clamp(min=0).sqrt()
 
     @property
-    def calibrated_range(self) -> tuple[float, float]:
-        """(low, high) of the partitions now, in units of the loss. Synchronises."""
-        return self._law.coordinates()[:2]
-
-    @property
-    def calibrated_temperature(self) -> float:
-        """Tau now, in units of the loss. Synchronises."""
-        return self._law.coordinates()[2]
+    def coordinates(self) -> tuple[float, float, float]:
+        """Low and high end of the partitions, and tau, now, in units of the loss. Synchronises."""
+        return self._law.coordinates()
 
     def numbers(self, course: Course | None = None) -> dict[str, float | Tensor]:
         """`nu`, after the warm-up; and the energy's recent mean and deviation, where they count."""
         if self._taken <= self.warmup:
             return {}
-        return {"nu": self._law.nu.clone(), **self._law.numbers()}
+        known = self._law.numbers() if isinstance(self._law, MovingPartitions) else {}
+        return {"nu": self._law.nu.clone(), **known}
 
     def evidence(self, course: Course) -> Tensor | None:
         """[4]: sums of nu's powers 0, 1 and 2; Theta's share in the open partition at the top."""
         return torch.cat([self._moments(), self._law.weights[-1:].to(self._law.nu.dtype)])
 
     def useless(self, evidence: list[float], course: Course) -> str | None:
-        """Where nu has been nearly constant for 300 energies, or for a thirtieth of the run."""
-        *powers, above = evidence
-        return self._constancy.judge("nu", powers, course.total_steps, above <= TOP_SHARE)
-
-    def instead(self) -> Part | None:
-        """A constant of nu's mean, unless that is 1."""
-        return self._constancy.constant
+        """Where nu has been nearly 1 in all of 300 energies, or of a thirtieth of the run."""
+        count, total, squares, above = evidence
+        if count < max(WINDOW, WINDOW_SHARE * course.total_steps) or above > TOP_SHARE:
+            return None
+        mean = total / count
+        deviation = math.sqrt(max(squares / count - mean * mean, 0.0))
+        if deviation > EFFECT or abs(mean - 1) > EFFECT:
+            return None
+        return f"nu was {mean:.3f}; its deviation was {deviation:.3f} over {count:.0f} energies"
 
     def state_dict(self) -> dict[str, Any]:
         """All that `observe` has learnt, as plain numbers and lists. Synchronises."""
@@ -243,7 +231,6 @@ class EnergyHistogram(Part):
             "num_observed": self.num_observed,
             "num_taken": self._taken,
             "sums": self._moments().tolist(),
-            "constant": self._constancy.state(),
             **self._law.state(),
         }
 
@@ -260,8 +247,7 @@ class EnergyHistogram(Part):
             saved = state[name]
             rows, length = (saved, len(own)) if isinstance(own, list) else ([saved], 1)
             plain = isinstance(rows, list) and all(isinstance(v, (int, float)) for v in rows)
-            fits = plain and (len(rows) == length or (name == "constant" and len(rows) <= 1))
-            if not fits or not all(map(math.isfinite, rows)):
+            if not plain or len(rows) != length or not all(map(math.isfinite, rows)):
                 needed = f"num_partitions={self.num_partitions} has {length} finite numbers there"
                 raise ValueError(f"{call}: {name}={saved!r}, but a histogram with {needed}")
         self._law.check(call, state)
@@ -271,7 +257,6 @@ class EnergyHistogram(Part):
         self._allocate(device)
         self._law.load(state)
         self._sums[:] = state["sums"] if self._on_host else torch.tensor(state["sums"])
-        self._constancy.load("nu", state["constant"])
         self.num_observed, self._taken = int(state["num_observed"]), int(state["num_taken"])
         self._factor = self._law.nu.item() if self._on_host else self._law.nu
 
@@ -280,8 +265,6 @@ class EnergyHistogram(Part):
         if self.energy_range != "auto":
             line += f"energy_range={self.energy_range!r}, temperature={self.temperature!r}, "
         line += f"zeta={self.zeta:g}, clamp={self.clamp}): nu "
-        if self._taken == 0:
-            return f"{line}1, no energy observed yet"
         if self._taken <= self.warmup:
             return f"{line}1, warm-up: {self._taken} of {self.warmup} energies"
         mean, deviation = float(self.mean_multiplier), float(self.multiplier_std)

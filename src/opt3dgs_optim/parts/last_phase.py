@@ -10,6 +10,7 @@ from torch import Tensor
 from opt3dgs_optim.checks import check_count
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Group, Part, Phase
+from opt3dgs_optim.rows import MOMENTS
 
 FRESH = "fresh_since"  # of a group: the switch at which its moments were started anew
 
@@ -56,7 +57,7 @@ class FreshMoments(Part):
         left = course.total_steps - course.switch_step
         if group.get(FRESH) != course.switch_step and left >= self.settling:
             group[FRESH] = course.switch_step
-            for key in ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq"):
+            for key in ("step", *MOMENTS):
                 if key in state:
                     state[key].zero_()
         return grad

@@ -1,18 +1,14 @@
-"""The lines of a run log: strict JSON values, whole-line appends, one writer at a time."""
+"""The lines of a run log: strict JSON, appended whole, by one writer at a time."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import math
-import operator
 import os
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-from torch import Tensor
 
 try:
     import fcntl
@@ -20,8 +16,7 @@ except ImportError:  # Windows
     fcntl = None
 
 START = b'{"kind":"start"'  # how the first line of every session begins
-DEEPEST = 32  # lists in lists; far below Python's limit for calls in calls
-NO_TEXT = re.compile("[\0\ud800-\udfff]")  # what no file name, page or terminal takes
+NON_FINITE = {"NaN": "nan", "Infinity": "inf", "-Infinity": "-inf"}  # Python's names: ours
 
 
 class LineFile:
@@ -33,7 +28,6 @@ class LineFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._owner = os.getpid()
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = open(path, "ab", buffering=0)  # noqa: SIM115 - closed by close()
         try:
@@ -53,8 +47,8 @@ class LineFile:
         return self._file.closed
 
     def append(self, line: Mapping[str, Any]) -> None:
-        """Write one JSON line in one system call (more only if the kernel cuts it short)."""
-        data = json.dumps(line, separators=(",", ":"), allow_nan=False).encode() + b"\n"
+        """Write one line in one system call (more only if the kernel cuts it short)."""
+        data = encoded(line).encode() + b"\n"
         if data.startswith(START) and self.path.read_bytes()[-1:] not in (b"", b"\n"):
             data = b"\n" + data  # the last session was killed within a line
         rest = memoryview(data)
@@ -62,61 +56,34 @@ class LineFile:
             rest = rest[self._file.write(rest) or 0 :]
 
     def close(self) -> None:
-        if fcntl and not self._file.closed and os.getpid() == self._owner:
-            # A forked data loader shares the lock: release it for both, but only from the owner.
+        """Release the file; a data loader that was forked meanwhile shares the lock."""
+        if fcntl and not self._file.closed:
             with contextlib.suppress(OSError):
                 fcntl.flock(self._file, fcntl.LOCK_UN)
         self._file.close()
 
 
-def index(call: str, iteration: int) -> int:
-    """`iteration` as an int >= 0; ValueError or TypeError otherwise."""
+def encoded(value: Any) -> str:
+    """`value` as strict JSON, NaN and infinities as strings; TypeError if JSON cannot hold it."""
     try:
-        value = operator.index(iteration)
-    except TypeError:
-        raise TypeError(f"{call}(iteration={iteration!r}): must be an integer >= 0") from None
-    if not 0 <= value < 2**53:
-        raise ValueError(f"{call}(iteration={value}): must be an integer >= 0, below 2**53")
-    return value
+        return json.dumps(value, separators=(",", ":"), allow_nan=False, default=_plain)
+    except ValueError:  # a number that is not finite
+        loose = json.dumps(value, default=_plain)
+        return encoded(json.loads(loose, parse_constant=NON_FINITE.__getitem__))
 
 
-def number(call: str, name: str, value: Any) -> float | int | str:
-    """A host number as strict JSON holds it; NaN and infinities become strings."""
-    if isinstance(value, Tensor) or hasattr(value, "item"):  # also numpy scalars
-        if isinstance(value, Tensor) and value.numel() != 1:
+def _plain(value: Any) -> Any:
+    return os.fspath(value) if isinstance(value, os.PathLike) else number("RunLog", "", value)
+
+
+def number(call: str, name: str, value: Any) -> float | int:
+    """A number, or that in a tensor or array of one element, on the host."""
+    if hasattr(value, "item"):
+        if math.prod(value.shape) != 1:
             raise ValueError(
-                f"{call}({name}=tensor of shape {tuple(value.shape)}): must have one element"
+                f"{call}({name}=tensor of {tuple(value.shape)}): must have one element"
             )
         value = value.item()
-    if isinstance(value, int):  # and bool: False is 0, True is 1
-        if abs(value) >= 2**1023:
-            raise ValueError(f"{call}({name}=...): an integer above 2**1023 is no float64")
-        return int(value)
-    if isinstance(value, float):
-        return value if math.isfinite(value) else str(value)
-    raise TypeError(f"{call}({name}={value!r}): must be a number or a one-element tensor")
-
-
-def text(value: str) -> str:
-    """`value` with a replacement character for each NUL and lone surrogate."""
-    return NO_TEXT.sub("\ufffd", value)
-
-
-def plain(call: str, value: Any, depth: int = 0) -> Any:
-    """`value` (metadata, event details) as strict JSON holds it; TypeError if it cannot."""
-    if depth > DEEPEST:
-        raise ValueError(f"{call}: lists or mappings nested deeper than {DEEPEST}")
-    if value is None or isinstance(value, bool):
-        return value
-    if isinstance(value, (str, os.PathLike)):
-        return text(os.fsdecode(value))
-    if isinstance(value, Mapping):
-        return {text(str(key)): plain(call, item, depth + 1) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(call, item, depth + 1) for item in value]
-    try:
-        return number(call, "value", value)
-    except TypeError:
-        raise TypeError(
-            f"{call}: {value!r} is no string, number, boolean, None, path, list or mapping"
-        ) from None
+    if not isinstance(value, (int, float)):
+        raise TypeError(f"{call}({name}={value!r}): must be a number or a one-element tensor")
+    return value

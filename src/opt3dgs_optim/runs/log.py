@@ -1,14 +1,13 @@
 """The run log: one JSON object a line, written while a trainer runs, without slowing it down.
 
 Lines are `{"kind": "start" | "step" | "evaluation" | "event", "iteration": ..., "seconds": ...}`
-plus whatever the call adds; `read_run` reads them back. `seconds` are run seconds: wall clock since
-the log was opened, without what `RunLog.paused` enclosed, carried on over a resume. JSON has no NaN
-or infinity: they are written as the strings "nan", "inf" and "-inf" and read back as floats.
+plus whatever the call adds. JSON has no NaN or infinity: they are the strings "nan", "inf", "-inf".
 """
 
 from __future__ import annotations
 
-import logging
+import json
+import operator
 import os
 import platform
 import re
@@ -25,10 +24,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.runs.lines import LineFile, index, number, plain, text
+from opt3dgs_optim.checks import LOGGER, check_count
+from opt3dgs_optim.runs.lines import LineFile, encoded, number
 from opt3dgs_optim.runs.read import read_run
 
-LOGGER = logging.getLogger("opt3dgs_optim")
 RESERVED = ("kind", "iteration", "seconds", "phase", "event")
 
 
@@ -54,12 +53,11 @@ class RunLog:
 
     Args:
         path: the log file; missing parent folders are made.
-        metadata: what describes the run (`arm`, `seed`, `scene`, options): strings, numbers,
-            booleans, None, lists and mappings of these. The report groups by `arm` and pairs
-            by `seed`. `command` replaces the command line recorded otherwise (base names only).
+        metadata: what describes the run, as JSON can hold it. The report groups by `scene` and
+            `arm` and pairs by `seed`; `command` replaces the command line recorded otherwise.
 
     Raises:
-        ValueError: metadata nested too deep, or `path` is no run log.
+        ValueError: `path` is no run log.
         TypeError: metadata that JSON cannot hold.
         BlockingIOError: another RunLog has the file open (noticed where files can be locked).
 
@@ -76,12 +74,9 @@ class RunLog:
     """
 
     def __init__(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        metadata: Mapping[str, Any] | None = None,
+        self, path: str | os.PathLike[str], *, metadata: Mapping[str, Any] | None = None
     ) -> None:
-        described = plain("RunLog(metadata)", dict(metadata or {}))
+        described = json.loads(encoded(dict(metadata or {})))
         self.path = Path(path)
         self._pending: deque[_Pending] = deque()
         self._mirrors: list[Any] = []
@@ -105,32 +100,28 @@ class RunLog:
         iteration: int,
         metadata: Mapping[str, Any] | None = None,
     ) -> RunLog:
-        """Continue the log of a run that goes on from a checkpoint taken at `iteration`.
+        """Continue the log, and its clock, from a checkpoint taken at `iteration`.
 
-        The clock goes on from the last second recorded at an iteration <= `iteration`, and a
-        "resumed" event tells readers to drop what was logged past it. Arguments and errors are
+        A "resumed" event tells readers to drop what was logged past it. Arguments and errors are
         those of the class, and FileNotFoundError if there is no log at `path`.
         """
-        iteration = index("RunLog.resume", iteration)
         if not Path(path).is_file():
             raise FileNotFoundError(f"RunLog.resume: no run log at {os.fspath(path)!r}")
         log = cls(path, metadata=metadata)
-        records = [r for r in read_run(path).records[:-1] if r["iteration"] <= iteration]
-        log._base = records[-1]["seconds"] if records else 0.0
-        log._since = time.perf_counter()
+        past = [r["seconds"] for r in read_run(path).records[:-1] if r["iteration"] <= iteration]
+        log._base, log._since = past[-1] if past else 0.0, time.perf_counter()
         log.event("resumed", iteration)
         return log
 
     def mirror(self, writer: Any) -> None:
         """Send every number that is logged from now on to TensorBoard or Weights & Biases too.
 
-        `log.mirror(SummaryWriter("runs/garden"))`, of `torch.utils.tensorboard`; in gsplat's
-        trainer, which has one, `log.mirror(self.writer)`; `log.mirror(wandb.init(project="3dgs"))`.
         Tags are `step/NAME` and `evaluation/NAME`, run seconds among them. Numbers go out with
         their line. A writer that raises gets nothing more, and the logger `opt3dgs_optim` says so.
 
         Args:
-            writer: has `add_scalar(tag, value, step)`, or `log({tag: value}, step=step)`.
+            writer: has `add_scalar(tag, value, step)`, as `torch.utils.tensorboard`'s
+                `SummaryWriter`, or `log({tag: value}, step=step)`, as what `wandb.init` returns.
 
         Raises:
             TypeError: it has neither.
@@ -142,30 +133,28 @@ class RunLog:
     @property
     def seconds(self) -> float:
         """Run seconds so far: wall clock, without pauses, of all sessions of this run."""
-        running = 0.0 if self._since is None else time.perf_counter() - self._since
-        return self._base + running
+        return self._base + (0.0 if self._since is None else time.perf_counter() - self._since)
 
     def step(
         self, iteration: int, *, phase: str | Enum | None = None, **columns: float | Tensor
     ) -> None:
         """Log one optimization step; `columns` are numbers or one-element tensors.
 
-        Any name will do, and a column may begin or end at any step. The report marks where
-        `phase` changes, and shows the means of the columns that are no loss.
+        The report marks where `phase` changes, and shows the means of the columns that are no loss.
 
         Raises:
             ValueError: a negative iteration, a reserved name or a tensor of several elements.
             TypeError: a value that is no number.
         """
-        line = self._line("step", index("RunLog.step", iteration))
+        line = self._line("step", iteration)
         if phase is not None:
-            line["phase"] = text(str(phase.value if isinstance(phase, Enum) else phase))
+            line["phase"] = str(phase.value if isinstance(phase, Enum) else phase)
         self._pending.append(_pack("RunLog.step", line, columns))
         self._drain(wait=False)
 
     def evaluation(self, iteration: int, **metrics: float | Tensor) -> None:
         """Log metrics (`psnr` in dB, `ssim`, `points`, ...), a number each; raises as `step`."""
-        line = self._line("evaluation", index("RunLog.evaluation", iteration))
+        line = self._line("evaluation", iteration)
         self._pending.append(_pack("RunLog.evaluation", line, metrics))
         self._drain(wait=True)
 
@@ -175,16 +164,14 @@ class RunLog:
         `info` may hold what `metadata` may, and one-element tensors. Raises as `step`.
         """
         _check_names("RunLog.event", info)
-        line = self._line("event", index("RunLog.event", iteration)) | {"event": text(kind)}
-        self._pending.append(_Pending(line | plain("RunLog.event", info)))
+        self._pending.append(_Pending(self._line("event", iteration) | {"event": kind} | info))
         self._drain(wait=True)
 
     @contextmanager
     def paused(self) -> Iterator[None]:
         """Let the run's clock stand still, for an evaluation or a checkpoint; may be nested.
 
-        Waits for the GPU on both sides, so that queued training work counts and the work done
-        inside does not.
+        Waits for the GPU on both sides: queued training work counts, the work inside does not.
         """
         if self._pauses == 0:
             _synchronize()
@@ -203,7 +190,6 @@ class RunLog:
         try:
             self._drain(wait=True)
         finally:
-            self._pending.clear()
             self._file.close()
 
     def __enter__(self) -> RunLog:
@@ -215,7 +201,8 @@ class RunLog:
     def _line(self, kind: str, iteration: int) -> dict[str, Any]:
         if self._file.closed:
             raise ValueError(f"RunLog.{kind}: the log {str(self.path)!r} is closed")
-        return {"kind": kind, "iteration": iteration, "seconds": round(self.seconds, 6)}
+        at = check_count(f"RunLog.{kind}", "iteration", operator.index(iteration), 0, 2**53 - 1)
+        return {"kind": kind, "iteration": at, "seconds": round(self.seconds, 6)}
 
     def _drain(self, *, wait: bool) -> None:
         """Write pending lines in order, up to the first whose numbers have not arrived."""
@@ -226,17 +213,16 @@ class RunLog:
                     ready.synchronize()
                 elif not ready.query():
                     return
-                values = zip(names, host.tolist(), strict=True)
-                line |= {name: number("RunLog", name, value) for name, value in values}
+                line |= dict(zip(names, host.tolist(), strict=True))
             self._pending.popleft()
             self._file.append(line)
-            if self._mirrors and line["kind"] != "event":
+            if line["kind"] != "event":
                 self._send(line)
 
     def _send(self, line: dict[str, Any]) -> None:
-        names = sorted(line.keys() - {"kind", "iteration", "phase"})
-        values = {f"{line['kind']}/{name}": float(line[name]) for name in names}
         for writer in list(self._mirrors):
+            names = sorted(line.keys() - {"kind", "iteration", "phase"})
+            values = {f"{line['kind']}/{name}": float(line[name]) for name in names}
             try:
                 if hasattr(writer, "add_scalar"):
                     for tag, value in values.items():
@@ -257,14 +243,13 @@ def _origin() -> dict[str, Any]:
     words = [re.sub(r"[^=]*[/\\](?=[^=]*$)", "", word.rstrip("/\\")) for word in sys.argv]
     return {
         "time": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "command": text(" ".join(words)),
+        "command": " ".join(words),
         "machine": f"{machine}, Python {platform.python_version()}, torch {torch.__version__}",
     }
 
 
 def _synchronize() -> None:
-    """Wait for the GPU, where one is in use; asking it anything else would start CUDA."""
-    if torch.cuda.is_initialized():
+    if torch.cuda.is_initialized():  # anything else would start CUDA
         torch.cuda.synchronize()
 
 

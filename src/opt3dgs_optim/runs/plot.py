@@ -52,28 +52,23 @@ def _figure(comparison: Comparison, footer: str) -> Any:
 
     labels = [_label(arm, comparison) for arm in comparison.arms]
     columns = max(1, min(4, 150 // (max(map(len, labels)) + 8)))  # of the legend
-    above = 0.6 + 0.25 * -(-len(labels) // columns)  # inches, as all here
-    height = above + 3.6 + 1.0
-    figure = Figure(figsize=(11, height), dpi=150, facecolor="white")
-    place = {"left": 0.075, "right": 0.985, "top": 1 - above / height, "bottom": 1.0 / height}
-    panels = figure.subplots(1, len(AXES), sharey=True, gridspec_kw=place | {"wspace": 0.06})
+    height = 5 + 0.25 * -(-len(labels) // columns)  # inches
+    figure = Figure(figsize=(11, height), dpi=150, facecolor="white", layout="constrained")
+    metric = _cut(LABELS.get(comparison.metric, comparison.metric), 40)
+    panels = figure.subplots(1, len(AXES), sharey=True)
     for panel, (axis, name) in zip(panels, AXES.items(), strict=True):
         _panel(panel, comparison, axis)
         panel.set_xlabel(name)
-    metric = _cut(LABELS.get(comparison.metric, comparison.metric), 40)
     panels[0].set_ylabel(metric)
     lines = [Line2D([], [], lw=2.4, **_look(arm)) for arm in comparison.arms]
     # " ": a label may begin with "_", which would hide it
-    corner = {"loc": "upper left", "bbox_to_anchor": (0.068, 1 - 0.4 / height)}
-    figure.legend(lines, [f" {label}" for label in labels], ncols=columns, **corner)
+    figure.legend(lines, [f" {la}" for la in labels], ncols=columns, loc="outside upper left")
     scene = "" if comparison.scene is None else f", {comparison.scene}"
-    title = _cut(f"{metric} against run time and iterations{scene}", 85)
-    figure.text(0.075, 1 - 0.15 / height, title, fontsize=13, weight="bold", va="top")
+    figure.suptitle(_cut(f"{metric} against run time and iterations{scene}", 85), weight="bold")
     better = "higher" if higher_is_better(comparison.metric) else "lower"
     caption = f"Lines: mean over seeds; bands: least to greatest; {better} is better. Dashed: "
     caption += f"the baseline's final mean. Dotted: next phase. {footer}"
-    small = textwrap.fill(_cut(caption, 520), 175)
-    figure.text(0.075, 0.1 / height, small, fontsize=7.5, color="#666666", va="bottom")
+    figure.supxlabel(textwrap.fill(_cut(caption, 520), 175), fontsize=7.5, color="#666666")
     return figure
 
 
@@ -93,7 +88,7 @@ def _look(arm: Arm) -> dict[str, Any]:
 
 def _panel(panel: Any, comparison: Comparison, axis: str) -> None:
     """The metric over seconds or iterations."""
-    seen: list[Curve] = []
+    shown: list[np.ndarray] = []
     for arm in comparison.arms:
         curves = [curve for run in arm.runs if len((curve := _curve(run, comparison, axis))[0])]
         if not curves:
@@ -103,14 +98,16 @@ def _panel(panel: Any, comparison: Comparison, axis: str) -> None:
             low, high = table.min(axis=0), table.max(axis=0)
             panel.fill_between(x, low, high, color=_look(arm)["color"], alpha=0.16, lw=0)
         panel.plot(x, table.mean(axis=0), lw=1.8, **_look(arm))
-        seen += curves
+        # Without the steep first fifth, which would flatten the differences to be seen.
+        shown += [y[x >= 0.2 * x[-1]] for x, y in curves]
         for switch in _switches(arm.runs[0], axis):
             panel.axvline(switch, lw=1.0, ls=":", color=FAINT, zorder=1)
-    if not seen:
+    if not shown:
         panel.text(0.5, 0.5, "nothing finite", transform=panel.transAxes, ha="center", color=FAINT)
         return
-    _zoom(panel, seen)
-    low, high = panel.get_ylim()
+    low, high = float(np.concatenate(shown).min()), float(np.concatenate(shown).max())
+    room = 0.06 * (high - low) or 0.05 * abs(high) or 1.0
+    panel.set_ylim(low - room, high + room)
     if comparison.target is not None and low < comparison.target < high:
         panel.axhline(comparison.target, lw=0.8, ls="--", color=FAINT, zorder=1)
 
@@ -129,15 +126,6 @@ def _on_common_grid(curves: list[Curve]) -> Curve:
     x = np.unique(np.concatenate([[start, end], *(x for x, _ in curves)]))
     x = x[(x >= start) & (x <= end)]
     return x, np.stack([np.interp(x, *curve) for curve in curves])
-
-
-def _zoom(panel: Any, curves: list[Curve]) -> None:
-    """Cut off the steep first fifth of the run, which would flatten the differences to be seen."""
-    last = max(x[-1] for x, _ in curves)
-    shown = np.concatenate([y[x >= 0.2 * last] for x, y in curves])
-    low, high = float(shown.min()), float(shown.max())
-    room = 0.06 * (high - low) or 0.05 * abs(high) or 1.0
-    panel.set_ylim(low - room, high + room)
 
 
 def _switches(run: Run, axis: str) -> list[float]:

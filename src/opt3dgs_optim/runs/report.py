@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -68,7 +67,8 @@ def write_report(
         raise ValueError("write_report: no runs; pass at least one")
     comparisons = compare(runs, metric, baseline)
     names = _picture_names([comparison.scene for comparison in comparisons])
-    out = _writable(out)
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
     try:
         for comparison, name in zip(comparisons, names, strict=True):
             draw(comparison, out / name, origin(runs))
@@ -84,19 +84,9 @@ def _picture_names(scenes: list[str | None]) -> list[str]:
     if len(scenes) == 1:
         return ["report.png"]
     names = ["report-" + re.sub(r"[^\w.-]+", "_", s or "")[:60] + ".png" for s in scenes]
-    lower = [name.lower() for name in names]  # as some file systems see them
-    for i, name in enumerate(lower):
-        if (first := lower.index(name)) < i:
-            both = f"{scenes[first]!r} and {scenes[i]!r}"
-            raise ValueError(f"the scenes {both} would both be drawn into {names[i]}")
+    if len({name.lower() for name in names}) < len(names):  # as some file systems see them
+        raise ValueError(f"two of the scenes {scenes} would be drawn into one of {names}")
     return names
-
-
-def _writable(out: str | Path) -> Path:
-    """The folder `out`, made if it is missing; OSError if nothing can be written into it."""
-    Path(out).mkdir(parents=True, exist_ok=True)
-    tempfile.TemporaryFile(dir=out).close()
-    return Path(out)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -111,9 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--baseline", metavar="ARM", help="reference arm (default: mcmc if there, else the first)")
     options = parser.parse_args(arguments)
     try:
-        logs = find_logs(options.runs)
-        _writable(options.out)
-        runs = [read_run(path) for path in logs]
+        runs = [read_run(path) for path in find_logs(options.runs)]
         written = write_report(runs, options.out, metric=options.metric, baseline=options.baseline)
     except (OSError, ValueError) as error:
         line = "".join(c if c.isprintable() else " " for c in str(error))  # names from logs in it

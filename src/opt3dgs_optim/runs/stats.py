@@ -52,7 +52,6 @@ class Comparison:
     baseline: str | None  # None: it did not run on this scene
     target: float | None  # the baseline's mean final metric
     arms: list[Arm]
-    notes: list[str]
 
 
 def compare(
@@ -90,16 +89,18 @@ def _compare_scene(
     scene: str | None, runs: dict[str, list[Run]], order: list[str], metric: str
 ) -> Comparison:
     everything = [run for arm in runs.values() for run in arm]
-    metrics, columns = metric_names(everything), step_names(everything)
+    metrics = metric_names(everything)
+    found = dict.fromkeys(name for run in everything for name in run.steps)
+    columns = [name for name in found if name not in NO_NUMBERS and higher_is_better(name)]
     references = runs.get(order[0], [])
-    final = _stat(references, metric, lambda values: values[-1])
+    final = _stat(references, metric, _last)
     target = final.mean if final and np.isfinite(final.mean) else None
     arms = []
     for colour, name in enumerate(order):
-        if name not in runs:
+        own = runs.get(name, [])
+        if not own:
             continue
-        own = runs[name]
-        numbers = {f"final {m}": _stat(own, m, lambda values: values[-1]) for m in metrics}
+        numbers = {f"final {m}": _stat(own, m, _last) for m in metrics}
         seconds = [max((r["seconds"] for r in run.records), default=0.0) for run in own]
         iterations = [max((r["iteration"] for r in run.records), default=0) for run in own]
         rates = [i / s for i, s in zip(iterations, seconds, strict=True) if s > 0]
@@ -112,8 +113,7 @@ def _compare_scene(
         gains = [] if name == order[0] else _gains(own, references, metric)
         numbers[f"{metric} gain at equal seconds"] = Stat.of(gains)
         arms.append(Arm(name, own, colour, numbers))
-    notes = [note for arm in arms for run in arm.runs if (note := _note(run, arm.name, metric))]
-    return Comparison(scene, metric, order[0] if references else None, target, arms, notes)
+    return Comparison(scene, metric, order[0] if references else None, target, arms)
 
 
 def metric_names(runs: Sequence[Run]) -> list[str]:
@@ -123,28 +123,25 @@ def metric_names(runs: Sequence[Run]) -> list[str]:
     return [name for name in dict.fromkeys(named) if name not in NO_NUMBERS]
 
 
-def step_names(runs: Sequence[Run]) -> list[str]:
-    """The columns of the step lines that are no loss: what the parts say of themselves."""
-    found = dict.fromkeys(name for run in runs for name in run.steps if higher_is_better(name))
-    return [name for name in found if name not in NO_NUMBERS]
-
-
 def higher_is_better(metric: str) -> bool:
     """False for names that say error, loss, lpips and the like."""
     return not any(word in metric.lower() for word in LOWER_IS_BETTER)
 
 
 def _stat(runs: list[Run], name: str, of: Any, kind: str = "evaluation") -> Stat | None:
-    """Of the values of `name` in every run that logs it: `of` them, None to leave a run out."""
+    """Of what `of` makes of the values of `name`, over the runs that log it."""
     series = [run.series(name, kind)[2] for run in runs]
-    values = [of(values) for values in series if len(values)]
-    return Stat.of([float(value) for value in values if value is not None])
+    return Stat.of([of(values) for values in series if len(values)])
 
 
-def _finite_mean(values: np.ndarray) -> float | None:
+def _last(values: np.ndarray) -> float:
+    return float(values[-1])
+
+
+def _finite_mean(values: np.ndarray) -> float:
     values = values[np.isfinite(values)]
     with np.errstate(over="ignore"):
-        return float(values.mean()) if len(values) else None
+        return float(values.mean()) if len(values) else float("nan")
 
 
 def _curve(run: Run, metric: str) -> tuple[np.ndarray, np.ndarray]:
@@ -180,20 +177,3 @@ def _gains(runs: list[Run], references: list[Run], metric: str) -> list[float]:
         if time >= max(ours[0][0], theirs[0][0]):
             gains.append(float(np.interp(time, *ours) - np.interp(time, *theirs)))
     return gains
-
-
-def _note(run: Run, arm: str, metric: str) -> str | None:
-    """What a reader must know of a run before trusting the table."""
-    values = run.series(metric)[2]
-    odd = int((~np.isfinite(values)).sum())
-    if all(record["kind"] == "start" for record in run.records):
-        note = "empty run, nothing logged"
-    elif len(values) == 0:
-        note = f"no evaluation of {metric}"
-    elif odd:
-        note = f"{metric} not finite in {odd} evaluations"
-    elif len(values) == 1:
-        note = f"a single evaluation of {metric}"
-    else:
-        return None
-    return f"{run.name} ({arm}): {note}"

@@ -20,7 +20,7 @@ READING = (
 def as_markdown(
     comparisons: Sequence[Comparison], runs: Sequence[Run], pictures: Sequence[str]
 ) -> str:
-    """A section a scene: table, picture (all have one, or none), notes; how to read them."""
+    """A section a scene: table and picture (all have one, or none); how to read them."""
     parts = ["# Error against run time"]
     for i, comparison in enumerate(comparisons):
         if comparison.scene is not None:
@@ -29,8 +29,6 @@ def as_markdown(
         if pictures:
             metric = escaped(comparison.metric)
             parts.append(f"![{metric} over seconds and iterations]({pictures[i]})")
-        if comparison.notes:
-            parts.append("\n".join(f"- run {escaped(note)}" for note in comparison.notes))
         if comparison.baseline is None:
             parts.append("The baseline arm did not run on this scene: nothing to compare with.")
     return "\n\n".join([*parts, READING, escaped(origin(runs))]).rstrip() + "\n"
