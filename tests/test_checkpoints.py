@@ -28,6 +28,7 @@ from opt3dgs_optim import (
     PhaseScheduler,
     StepAdam,
 )
+from opt3dgs_optim.names import GAUSSIAN
 
 BOTH = [AWSGLD, LQNAdam]
 
@@ -201,7 +202,7 @@ def test_a_truncated_file_raises_before_it_reaches_us(cut: float) -> None:
 
 def scheduler_state(change: Callable[[Any], Any]) -> tuple[PhaseScheduler, Any, dict]:
     splats = make_splats()
-    phases = everything(60, 40, Annealing(), Fading(), nu=EnergyHistogram(warmup=10))
+    phases = everything(60, 40, Annealing(names=GAUSSIAN), Fading(), nu=EnergyHistogram(warmup=10))
     optimizers = phases.upgrade(gsplat_optimizers(splats))
     train(splats, optimizers, phases, 0, 45)
     saved = copy.deepcopy(optimizers["means"].state_dict())
@@ -249,7 +250,7 @@ def test_parts_that_a_checkpoint_does_not_know_begin_anew_and_others_are_left_ou
     """A run may go on with other parts than those that it was saved with."""
     phases, optimizer, saved = scheduler_state(lambda state: state)
     x = torch.nn.Parameter(torch.zeros(12, 3))
-    other = PhaseScheduler(60, 40, [Halves(), Annealing()])
+    other = PhaseScheduler(60, 40, [Halves(), Annealing(names=GAUSSIAN)])
     means = other.upgrade({"means": torch.optim.Adam([x], lr=0.01)})["means"]
     means.load_state_dict(saved)
     assert other.iteration == phases.iteration == 45

@@ -34,6 +34,7 @@ from opt3dgs_optim import (
     Pooling,
     PositionNoise,
 )
+from opt3dgs_optim.names import GAUSSIAN
 
 ROWS, STEPS = 7, 30
 
@@ -160,7 +161,7 @@ def test_pairs_are_kept_between_two_visible_steps_of_a_point() -> None:
 @pytest.mark.parametrize("call", ["visible", "positional", "sparse_adam", "visibility"])
 def test_invisible_rows_stand_still_in_both_phases(kind: Any, exploiting: bool, call: str) -> None:
     splats = make_splats()
-    others = (Annealing(), Fading(1.0, events=40, start=0.0, stop=1.0), Pooling())
+    others = (Annealing(names=GAUSSIAN), Fading(1.0, events=40, start=0.0, stop=1.0), Pooling())
     noise = PositionNoise(splats, scale=1.0)
     phases = everything(40, 10, *others, noise, nu=EnergyHistogram(warmup=4), settling=0)
     optimizers: Any = phases.upgrade(kind(splats))
@@ -192,7 +193,7 @@ def test_invisible_rows_stand_still_in_both_phases(kind: Any, exploiting: bool, 
 def test_a_mask_before_the_first_energy() -> None:
     """Plain Adam's step, of the visible rows only."""
     splats = make_splats()
-    optimizers: Any = only(40, Annealing()).upgrade(gsplat_optimizers(splats))
+    optimizers: Any = only(40, Annealing(names=GAUSSIAN)).upgrade(gsplat_optimizers(splats))
     before, mask = splats["means"].detach().clone(), torch.arange(12) % 3 == 0
     splats["means"].grad = torch.ones(12, 3)
     optimizers["means"].step(mask)
@@ -240,7 +241,7 @@ def test_plain_drift_with_a_mask() -> None:
 def test_a_stale_mask_with_nothing_to_step_is_nothing() -> None:
     """INRIA after an edit: the mask has the old rows, the new Parameters no gradient yet."""
     splats = make_splats()
-    phases = only(40, Annealing(), Pooling())
+    phases = only(40, Annealing(names=GAUSSIAN), Pooling())
     optimizer: Any = phases.upgrade(inria_optimizer(splats))
     train(splats, optimizer, phases, 0, 3)
     before = values_of(splats)
@@ -252,7 +253,7 @@ def test_a_stale_mask_with_nothing_to_step_is_nothing() -> None:
 def test_only_the_opacities_have_no_gradient() -> None:
     """INRIA's reset of the opacities: their new Parameter has none, the others go on."""
     splats = make_splats()
-    phases = only(40, Annealing())
+    phases = only(40, Annealing(names=GAUSSIAN))
     optimizer: Any = phases.upgrade(inria_optimizer(splats))
     train(splats, optimizer, phases, 0, 3)
     before = values_of(splats)
@@ -269,7 +270,7 @@ def test_other_groups_ride_along_without_the_mask() -> None:
     splats, exposure = make_splats(), Parameter(torch.ones(3, 4))
     optimizer = inria_optimizer(splats)
     optimizer.add_param_group({"params": [exposure], "lr": 0.1, "name": "exposure"})
-    phases = only(10, Annealing(), Pooling())
+    phases = only(10, Annealing(names=GAUSSIAN), Pooling())
     upgraded: Any = phases.upgrade(optimizer)
     twin = Parameter(torch.ones(3, 4))
     plain = Adam([twin], lr=0.1, eps=1e-15)
@@ -334,7 +335,7 @@ def test_an_optimizer_with_masked_steps_keeps_its_arithmetic(
         ours.grad, theirs.grad = gradients(ours, step), gradients(theirs, step)
         mine.step(mask, *rest)
         stock.step(mask, *rest)
-    annealing = Annealing(8.0, 0.5)
+    annealing = Annealing(8.0, 0.5, names=GAUSSIAN)
     chosen = {
         "none": [],
         "annealing": [annealing],
@@ -362,7 +363,7 @@ def test_an_optimizer_with_masked_steps_keeps_its_arithmetic(
 def test_an_optimizer_with_masked_steps_and_parts_after_the_step() -> None:
     """Pooling writes into moments: those of invisible rows are put back."""
     x = points()
-    phases = only(STEPS, Pooling(), Annealing())
+    phases = only(STEPS, Pooling(), Annealing(names=GAUSSIAN))
     optimizer: Any = phases.upgrade(SelectiveAdam([{"params": [x], "lr": 0.1, "name": "means"}]))
     for step, mask in enumerate(masks()):
         x.grad = gradients(x, step)
@@ -380,7 +381,7 @@ def test_an_optimizer_with_masked_steps_and_parts_after_the_step() -> None:
 
 def test_its_broken_loss_skips_the_step_too() -> None:
     x = points()
-    phases = only(STEPS, Annealing())
+    phases = only(STEPS, Annealing(names=GAUSSIAN))
     optimizer: Any = phases.upgrade(SelectiveAdam([{"params": [x], "lr": 0.1, "name": "means"}]))
     phases.observe(float("nan"))
     x.grad = torch.ones(ROWS, 3)

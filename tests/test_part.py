@@ -24,6 +24,7 @@ from trainers import (
 
 import opt3dgs_optim
 from opt3dgs_optim import Annealing, Part, Phase, PhaseScheduler, RunLog, reset_points
+from opt3dgs_optim.names import GAUSSIAN
 
 SOURCE = Path(opt3dgs_optim.__file__).parent
 TOTAL = 40
@@ -91,7 +92,7 @@ def test_its_rows_and_its_state_are_in_checkpoints(make: Any, at: int, tmp_path:
     ends = []
     for cut in (False, True):
         splats, part = make_splats(), SignAgreement()
-        phases = only(TOTAL, Annealing(), part, switch=20)
+        phases = only(TOTAL, Annealing(names=GAUSSIAN), part, switch=20)
         optimizers: Any = phases.upgrade(make(splats))
         pulled(splats, optimizers, phases, at)
         if cut:
@@ -99,7 +100,7 @@ def test_its_rows_and_its_state_are_in_checkpoints(make: Any, at: int, tmp_path:
             torch.save({n: o.state_dict() for n, o in every.items()}, tmp_path / "state.pt")
             saved = torch.load(tmp_path / "state.pt", weights_only=True)
             part = SignAgreement()
-            phases = only(TOTAL, Annealing(), part, switch=20)
+            phases = only(TOTAL, Annealing(names=GAUSSIAN), part, switch=20)
             optimizers = phases.upgrade(make(splats))
             every = optimizers if isinstance(optimizers, dict) else {"all": optimizers}
             for name, optimizer in every.items():
@@ -140,7 +141,7 @@ def test_its_rows_follow_the_trainers_edits() -> None:
 
 
 def test_it_is_in_the_repr_and_in_the_upgrades_line(caplog: pytest.LogCaptureFixture) -> None:
-    phases = only(TOTAL, SignAgreement(), Annealing())
+    phases = only(TOTAL, SignAgreement(), Annealing(names=GAUSSIAN))
     with caplog.at_level("INFO", "opt3dgs_optim"):
         means = phases.upgrade(gsplat_optimizers(make_splats()))["means"]
     for said in (repr(phases), repr(means), caplog.text):
@@ -150,7 +151,7 @@ def test_it_is_in_the_repr_and_in_the_upgrades_line(caplog: pytest.LogCaptureFix
 def test_its_numbers_are_columns_of_the_run_log(tmp_path: Path) -> None:
     splats = make_splats()
     with RunLog(tmp_path / "run.jsonl") as log:
-        phases = PhaseScheduler(TOTAL, 20, [SignAgreement(), Annealing()], log=log)
+        phases = PhaseScheduler(TOTAL, 20, [SignAgreement(), Annealing(names=GAUSSIAN)], log=log)
         optimizers = phases.upgrade(gsplat_optimizers(splats))
         pulled(splats, optimizers, phases, TOTAL)
     lines = [json.loads(line) for line in (tmp_path / "run.jsonl").read_text().splitlines()]

@@ -43,6 +43,7 @@ from opt3dgs_optim import (
     SquaredLoss,
     StepAdam,
 )
+from opt3dgs_optim.names import GAUSSIAN
 
 TOTAL, SWITCH = 60, 40
 
@@ -374,7 +375,7 @@ def test_bad_options(options: dict, message: str) -> None:
 @pytest.mark.parametrize("part", ["annealing", Annealing, 4.0, None, torch.optim.Adam])
 def test_what_is_no_part_is_refused(part: Any) -> None:
     with pytest.raises(TypeError, match=r"PhaseScheduler: parts has .*, but a Part is needed"):
-        PhaseScheduler(10, parts=[Annealing(), part])
+        PhaseScheduler(10, parts=[Annealing(names=GAUSSIAN), part])
 
 
 def test_optimizers_that_cannot_be_upgraded_are_named() -> None:
@@ -477,7 +478,7 @@ def test_a_second_optimizer_without_positions_is_upgraded() -> None:
     splats = make_splats()
     optimizers = gsplat_optimizers(splats)
     rest = {"means": optimizers.pop("means")}
-    phases = only(TOTAL, Annealing(8.0, 0.5))
+    phases = only(TOTAL, Annealing(8.0, 0.5, names=GAUSSIAN))
     phases.upgrade(optimizers)
     phases.upgrade(rest)
     both = {**optimizers, **rest}
@@ -570,7 +571,7 @@ def test_an_energy_that_stops_coming() -> None:
 
 def test_steps_before_the_first_energy_are_plain_adams() -> None:
     ours, theirs = make_splats(), make_splats()
-    optimizers = PhaseScheduler(500, parts=[Annealing(), Pooling()]).upgrade(
+    optimizers = PhaseScheduler(500, parts=[Annealing(names=GAUSSIAN), Pooling()]).upgrade(
         gsplat_optimizers(ours)
     )
     train(ours, optimizers, None, 0, 15)
@@ -642,7 +643,7 @@ def test_an_iteration_that_is_none(iteration: Any) -> None:
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
 def test_copies_go_on_alike(copied: Any) -> None:
-    splats, phases = make_splats(), scheduler(Annealing(), Fading(), Pooling())
+    splats, phases = make_splats(), scheduler(Annealing(names=GAUSSIAN), Fading(), Pooling())
     optimizers = phases.upgrade(gsplat_optimizers(splats))
     train(splats, optimizers, phases, 0, SWITCH + 4)
     twins, other, adams = copied((splats, phases, optimizers))

@@ -37,6 +37,7 @@ from opt3dgs_optim import (
     Pooling,
     PositionNoise,
 )
+from opt3dgs_optim.names import GAUSSIAN
 
 PATHS: list[dict[str, Any]] = [
     {},
@@ -111,7 +112,7 @@ def test_a_factor_is_a_learning_rate(path: dict[str, Any], lr: Any) -> None:
 
 def test_step_hooks_of_torch_run_once() -> None:
     splats, calls = make_splats(), []
-    phases, optimizers = upgraded(splats, Annealing())
+    phases, optimizers = upgraded(splats, Annealing(names=GAUSSIAN))
     means = optimizers["means"]
     torch.optim.Adam([Parameter(torch.ones(1))])  # torch wraps Adam.step when one is made
     means.register_step_pre_hook(lambda *_: calls.append("pre"))
@@ -124,7 +125,7 @@ def test_hooks_registered_before_the_upgrade_go_on() -> None:
     splats, calls = make_splats(), []
     stock = gsplat_optimizers(splats)
     stock["means"].register_step_post_hook(lambda *_: calls.append("post"))
-    phases = only(TOTAL, Annealing())
+    phases = only(TOTAL, Annealing(names=GAUSSIAN))
     train(splats, phases.upgrade(stock), phases, 0, 1)
     assert calls == ["post"]
 
@@ -158,7 +159,7 @@ def test_what_is_lent_is_taken_back_after_an_exception(
     from opt3dgs_optim import stepadam
 
     splats = make_splats()
-    phases = only(TOTAL, Annealing(), Fails(hook))
+    phases = only(TOTAL, Annealing(names=GAUSSIAN), Fails(hook))
     optimizer = phases.upgrade(inria_optimizer(splats))
     phases.observe(0.1)
     for param in splats.values():
@@ -180,7 +181,7 @@ def test_what_is_lent_is_taken_back_after_an_exception(
 
 def test_a_parameter_without_gradient_is_left_alone() -> None:
     splats = make_splats()
-    phases, optimizers = upgraded(splats, Annealing(), Fading(), Pooling())
+    phases, optimizers = upgraded(splats, Annealing(names=GAUSSIAN), Fading(), Pooling())
     before = splats["means"].detach().clone()
     for _ in range(3):
         phases.observe(0.1)
@@ -191,7 +192,7 @@ def test_a_parameter_without_gradient_is_left_alone() -> None:
 
 def test_sparse_gradients_are_refused_by_torch() -> None:
     x = Parameter(torch.ones(4, 3))
-    phases = only(TOTAL, Annealing())
+    phases = only(TOTAL, Annealing(names=GAUSSIAN))
     means = phases.upgrade({"means": torch.optim.Adam([x])})["means"]
     phases.observe(0.1)
     x.grad = torch.ones(4, 3).to_sparse()
@@ -217,7 +218,7 @@ def test_numbers_that_are_not_finite_are_zero_and_nobody_else_notices(
     def optimizer(x: Parameter) -> tuple[Any, Any]:
         if make != "phases":
             return make([x], lr=0.01, **path), None
-        phases = only(TOTAL, Annealing(), Pooling())
+        phases = only(TOTAL, Annealing(names=GAUSSIAN), Pooling())
         adam = torch.optim.Adam([x], lr=0.01, **path)
         return phases.upgrade({"means": adam})["means"], phases
 
@@ -288,7 +289,7 @@ def test_a_broken_loss_skips_the_step(make: Any, bad: float) -> None:
     ends, histograms = [], []
     for hostile in (False, True):
         splats, histogram = make_splats(), EnergyHistogram(warmup=10)
-        phases = everything(60, 40, Annealing(), Fading(), nu=histogram, settling=0)
+        phases = everything(60, 40, Annealing(names=GAUSSIAN), Fading(), nu=histogram, settling=0)
         optimizers: Any = phases.upgrade(make(splats))
         for iteration in range(60):
             if hostile and iteration in (0, 5, 22, 38, 40, 55):
@@ -322,7 +323,7 @@ def test_a_broken_loss_is_dropped_on_a_device_too(
     noise = PositionNoise(splats, scale=1.0)
     fading = Fading(share=1.0, events=TOTAL, start=0.0, stop=1.0)
     phases = everything(
-        TOTAL, 20, Annealing(), fading, Pooling(), noise, nu=ConstantMultiplier(2.0)
+        TOTAL, 20, Annealing(names=GAUSSIAN), fading, Pooling(), noise, nu=ConstantMultiplier(2.0)
     )
     options: dict[str, Any] = {"decoupled_weight_decay": True, "weight_decay": 0.1, **path}
     optimizers = phases.upgrade(gsplat_optimizers(splats, **options))
@@ -355,7 +356,9 @@ def test_a_finite_loss_on_a_device_is_the_step_on_a_host(
         if device:
             on_a_device(monkeypatch)
         splats = make_splats()
-        phases = everything(TOTAL, 20, Annealing(), Fading(), Pooling(), nu=ConstantMultiplier(2.0))
+        phases = everything(
+            TOTAL, 20, Annealing(names=GAUSSIAN), Fading(), Pooling(), nu=ConstantMultiplier(2.0)
+        )
         optimizers = phases.upgrade(gsplat_optimizers(splats, **path))
         train(splats, optimizers, phases, 0, TOTAL)
         ends.append(splats)
@@ -369,7 +372,7 @@ def test_a_masked_step_with_a_broken_loss_on_a_device(
 ) -> None:
     on_a_device(monkeypatch)
     splats = make_splats()
-    phases, optimizers = upgraded(splats, Annealing(), Pooling(), **path)
+    phases, optimizers = upgraded(splats, Annealing(names=GAUSSIAN), Pooling(), **path)
     train(splats, optimizers, phases, 0, 5)
     before = splats["means"].detach().clone()
     phases.observe(torch.tensor(math.inf))
@@ -397,7 +400,7 @@ def test_a_closure_with_a_broken_loss() -> None:
 def test_a_capture_is_refused_where_parts_act(monkeypatch: pytest.MonkeyPatch) -> None:
     """A replay would repeat one iteration's annealing factor, phase and fading for ever."""
     splats = make_splats()
-    phases, optimizers = upgraded(splats, Annealing())
+    phases, optimizers = upgraded(splats, Annealing(names=GAUSSIAN))
     plain, bare = upgraded(make_splats())
     view_loss(splats, 0, phases).backward()
     phases.observe(0.1)
@@ -416,7 +419,7 @@ def test_a_capture_is_refused_where_parts_act(monkeypatch: pytest.MonkeyPatch) -
 
 def scaled(fused: bool | None) -> tuple[Any, dict[str, Parameter], Any, Any, EnergyHistogram]:
     splats, histogram = make_splats(), EnergyHistogram(warmup=4)
-    others = (Annealing(), Fading(share=1.0, events=100, start=0.0, stop=1.0))
+    others = (Annealing(names=GAUSSIAN), Fading(share=1.0, events=100, start=0.0, stop=1.0))
     phases = everything(100, 50, *others, nu=histogram)
     optimizers = phases.upgrade(gsplat_optimizers(splats, fused=fused))
     # like nerfstudio's Trainer; a first scale at which nothing overflows
@@ -528,7 +531,7 @@ def test_a_compiled_step_is_the_step_in_both_phases() -> None:
     results = []
     for compiled in (False, True):
         splats = make_splats()
-        phases = everything(12, 6, Annealing(), settling=0)
+        phases = everything(12, 6, Annealing(names=GAUSSIAN), settling=0)
         optimizers: Any = phases.upgrade(gsplat_optimizers(splats))
         if compiled:
             with warnings.catch_warnings():
@@ -558,7 +561,9 @@ def test_both_phases_with_a_constant_image() -> None:
     """Loss 0 and gradient 0 from the first step to the last: nothing moves, nothing is NaN."""
     splats = make_splats()
     before = values_of(splats)
-    phases = everything(50, 20, Annealing(), Fading(), nu=ConstantMultiplier(2.0), settling=0)
+    phases = everything(
+        50, 20, Annealing(names=GAUSSIAN), Fading(), nu=ConstantMultiplier(2.0), settling=0
+    )
     optimizers = phases.upgrade(gsplat_optimizers(splats))
     for _ in range(40):
         for param in splats.values():

@@ -57,9 +57,9 @@ class Part:
     names: Any = GAUSSIAN  # tuple[str, ...] | None
 
     def __repr__(self) -> str:
-        """The options, without those of all Gaussian parameters."""
-        options = [f.name for f in fields(self)] if is_dataclass(self) else []
-        shown = [name for name in options if name != "names" or self.names != GAUSSIAN]
+        """The options; the parameters where they are not the part's usual ones."""
+        options = fields(self) if is_dataclass(self) else ()
+        shown = [f.name for f in options if f.name != "names" or self.names != f.default]
         return f"{type(self).__name__}({', '.join(f'{n}={getattr(self, n)!r}' for n in shown)})"
 
     # -- once per iteration; nothing here may read a GPU's number back --------------------------

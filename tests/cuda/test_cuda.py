@@ -23,6 +23,7 @@ from opt3dgs_optim import (
 )
 from opt3dgs_optim.covariance import add_covariance_noise
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
+from opt3dgs_optim.names import GAUSSIAN
 
 REASON = "torch sees no CUDA device"
 if torch.cuda.is_available():
@@ -194,7 +195,7 @@ def test_phase_scheduler_steps_without_synchronisation() -> None:
         name: torch.optim.Adam([{"params": [p], "lr": 1e-3, "name": name}], fused=True)
         for name, p in splats.items()
     }
-    others = Annealing(), Fading(events=10), Pooling(), PositionNoise(splats, 1.0)
+    others = Annealing(names=GAUSSIAN), Fading(events=10), Pooling(), PositionNoise(splats, 1.0)
     phases = everything(40, 20, *others, curvature=Curvature(backend="cuda"))
     optimizers = phases.upgrade(adams)
     loss = torch.tensor(0.1, device="cuda")

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 
 import numpy as np
 import pytest
 import torch
 from oracles import covariance
-from trainers import gsplat_optimizers, make_splats, only, values_of
+from trainers import edit_rows, gsplat_optimizers, make_splats, only, train, values_of
 
 from opt3dgs_optim import Annealing, Course, IsotropicNoise, Phase, PositionNoise
 from opt3dgs_optim.covariance import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
+from opt3dgs_optim.names import GAUSSIAN
 
 
 def gaussians(n: int, seed: int = 0) -> dict[str, torch.Tensor]:
@@ -163,7 +165,7 @@ def test_it_can_stop_at_the_switch() -> None:
 def test_its_size_goes_by_the_trainers_rate_without_any_factor() -> None:
     """3DGS-MCMC's noise is proportional to the learning rate that the trainer has set."""
     ends = []
-    for parts in ([], [Annealing(8.0, 0.5)]):
+    for parts in ([], [Annealing(8.0, 0.5, names=GAUSSIAN)]):
         splats = make_splats()
         splats["opacities"].data.fill_(-9.0)
         noise = PositionNoise(splats, 1.0, generator=torch.Generator().manual_seed(5))
@@ -174,3 +176,31 @@ def test_its_size_goes_by_the_trainers_rate_without_any_factor() -> None:
         means.step()
         ends.append(splats["means"].detach())
     assert torch.equal(*ends)
+
+
+@pytest.mark.parametrize("host_adds_noise", [True, False])
+def test_noise_of_a_trainer_that_nobody_told_us_of(host_adds_noise: bool) -> None:
+    """The trainer writes noise into the positions after every step, as ours does."""
+    splats = make_splats()
+    phases = only(60, PositionNoise(splats, 1.0))
+    upgraded = phases.upgrade(gsplat_optimizers(splats))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        for iteration in range(20):
+            train(splats, upgraded, phases, iteration, iteration + 1)
+            if host_adds_noise:
+                with torch.no_grad():
+                    splats["means"].add_(0.01 * torch.randn(splats["means"].shape))
+            if iteration % 7 == 0:
+                edit_rows(splats, upgraded, torch.arange(len(splats["means"])), 1)
+    said = [str(warning.message) for warning in told if "noise_lr to 0" in str(warning.message)]
+    assert len(said) == host_adds_noise
+
+
+def test_a_trainers_noise_is_fine_where_ours_is_off() -> None:
+    splats, phases = make_splats(), only(60, Annealing(names=GAUSSIAN))
+    upgraded = phases.upgrade(gsplat_optimizers(splats))
+    for iteration in range(10):
+        train(splats, upgraded, phases, iteration, iteration + 1)
+        with torch.no_grad():
+            splats["means"].add_(0.01)

@@ -353,3 +353,16 @@ def test_command_line_says_in_one_line_what_is_wrong_and_writes_nothing(tmp_path
         assert message in error
         assert error.count("\n") == 1
         assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
+
+
+def test_a_place_that_cannot_be_written_is_found_before_any_log_is_read(
+    tmp_path, monkeypatch, capsys
+):
+    def refuse(**_):
+        raise PermissionError(13, "Permission denied", str(tmp_path))
+
+    two_arms(tmp_path / "logs")
+    monkeypatch.setattr(report, "read_run", pytest.fail)
+    monkeypatch.setattr("tempfile.TemporaryFile", refuse)  # root may write anywhere
+    assert report.main([str(tmp_path / "logs"), "-o", str(tmp_path / "out")]) == 2
+    assert "Permission denied" in capsys.readouterr().err

@@ -9,20 +9,22 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.backend import BACKENDS, Backend
-from opt3dgs_optim.checks import check_choice, check_number
+from opt3dgs_optim.checks import check_choice, check_number, warn_user
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.covariance import add_covariance_noise, largest_noise
 from opt3dgs_optim.part import Group, Part, Phase
 
 GaussianTensors = Mapping[str, Tensor]
+TWICE = 5  # steps in a row with positions changed by somebody else before it is said
 EFFECT = 1e-3  # of the noise's deviation along a Gaussian's longest axis, in learning rates
 
 
 class PositionNoise(Part):
     """3DGS-MCMC's position noise: `scale * lr * covariance_noise(...)` after each step (eq. 2).
 
-    For trainers that do not inject it themselves: with gsplat's MCMCStrategy or 3dgs-mcmc leave it
-    out. lr is the trainer's own present learning rate of the positions, without any factor.
+    For trainers that do not inject it themselves; gsplat's MCMCStrategy and 3dgs-mcmc do, and
+    then this part must be left out (or their noise_lr be 0). lr is the trainer's own present
+    learning rate of the positions, without any factor.
 
     Args:
         gaussians: the trainer's dict with `scales` [N, 3] log, `quats` [N, 4] wxyz and
@@ -56,6 +58,8 @@ class PositionNoise(Part):
         self.backend: Backend = check_choice(  # pyright: ignore[reportAttributeAccessIssue]
             "PositionNoise", "backend", backend, BACKENDS
         )
+        self._left = (0, 0)  # where the positions lay after the last step, and how often written
+        self._moved = 0
 
     def __repr__(self) -> str:
         during = "" if self.during is None else f", during={self.during.value}"
@@ -76,9 +80,26 @@ class PositionNoise(Part):
             )
         return source
 
+    def before(
+        self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
+    ) -> Tensor:
+        """Say once that somebody else moves the positions too, as a trainer's own noise does."""
+        # Density control puts another tensor in place; noise writes into this one, every time.
+        written = self._left[0] == param.data_ptr() and self._left[1] != param._version
+        if self._moved <= TWICE:
+            self._moved = self._moved + 1 if written else 0
+            if self._moved > TWICE:
+                warn_user(
+                    f"PositionNoise: the positions were changed in place between {TWICE} steps in "
+                    "a row, while this part adds noise in every step; if the trainer injects its "
+                    "own noise, set its noise_lr to 0, or leave this part out"
+                )
+        return grad
+
     def after(self, group: Group, param: Tensor, state: dict[str, Any], course: Course) -> None:
         """Add the noise to the positions [N, 3] in place."""
         self.add_to(param, group["lr"], course.valid)
+        self._left = (param.data_ptr(), param._version)
 
     @torch.no_grad()
     def add_to(self, means: Tensor, lr: float | Tensor, valid: Tensor | bool = True) -> None:

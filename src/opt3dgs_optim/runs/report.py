@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -101,7 +102,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--baseline", metavar="ARM", help="reference arm (default: mcmc if there, else the first)")
     options = parser.parse_args(arguments)
     try:
-        runs = [read_run(path) for path in find_logs(options.runs)]
+        logs = find_logs(options.runs)
+        Path(options.out).mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=options.out).close()  # before any work is done
+        runs = [read_run(path) for path in logs]
         written = write_report(runs, options.out, metric=options.metric, baseline=options.baseline)
     except (OSError, ValueError) as error:
         line = "".join(c if c.isprintable() else " " for c in str(error))  # names from logs in it
