@@ -314,5 +314,5 @@ def test_a_line_at_upgrade(capsys: pytest.CaptureFixture, caplog: pytest.LogCapt
     printed = capsys.readouterr()
     said = (printed.out + printed.err + caplog.text).lower()
     assert "opt3dgs" in said
-    assert "annealing" in said
+    assert "fading" in said
     assert "12345" in said.replace(",", "").replace("_", "")

@@ -278,9 +278,9 @@ def test_the_package_defaults_unless_the_paper_is_asked_for(ours: Any) -> None:
     ask = Training(ours, ours.splatfacto_opt3dgs)
     plain = Training(ours, ours.splatfacto_opt3dgs, paper=False)
     assert "Curvature" in repr(ask.model.phases)
-    assert "Annealing" not in repr(ask.model.phases)
+    assert "Fading" not in repr(ask.model.phases)
     assert "Curvature" not in repr(plain.model.phases)
-    assert "Annealing" in repr(plain.model.phases)
+    assert "Fading" in repr(plain.model.phases)
 
 
 @pytest.mark.filterwarnings("ignore::FutureWarning")
@@ -301,7 +301,7 @@ def test_resume(ours: Any, at: int) -> None:
 
 @pytest.mark.parametrize(("given", "steps"), [(None, 25), (31, 31)])
 def test_the_trainers_number_of_iterations(ours: Any, given: int | None, steps: int) -> None:
-    """--max-num-iterations alone: annealing ends where the training ends."""
+    """--max-num-iterations alone: the schedule ends where the training ends."""
     spec = ours.splatfacto_opt3dgs
     spec.config.max_num_iterations = 25
     spec.config.pipeline.model.total_steps = given

@@ -143,4 +143,4 @@ def test_a_sign_of_life(scene: Path, work: Path, tmp_path: Path) -> None:
     command = trial.command(scene, tmp_path / "out", 10, ours=True)
     done = run(script, command, tmp_path / "cwd")
     lines = [line.lower() for line in done.output.splitlines() if "opt3dgs" in line.lower()]
-    assert any("annealing" in line and "10" in line for line in lines)
+    assert any("fading" in line and "10" in line for line in lines)

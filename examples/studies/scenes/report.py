@@ -26,6 +26,7 @@ from studies.scenes.arms import (
     BASELINE,
     DEFAULTS,
     GROUPS,
+    MEANS_LEFT,
     POOLED,
     STUDY_ARMS,
     UNFADED_OPACITIES,
@@ -77,7 +78,7 @@ COSTS = "costs.json"
 ROTATED = "rotated.json"  # records whose held-out views rotate with the seed
 LONG, BRIEF, DETAIL = 30_000, 7_500, 2_000
 SCENE_SIZE: Size = "images_4"
-REACH_ARMS = ("faded", DEFAULTS)
+REACH_ARMS = (DEFAULTS, MEANS_LEFT)
 MARKER = re.compile(r"(<!-- study:([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -247,7 +248,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         (FOLDER / "decisions.json").write_text(text, encoding="utf-8")
         drawn = plots(study, FOLDER)
         if many := settings_of(rotating, LONG):
-            arms = (BASELINE, "faded", DEFAULTS)
+            arms = (BASELINE, DEFAULTS, MEANS_LEFT)
             plot_metrics(rotating, many, arms, FOLDER / "rotated.png")
             drawn.append(FOLDER / "rotated.png")
     except (OSError, ValueError) as error:
