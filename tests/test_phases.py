@@ -541,9 +541,7 @@ def test_an_energy_that_nobody_steps_after() -> None:
     phases.upgrade(gsplat_optimizers(make_splats()))
     for _ in range(20):
         phases.observe(0.1)
-    with pytest.warns(
-        UserWarning, match=r"20 losses were observed and no upgraded.*Fading"
-    ):
+    with pytest.warns(UserWarning, match=r"20 losses were observed and no upgraded.*Fading"):
         phases.observe(0.1)
     for _ in range(50):
         phases.observe(0.1)  # once

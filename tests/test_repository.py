@@ -117,7 +117,7 @@ def test_readme_is_short() -> None:
 
 def test_readme_says_the_limits_before_the_install_line() -> None:
     """Its table is compared with the records in the study's own tests."""
-    assert "<!-- study:front -->" in README
+    assert "<!-- study:headline -->" in README
     assert README.index("run on a GPU yet") < README.index("pip install")
 
 
