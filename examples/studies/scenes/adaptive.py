@@ -56,7 +56,7 @@ class AdaptiveFit(Fit):
         lens = torch.tensor(
             [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
         )
-        parts = [gaussians[name] for name in ("sh0", "shN") if name in gaussians]
+        parts: list[Tensor] = [gaussians[name] for name in ("sh0", "shN") if name in gaussians]
         images, _, density.info = gsplat_modules.rasterize(
             gaussians["means"],
             gaussians["quats"],

@@ -145,6 +145,7 @@ def test_the_second_moment_of_points_out_of_view_is_kept() -> None:
         }
         phases = PhaseScheduler(10_000, 1.0, list(parts))
         phases.upgrade(optimizers)
+        start = own["opacities"].detach()
         for i in range(2_000):
             seen = i < 300
             own["means"].grad = torch.tensor([[1.0] * 3, [float(seen)] * 3])
