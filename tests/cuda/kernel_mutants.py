@@ -44,7 +44,9 @@ class Mutant(NamedTuple):
 GUARD_LINE = "if (row >= rows) return;"
 MUTANTS = (
     Mutant("sign in the second loop", "two_loop.cuh", "alpha[j] - beta", "alpha[j] + beta"),
-    Mutant("slot of a pair", "two_loop.cuh", "s[j].v = s[j - 1].v", "s[j].v = s[j > 1 ? j - 2 : 0].v"),
+    Mutant(
+        "slot of a pair", "two_loop.cuh", "s[j].v = s[j - 1].v", "s[j].v = s[j > 1 ? j - 2 : 0].v"
+    ),
     Mutant("noise component", "noise.cu", "m[1] += noise.y", "m[1] += noise.z"),
     Mutant("sign of the gate", "noise.cu", "sigmoid(-sharpness *", "sigmoid(sharpness *"),
     Mutant("tail guard", "lqn.cu", f"{GUARD_LINE}\n  Vec3", "if (row > rows) return;\n  Vec3"),
