@@ -95,6 +95,10 @@ def measure_all(runs: Path, iterations: Sequence[int]) -> list[dict[str, Any]]:
     return made
 
 
+def _key(entry: dict[str, Any]) -> tuple[str, str, int]:
+    return entry["scene"], entry["size"], entry["iterations"]
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; 0, or 2 after one line that says what is wrong."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -106,7 +110,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         made = measure_all(args.runs, args.iterations)
         if not made:
             raise ValueError(f"--runs {args.runs}: holds no scene with {BASELINE} and another arm")
-        PATH.write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
+        old = json.loads(PATH.read_text(encoding="utf-8")) if PATH.exists() else []
+        entries = {_key(entry): entry for entry in (*old, *made)}  # the new take their place
+        text = json.dumps([entries[key] for key in sorted(entries)], indent=1)
+        PATH.write_text(text + "\n", encoding="utf-8")
     except (OSError, ValueError) as error:
         print(f"costs: {error}", file=sys.stderr)
         return 2
