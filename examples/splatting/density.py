@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -67,6 +68,7 @@ class MCMCDensityControl:
         self.refine_start, self.refine_stop = refine_start, refine_stop
         self.refine_every = refine_every
         self.generator = generator
+        self.state: dict[str, Any] = {}  # nothing that a checkpoint must hold
 
     @classmethod
     def for_run(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -15,7 +15,7 @@ from torch.nn import Parameter
 from opt3dgs_optim import Phase, PhaseScheduler, PositionNoise
 from opt3dgs_optim.runs import RunLog
 from splatting.arms import NOISE_LR, Arm
-from splatting.density import DensityReport, MCMCDensityControl, regularisers
+from splatting.density import DensityReport, MCMCDensityControl, Optimizers, regularisers
 from splatting.gaussians import (
     DEFAULT_PRESET,
     MCMC_PRESET,
@@ -62,12 +62,10 @@ class FitOptions:
 class DensityControl(Protocol):
     """What moves, adds and removes Gaussians between the steps."""
 
+    state: dict[str, Any]  # part of a checkpoint
+
     def step(
-        self,
-        iteration: int,
-        gaussians: dict[str, Parameter],
-        optimizers: Mapping[str, torch.optim.Optimizer],
-        /,
+        self, iteration: int, gaussians: dict[str, Parameter], optimizers: Optimizers, /
     ) -> DensityReport:
         """Called after the optimizers' step, with the iteration from 0."""
         ...
@@ -247,7 +245,7 @@ class Fit:
             "options": asdict(self.options),
             "iteration": self.iteration,
             "relocated": self.relocated,
-            "density": getattr(self.density, "state", None),
+            "density": {} if self.density is None else self.density.state,
             "gaussians": {name: param.detach() for name, param in self.gaussians.items()},
             "optimizers": {name: opt.state_dict() for name, opt in self.optimizers.items()},
             "views": self.views,
@@ -285,8 +283,8 @@ class Fit:
             self.gaussians[name] = fresh
         self.iteration, self.views = state["iteration"], state["views"]
         self.relocated = state.get("relocated", 0)
-        if state.get("density") is not None:
-            vars(self.density).update(state=state["density"])
+        if self.density is not None:
+            self.density.state = state.get("density") or {}
         torch.set_rng_state(state["random"][0])
         self.order.set_state(state["random"][1])
         self.density_draws.set_state(state["random"][2])

@@ -39,7 +39,7 @@ COLORS = {"stock": "0.6", "frozen": "#d55e00", "default": "#0072b2"}
 LOOKS = 60
 WARMUP = 1 / 12
 EVERY = 4  # iterations between two that the picture shows
-SHOWN = ("lund_door", 0)  # scene and seed of the picture
+SHOWN = ("lund_door", 0, 3_000)  # scene, seed and iterations of the picture
 
 
 class Frozen(Part):
@@ -77,12 +77,14 @@ def train(folder: Path | str, arm: str, seed: int, iterations: int, points: int)
     from splatting.fit import Fit, FitOptions
     from splatting.scenes import load_scene
 
+    from studies.scenes.training import BACKGROUNDS
+
     torch.set_num_threads(1)
     warmup = round(iterations * WARMUP)
     part = {"stock": None, "frozen": Frozen(warmup), "default": EnergyHistogram(warmup=warmup)}[arm]
     parts: list[Part] = [] if part is None else [part]
     made = Arm(arm, arm, lambda *_: parts)
-    background = "white" if Path(folder).name == "lego" else "black"
+    background = BACKGROUNDS.get(Path(folder).name, "black")
     fit = Fit(
         load_scene(folder, background=background),
         made,
@@ -126,7 +128,7 @@ def recorded(
         record["nu_deviation"] = round(float(nu.std()), 3)
         low, high = clamp
         record["at_clamp"] = round(float(((nu <= low) | (nu >= high)).mean()), 5)
-        if (scene, seed) == SHOWN and iterations == 3_000:
+        if (scene, seed, iterations) == SHOWN:
             shown = [[float(f"{value:.4g}") for value in line[:4]] for line in trace[::EVERY]]
             record["trace"] = shown  # loss, nu, low and high end of the partitions
     return record
@@ -156,9 +158,7 @@ def draw(records: list[dict[str, Any]], path: Path) -> None:
     """Training PSNR, and energy, range and nu of one training before and after."""
     import matplotlib.pyplot as plt
 
-    one = {
-        r["arm"]: r for r in records if (r["scene"], r["seed"], r["iterations"]) == (*SHOWN, 3_000)
-    }
+    one = {r["arm"]: r for r in records if (r["scene"], r["seed"], r["iterations"]) == SHOWN}
     fig, axes = plt.subplots(3, 2, figsize=(10, 7), sharex=True, layout="constrained")
     for column, arm in enumerate(("frozen", "default")):
         top, middle, bottom = axes[:, column]

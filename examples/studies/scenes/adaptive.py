@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
 from typing import Any
 
 import torch
 from hosts.cpu_host import gsplat_modules
-from splatting.density import DensityReport
+from splatting.density import DensityReport, Optimizers
 from splatting.fit import Fit
 from splatting.scenes import View
 from torch import Tensor
@@ -30,10 +29,7 @@ class DefaultDensityControl:
         self.info: dict[str, Any] = {}
 
     def step(
-        self,
-        iteration: int,
-        gaussians: dict[str, Parameter],
-        optimizers: Mapping[str, torch.optim.Optimizer],
+        self, iteration: int, gaussians: dict[str, Parameter], optimizers: Optimizers
     ) -> DensityReport:
         """What the strategy does after the optimizers' step."""
         before = len(gaussians["means"])

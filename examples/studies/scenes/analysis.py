@@ -48,7 +48,7 @@ class Study:
     """The records, by setting, arm and seed; and what an iteration costs, where measured."""
 
     def __init__(self, records: Iterable[Record], costs: Costs | None = None) -> None:
-        self.costs = costs or {}
+        self._costs = costs or {}
         self._of: dict[tuple[Setting, str], dict[int, Record]] = defaultdict(dict)
         for record in records:
             self._of[record.setting, record.arm][record.seed] = record
@@ -56,6 +56,10 @@ class Study:
     def records(self) -> list[Record]:
         """All of them."""
         return [record for runs in self._of.values() for record in runs.values()]
+
+    def cost(self, setting: Setting, arm: str) -> float:
+        """Seconds of an iteration of the arm, as a share of stock's; 1 where not measured."""
+        return self._costs.get((setting.scene, setting.size, setting.iterations, arm), 1.0)
 
     def all_settings(self) -> list[Setting]:
         """In the order of their fields."""

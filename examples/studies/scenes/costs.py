@@ -23,11 +23,11 @@ import torch
 from splatting.fit import Fit
 
 from studies.scenes.arms import BASELINE, STUDY_ARMS, find_study_arm
+from studies.scenes.records import COSTS
 from studies.scenes.training import Spec, fit_of, machine, scene_of
 
 ROUNDS, STEPS, FIRST = 7, 10, 5  # rounds of so many iterations in turns, after the first few
 SHARES = (0.5, 0.75, 0.9)  # of a training, where it left checkpoints
-PATH = Path(__file__).resolve().parents[3] / "docs" / "results" / "study" / "costs.json"
 
 
 def measure(fits: dict[str, Fit]) -> dict[str, float]:
@@ -110,14 +110,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         made = measure_all(args.runs, args.iterations)
         if not made:
             raise ValueError(f"--runs {args.runs}: holds no scene with {BASELINE} and another arm")
-        old = json.loads(PATH.read_text(encoding="utf-8")) if PATH.exists() else []
+        old = json.loads(COSTS.read_text(encoding="utf-8")) if COSTS.exists() else []
         entries = {_key(entry): entry for entry in (*old, *made)}  # the new take their place
         text = json.dumps([entries[key] for key in sorted(entries)], indent=1)
-        PATH.write_text(text + "\n", encoding="utf-8")
+        COSTS.write_text(text + "\n", encoding="utf-8")
     except (OSError, ValueError) as error:
         print(f"costs: {error}", file=sys.stderr)
         return 2
-    print(PATH)
+    print(COSTS)
     return 0
 
 

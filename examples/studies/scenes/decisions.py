@@ -46,13 +46,8 @@ class Decision:
 
 def settings_of(study: Study, iterations: int) -> list[Setting]:
     """The scenes of the rotated trainings at a quarter of their size, all views, stock rates."""
-    plain = Setting("", 0, iterations, "sfm", rotated=True)
-    return [
-        setting
-        for setting in study.all_settings()
-        if (setting.iterations, setting.size, setting.views, setting.tiled, setting.rates)
-        == (plain.iterations, plain.size, plain.views, plain.tiled, plain.rates)
-    ]
+    every = study.all_settings()
+    return [s for s in every if s == Setting(s.scene, s.points, iterations, "sfm", rotated=True)]
 
 
 def decide(study: Study) -> dict[str, Decision]:

@@ -78,13 +78,12 @@ def difference(
 ) -> Difference:
     """The arm against its control on all scenes and seeds that have both."""
     control = control or STUDY_ARMS[arm].control
-    costs, pairs = study.costs, {}
+    pairs = {}
     for setting in settings:
         ours, theirs = study.runs(setting, arm), study.runs(setting, control)
         shared = sorted(ours.keys() & theirs.keys())
         if shared:
-            key = (setting.scene, setting.size, setting.iterations)
-            cost = costs.get((*key, arm), 1.0) / costs.get((*key, control), 1.0)
+            cost = study.cost(setting, arm) / study.cost(setting, control)
             pairs[setting.scene] = [(ours[seed], theirs[seed], cost) for seed in shared]
     return Difference(arm, control, pairs)
 
@@ -163,25 +162,23 @@ def reach_table(study: Study, long: Sequence[Setting], arms: Sequence[str], shor
         stock, brief = study.runs(setting, BASELINE), replace(setting, iterations=short)
         for arm in arms:
             found = difference(study, [setting], arm, BASELINE)
-            shares = [
-                reached * found.cost / total if reached is not None else None
+            reached = [
+                ours.iteration_of(theirs.final)
                 for pairs in found.pairs.values()
                 for ours, theirs, _ in pairs
-                for reached in [ours.iteration_of(theirs.final)]
             ]
             quick = study.runs(brief, arm)
             both = sorted(quick.keys() & stock.keys())
-            if not shares and not both:
+            if not reached and not both:
                 continue
-            known = [share for share in shares if share is not None]
-            said = "never" if shares else "-"
-            if shares and len(known) == len(shares):
-                said = f"x{fmean(known):.2f} of its seconds"
+            known = [iteration for iteration in reached if iteration is not None]
+            said = "never" if reached else "-"
+            if reached and len(known) == len(reached):
+                said = f"x{fmean(known) * found.cost / total:.2f} of its seconds"
             beside = "-"
             if both:
                 gain = fmean(quick[s].final - stock[s].final for s in both)
-                key = (setting.scene, setting.size, short, arm)
-                share = short / total * study.costs.get(key, 1.0)
+                share = short / total * study.cost(brief, arm)
                 beside = f"{gain:+.2f} dB in x{share:.2f} of its seconds"
             final = fmean(record.final for record in stock.values())
             row = f"| {setting.scene} | {final:.2f} dB ({len(stock)}) | `{label(arm)}`"

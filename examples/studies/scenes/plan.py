@@ -11,6 +11,7 @@ from studies.scenes.arms import (
     ALL_ANNEALED,
     ANNEALED,
     GROUPS,
+    MEANS_LEFT,
     POOLED,
     STABLE,
     STUDY_ARMS,
@@ -25,10 +26,11 @@ QUICK_SCENES = ("banana", "embedded")  # for the options of a part
 MANY_VIEWS_SCENES = ("bonsai", "lego", "plush")
 ROTATED_SCENES = (*MANY_VIEWS_SCENES, "embedded", "banana", "lund_door", "brighton_beach")
 ROTATED_ARMS = (
-    *("mcmc", "faded", ANNEALED, "paper", "paper-constant"),
+    *("mcmc", "faded", MEANS_LEFT, ANNEALED, "paper", "paper-constant"),
     *("faded-3000", "rates-x2", POOLED, "annealed-2", "own-step"),
     *(STABLE, f"{STABLE}-constant"),
 )
+BRIEF_ARMS = ("mcmc", "faded", MEANS_LEFT, ANNEALED)
 LONG_ARMS = tuple(arm.name for arm in long_runs())
 FULL_PARTS_SCENES = ("brighton_beach", "lund_door")  # where the defaults lose
 POINTS = 4_000
@@ -81,7 +83,15 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         "defaults": cross(SCENES, [ALL_ANNEALED, ANNEALED, POOLED], seeds, 3_000),
         "long-parts": cross(SCENES, [*longer, UNFADED_OPACITIES], 1, 7_500),
         "full": cross(SCENES, [*two, POOLED], 1, 30_000),
-        "rotated-first": cross(MANY_VIEWS_SCENES, two, 1, 30_000, rotated=True),
+        "rotated-brief": [
+            *cross(MANY_VIEWS_SCENES, BRIEF_ARMS, seeds, 7_500, rotated=True),
+            *cross(("bonsai",), arms["schedules"] + arms["detail"], 1, 7_500, rotated=True),
+        ],
+        "explorations": cross(("plush", "embedded"), arms["explorations"], 1, 30_000, rotated=True),
+        "unseen": cross(
+            ("bonsai",), ["mcmc", "faded", *arms["unseen"]], 1, 7_500, rotated=True, tiled=True
+        ),
+        "adaptive": cross(MANY_VIEWS_SCENES, arms["adaptive"], 1, 30_000, rotated=True),
         "rotated": [
             spec
             for seed in range(seeds)

@@ -84,7 +84,7 @@ def plot_metrics(
     )
     for column, setting in zip(axes.T, settings, strict=True):
         for arm in arms:
-            cost = study.costs.get((setting.scene, setting.size, setting.iterations, arm), 1.0)
+            cost = study.cost(setting, arm)
             for axis, metric in zip(column, ("psnr", "lpips"), strict=True):
                 records = list(study.runs(setting, arm).values())
                 if not records:

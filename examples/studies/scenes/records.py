@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+FOLDER = Path(__file__).resolve().parents[3] / "docs" / "results" / "study"  # what is committed
+COSTS = FOLDER / "costs.json"
 MEASURED = ("iteration", "seconds", "psnr", "ssim", "train_psnr", "num_points")  # in all records
 COLUMNS = (*MEASURED, "lpips", "relocated", "median_scale", "median_opacity")
 

@@ -17,7 +17,6 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from splatting.scenes import Size
 
 from studies.scenes.analysis import Gain, Study, baseline_of
 from studies.scenes.arms import (
@@ -41,7 +40,7 @@ from studies.scenes.long_tables import (
     reach_table,
 )
 from studies.scenes.plots import plot_curves, plot_gains, plot_metrics
-from studies.scenes.records import Setting, gather, merge, read, read_costs, write
+from studies.scenes.records import COSTS, FOLDER, gather, merge, read, read_costs, write
 from studies.scenes.tables import (
     front_table,
     gains_table,
@@ -52,7 +51,6 @@ from studies.scenes.tables import (
 )
 
 REPOSITORY = Path(__file__).resolve().parents[3]
-FOLDER = REPOSITORY / "docs" / "results" / "study"
 PAGE = REPOSITORY / "docs" / "evidence.md"
 PAGES = (PAGE, FOLDER / "tables.md", REPOSITORY / "README.md")  # that have tables
 FRONT = (  # what it is, arm, control
@@ -74,10 +72,8 @@ FEW_VIEWS_ARMS = (
     *(UNFADED_OPACITIES, BEST, POOLED),
 )
 CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4", BEST)
-COSTS = "costs.json"
 ROTATED = "rotated.json"  # records whose held-out views rotate with the seed
-LONG, BRIEF, DETAIL = 30_000, 7_500, 2_000
-SCENE_SIZE: Size = "images_4"
+LONG, BRIEF = 30_000, 7_500
 REACH_ARMS = (DEFAULTS, MEANS_LEFT)
 MARKER = re.compile(r"(<!-- study:([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -122,32 +118,21 @@ def tables(study: Study) -> dict[str, str]:
 
 def rotating_study() -> Study:
     """The trainings with rotating views, and what their iterations cost."""
-    return Study(read(FOLDER / ROTATED), read_costs(FOLDER / COSTS))
+    return Study(read(FOLDER / ROTATED), read_costs(COSTS))
 
 
 def rotated_tables(study: Study) -> dict[str, str]:
     """The pieces that are made from the trainings with rotating views."""
-
-    def settings(iterations: int, size: Size = SCENE_SIZE, tiled: bool = False) -> list[Setting]:
-        every = study.all_settings()
-        return [s for s in every if (s.iterations, s.size, s.tiled) == (iterations, size, tiled)]
-
     made = {
         "rotated-machines": machines_line(study.records()),
         "decisions": decisions_table(study),
     }
-    kinds = {
-        "rotated-30000": settings_of(study, LONG),
-        "rotated-7500": settings_of(study, BRIEF),
-        "rotated-detail": settings(DETAIL, "images_2"),
-        "rotated-tiled": settings(BRIEF, tiled=True),
-    }
-    for name, found in kinds.items():
-        made[name] = _missing("rotated") if not found else metrics_table(study, found, STUDY_ARMS)
-        gains = differences_table(study, found, STUDY_ARMS)
-        made[f"{name}-gains"] = _missing("rotated") if not found else gains
-    made["headline"] = headline_table(study, kinds["rotated-30000"], BRIEF)
-    made["reach"] = reach_table(study, kinds["rotated-30000"], REACH_ARMS, BRIEF)
+    long, brief = settings_of(study, LONG), settings_of(study, BRIEF)
+    made["headline"] = headline_table(study, long, BRIEF)
+    made["reach"] = reach_table(study, long, REACH_ARMS, BRIEF)
+    made["rotated-30000"] = metrics_table(study, long, STUDY_ARMS)
+    made["rotated-7500"] = metrics_table(study, brief, STUDY_ARMS)
+    made["rotated-7500-gains"] = differences_table(study, brief, STUDY_ARMS)
     return made
 
 

@@ -29,6 +29,7 @@ from tqdm import tqdm
 from studies.scenes.arms import find_study_arm
 from studies.scenes.parts.step_lengths import StepLengths
 from studies.scenes.plots import COLOURS, DPI
+from studies.scenes.records import FOLDER
 from studies.scenes.training import machine
 
 mpl.use("Agg")
@@ -37,7 +38,6 @@ import matplotlib.pyplot as plt
 
 ARMS = ("mcmc", "faded", "annealed-8-0.4")
 EVERY = 50
-FOLDER = Path(__file__).resolve().parents[3] / "docs" / "results" / "study"
 
 
 def step_lengths(scene: Scene, name: str, iterations: int, points: int) -> dict[str, Any]:

@@ -16,12 +16,14 @@ from torch import Tensor
 from opt3dgs_optim import Course, EnergyHistogram, Part, PositionNoise
 from opt3dgs_optim.names import slot
 from opt3dgs_optim.part import Group
+from opt3dgs_optim.partitions import BANDWIDTH, REACH
+from opt3dgs_optim.parts.histogram import CLAMP
+from opt3dgs_optim.rows import shaped
 
 VISITS = 5  # of a view, over which its mean energy is taken, weighed exponentially
 RESTART = 1_000  # iterations: ten refinements
 RESETTLING = 100  # energies after a restart for which nu is 1
-REACH, BINS, BANDWIDTH = 6.0, 48, 0.4  # deviations, as the partitions that follow the energy
-CLAMP = (-1.0, 3.0)
+BINS = 48  # of the density over the points
 
 
 class Wrapped(Part):
@@ -165,8 +167,7 @@ class NuPerPoint(Part):
         old, nu = self._old, self._nu
         if old is not None and len(nu) == len(param):
             with torch.no_grad():
-                shape = (-1, *[1] * (param.dim() - 1))
-                param.copy_(old + nu.view(shape) * (param - old))
+                param.copy_(old + shaped(nu, param) * (param - old))
         self._old = None
 
     def numbers(self, course: Course) -> dict[str, Tensor]:

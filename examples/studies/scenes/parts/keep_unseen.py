@@ -10,6 +10,7 @@ from torch import Tensor
 from opt3dgs_optim import Course, Part
 from opt3dgs_optim.names import slot
 from opt3dgs_optim.part import Group
+from opt3dgs_optim.rows import shaped
 
 
 class KeepUnseen(Part):
@@ -46,5 +47,5 @@ class KeepUnseen(Part):
         elif len(self._unseen) == len(param):
             kept = group["betas"][1] ** (self.floor - 1)
             factor = torch.where(self._unseen, kept, 1.0)
-            state["exp_avg_sq"].mul_(factor.view(-1, *[1] * (param.dim() - 1)))
+            state["exp_avg_sq"].mul_(shaped(factor, param))
         return grad
