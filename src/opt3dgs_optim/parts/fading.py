@@ -13,6 +13,7 @@ from opt3dgs_optim.checks import check_count, check_number
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import GAUSSIAN, check_names
 from opt3dgs_optim.part import Group, Part
+from opt3dgs_optim.rows import shaped
 
 CALL = "Fading"
 DONE = "faded"  # of a group: events that its parameter has had
@@ -92,13 +93,13 @@ class Fading(Part):
     def _fade(
         self, param: Tensor, state: dict[str, Any], events: range, valid: Tensor | bool
     ) -> None:
-        shape = (-1, *[1] * (param.dim() - 1))
         for event in events:
             chosen = self.chosen(event, param.shape[0], param.device)
             if isinstance(valid, Tensor):
                 chosen = chosen & valid
-            state["exp_avg"].mul_(torch.where(chosen, self.exp_avg, 1.0).view(shape))
-            second = torch.where(chosen, self.exp_avg_sq, 1.0).view(shape)
+            chosen = shaped(chosen, param)
+            state["exp_avg"].mul_(torch.where(chosen, self.exp_avg, 1.0))
+            second = torch.where(chosen, self.exp_avg_sq, 1.0)
             for key in ("exp_avg_sq", "max_exp_avg_sq"):
                 if key in state:
                     state[key].mul_(second)
