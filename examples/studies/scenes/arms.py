@@ -54,6 +54,8 @@ def annealing(peak: float, final: float, opacity_peak: float = 1.0) -> Annealing
 ANNEALING = annealing(4.0, 0.4)
 ANNEALING_OF_REST = Annealing(4.0, 0.4, 1.0, names=("scales", "quats", "opacities", "sh0", "shN"))
 FADING = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=300)
+FADING_EARLY = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=140, stop=0.25)
+UNTIL = "-to-1/4"  # of the run
 # What the arms beyond the paper are made of, by the arm's name; what a table calls them; and the
 # names of the arms that add a last phase.
 TRUNKS: dict[str, list[Part]] = {
@@ -261,6 +263,18 @@ def long_runs() -> list[StudyArm]:
             "root mean square of the steps on a schedule, whatever the learning rates",
             lambda _iterations, _nu: [OwnStep()],
             control=ANNEALED,
+        ),
+        StudyArm(
+            f"faded{UNTIL}",
+            "faded as often, but only in the first quarter",
+            of(FADING_EARLY),
+            control="faded",
+        ),
+        StudyArm(
+            f"{MEANS_LEFT}{UNTIL}",
+            "the same, and all but the positions annealed",
+            of(ANNEALING_OF_REST, FADING_EARLY),
+            control=MEANS_LEFT,
         ),
     ]
 
