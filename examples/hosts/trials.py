@@ -210,6 +210,7 @@ TRIALS = (
         different="upgraded again where the loop sets up anew; prints no PSNR",
     ),
     _splatfacto("splatfacto"),
+    _splatfacto("splatfacto-mcmc"),
 )
 
 
