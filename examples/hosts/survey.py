@@ -1,10 +1,10 @@
 """Which trainers `hosts diff` edits, and what ran: makes docs/hosts/survey.md.
 
+    OPT3DGS_TRAINERS=DIR OPT3DGS_RECORD=1 python -m pytest -m hosts tests/hosts
     python examples/hosts/survey.py --trainers DIR --write
-    python examples/hosts/survey.py --trainers DIR --scene SCENE --run --write
 
-DIR has a folder for each repository. Without `--run` the trainings of the last time stay in the
-page, with their date; they are kept in survey.json beside it. `--run` needs an hour of two cores.
+DIR has a folder for each repository. The first command trains, most of an hour of a core, and puts
+what came of it into survey.json beside the page; the second needs a few seconds.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import platform
 import re
 import subprocess
 import sys
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,12 +23,13 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torch
-from hosts.trials import ITERATIONS, TRIALS, Done, Nerfstudio, Trial, copy_scene
+from hosts.trials import ITERATIONS, TRIALS, Done, Nerfstudio, Outcome, Trial
 
 from opt3dgs_optim import __version__
 from opt3dgs_optim.hosts import diff
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "hosts" / "survey.md"
+TRAINED = PAGE.with_suffix(".json")
 SCRIPTS = ("*train*.py", "prune_finetune.py")
 OTHERS = re.compile(
     r"(^|/)(submodules|tests?|scripts|docs|utils?|preprocess|ext|internal|Tracking[^/]*)/"
@@ -88,25 +88,16 @@ def survey(trainers: Path) -> list[Script]:
 # -- trainings -------------------------------------------------------------------------------------
 
 
-def outcome(trial: Trial, trainers: Path, scene: Path, work: Path) -> dict[str, Any]:
-    """Stock, edited, and going on from both checkpoints."""
-    folder = re.sub(r"\W+", "_", trial.name)
+def keep(trial: Trial, trainers: Path, scene: str, got: Outcome) -> None:
+    """Put what a trial came to into survey.json, in the place of an earlier one."""
     row: dict[str, Any] = {"name": trial.name, "commit": commit_of(trainers / trial.trainer)}
     row |= {"date": datetime.date.today().isoformat(), "torch": torch.__version__}
-
-    def train(out: str, *more: str, ours: bool = True) -> Done:
-        return trial.start(trainers, scene, work, f"{folder}/{out}", *more, ours=ours)
-
-    row["stock"], row["ours"] = _shown(train("stock", ours=False)), _shown(train("ours"))
-    own = trial.checkpoint(work / folder / "ours", ITERATIONS)
-    row["checkpoint"] = "yes" if own.is_file() else "-"
-    row["resume"] = "-"
-    if own.is_file() and not trial.gsplat:
-        theirs = trial.checkpoint(work / folder / "stock", ITERATIONS)
-        again = _shown(train("again", *trial.going_on(own)))
-        taken = _shown(train("taken", *trial.going_on(theirs)))
-        row["resume"] = f"own: {again}; stock's: {taken}"
-    return row
+    row |= {"stock": _shown(got.stock), "ours": _shown(got.ours)}
+    row |= {"checkpoint": "yes" if got.checkpoint else "-", "resume": "-"}
+    if got.own and got.theirs:
+        row["resume"] = f"own: {_shown(got.own)}; stock's: {_shown(got.theirs)}"
+    kept = _kept(json.loads(TRAINED.read_text())["rows"], row, scene)
+    TRAINED.write_text(json.dumps(kept, indent=1) + "\n")
 
 
 def _kept(rows: list[dict[str, Any]], new: dict[str, Any], scene: str) -> dict[str, Any]:
@@ -160,7 +151,7 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
     text += [
         "",
         f"{len(trials['rows'])} of the {len(TRIALS)} trials in `examples/hosts/trials.py` have "
-        "been run for this table (`--run`). Resume: from the edited trainer's own checkpoint, and "
+        "been run for this table. Resume: from the edited trainer's own checkpoint, and "
         "from the stock one's; gsplat's scripts evaluate a checkpoint and do not go on from one.",
         "",
         "## `hosts diff` over public trainers",
@@ -195,28 +186,12 @@ def _cell(text: str) -> str:
 
 
 def main() -> None:
-    """Survey, run if asked for, and print or write the page."""
+    """Survey, and print or write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trainers", type=Path, required=True, help="a folder of repositories")
-    parser.add_argument("--scene", type=Path, help="a COLMAP scene with images and images_4")
-    parser.add_argument("--run", action="store_true", help="run the trainings too")
-    parser.add_argument("--only", default="", help="run only those whose name contains this")
     parser.add_argument("--write", action="store_true", help=f"write {PAGE.name}")
     options = parser.parse_args()
-    kept = PAGE.with_suffix(".json")
-    trials = json.loads(kept.read_text())
-    if options.run:
-        if options.scene is None:
-            parser.error("--run needs --scene")
-        chosen = [trial for trial in TRIALS if options.only in trial.name]
-        with tempfile.TemporaryDirectory() as work:
-            scene = copy_scene(options.scene, Path(work) / "scene")
-            for trial in chosen:
-                new = outcome(trial, options.trainers, scene, Path(work))
-                print(json.dumps(new), flush=True)
-                trials = _kept(trials["rows"], new, options.scene.name)
-                kept.write_text(json.dumps(trials, indent=1) + "\n")
-    text = page(survey(options.trainers), trials)
+    text = page(survey(options.trainers), json.loads(TRAINED.read_text()))
     if options.write:
         PAGE.write_text(text, encoding="utf-8")
     else:

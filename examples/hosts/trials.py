@@ -1,4 +1,4 @@
-"""Short trainings of real trainers on a CPU, stock and edited: what `survey.py` and tests run."""
+"""Short trainings of real trainers on a CPU, stock and edited: `pytest -m hosts` runs them."""
 
 from __future__ import annotations
 
@@ -234,6 +234,41 @@ class Done:
         lines = [line.strip() for line in re.split(r"[\r\n]", self.output)]
         errors = [line for line in lines if re.match(r"[\w.]*(Error|Exit|Exception): ", line)]
         return (errors or [line for line in lines if line] or ["no output"])[-1]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one trial came to.
+
+    Args:
+        stock, ours: the whole runs.
+        checkpoint: the file that ours left behind, where it did.
+        own, theirs: ours, gone on from its own checkpoint and from the stock run's; None where
+            there is no checkpoint, or the trainer does not go on from one.
+    """
+
+    stock: Done
+    ours: Done
+    checkpoint: Path | None = None
+    own: Done | None = None
+    theirs: Done | None = None
+
+
+def try_out(trial: Trial, trainers: Path, scene: Path, work: Path) -> Outcome:
+    """Stock, edited, and going on from both checkpoints, below the folder `work`."""
+    stock = trial.start(trainers, scene, work, "stock", ours=False)
+    ours = trial.start(trainers, scene, work, "ours", ours=True)
+    own = trial.checkpoint(work / "ours", ITERATIONS)
+    if not own.is_file():
+        return Outcome(stock, ours)
+    if trial.gsplat:  # evaluates a checkpoint, and does not go on from one
+        return Outcome(stock, ours, own)
+    theirs = trial.checkpoint(work / "stock", ITERATIONS)
+    again = [
+        trial.start(trainers, scene, work, out, *trial.going_on(file), ours=True)
+        for out, file in (("own", own), ("theirs", theirs))
+    ]
+    return Outcome(stock, ours, own, *again)
 
 
 def copy_scene(source: Path, target: Path) -> Path:
