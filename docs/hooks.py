@@ -85,7 +85,7 @@ def mathml(latex: str, *, block: bool) -> str:
     return f'<div class="formula">{formula}</div>' if block else formula
 
 
-STEPS = ("six Adams", "six Adams + gsplat's noise", "exploration step", "exploitation step")
+STEPS = ("six Adams", "defaults", "the paper's exploration", "the paper's exploitation")
 
 
 def step_costs() -> str:

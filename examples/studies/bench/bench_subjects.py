@@ -136,10 +136,6 @@ def upgraded(case: Case, parts: list[Part], *, exploit: bool = False) -> Callabl
     return step
 
 
-def histogram() -> EnergyHistogram:
-    return EnergyHistogram(energy_range=(0.0, 0.2), warmup=4)
-
-
 def noise_alone(case: Case) -> Callable[[], Any]:
     splats = {name: param.detach() for name, param in case.splats().items()}
     lr = torch.tensor(LEARNING_RATES["means"], device=case.device)
@@ -190,8 +186,8 @@ def copy_144(case: Case) -> Callable[[], Any]:
 SUBJECTS: dict[str, Callable[[Case], Callable[[], Any]]] = {
     "six Adams": six_adams,
     "defaults": lambda case: upgraded(case, [*DEFAULTS]),
-    "defaults + histogram": lambda case: upgraded(case, [*DEFAULTS, histogram()]),
-    "the paper's exploration": lambda case: upgraded(case, [histogram()]),
+    "defaults + histogram": lambda case: upgraded(case, [*DEFAULTS, EnergyHistogram(warmup=4)]),
+    "the paper's exploration": lambda case: upgraded(case, [EnergyHistogram.paper(warmup=4)]),
     "the paper's exploitation": lambda case: upgraded(
         case, [SquaredLoss(), Curvature()], exploit=True
     ),

@@ -110,14 +110,21 @@ def cells_of(found: Difference) -> list[str]:
     return [_signed(*found.of(metric), digits) for metric, (_, digits) in METRICS.items()]
 
 
-def metrics_table(study: Study, settings: Sequence[Setting], arms: Iterable[str]) -> str:
-    """PSNR / SSIM / LPIPS of every arm on every scene, means over the seeds."""
+def metrics_table(
+    study: Study, settings: Sequence[Setting], arms: Iterable[str], *, gaussians: bool = False
+) -> str:
+    """PSNR / SSIM / LPIPS of every arm on every scene, means over the seeds.
+
+    Args:
+        gaussians: whether their last number stands beside, for arms that grow it.
+    """
     lines = [
         f"| arm | {' | '.join(setting.scene for setting in settings)} |",
         f"|---|{'---|' * len(settings)}",
     ]
     for arm in arms:
-        cells = [_cell(list(study.runs(setting, arm).values())) for setting in settings]
+        found = [list(study.runs(setting, arm).values()) for setting in settings]
+        cells = [_cell(records, gaussians=gaussians) for records in found]
         if any(cell != "-" for cell in cells):
             lines.append(f"| `{label(arm)}` | {' | '.join(cells)} |")
     return "\n".join(lines)
@@ -186,13 +193,15 @@ def reach_table(study: Study, long: Sequence[Setting], arms: Sequence[str], shor
     return "\n".join(lines)
 
 
-def _cell(records: Sequence[Record]) -> str:
+def _cell(records: Sequence[Record], *, gaussians: bool = False) -> str:
     if not records:
         return "-"
     values = [fmean(float(r.curve[m][-1]) for r in records) for m in METRICS]
     psnr, ssim, lpips = values
     seeds = f" ({len(records)} seeds)" if len(records) > 1 else ""
-    return f"{psnr:.2f} / {ssim:.3f} / {lpips:.3f}{seeds}"
+    count = fmean(float(r.curve["num_points"][-1]) for r in records)
+    beside = f", {count:,.0f} Gaussians" if gaussians else ""
+    return f"{psnr:.2f} / {ssim:.3f} / {lpips:.3f}{beside}{seeds}"
 
 
 def _signed(mean: float, spread: float, digits: int) -> str:

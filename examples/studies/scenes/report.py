@@ -27,6 +27,7 @@ from studies.scenes.arms import (
     GROUPS,
     MEANS_LEFT,
     POOLED,
+    STABLE,
     STUDY_ARMS,
     UNFADED_OPACITIES,
     label,
@@ -74,6 +75,7 @@ FEW_VIEWS_ARMS = (
 CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4", BEST)
 ROTATED = "rotated.json"  # records whose held-out views rotate with the seed
 LONG, BRIEF = 30_000, 7_500
+ASIDE = ("explorations", "unseen", "adaptive")  # groups with a table of their own
 REACH_ARMS = (DEFAULTS, MEANS_LEFT)
 MARKER = re.compile(r"(<!-- study:([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -81,8 +83,7 @@ MARKER = re.compile(r"(<!-- study:([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTA
 def tables(study: Study) -> dict[str, str]:
     """Every generated piece of the page, by the name in its marker."""
     short = study.settings(SHORT)
-    names = {kind: [arm.name for arm in arms] for kind, arms in GROUPS.items()}
-    gains = {kind: study.gains(short, arms) for kind, arms in names.items()}
+    gains = {kind: study.gains(short, names(kind)) for kind in GROUPS}
     long = {
         "7,500 iterations": study.settings(7_500),
         "30,000 iterations": study.settings(30_000),
@@ -92,8 +93,8 @@ def tables(study: Study) -> dict[str, str]:
         "machines": machines_line(study.records()),
         "core": gains_table(gains["core"]),
         "with-nu": gains_table(gains["with-nu"]),
-        "scenes": scenes_table(study, short, [*names["core"], *names["with-nu"]]),
-        "nu": nu_table(study, short, [*names["core"], *names["with-nu"], *names["options"]]),
+        "scenes": scenes_table(study, short, [*names("core"), *names("with-nu")]),
+        "nu": nu_table(study, short, [*names("core"), *names("with-nu"), *names("options")]),
         "tails": gains_table(gains["tails"]),
         "on-top": gains_table(gains["on-top"]),
         "options": gains_table(gains["options"]) if gains["options"] else _missing("options"),
@@ -130,10 +131,21 @@ def rotated_tables(study: Study) -> dict[str, str]:
     long, brief = settings_of(study, LONG), settings_of(study, BRIEF)
     made["headline"] = headline_table(study, long, BRIEF)
     made["reach"] = reach_table(study, long, REACH_ARMS, BRIEF)
-    made["rotated-30000"] = metrics_table(study, long, STUDY_ARMS)
-    made["rotated-7500"] = metrics_table(study, brief, STUDY_ARMS)
-    made["rotated-7500-gains"] = differences_table(study, brief, STUDY_ARMS)
+    aside = {arm for kind in ASIDE for arm in names(kind)}
+    shown = [arm for arm in STUDY_ARMS if arm not in aside]
+    for count, settings in ((LONG, long), (BRIEF, brief)):
+        made[f"rotated-{count}"] = metrics_table(study, settings, shown)
+        made[f"rotated-{count}-gains"] = differences_table(study, settings, shown)
+    made["explorations"] = differences_table(study, brief, (STABLE, *names("explorations")))
+    made["adaptive"] = metrics_table(study, brief, names("adaptive"), gaussians=True)
+    tiled = [s for s in study.all_settings() if s.tiled]
+    made["unseen"] = metrics_table(study, tiled, STUDY_ARMS)
     return made
+
+
+def names(kind: str) -> list[str]:
+    """The arms of a group."""
+    return [arm.name for arm in GROUPS[kind]]
 
 
 def _missing(stage: str) -> str:
@@ -182,7 +194,7 @@ def plots(study: Study, folder: Path) -> list[Path]:
     ):
         gains: list[Gain] = []
         for kind in kinds:
-            gains += study.gains(short, [arm.name for arm in GROUPS[kind]])
+            gains += study.gains(short, names(kind))
         if gains:
             plot_gains(gains, folder / name, _title(study, gains))
             drawn.append(folder / name)

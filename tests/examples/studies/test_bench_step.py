@@ -1,0 +1,38 @@
+"""The benchmark of a step: every subject runs, and the page shows rows that it writes."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from studies.bench.bench_step import main
+from studies.bench.bench_subjects import SUBJECTS
+
+DOCS = Path(__file__).resolve().parents[3] / "docs"
+
+
+def test_every_subject_is_timed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--points", "64", "--repeats", "1", "--out", str(tmp_path)]) == 0
+    made = json.loads((tmp_path / "step_cpu.json").read_text(encoding="utf-8"))
+    rows = made["results"]["64"]
+    assert list(rows) == list(SUBJECTS)
+    assert rows["six Adams"]["per_adam"] == 1.0
+    assert all(row["ns_per_point"] > 0 for row in rows.values())
+    table = (tmp_path / "step_cpu.md").read_text(encoding="utf-8")
+    assert all(f"| {name} |" in table for name in SUBJECTS)
+    assert table in capsys.readouterr().out
+
+
+def test_the_committed_figures_have_the_rows_that_the_page_shows() -> None:
+    spec = importlib.util.spec_from_file_location("docs_hooks", DOCS / "hooks.py")
+    assert spec is not None
+    assert spec.loader is not None
+    hooks = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = hooks
+    spec.loader.exec_module(hooks)
+    made = json.loads((DOCS / "benchmarks" / "step_cpu.json").read_text(encoding="utf-8"))
+    for rows in made["results"].values():
+        assert set(hooks.STEPS) <= set(rows)
