@@ -18,6 +18,7 @@ from opt3dgs_optim.rows import shaped
 CALL = "Fading"
 DONE = "faded"  # of a group: events that its parameter has had
 MOST = 32  # events made up for at once, where a trainer's iteration count jumps
+APART = 4  # iterations between two events; in 600, events 1 apart lose half of what 4 apart gain
 
 
 @dataclass(frozen=True, repr=False)
@@ -36,7 +37,7 @@ class Fading(Part):
         share: of the points in each event, chance per point in (0, 1].
         exp_avg, exp_avg_sq: factors on the moments, in [0, 1]. exp_avg^2 <= exp_avg_sq keeps the
             next step from being longer than the last.
-        events: how many over the run.
+        events: how many over the run, but never less than 4 iterations apart.
         start, stop: where the first and the last event are, as shares of the run.
         seed: of the choice of points.
         names: the Gaussian parameters, under gsplat's or INRIA's names.
@@ -66,8 +67,9 @@ class Fading(Part):
 
     def events_before(self, iteration: int, total_steps: int) -> int:
         """Number of events before the step of this iteration (from 0)."""
-        share = (iteration / total_steps - self.start) / (self.stop - self.start)
-        return int(min(max(share, 0.0), 1.0) * self.events)
+        length = self.stop - self.start
+        share = (iteration / total_steps - self.start) / length
+        return int(min(max(share, 0.0), 1.0) * min(self.events, length * total_steps / APART))
 
     def chosen(self, event: int, num_points: int, device: torch.device) -> Tensor:
         """Which points an event fades, [num_points] bool: the same in every parameter."""
