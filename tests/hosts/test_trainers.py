@@ -28,6 +28,7 @@ BESIDE = Path(__file__).resolve().parents[3] / "shared" / "scenes" / "banana"
 SCENE = Path(os.environ.get("OPT3DGS_SCENE", BESIDE))
 NEEDED = {
     "gsplat": "torchmetrics tyro cv2 sklearn yaml imageio",
+    "gsplat-main": "pycolmap piexif",
     "nerfstudio": "torchmetrics tyro cv2 sklearn yaml imageio nerfacc pytorch_msssim rawpy mediapy",
 }
 GAUSSIANS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
