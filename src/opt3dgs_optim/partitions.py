@@ -15,9 +15,6 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from opt3dgs_optim import cuda
-from opt3dgs_optim.backend import uses_kernel
-
 FLOOR = 1e-8  # smallest weight of a fixed range before renormalisation; log theta never sees 0
 # Of the moving partitions; lengths are in deviations of the energy.
 MEMORY = 100  # energies that mean, deviation and density remember
@@ -137,7 +134,7 @@ class MovingPartitions:
     absolute one, and an energy counts for at most four deviations: a spike moves them by 4 %.
 
     Few operators: one packed state follows one packed target by one `lerp_`, and all products with
-    q are one `addmv`. Where the CUDA kernels run, all of it is one launch.
+    q are one `addmv`.
     """
 
     def __init__(self, num_partitions: int, zeta: float, clamp: tuple[float, float] | None) -> None:
@@ -170,7 +167,6 @@ class MovingPartitions:
         self._powers = torch.arange(3, **like)
         tiny = 1e-150 if dtype.itemsize == 8 else 1e-30
         self._tiny = torch.full((), tiny, **like)
-        self._constants = (REACH, BANDWIDTH, EVEN, MEAN_ABS, RESOLUTION, tiny)
         self._views()
 
     def _views(self) -> None:
@@ -190,10 +186,6 @@ class MovingPartitions:
         """
         limit = LIMIT / MEAN_ABS if count > UNLIMITED else 1 / RESOLUTION
         rate = max(1 / count, 1 / MEMORY)
-        if uses_kernel("auto", self._state.device, self._state.dtype):
-            numbers = (rate, limit, *self.clamp, *self._constants)
-            cuda.take_energy(energy, valid, self._state, self.nu, sums, *numbers)
-            return
         known = valid is True
         if count == 1:
             self._mean.copy_(energy if known else torch.where(valid, energy, 0.0))

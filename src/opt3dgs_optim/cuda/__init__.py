@@ -22,7 +22,6 @@ KERNELS = {  # the kernel: its file
     "lqn_direction": "lqn.cu",
     "two_loop": "lqn.cu",
     "add_covariance_noise": "noise.cu",
-    "take_energy": "histogram.cu",
 }
 
 
@@ -192,22 +191,6 @@ def add_covariance_noise(
     launch("add_covariance_noise", means, rows, target, *tensors, rate, *numbers, np.int64(rows))
     if target is not means:
         means.copy_(target)
-
-
-def take_energy(
-    energy: Tensor,
-    valid: Tensor | bool,
-    state: Tensor,
-    nu: Tensor,
-    sums: Tensor | None,
-    *numbers: float,
-) -> None:
-    """`MovingPartitions.take` on the GPU; `numbers` as in the kernel. Never synchronises."""
-    # Where a 0 stands it is a null pointer.
-    known = 0 if valid is True else torch.as_tensor(valid, dtype=torch.bool, device=state.device)
-    tensors = (energy.to(state), known, state, nu, 0 if sums is None else sums)
-    reals = map(_real(state.dtype), numbers)
-    launch("take_energy", state, 1, *tensors, np.int64(len(state) - 3), *reals)
 
 
 @functools.cache
