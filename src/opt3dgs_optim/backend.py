@@ -44,8 +44,7 @@ def backend_info(
 
     The two give the same numbers, up to rounding. The kernels are for points of three coordinates
     with at most five curvature pairs; others are stepped by pure torch. A kernel that fails to
-    compile or to launch raises: nothing is replaced after an error. The histogram's is always
-    "auto".
+    compile or to launch raises: nothing is replaced after an error.
 
     Raises:
         ValueError: `backend` is none of these.
@@ -60,15 +59,9 @@ def backend_info(
     if device is None:
         device = "cuda" if torch.cuda.is_available() else "cpu"
     place = torch.device(device)
-    asked = "backend='torch' was asked for" if backend == "torch" else None
-    obstacle = asked or _obstacle(place, dtype)
+    obstacle = _obstacle(backend, place, dtype)
     if obstacle is None:
         return BackendInfo(str(place), dtype, "cuda", "cuda.core and a CUDA device are present")
-    if backend == "cuda":
-        raise RuntimeError(
-            f"backend='cuda' was asked for on {place} in {dtype}, but {obstacle}; "
-            "backend='auto' takes pure torch then"
-        )
     return BackendInfo(str(place), dtype, "torch", obstacle)
 
 
@@ -80,21 +73,30 @@ def uses_kernel(
     Raises:
         RuntimeError: they were asked for and cannot.
     """
-    fits = dim == 3 and history_size <= KERNEL_HISTORY
-    if backend == "torch" or (backend == "auto" and (device.type != "cuda" or not fits)):
-        return False
-    if not fits:
+    return _obstacle(backend, device, dtype, dim, history_size) is None
+
+
+def _obstacle(
+    backend: str, device: torch.device, dtype: torch.dtype, dim: int = 3, history_size: int = 1
+) -> str | None:
+    """Why pure torch runs, or None; RuntimeError as `uses_kernel`."""
+    if backend == "torch":
+        return "backend='torch' was asked for"
+    if dim != 3 or history_size > KERNEL_HISTORY:
+        found = (
+            f"the kernels are for at most {KERNEL_HISTORY} pairs of points of 3 coordinates, not "
+            f"for {history_size} of points of {dim} coordinates"
+        )
+    elif device.type != "cuda":
+        found = "the kernels need a CUDA device"
+    elif dtype not in KERNEL_DTYPES:
+        kind = str(dtype).removeprefix("torch.")
+        found = f"the kernels take float32 and float64, not {kind}"
+    else:
+        found = cuda.missing()
+    if found is not None and backend == "cuda":
         raise RuntimeError(
-            f"backend='cuda' was asked for with {history_size} pairs of points of {dim} "
-            f"coordinates, but the kernels are for at most {KERNEL_HISTORY} of 3; backend='auto' "
+            f"backend='cuda' was asked for on {device} in {dtype}, but {found}; backend='auto' "
             "takes pure torch then"
         )
-    return backend_info(device, dtype, backend=backend).backend == "cuda"  # pyright: ignore
-
-
-def _obstacle(device: torch.device, dtype: torch.dtype) -> str | None:
-    if device.type != "cuda":
-        return "the kernels need a CUDA device"
-    if dtype not in KERNEL_DTYPES:
-        return f"the kernels take float32 and float64, not {str(dtype).removeprefix('torch.')}"
-    return cuda.missing()
+    return found

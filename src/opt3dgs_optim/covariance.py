@@ -54,8 +54,7 @@ def add_covariance_noise(
         RuntimeError: `backend="cuda"` where the kernel cannot run.
         ValueError: the shapes or dtypes do not fit (the kernel's; torch has its own words).
     """
-    compiling = torch.compiler.is_compiling()
-    if not compiling and uses_kernel(backend, means.device, means.dtype, means.shape[1]):
+    if uses_kernel(backend, means.device, means.dtype, means.shape[1]):
         gate = GATE_SHARPNESS, GATE_OPACITY
         cuda.add_covariance_noise(means, scales, quats, opacities, eta, lr, noise_scale, *gate)
         return

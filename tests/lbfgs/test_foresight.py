@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from opt3dgs_optim.lbfgs import foresight, history_from_pairs, lqn_direction, new_history
+from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history
 from opt3dgs_optim.lbfgs import pairs as columns_of
+from opt3dgs_optim.lbfgs.foresight import foresight
 from opt3dgs_optim.lbfgs.history import header
 
 POINTS, VIEWS, STEPS = 300, 30, 150

@@ -13,16 +13,8 @@ from oracles import dense_bfgs
 from points_first import direction, newest_gamma, record
 from torch import Tensor
 
-from opt3dgs_optim.lbfgs import (
-    MAX_HISTORY,
-    history_from_pairs,
-    history_shape,
-    laid_out,
-    lqn_direction,
-    new_history,
-    two_loop,
-)
-from opt3dgs_optim.lbfgs.history import header, stored_pairs
+from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
+from opt3dgs_optim.lbfgs.history import MAX_HISTORY, header, history_shape, laid_out, stored_pairs
 from opt3dgs_optim.lbfgs.pairs import length, normalised_pair
 
 F64 = torch.float64

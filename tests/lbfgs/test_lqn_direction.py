@@ -16,8 +16,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import opt3dgs_optim
 from opt3dgs_optim import cuda
 from opt3dgs_optim.backend import uses_kernel
-from opt3dgs_optim.lbfgs import foresight, laid_out, lqn_direction, new_history, two_loop
+from opt3dgs_optim.lbfgs import lqn_direction, new_history, two_loop
 from opt3dgs_optim.lbfgs import pairs as columns_of
+from opt3dgs_optim.lbfgs.foresight import foresight
+from opt3dgs_optim.lbfgs.history import laid_out
 
 # inductor imports parts of torch that torch itself has deprecated
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")

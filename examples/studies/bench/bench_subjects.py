@@ -20,7 +20,8 @@ from opt3dgs_optim import (
     two_loop,
 )
 from opt3dgs_optim.covariance import add_covariance_noise
-from opt3dgs_optim.lbfgs import history_from_pairs, laid_out, lqn_direction, new_history
+from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history
+from opt3dgs_optim.lbfgs.history import laid_out
 
 HISTORY_SIZE = 5
 NOISE_LR = 5e5

@@ -47,10 +47,8 @@ def normalised_pair(s: Tensor, y: Tensor) -> Pair:
 
 
 def row_chunks(points: Tensor) -> list[slice]:
-    """Rows to work on at a time: all of them for a compiler, which fuses the loops itself."""
+    """Rows to work on at a time."""
     rows = points.shape[0]
-    if torch.compiler.is_compiling():
-        return [slice(0, rows)]
     size = CHUNK if points.device.type == "cpu" else DEVICE_CHUNK
     return [slice(start, min(start + size, rows)) for start in range(0, max(rows, 1), size)]
 

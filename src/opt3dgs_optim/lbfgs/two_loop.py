@@ -1,7 +1,4 @@
-"""The per-point L-BFGS: the two-loop recursion, and one step of it for Adam.
-
-A CUDA kernel for points of three coordinates, and pure torch for all else.
-"""
+"""The two-loop recursion on the pairs of every point, and one step of it for Adam."""
 
 from __future__ import annotations
 
@@ -41,7 +38,7 @@ def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
     check_history("two_loop", grad, history, history_size)
     same = history.dtype == grad.dtype and history.device == grad.device
     like = grad.device, grad.dtype, grad.shape[1], history_size
-    if same and not torch.compiler.is_compiling() and uses_kernel("auto", *like):
+    if same and uses_kernel("auto", *like):
         return cuda.two_loop(grad, history, history_size)
     result = torch.empty_like(grad)
     for rows in row_chunks(grad):
@@ -118,7 +115,7 @@ def lqn_direction(
     """
     check_history("lqn_direction", grad, history, history_size)
     like = grad.device, grad.dtype, grad.shape[1], history_size
-    if (grad.is_cuda or backend == "cuda") and uses_kernel(backend, *like):
+    if uses_kernel(backend, *like):
         return cuda.lqn_direction(position, grad, history, history_size, min_cosine, graft)
     fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
     accepted = torch.empty(grad.shape[0], dtype=torch.bool, device=grad.device)

@@ -11,14 +11,9 @@ from torch import Tensor
 from opt3dgs_optim.backend import BACKENDS, Backend, uses_kernel
 from opt3dgs_optim.checks import check_choice, check_count, check_flag, check_number
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.lbfgs import (
-    MAX_HISTORY,
-    foresight,
-    history_shape,
-    laid_out,
-    lqn_direction,
-    new_history,
-)
+from opt3dgs_optim.lbfgs.foresight import foresight
+from opt3dgs_optim.lbfgs.history import MAX_HISTORY, history_shape, laid_out, new_history
+from opt3dgs_optim.lbfgs.two_loop import lqn_direction
 from opt3dgs_optim.names import check_names
 from opt3dgs_optim.part import Group, Part, Phase
 
@@ -116,8 +111,7 @@ class Curvature(Part):
     def _history(self, state: dict[str, Any], position: Tensor) -> Tensor:
         shape = history_shape(position, self.history_size)
         like = position.device, position.dtype, position.shape[1], self.history_size
-        asked = position.is_cuda or self.backend == "cuda"
-        kernel = asked and uses_kernel(self.backend, *like)
+        kernel = uses_kernel(self.backend, *like)
         if HISTORY not in state or tuple(state[HISTORY].shape) != shape:
             state.pop(HISTORY, None)  # before the new one, or both would be in memory
             state[HISTORY] = new_history(position, self.history_size, contiguous=kernel)
