@@ -133,7 +133,6 @@ def test_commands_exist_with_their_options(page: Path) -> None:
         "python -m opt3dgs_optim.no_such_module",
         "opt3dgs hosts diff PATH --no-such-option",
         "opt3dgs report runs --no-such-option",
-        "python -m opt3dgs_optim.hosts diff PATH --no-such-option",
         "python examples/no_such_file.py",
         "python examples/train.py --no-such-option",
         "pip install .[no_such_extra]",

@@ -154,7 +154,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if failed:
         print(f"\n{failed} of {len(CHECKS)} FAILED: this installation gives wrong numbers.")
     return 1 if failed else 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

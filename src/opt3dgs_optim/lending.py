@@ -7,6 +7,7 @@ import inspect
 import math
 import operator
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any, TypedDict
 
 import torch
@@ -30,34 +31,26 @@ class AdamOptions(TypedDict, total=False):
     decoupled_weight_decay: bool
 
 
-class Lent:
-    """Learning rates, gradients and flags that stand in place of others for one step.
+class Lent(ExitStack):
+    """Learning rates, gradients and flags that stand in place of others until the `with` ends.
 
     Attributes:
         frozen: rows that are to be put back after it.
     """
 
     def __init__(self) -> None:
+        super().__init__()
         self.frozen: list[Frozen] = []
-        self._items: list[tuple[dict[str, Any], str, Any]] = []
-        self._attributes: list[tuple[Any, str, Any]] = []
 
     def item(self, owner: dict[str, Any], key: str, value: Any) -> None:
         """Put `value` in place of `owner[key]`."""
-        self._items.append((owner, key, owner[key]))
+        self.callback(operator.setitem, owner, key, owner[key])
         owner[key] = value
 
     def attribute(self, owner: Any, name: str, value: Any) -> None:
         """Put `value` in place of `owner.name`; None where there is none."""
-        self._attributes.append((owner, name, getattr(owner, name, None)))
+        self.callback(setattr, owner, name, getattr(owner, name, None))
         setattr(owner, name, value)
-
-    def take_back(self) -> None:
-        """Put everything back."""
-        for owner, key, value in self._items:
-            owner[key] = value
-        for owner, name, value in self._attributes:
-            setattr(owner, name, value)
 
     def rate(self, group: Group, factors: list[Any], valid: Tensor | bool) -> None:
         """lr times the factors, never left in the group: schedulers would compound it.

@@ -121,23 +121,24 @@ class StepAdam(Adam):
 
     def _step(self, mask: Tensor | None, acting: bool) -> None:
         """Lend the base's step what the parts say, if they act, and take it back."""
-        course, lent = self.course, Lent()
+        course, moved = self.course, []
         hooks = [course.hooks(name) if acting else [] for name in ("before", "factor", "after")]
         if mask is not None:
             self._check_mask(mask)
-        moved: list[tuple[Group, Tensor, list[Part]]] = []
-        try:
+        with Lent() as lent:
             for group in self.param_groups:
                 befores, factors, afters = (
                     [part for part in parts if self.acts_on(part, group)] for parts in hooks
                 )
+                masked = mask is not None and self._takes_mask(group, mask.numel())
+                # Another base's own step knows its mask; the parts' doing it does not.
+                masked = masked and (self.base is Adam or bool(befores or afters))
                 for param in group["params"]:
                     if param.grad is None or param.grad.is_sparse:
                         continue
                     self._told |= guard(param.grad, course, self._told)
-                    moving = self._moving(group, param, mask, bool(befores or afters))
-                    if moving is not None or befores or self._puts_back(mask):
-                        self._lend_gradient(group, param, moving, befores, lent, mask)
+                    if masked or befores or self._puts_back(mask):
+                        self._lend_gradient(group, param, masked, befores, lent, mask)
                     moved.append((group, param, afters))
                 said = [part.factor(group, course) for part in factors]
                 lent.rate(group, [factor for factor in said if factor is not None], course.valid)
@@ -145,8 +146,6 @@ class StepAdam(Adam):
                 # As a GradScaler tells torch's step on the device not to be made.
                 lent.attribute(self, "found_inf", (~course.valid).to(torch.float32))
             self._step_base(mask)
-        finally:
-            lent.take_back()
         for group, param, parts in moved:
             for part in parts:
                 part.after(group, param, self.state[param], course)
@@ -171,17 +170,18 @@ class StepAdam(Adam):
         self,
         group: Group,
         param: Tensor,
-        moving: Tensor | None,
+        masked: bool,
         parts: list[Part],
         lent: Lent,
         mask: Tensor | None,
     ) -> None:
-        """Put what Adam is to be fed into `param.grad`."""
+        """Put what Adam is to be fed into `param.grad`; `masked`: zero in rows that stand still."""
         fed, state = cast(Tensor, param.grad), self.state[param]
         if not state:  # torch makes its moments only where there is nothing else yet
             self._init_group({**group, "params": [param]}, [], [], [], [], [], [])
         self._ledger.drop_strangers(param, state, self.course.keys)
-        if moving is not None:
+        if masked and mask is not None:
+            moving = mask.to(param.device)
             lent.frozen.append(Frozen(moving, param, state))
             fed = torch.where(shaped(moving, fed), fed, 0.0)
         # Parts see the gradient of what is minimised, without AMP's scale.
@@ -196,14 +196,6 @@ class StepAdam(Adam):
             lent.frozen.append(Frozen(cast(Tensor, self.course.valid), param, state))
         if fed is not param.grad:
             lent.attribute(param, "grad", fed)
-
-    def _moving(
-        self, group: Group, param: Tensor, mask: Tensor | None, with_parts: bool
-    ) -> Tensor | None:
-        """The rows that may move, [N] bool; None: all, or the base's own step knows."""
-        if mask is None or not self._takes_mask(group, mask.numel()):
-            return None
-        return mask.to(param.device) if self.base is Adam or with_parts else None
 
     def _puts_back(self, mask: Tensor | None) -> bool:
         """Whether only the device knows if the step counts, and the step cannot ask it."""

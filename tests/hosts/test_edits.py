@@ -1,4 +1,4 @@
-"""`python -m opt3dgs_optim.hosts diff`: lines that fit the file, or a refusal that says why."""
+"""`opt3dgs hosts diff`: lines that fit the file, or a refusal that says why."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 from trainer_files import GSPLAT, INRIA, MINI_SPLATTING, SYNTHETIC, TAMING, added
 
-from opt3dgs_optim.hosts import diff, main, write
+from opt3dgs_optim.hosts import diff, write
+from opt3dgs_optim.hosts.cli import main
 
 IMPORT = "from opt3dgs_optim import PhaseScheduler"
 OURS = [
@@ -263,7 +264,7 @@ def test_a_file_that_cannot_be_written_is_left_alone(
 
 def test_as_a_module_it_prints_the_lines(tmp_path: Path) -> None:
     path = saved(tmp_path, INRIA)
-    command = [sys.executable, "-m", "opt3dgs_optim.hosts", "diff", str(path)]
+    command = [sys.executable, "-m", "opt3dgs_optim", "hosts", "diff", str(path)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert added(done.stdout) == [IMPORT, *OURS]
     assert path.read_text() == INRIA

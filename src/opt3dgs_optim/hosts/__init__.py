@@ -3,7 +3,6 @@
 `edits` writes the lines that a training script needs, `nerfstudio` adds methods to nerfstudio.
 """
 
-from opt3dgs_optim.hosts.cli import main
 from opt3dgs_optim.hosts.edits import Edited, diff, write
 
-__all__ = ["Edited", "diff", "main", "write"]
+__all__ = ["Edited", "diff", "write"]
