@@ -67,12 +67,11 @@ def test_lqnadam_shows_the_accepted_share_of_its_last_step() -> None:
 
 
 @pytest.mark.parametrize("rate", [0.25, torch.tensor(0.25)])
-def test_learning_rates_of_all_kinds_and_many_groups(rate: Any) -> None:
-    groups = [{"params": [points(), points(5)], "name": f"p{i}", "lr": rate} for i in range(10)]
+def test_learning_rates_of_all_kinds(rate: Any) -> None:
+    groups = [{"params": [points(), points(5)], "name": f"p{i}", "lr": rate} for i in range(2)]
     said = LQNAdam(groups)
     assert line(said, "p0") == "p0 2 tensors, 27 numbers: lr 0.25"
-    assert line(said, "and") == "and 2 more groups"
-    assert "p8" not in repr(said)
+    assert line(said, "p1") == "p1 2 tensors, 27 numbers: lr 0.25"
 
 
 def test_the_phases_of_a_training() -> None:

@@ -70,7 +70,7 @@ class SignAgreement(Part):
 
 parts: list[Part] = [*DEFAULTS, Pooling(), SignAgreement(), ConstantMultiplier(1.5)]
 phases = PhaseScheduler(30_000, 0.9, parts, adaptive=True)
-phases = PhaseScheduler(30_000, 29_000, [Annealing(peak={"means": 4.0}), Fading(seed=3)])
+phases = PhaseScheduler(30_000, 29_000, [Annealing(4.0, names=("means",)), Fading(seed=3)])
 phases = PhaseScheduler(300, parts=[FreshMoments(), SquaredLoss(), Curvature(history_size=3)])
 phases = PhaseScheduler.paper(total_steps=3_000)
 phase: Phase = phases.phase

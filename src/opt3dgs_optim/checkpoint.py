@@ -29,8 +29,7 @@ def loading(optimizer: Any) -> Iterator[None]:
         optimizer.state, optimizer.param_groups = before
         raise
     for group, name in zip(optimizer.param_groups, names, strict=True):
-        if name is not None:  # a plain Adam's checkpoint does not say it
-            group[SLOT] = name
+        group[SLOT] = name  # a plain Adam's checkpoint does not say it
     if optimizer.base is Adam and optimizer.defaults["fused"]:
         use_fused(optimizer)
     optimizer.trust_rows()

@@ -9,10 +9,10 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import LOGGER, check_keys
+from opt3dgs_optim.checks import LOGGER, check_count, check_keys
 from opt3dgs_optim.part import Part, Phase, overrides
 
-HOOKS = ("observe", "pixel_loss", "factor", "before", "after")
+HOOKS = ("observe", "pixel_loss", "factor", "before", "after", "numbers")
 CHECK_STEPS = 100  # iterations between two looks at the parts' evidence
 FORMAT = 2  # of a checkpoint
 P = TypeVar("P", bound=Part)
@@ -55,15 +55,12 @@ class Course:
 
     def _plan(self) -> None:
         """Which parts have which hooks in which phase; a hook that nobody has is never called."""
-        acting = [part for name, part in self._named() if name not in self.switched_off]
-        self._acting: dict[Phase | None, list[Part]] = {None: acting}
-        for phase in Phase:
-            self._acting[phase] = [part for part in acting if part.during in (None, phase)]
-        self._hooks = {
-            (phase, hook): [part for part in parts if overrides(part, hook)]
-            for phase, parts in self._acting.items()
-            for hook in HOOKS
-        }
+        on = [part for name, part in self.named().items() if name not in self.switched_off]
+        self._hooks: dict[tuple[Phase | None, str], list[Part]] = {}
+        for phase in (None, *Phase):
+            acting = [part for part in on if phase is None or part.during in (None, phase)]
+            for hook in HOOKS:
+                self._hooks[phase, hook] = [part for part in acting if overrides(part, hook)]
         self.keys = tuple({key: None for part in self.parts for key in part.keys})
 
     # -- where the training is -----------------------------------------------------------------
@@ -86,7 +83,7 @@ class Course:
     @property
     def exploiting(self) -> bool:
         """Whether the iteration observed last, whose step comes next, is exploitation."""
-        return self._has_phases and self.current >= self.switch_step
+        return self.phase_of(self.current) is Phase.EXPLOITATION
 
     @property
     def check_steps(self) -> int:
@@ -108,14 +105,14 @@ class Course:
         """The first part of a class, or None."""
         return next((part for part in self.parts if isinstance(part, kind)), None)
 
-    def part_names(self) -> list[str]:
-        """Their classes' names, in `switched_off` and checkpoints; "#2": the second of a class."""
-        names: list[str] = []
+    def named(self) -> dict[str, Part]:
+        """The parts by their classes' names, as in checkpoints; "#2" is the second of a class."""
+        named: dict[str, Part] = {}
         for part in self.parts:
-            name = type(part).__name__
-            again = sum(other.split("#")[0] == name for other in names)
-            names.append(f"{name}#{again + 1}" if again else name)
-        return names
+            kind = type(part).__name__
+            again = sum(name.split("#")[0] == kind for name in named)
+            named[f"{kind}#{again + 1}" if again else kind] = part
+        return named
 
     # -- one iteration -------------------------------------------------------------------------
 
@@ -146,7 +143,7 @@ class Course:
     def numbers(self) -> dict[str, float | Tensor]:
         """What the parts that act say of themselves: columns of the run log."""
         columns: dict[str, float | Tensor] = {}
-        for part in self._acting[self.phase_of(self.current)]:
+        for part in self.hooks("numbers"):
             columns.update(part.numbers(self))
         return columns
 
@@ -156,7 +153,7 @@ class Course:
         `over_ranks` averages a tensor over the ranks, so that all decide alike. Returns (event,
         part's name, reason) of each change.
         """
-        shown = [(name, part, part.evidence(self)) for name, part in self._named()]
+        shown = [(name, part, part.evidence(self)) for name, part in self.named().items()]
         known = [(name, part, seen) for name, part, seen in shown if seen is not None]
         if not known:
             return []
@@ -189,7 +186,7 @@ class Course:
             "iteration": self.iteration,
             "num_observed": self.num_observed,
             "switched_off": dict(self.switched_off),
-            "parts": {name: state for name, part in self._named() if (state := part.state_dict())},
+            "parts": {n: state for n, part in self.named().items() if (state := part.state_dict())},
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -203,25 +200,18 @@ class Course:
         if state.get("format") != FORMAT:
             raise ValueError(f"{call}: format={state.get('format')!r}, but {FORMAT} is needed")
         for name in ("iteration", "num_observed"):
-            value = state[name]
-            if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-                raise ValueError(f"{call}: {name}={value!r}, but a whole number is needed")
+            check_count(call, name, state[name], 0)
         for name in ("parts", "switched_off"):
             check_keys(f"{call}: {name}", state[name], ())
-        old = {name: part.state_dict() for name, part in self._named()}
+        named = self.named()
+        old = {name: part.state_dict() for name, part in named.items()}
         try:
-            for name, part in self._named():
-                if name in state["parts"]:
-                    part.load_state_dict(state["parts"][name])
+            for name in [name for name in named if name in state["parts"]]:
+                named[name].load_state_dict(state["parts"][name])
         except (ValueError, LookupError, TypeError, AttributeError) as error:
-            for name, part in self._named():
-                if old[name]:
-                    part.load_state_dict(old[name])
+            for name in [name for name in named if old[name]]:
+                named[name].load_state_dict(old[name])
             raise ValueError(f"{call}: {error}") from None
         self.current, self.num_observed = state["iteration"] - 1, state["num_observed"]
-        known = dict(self._named())
-        self.switched_off = {k: str(v) for k, v in state["switched_off"].items() if k in known}
+        self.switched_off = {k: str(v) for k, v in state["switched_off"].items() if k in named}
         self._plan()
-
-    def _named(self) -> list[tuple[str, Part]]:
-        return list(zip(self.part_names(), self.parts, strict=True))

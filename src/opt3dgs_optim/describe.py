@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from opt3dgs_optim.names import slot
-
-MOST_GROUPS = 8
+from opt3dgs_optim.names import SLOT
 
 
 def block(name: str, lines: Iterable[str]) -> str:
@@ -15,22 +13,15 @@ def block(name: str, lines: Iterable[str]) -> str:
     return "\n".join([f"{name}(", *(f"  {line}" for line in lines), ")"])
 
 
-def group_lines(groups: Iterable[Mapping[str, Any]]) -> list[str]:
-    """A line per parameter group: name, shape and learning rate."""
-    lines = [_group_line(i, group) for i, group in enumerate(groups)]
-    more = len(lines) - MOST_GROUPS
-    return lines if more <= 0 else [*lines[:MOST_GROUPS], f"and {more} more groups"]
-
-
 def group_name(index: int, group: Mapping[str, Any]) -> str:
     """How a group is called in messages."""
-    return str(group.get("name") or slot(group) or f"group {index}")
+    return str(group.get("name") or group.get(SLOT) or f"group {index}")
 
 
-def _group_line(index: int, group: Mapping[str, Any]) -> str:
+def group_line(index: int, group: Mapping[str, Any]) -> str:
+    """A parameter group's name, shape and learning rate."""
     params = group["params"]
-    if len(params) == 1:
-        size = str(list(params[0].shape))
-    else:
+    size: Any = list(params[0].shape)
+    if len(params) != 1:
         size = f"{len(params)} tensors, {sum(p.numel() for p in params):,} numbers"
     return f"{group_name(index, group)} {size}: lr {float(group['lr']):.4g}"

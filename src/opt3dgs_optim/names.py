@@ -24,11 +24,6 @@ def canonical_name(name: Any) -> str | None:
     return _CANONICAL.get(name) if isinstance(name, str) else None
 
 
-def slot(group: Mapping[str, Any]) -> str | None:
-    """gsplat's name of the Gaussian parameter in a group: what `upgrade` said, or its own; None."""
-    return group[SLOT] if SLOT in group else canonical_name(group.get("name"))
-
-
 def check_names(call: str, names: Any) -> tuple[str, ...]:
     """gsplat's names of these Gaussian parameters; ValueError for another name, or none at all."""
     known: tuple[str | None, ...] = ()

@@ -50,9 +50,8 @@ class FixedPartitions:
         scalar = torch.tensor([low, (high - low) / m, self.tau, 0, 1], dtype=dtype, device=device)
         self._low, self._width, self._tau, self._count, self.nu = scalar.unbind()
         self.weights = torch.full((m,), 1.0 / m, dtype=dtype, device=device)
-        self._powers = torch.arange(3, dtype=dtype, device=device)
 
-    def take(self, energy: Tensor, valid: Tensor | bool, count: int, sums: Tensor | None) -> None:
+    def take(self, energy: Tensor, valid: Tensor | bool, count: int) -> None:
         """Nu from the present weights, then their update; as `MovingPartitions.take`."""
         valid = torch.as_tensor(valid, device=energy.device)
         value = torch.where(valid, energy.to(self.weights.dtype), 0.0)
@@ -64,8 +63,6 @@ class FixedPartitions:
         self.nu.copy_(torch.where(valid, nu, self.nu))
         self._update(index, valid)
         self._count.add_(valid)
-        if sums is not None:
-            sums.addcmul_(torch.pow(self.nu, self._powers), valid)
 
     def _multiplier(self, index: Tensor) -> Tensor:
         """Nu of eq. 14 for partition `index`, before the warm-up is considered."""
@@ -164,7 +161,6 @@ class MovingPartitions:
         self._state, self._target = torch.full((2, m + 3), 1.0 / m, **like).unbind()
         self._state[:3] = torch.tensor([0.0, 1.0, 0.0])
         self.nu = torch.ones((), **like)
-        self._powers = torch.arange(3, **like)
         tiny = 1e-150 if dtype.itemsize == 8 else 1e-30
         self._tiny = torch.full((), tiny, **like)
         self._views()
@@ -177,12 +173,10 @@ class MovingPartitions:
         self._t = self._products[-1]
         self._up, self._below, self._base = self._sums.unbind()
 
-    def take(
-        self, energy: Tensor, valid: Tensor | Literal[True], count: int, sums: Tensor | None
-    ) -> None:
+    def take(self, energy: Tensor, valid: Tensor | Literal[True], count: int) -> None:
         """Nu from the present density, then its update with an energy, 0-d, the `count`-th.
 
-        `valid` is whether it is finite; nu's powers 0, 1 and 2 are added to `sums`, [3] or None.
+        `valid` is whether it is finite.
         """
         limit = LIMIT / MEAN_ABS if count > UNLIMITED else 1 / RESOLUTION
         rate = max(1 / count, 1 / MEMORY)
@@ -207,8 +201,6 @@ class MovingPartitions:
         torch.add(self._mean, step, out=self._to_mean)
         torch.hypot(step, self._tiny, out=self._to_deviation)
         self._state.lerp_(self._target, rate if known else rate * valid.to(self._state.dtype))
-        if sums is not None:
-            sums.addcmul_(torch.pow(self.nu, self._powers), torch.as_tensor(valid))
 
     @property
     def weights(self) -> Tensor:

@@ -203,8 +203,7 @@ class PhaseScheduler(Course):
         self.take(value if self._over_ranks is None else self._over_ranks(value))
         if self.log is not None:
             phase = self.phase_of(self.current)
-            name = "" if phase is None else phase.value
-            self.log.step(self.current, phase=name, energy=value, **self.numbers())
+            self.log.step(self.current, phase=phase, energy=value, **self.numbers())
         if self.adaptive and self.num_observed % self.check_steps == 0:
             for event, part, reason in self.judge(self._over_ranks):
                 if self.log is not None:
@@ -250,7 +249,7 @@ class PhaseScheduler(Course):
         """Say once what keeps the parts from acting."""
         if self.parts and not self._told:
             self._told = True
-            warn_user(f"{CALL}: {mistake.format(', '.join(self.part_names()))}")
+            warn_user(f"{CALL}: {mistake.format(', '.join(self.named()))}")
 
     def _watch_clock(self) -> None:
         steps, self._adam_steps = self._adam_steps, None
@@ -284,7 +283,7 @@ class PhaseScheduler(Course):
         if self.switch_step >= self.total_steps:
             switch = "no switch"
         lines = [f"iteration {self.iteration} of {self.total_steps}, {self.phase.value}, {switch}"]
-        for name, part in self._named():
+        for name, part in self.named().items():
             off = self.switched_off.get(name)
             lines.append(str(part) + ("" if off is None else f": switched off, {off}"))
         return block(CALL, lines)

@@ -13,7 +13,7 @@ from torch.optim import Adam
 
 from opt3dgs_optim.checkpoint import STATE_KEY, check_rows, loading
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.describe import block, group_lines
+from opt3dgs_optim.describe import block, group_line
 from opt3dgs_optim.lending import Lent, guard, own_step, refuse_capture, use_fused
 from opt3dgs_optim.names import SLOT, canonical_name
 from opt3dgs_optim.part import Group, Part
@@ -281,5 +281,5 @@ class StepAdam(Adam):
             super().load_state_dict(state_dict)
 
     def __repr__(self) -> str:
-        lines = [str(part) for part in self.course.parts] + group_lines(self.param_groups)
-        return block(type(self).__name__, lines)
+        groups = [group_line(i, group) for i, group in enumerate(self.param_groups)]
+        return block(type(self).__name__, [*map(str, self.course.parts), *groups])

@@ -44,7 +44,6 @@ def test_opacities_have_a_peak_of_their_own() -> None:
     assert annealing.at("opacities", 0.0) == annealing.at("opacity", 0.0) == 1.0
     assert annealing.at("opacities", 1.0) == annealing.at("scales", 1.0) == 0.5
     assert Annealing(8.0, 0.5, opacity_peak=2.0).at("opacities", 0.5) == pytest.approx(1.0)
-    assert Annealing({"means": 8.0}, 0.5, opacity_peak=2.0).at("opacities", 0.5) == 1.0
 
 
 def test_the_positions_are_left_alone_unless_they_are_named() -> None:
@@ -121,17 +120,16 @@ def test_the_factor_is_none_of_decoupled_decays_business(decoupled: str) -> None
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
-def test_peaks_by_parameter_can_be_copied(copied: Any) -> None:
-    annealing = Annealing(peak={"xyz": 4.0, "scales": 2.0})
+def test_it_can_be_copied(copied: Any) -> None:
+    annealing = Annealing(names=("xyz", "scales"))
     assert copied(annealing) == annealing
     splats, phases, optimizers = upgraded(TOTAL, annealing)
     train(splats, optimizers, phases, 0, 3)
     assert repr(copied(optimizers["means"])) == repr(optimizers["means"])
 
 
-@pytest.mark.parametrize("peak", [4.0, {"means": 4.0}])
-def test_the_log_gets_the_factor(peak: Any) -> None:
-    phases = only(TOTAL, Annealing(peak, 1.0))
+def test_the_log_gets_the_factor() -> None:
+    phases = only(TOTAL, Annealing(4.0, 1.0))
     phases.observe(0.1, iteration=TOTAL // 2)
     assert phases.numbers() == {"annealing": pytest.approx(2.0)}
 
@@ -141,8 +139,6 @@ def test_the_log_gets_the_factor(peak: Any) -> None:
     [
         (lambda: Annealing(0.0), r"Annealing: peak=0.0, but a finite number in \(0"),
         (lambda: Annealing(8.0, -1.0), r"Annealing: final=-1.0"),
-        (lambda: Annealing({"means": -1.0}), r"Annealing: peak\['means'\]=-1.0"),
-        (lambda: Annealing({"pose": 2.0}), r"'pose', which is no Gaussian.*means, scales"),
         (lambda: Annealing(float("nan")), r"Annealing: peak=nan"),
         (lambda: Annealing(names=("pose",)), r"Annealing: names=\('pose',\), but a tuple"),
         (lambda: Annealing(names=()), r"Annealing: names=\(\), but a tuple"),

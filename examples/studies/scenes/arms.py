@@ -311,7 +311,7 @@ def detail() -> list[StudyArm]:
             StudyArm(
                 f"annealed-{name}+faded",
                 f"faded, and {', '.join(names)} alone annealed",
-                of(Annealing({n: 1.0 if n == "opacities" else 4.0 for n in names}, 0.4), FADING),
+                of(Annealing(4.0, 0.4, names=names), FADING),
                 control="faded",
             )
             for name, names in alone.items()

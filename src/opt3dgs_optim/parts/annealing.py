@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from opt3dgs_optim.checks import check_number
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.names import GAUSSIAN, GAUSSIAN_NAMES, canonical_name, check_names, slot
+from opt3dgs_optim.names import GAUSSIAN, SLOT, canonical_name, check_names
 from opt3dgs_optim.part import Group, Part
 
 CALL = "Annealing"
@@ -33,40 +33,24 @@ class Annealing(Part):
     is over-fitted.
 
     Args:
-        peak: factor at the first iteration, above 0: a number for all parameters but the
-            opacities, or a dict by parameter (gsplat's or INRIA's names; those left out are not
-            annealed).
+        peak: factor at the first iteration, above 0, of all parameters but the opacities.
         final: factor at the last iteration, above 0.
-        opacity_peak: `peak` of the opacities, where that is a number.
-        names: the Gaussian parameters, where the peak is a number.
+        opacity_peak: `peak` of the opacities.
+        names: the Gaussian parameters, under gsplat's or INRIA's names.
 
     Raises:
         ValueError: an option is outside what is allowed, or a name is no Gaussian parameter's.
     """
 
-    peak: float | Mapping[str, float] = 4.0
+    peak: float = 4.0
     final: float = 0.4
     opacity_peak: float = 1.0
     names: tuple[str, ...] = ANNEALED
 
     def __post_init__(self) -> None:
-        check_number(CALL, "final", self.final, 0.0, open_low=True)
-        check_number(CALL, "opacity_peak", self.opacity_peak, 0.0, open_low=True)
-        if not isinstance(self.peak, Mapping):
-            check_number(CALL, "peak", self.peak, 0.0, open_low=True)
-            object.__setattr__(self, "names", check_names(CALL, self.names))
-            return
-        peaks: dict[str, float] = {}
-        for name, value in self.peak.items():
-            known = canonical_name(name)
-            if known is None:
-                raise ValueError(
-                    f"{CALL}: peak has {name!r}, which is no Gaussian parameter's name; allowed "
-                    f"are {', '.join(GAUSSIAN_NAMES)}"
-                )
-            peaks[known] = check_number(CALL, f"peak[{name!r}]", value, 0.0, open_low=True)
-        object.__setattr__(self, "peak", peaks)
-        object.__setattr__(self, "names", tuple(peaks))
+        for option in ("peak", "final", "opacity_peak"):
+            check_number(CALL, option, getattr(self, option), 0.0, open_low=True)
+        object.__setattr__(self, "names", check_names(CALL, self.names))
 
     def at(self, name: str | None, progress: float) -> float:
         """The factor on a parameter's step.
@@ -78,16 +62,13 @@ class Annealing(Part):
         known = canonical_name(name)
         if known not in self.names:
             return 1.0
-        if isinstance(self.peak, Mapping):
-            peak = self.peak[known]
-        else:
-            peak = self.opacity_peak if known == "opacities" else self.peak
+        peak = self.opacity_peak if known == "opacities" else self.peak
         t = min(max(progress, 0.0), 1.0)
         return peak ** (1.0 - t) * self.final**t
 
     def factor(self, group: Group, course: Course) -> float:
         """The factor on the group's next step."""
-        return self.at(slot(group), course.progress)
+        return self.at(group.get(SLOT), course.progress)
 
     def numbers(self, course: Course) -> Mapping[str, float]:
         """`annealing`: the factor on the steps of the first of its parameters."""

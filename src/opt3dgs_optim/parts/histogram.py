@@ -112,6 +112,7 @@ class EnergyHistogram(Part):
         self.last_finite: Tensor | bool = True  # whether the last energy was
         # Powers 0, 1 and 2 of nu, summed over the energies after the warm-up; on a CPU as numbers.
         self._sums: Any = [0.0] * 3 if self._on_host else self._law.nu.new_zeros(3)
+        self._powers = torch.arange(3).to(self._law.nu)
         self._factor: float | Tensor = 1.0
 
     @torch.no_grad()
@@ -149,13 +150,14 @@ class EnergyHistogram(Part):
     def _take(self, value: Tensor, valid: Tensor | Literal[True]) -> None:
         law = self._law
         self._taken += 1
-        warm = self._taken > self.warmup
-        law.take(value, valid, self._taken, self._sums if warm and not self._on_host else None)
-        if not warm:
+        law.take(value, valid, self._taken)
+        if self._taken <= self.warmup:
             law.nu.fill_(1.0)
         self._factor = nu = law.nu.item() if self._on_host else law.nu
-        if self._on_host and warm:
+        if self._taken > self.warmup and isinstance(nu, float):
             self._sums = [a + b for a, b in zip(self._sums, (1.0, nu, nu * nu), strict=True)]
+        elif self._taken > self.warmup:
+            self._sums.addcmul_(torch.pow(nu, self._powers), torch.as_tensor(valid))
 
     def _on_device(self, energy: Tensor | float) -> Tensor:
         if not isinstance(energy, Tensor):

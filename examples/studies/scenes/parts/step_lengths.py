@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor
 
 from opt3dgs_optim import Course, Part
-from opt3dgs_optim.names import slot
+from opt3dgs_optim.names import SLOT
 from opt3dgs_optim.part import Group
 
 
@@ -31,12 +31,12 @@ class StepLengths(Part):
     ) -> Tensor:
         """Remember where the parameter was."""
         if course.iteration % self.every == 0:
-            self._old[str(slot(group))] = param.detach().clone()
+            self._old[str(group[SLOT])] = param.detach().clone()
         return grad
 
     def after(self, group: Group, param: Tensor, state: dict[str, Any], course: Course) -> None:
         """Compare; a part that adds noise comes later in the list."""
-        old = self._old.pop(str(slot(group)), None)
+        old = self._old.pop(str(group[SLOT]), None)
         if old is not None:
             length = float(((param.detach() - old) / group["lr"]).square().mean().sqrt())
-            self.rows.setdefault(str(slot(group)), []).append((course.iteration, round(length, 5)))
+            self.rows.setdefault(str(group[SLOT]), []).append((course.iteration, round(length, 5)))
