@@ -84,8 +84,8 @@ def _obstacle(
         return "backend='torch' was asked for"
     if dim != 3 or history_size > KERNEL_HISTORY:
         found = (
-            f"the kernels are for at most {KERNEL_HISTORY} pairs of points of 3 coordinates, not "
-            f"for {history_size} of points of {dim} coordinates"
+            f"there is no kernel for {history_size} pairs of points of {dim} coordinates, "
+            f"only for at most {KERNEL_HISTORY} of 3"
         )
     elif device.type != "cuda":
         found = "the kernels need a CUDA device"

@@ -54,16 +54,14 @@ def check_rows(call: str, params: list[Tensor], keys: Iterable[str], state: Any)
         own = state.get(param)
         if not own and isinstance(own, (Mapping, type(None))):
             continue
-        check_keys(call, own, ())
+        check_keys(call, own, ("step", "exp_avg", "exp_avg_sq"))
         for key in ("exp_avg", "exp_avg_sq"):
-            value = own.get(key)
+            value = own[key]
             if not isinstance(value, Tensor) or value.shape[1:] != param.shape[1:]:
                 shape = tuple(value.shape) if isinstance(value, Tensor) else value
                 raise ValueError(
                     f"{call}: {key} has shape {shape}, but the parameter has {tuple(param.shape)}"
                 )
-        if "step" not in own:
-            raise ValueError(f"{call}: no 'step' among {list(own)}; an Adam's state is needed")
         for key in keys:
             if key in own and own[key].shape[0] != rows_of(param):
                 warn_user(

@@ -164,12 +164,11 @@ class Course:
         changes = []
         for name, part, seen in known:
             own, numbers = numbers[: seen.numel()], numbers[seen.numel() :]
-            why, before = part.useless(own, self), self.switched_off.pop(name, None)
-            if why is not None:
-                self.switched_off[name] = before or why
-            if why is not None and before is None:
+            why = part.useless(own, self)
+            if why is not None and name not in self.switched_off:
+                self.switched_off[name] = why
                 changes.append(("switched_off", name, why))
-            elif why is None and before is not None:
+            elif why is None and self.switched_off.pop(name, None) is not None:
                 changes.append(("switched_on", name, "it is of use again"))
         if changes:
             self._plan()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 # gsplat | INRIA and 3dgs-mcmc | nerfstudio
@@ -24,13 +24,21 @@ def canonical_name(name: Any) -> str | None:
     return _CANONICAL.get(name) if isinstance(name, str) else None
 
 
+def group_name(index: int, group: Mapping[str, Any]) -> str:
+    """How a group is called in messages."""
+    return str(group.get("name") or group.get(SLOT) or f"group {index}")
+
+
+def block(name: str, lines: Iterable[str]) -> str:
+    """What an object with parts says of itself: `name(`, the lines, indented, and `)`."""
+    return "\n".join([f"{name}(", *(f"  {line}" for line in lines), ")"])
+
+
 def check_names(call: str, names: Any) -> tuple[str, ...]:
     """gsplat's names of these Gaussian parameters; ValueError for another name, or none at all."""
-    known: tuple[str | None, ...] = ()
-    if isinstance(names, (tuple, list)):
-        known = tuple(canonical_name(name) for name in names)
-    found = tuple(name for name in known if name is not None)
-    if not found or len(found) < len(known):
+    given = names if isinstance(names, (tuple, list)) else ()
+    found = tuple(known for name in given if (known := canonical_name(name)) is not None)
+    if not found or len(found) < len(given):
         raise ValueError(
             f"{call}: names={names!r}, but a tuple of Gaussian parameters' names is needed: "
             f"{', '.join(GAUSSIAN_NAMES)}"

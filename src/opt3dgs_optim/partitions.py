@@ -47,8 +47,9 @@ class FixedPartitions:
         # MPS has no float64.
         dtype = torch.float32 if device.type == "mps" else torch.float64
         m, (low, high) = self.num_partitions, self.energy_range
-        scalar = torch.tensor([low, (high - low) / m, self.tau, 0, 1], dtype=dtype, device=device)
-        self._low, self._width, self._tau, self._count, self.nu = scalar.unbind()
+        scalars = [low, (high - low) / m, self.tau, 0, 1]
+        self._scalars = torch.tensor(scalars, dtype=dtype, device=device)
+        self._low, self._width, self._tau, self._count, self.nu = self._scalars.unbind()
         self.weights = torch.full((m,), 1.0 / m, dtype=dtype, device=device)
 
     def take(self, energy: Tensor, valid: Tensor | bool, count: int) -> None:
@@ -88,13 +89,12 @@ class FixedPartitions:
 
     def coordinates(self) -> tuple[float, float, float]:
         """Low and high end of the range, and tau. Synchronises."""
-        low = float(self._low)
-        return low, low + float(self._width) * self.num_partitions, float(self._tau)
+        low, width, tau, *_ = self._scalars.tolist()
+        return low, low + width * self.num_partitions, tau
 
     def state(self) -> dict[str, Any]:
         """Plain floats and lists. Synchronises."""
-        scalars = torch.stack([self._low, self._width, self._tau, self._count, self.nu])
-        return {"weights": self.weights.tolist(), "scalars": scalars.tolist()}
+        return {"weights": self.weights.tolist(), "scalars": self._scalars.tolist()}
 
     def check(self, call: str, state: Mapping[str, Any]) -> None:
         """ValueError unless the weights are weights, and the range is one."""
@@ -107,9 +107,7 @@ class FixedPartitions:
     def load(self, state: Mapping[str, Any]) -> None:
         """Restore `state()`."""
         self.weights.copy_(torch.tensor(state["weights"], dtype=torch.float64))
-        scalars = (self._low, self._width, self._tau, self._count, self.nu)
-        for scalar, value in zip(scalars, state["scalars"], strict=True):
-            scalar.fill_(value)
+        self._scalars.copy_(torch.tensor(state["scalars"], dtype=torch.float64))
 
 
 class MovingPartitions:

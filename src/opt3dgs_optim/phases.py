@@ -11,8 +11,7 @@ from torch.optim import Optimizer
 
 from opt3dgs_optim.checks import check_count, check_flag, check_number, warn_user
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.describe import block
-from opt3dgs_optim.names import GAUSSIAN_NAMES, canonical_name
+from opt3dgs_optim.names import GAUSSIAN_NAMES, block, canonical_name
 from opt3dgs_optim.part import Part, Phase
 from opt3dgs_optim.presets import DEFAULTS, PAPER_STEPS, PAPER_SWITCH, paper_parts
 from opt3dgs_optim.ranks import RankMean

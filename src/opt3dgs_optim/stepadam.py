@@ -13,9 +13,8 @@ from torch.optim import Adam
 
 from opt3dgs_optim.checkpoint import STATE_KEY, check_rows, loading
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.describe import block, group_line
 from opt3dgs_optim.lending import Lent, guard, own_step, refuse_capture, use_fused
-from opt3dgs_optim.names import SLOT, canonical_name
+from opt3dgs_optim.names import SLOT, block, canonical_name, group_name
 from opt3dgs_optim.part import Group, Part
 from opt3dgs_optim.rows import Frozen, Ledger, check_mask, shaped
 
@@ -281,5 +280,9 @@ class StepAdam(Adam):
             super().load_state_dict(state_dict)
 
     def __repr__(self) -> str:
-        groups = [group_line(i, group) for i, group in enumerate(self.param_groups)]
-        return block(type(self).__name__, [*map(str, self.course.parts), *groups])
+        lines = [str(part) for part in self.course.parts]
+        for i, group in enumerate(self.param_groups):
+            sizes = [list(param.shape) for param in group["params"]]
+            size = sizes[0] if len(sizes) == 1 else f"{len(sizes)} tensors"
+            lines.append(f"{group_name(i, group)} {size}: lr {float(group['lr']):.4g}")
+        return block(type(self).__name__, lines)

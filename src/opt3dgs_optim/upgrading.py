@@ -12,8 +12,7 @@ from torch.optim import Adam
 from opt3dgs_optim.checkpoint import take_loaded
 from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.describe import group_name
-from opt3dgs_optim.names import SLOT, canonical_name
+from opt3dgs_optim.names import SLOT, canonical_name, group_name
 from opt3dgs_optim.stepadam import StepAdam
 
 CALL = "PhaseScheduler.upgrade"

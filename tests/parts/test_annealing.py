@@ -31,11 +31,11 @@ def test_factor_falls_geometrically(progress: float, factor: float) -> None:
     assert Annealing(8.0, 0.5).at("scales", progress) == pytest.approx(factor)
 
 
-def test_peaks_by_parameter_take_every_trainers_names() -> None:
-    annealing = Annealing({"xyz": 4.0, "scaling": 2.0}, 1.0)
+def test_names_are_those_of_every_trainer() -> None:
+    annealing = Annealing(4.0, 1.0, names=("xyz", "scaling"))
     assert annealing.at("means", 0.0) == annealing.at("xyz", 0.0) == 4.0
-    assert annealing.at("scales", 0.5) == pytest.approx(2**0.5)
-    assert annealing.at("opacities", 0.0) == 1.0  # left out
+    assert annealing.at("scales", 0.5) == pytest.approx(2.0)
+    assert annealing.at("quats", 0.0) == annealing.at("opacities", 0.0) == 1.0  # left out
     assert annealing.at("camera_opt", 0.0) == Annealing().at(None, 0.0) == 1.0
 
 

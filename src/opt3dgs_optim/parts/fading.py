@@ -88,23 +88,17 @@ class Fading(Part):
         if done is None:
             done = self.events_before(course.iteration - 1, course.total_steps)
         group[DONE] = now
-        if now > done and param.dim() > 0:
-            self._fade(param, state, range(max(done, now - MOST), now), course.valid)
-        return grad
-
-    def _fade(
-        self, param: Tensor, state: dict[str, Any], events: range, valid: Tensor | bool
-    ) -> None:
-        for event in events:
+        for event in range(max(done, now - MOST), now if param.dim() > 0 else 0):
             chosen = self.chosen(event, param.shape[0], param.device)
-            if isinstance(valid, Tensor):
-                chosen = chosen & valid
+            if isinstance(course.valid, Tensor):
+                chosen = chosen & course.valid
             chosen = shaped(chosen, param)
             state["exp_avg"].mul_(torch.where(chosen, self.exp_avg, 1.0))
             second = torch.where(chosen, self.exp_avg_sq, 1.0)
             for key in ("exp_avg_sq", "max_exp_avg_sq"):
                 if key in state:
                     state[key].mul_(second)
+        return grad
 
     def numbers(self, course: Course) -> Mapping[str, float]:
         """`faded`: the share of the points that the present iteration's events fade."""
