@@ -163,18 +163,6 @@ def test_without_any_energy_it_says_so_once() -> None:
         optimizer.step()
 
 
-def test_an_energy_that_stops_coming_is_noticed() -> None:
-    params = parameters()
-    histogram = EnergyHistogram()
-    optimizer = AWSGLD(params, lr=0.01, histogram=histogram)
-    set_gradients(params, 0)
-    histogram.observe(0.1)
-    for _ in range(200):
-        optimizer.step()
-    with pytest.warns(UserWarning, match="no energy has been observed for 200 steps"):
-        optimizer.step()
-
-
 def test_isotropic_noise_has_the_stated_deviation() -> None:
     torch.manual_seed(0)
     x = torch.nn.Parameter(torch.zeros(20_000))

@@ -174,16 +174,6 @@ def test_reset_points_keeps_the_pairs_of_the_others(rows: Tensor) -> None:
     assert int((dropped != 0).sum()) < int((counters != 0).sum())
 
 
-def test_reset_points_moments_too() -> None:
-    splats, optimizers, _ = exploited()
-    reset_points(optimizers, torch.arange(12) == 4, moments=True)
-    for name, optimizer in optimizers.items():
-        state = optimizer.state[splats[name]]
-        assert not bool(state["exp_avg"][4].any())
-        assert bool(state["exp_avg"][5].any())
-    assert not bool(optimizers["means"].state[splats["means"]]["history"][4].any())
-
-
 def test_reset_points_of_another_number() -> None:
     _, optimizers, _ = exploited()
     with pytest.raises(ValueError, match=re.escape("rows has shape (5,)")):
@@ -257,5 +247,5 @@ def test_a_checkpoint_of_other_rows_is_said() -> None:
 def test_reset_points_leaves_other_optimizers_alone() -> None:
     splats, optimizers, _, _ = aged()
     pose = torch.optim.Adam([Parameter(torch.ones(3))])
-    reset_points({**optimizers, "pose": pose}, torch.tensor([0]), moments=True)
+    reset_points({**optimizers, "pose": pose}, torch.tensor([0]))
     assert float(optimizers["means"].state[splats["means"]]["age"][0]) == 0.0

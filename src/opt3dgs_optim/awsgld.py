@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 PLAIN_EPS = 1e15  # so large that Adam's root of the second moment vanishes beside it
-STALE = 200  # steps without a new energy before it is said
 
 
 class AWSGLD(StepAdam):
@@ -88,7 +87,7 @@ class AWSGLD(StepAdam):
             parts.append(_PlainDrift())
         super().__init__(params, lr, betas, eps, weight_decay, amsgrad, **adam)
         self.histogram, self.noise = histogram, noise
-        self.follow(_ObservedCourse(parts, histogram))
+        self.follow(_ObservedCourse(parts))
 
     def acts_on(self, part: Part, group: Group) -> bool:
         """All parts on all groups, but the positions' noise on positions."""
@@ -103,26 +102,18 @@ class AWSGLD(StepAdam):
 class _ObservedCourse(Course):
     """A course without a clock whose energies a histogram is told."""
 
-    def __init__(self, parts: list[Part], histogram: EnergyHistogram | None) -> None:
-        super().__init__(parts)
-        self._histogram = histogram
-        self._seen, self._stale = -1, 0
-
     def stepping(self, closure_value: Any) -> bool:
         self.steps += 1
-        histogram = self._histogram
+        histogram = self.part(EnergyHistogram)
         if histogram is None:
             return True
         if closure_value is not None:
             histogram.observe(closure_value)
-        self._stale = self._stale + 1 if histogram.num_observed == self._seen else 0
-        self._seen = histogram.num_observed
-        if (histogram.num_observed == 0 and self.steps == 1) or self._stale == STALE:
-            since = f"for {STALE} steps" if histogram.num_observed else "yet"
+        if self.steps == 1 and histogram.num_observed == 0:
             warn_user(
-                f"AWSGLD: step() was called but no energy has been observed {since}, so the "
-                "multiplier is not being adapted. Call histogram.observe(loss) once per "
-                "iteration, before step(), or pass step() a closure that returns the loss."
+                "AWSGLD: step() was called but no energy has been observed yet, so the multiplier "
+                "is not being adapted. Call histogram.observe(loss) once per iteration, before "
+                "step(), or pass step() a closure that returns the loss."
             )
         self.valid = histogram.last_finite
         return True

@@ -47,14 +47,9 @@ class Ledger:
                 self._seen[state[key]] = seen
 
     def forget(
-        self,
-        call: str,
-        states: list[tuple[Tensor, dict[str, Any]]],
-        keys: Iterable[str],
-        rows: Tensor,
-        moments: bool,
+        self, call: str, states: list[tuple[Tensor, Any]], keys: Iterable[str], rows: Tensor
     ) -> None:
-        """Zero these rows under `keys`, and of the moments too if asked; see `reset_points`."""
+        """Zero these rows under `keys`; see `reset_points`."""
         is_mask = rows.dtype == torch.bool
         fitting = [
             s for s in states if s[0].dim() and (not is_mask or rows.shape == s[0].shape[:1])
@@ -71,11 +66,9 @@ class Ledger:
                 left_behind = seen is not None and seen.moment() is not state["exp_avg"]
                 if left_behind or state[key].shape[0] != rows_of(param):
                     del state[key]
-            kept = [key for key in keys if key in state]
-            for key in [*kept, *(MOMENTS if moments else ())]:
-                if key in state and state[key].shape[0] == param.shape[0]:
+                else:
                     state[key][rows.to(param.device)] = 0
-            self.remember(param, state, kept)
+            self.remember(param, state, keys)
 
     def _knows(self, param: Tensor, tensor: Tensor) -> bool:
         seen = self._seen.get(tensor)
@@ -129,7 +122,7 @@ def check_mask(call: str, masks: list[Any], num_points: int | None) -> Tensor:
     return mask if mask.dtype == torch.bool else mask != 0
 
 
-def reset_points(optimizers: Any, rows: Tensor, *, moments: bool = False) -> None:
+def reset_points(optimizers: Any, rows: Tensor) -> None:
     """Say which points have moved by other means than the optimizers: what parts kept of them goes.
 
     Call it after each edit of the parameters: curvature pairs of all other points stay in use,
@@ -139,7 +132,6 @@ def reset_points(optimizers: Any, rows: Tensor, *, moments: bool = False) -> Non
     Args:
         optimizers: an upgraded optimizer, or a dict of them (others in it are left alone).
         rows: [N] bool mask or a vector of indices, of the points as they are now.
-        moments: whether to start their Adam moments anew too.
 
     Raises:
         ValueError: a mask fits no parameter.
@@ -147,4 +139,4 @@ def reset_points(optimizers: Any, rows: Tensor, *, moments: bool = False) -> Non
     every = optimizers.values() if isinstance(optimizers, Mapping) else [optimizers]
     for optimizer in every:
         if hasattr(optimizer, "reset_points"):
-            optimizer.reset_points(rows, moments=moments)
+            optimizer.reset_points(rows)
