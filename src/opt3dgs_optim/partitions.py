@@ -161,10 +161,7 @@ class MovingPartitions:
         self.nu = torch.ones((), **like)
         tiny = 1e-150 if dtype.itemsize == 8 else 1e-30
         self._tiny = torch.full((), tiny, **like)
-        self._views()
-
-    def _views(self) -> None:
-        # Made once: a view is an operator too.
+        # Views are made once: a view is an operator too.
         self._mean, self._deviation, self._mean_slope = self._state[:3].unbind()
         self._to_mean, self._to_deviation, self._slope = self._target[:3].unbind()
         self._q, self._kernel, self._kq = self._state[3:], self._target[3:], self._products[:-1]

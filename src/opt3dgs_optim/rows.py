@@ -35,8 +35,9 @@ class Ledger:
 
     def drop_strangers(self, param: Tensor, state: dict[str, Any], keys: Iterable[str]) -> None:
         """Remove the tensors under `keys` that are of other rows than the parameter's present."""
-        for key in keys:
-            if key in state and not self._knows(param, state[key]):
+        for key in [key for key in keys if key in state]:
+            seen = self._seen.get(state[key])
+            if seen is None or seen.param() is not param or seen.rows != rows_of(param):
                 del state[key]
 
     def remember(self, param: Tensor, state: dict[str, Any], keys: Iterable[str]) -> None:
@@ -69,10 +70,6 @@ class Ledger:
                 else:
                     state[key][rows.to(param.device)] = 0
             self.remember(param, state, keys)
-
-    def _knows(self, param: Tensor, tensor: Tensor) -> bool:
-        seen = self._seen.get(tensor)
-        return seen is not None and seen.param() is param and seen.rows == rows_of(param)
 
 
 class Frozen:

@@ -105,7 +105,12 @@ class Curvature(Part):
         fed, accepted, candidates = lqn_direction(
             position, gradient, history, self.history_size, **options
         )
-        self._count(torch.stack([accepted.count_nonzero(), candidates.count_nonzero()]), course)
+        tally = torch.stack([accepted.count_nonzero(), candidates.count_nonzero()])
+        self._tally = tally if course.steps != self._step else self._tally + tally
+        self._step = course.steps
+        if course.adaptive:
+            self._seen = self._seen.to(tally.device)
+            self._seen[:2] += tally
         return fed.reshape(grad.shape)
 
     def _history(self, state: dict[str, Any], position: Tensor) -> Tensor:
@@ -117,13 +122,6 @@ class Curvature(Part):
             state[HISTORY] = new_history(position, self.history_size, contiguous=kernel)
         state[HISTORY] = laid_out(state[HISTORY], contiguous=kernel)
         return state[HISTORY]
-
-    def _count(self, tally: Tensor, course: Course) -> None:
-        self._tally = tally if course.steps != self._step else self._tally + tally
-        self._step = course.steps
-        if course.adaptive:
-            self._seen = self._seen.to(tally.device)
-            self._seen[:2] += tally
 
     def numbers(self, course: Course) -> Mapping[str, float | Tensor]:
         """`accepted`: the share of the candidate pairs that the last step accepted."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +13,7 @@ from opt3dgs_optim.runs.read import Run
 
 NO_NUMBERS = ("iteration", "seconds", "phase")  # of the columns, not of interest
 KNOWN = ("psnr", "ssim", "train_psnr", "lpips")  # listed first
+_last = operator.itemgetter(-1)
 LOWER_IS_BETTER = ("lpips", "loss", "error", "mse", "mae", "l1", "l2", "energy", "flip")
 
 
@@ -132,10 +134,6 @@ def _stat(runs: list[Run], name: str, of: Any, kind: str = "evaluation") -> Stat
     """Of what `of` makes of the values of `name`, over the runs that log it."""
     series = [run.series(name, kind)[2] for run in runs]
     return Stat.of([of(values) for values in series if len(values)])
-
-
-def _last(values: np.ndarray) -> float:
-    return float(values[-1])
 
 
 def _finite_mean(values: np.ndarray) -> float:
