@@ -220,10 +220,6 @@ class MovingPartitions:
         if deviation < 0 or min(q) < 0 or abs(math.fsum(q) - 1) > 1e-3:
             raise ValueError(f"{call}: recent={state['recent']!r}, but a density is needed")
 
-    def numbers(self) -> dict[str, Tensor]:
-        """The energy's recent mean and deviation, 0-d, in units of the loss."""
-        return {"energy_mean": self._mean.clone(), "energy_deviation": self._deviation / MEAN_ABS}
-
     def load(self, state: Mapping[str, Any]) -> None:
         """Restore `state()`."""
         self._state.copy_(torch.tensor(state["recent"], dtype=torch.float64))

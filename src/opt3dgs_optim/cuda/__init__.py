@@ -31,8 +31,7 @@ def source(name: str) -> str:
     cuda.core's disk cache refuses include paths, because it cannot see a header change.
     """
     folder = files(__name__)
-    header = (folder / HEADER).read_text().replace("#pragma once\n", "")
-    return header + (folder / name).read_text()
+    return (folder / HEADER).read_text() + (folder / name).read_text()
 
 
 def macros(dtype: torch.dtype, history_size: int | None = None) -> list[tuple[str, str]]:

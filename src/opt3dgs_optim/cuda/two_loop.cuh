@@ -1,7 +1,6 @@
 // The arithmetic of one point, for the GPU and, through tests/cuda/cuda_host_shim.h, for a host compiler.
 // No includes, no barriers, no shared memory, no atomics: one thread, one point.
 // The same formulas in the same order as in opt3dgs_optim/lbfgs.
-#pragma once
 
 #define POINT __host__ __device__ __forceinline__
 

@@ -206,11 +206,8 @@ class EnergyHistogram(Part):
         return self._law.coordinates()
 
     def numbers(self, course: Course | None = None) -> dict[str, float | Tensor]:
-        """`nu`, after the warm-up; and the energy's recent mean and deviation, where they count."""
-        if self._taken <= self.warmup:
-            return {}
-        known = self._law.numbers() if isinstance(self._law, MovingPartitions) else {}
-        return {"nu": self._law.nu.clone(), **known}
+        """`nu`, after the warm-up."""
+        return {"nu": self._law.nu.clone()} if self._taken > self.warmup else {}
 
     def evidence(self, course: Course) -> Tensor | None:
         """[4]: sums of nu's powers 0, 1 and 2; Theta's share in the open partition at the top."""

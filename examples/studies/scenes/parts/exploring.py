@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim import Course, EnergyHistogram, Part, PositionNoise
-from opt3dgs_optim.names import slot
+from opt3dgs_optim.names import SLOT
 from opt3dgs_optim.part import Group
 from opt3dgs_optim.partitions import BANDWIDTH, REACH
 from opt3dgs_optim.parts.histogram import CLAMP
@@ -157,7 +157,7 @@ class NuPerPoint(Part):
         self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
     ) -> Tensor:
         """Measure at the positions, which are stepped first; remember where every row was."""
-        if slot(group) == "means":
+        if group[SLOT] == "means":
             self._nu = nu_per_point(grad)
         self._old = param.detach().clone()
         return grad

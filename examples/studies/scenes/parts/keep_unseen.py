@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim import Course, Part
-from opt3dgs_optim.names import slot
+from opt3dgs_optim.names import SLOT
 from opt3dgs_optim.part import Group
 from opt3dgs_optim.rows import shaped
 
@@ -42,7 +42,7 @@ class KeepUnseen(Part):
         self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
     ) -> Tensor:
         """See who is in view at the positions, which are stepped first; keep the other moments."""
-        if slot(group) == "means":
+        if group[SLOT] == "means":
             self._unseen = (grad == 0).all(1)
         elif len(self._unseen) == len(param):
             kept = group["betas"][1] ** (self.floor - 1)

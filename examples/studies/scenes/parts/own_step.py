@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from opt3dgs_optim import Course, Part
-from opt3dgs_optim.names import slot
+from opt3dgs_optim.names import SLOT
 from opt3dgs_optim.part import Group
 
 STRIDE = 10  # iterations between two looks at the steps' size
@@ -59,7 +59,7 @@ class OwnStep(Part):
         self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
     ) -> Tensor:
         """Look at the size of the step that Adam's moments would make."""
-        name = slot(group)
+        name = group[SLOT]
         assert name is not None
         if name == "means" and not self._spread:
             points = param.detach()
@@ -71,7 +71,7 @@ class OwnStep(Part):
 
     def factor(self, group: Group, course: Course) -> float:
         """What makes the step as long as is wanted."""
-        name = slot(group)
+        name = group[SLOT]
         lr = float(group["lr"])
         if name not in self._sizes or lr == 0:
             return 1.0
