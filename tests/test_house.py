@@ -83,7 +83,7 @@ def test_the_package_is_small() -> None:
     """5,500 is the aim; hosts/, which reads and edits trainers' sources, is more than the rest."""
     kernels = (ROOT / "src" / PACKAGE / "cuda").glob("*.cu*")
     lines = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in kernels)
-    assert sum(LENGTHS.values()) + lines <= 5_935
+    assert sum(LENGTHS.values()) + lines <= 5_930
 
 
 # -- imports ---------------------------------------------------------------------------------------
