@@ -180,7 +180,7 @@ def test_the_kernel_gets_what_it_can_read(spoiled: str, monkeypatch: pytest.Monk
 def test_more_pairs_than_a_thread_holds_are_torchs() -> None:
     gpu = torch.device("cuda")
     assert not uses_kernel("auto", gpu, torch.float32, 3, 6)
-    with pytest.raises(RuntimeError, match="asked for with 6 pairs of points of 3 coordinates"):
+    with pytest.raises(RuntimeError, match="no kernel for 6 pairs of points of 3 coordinates"):
         uses_kernel("cuda", gpu, torch.float32, 3, 6)
 
 

@@ -115,7 +115,7 @@ def lqn_direction(
     """
     check_history("lqn_direction", grad, history, history_size)
     like = grad.device, grad.dtype, grad.shape[1], history_size
-    if uses_kernel(backend, *like):
+    if (grad.is_cuda or backend == "cuda") and uses_kernel(backend, *like):
         return cuda.lqn_direction(position, grad, history, history_size, min_cosine, graft)
     fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
     accepted = torch.empty(grad.shape[0], dtype=torch.bool, device=grad.device)

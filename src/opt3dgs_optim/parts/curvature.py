@@ -116,7 +116,8 @@ class Curvature(Part):
     def _history(self, state: dict[str, Any], position: Tensor) -> Tensor:
         shape = history_shape(position, self.history_size)
         like = position.device, position.dtype, position.shape[1], self.history_size
-        kernel = uses_kernel(self.backend, *like)
+        asked = position.is_cuda or self.backend == "cuda"
+        kernel = asked and uses_kernel(self.backend, *like)
         if HISTORY not in state or tuple(state[HISTORY].shape) != shape:
             state.pop(HISTORY, None)  # before the new one, or both would be in memory
             state[HISTORY] = new_history(position, self.history_size, contiguous=kernel)
