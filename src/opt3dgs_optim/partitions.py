@@ -15,6 +15,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from opt3dgs_optim import cuda
+from opt3dgs_optim.backend import uses_kernel
+
 FLOOR = 1e-8  # smallest weight of a fixed range before renormalisation; log theta never sees 0
 # Of the moving partitions; lengths are in deviations of the energy.
 MEMORY = 100  # energies that mean, deviation and density remember
@@ -129,7 +132,7 @@ class MovingPartitions:
     absolute one, and an energy counts for at most four deviations: a spike moves them by 4 %.
 
     Few operators: one packed state follows one packed target by one `lerp_`, and all products with
-    q are one `addmv`.
+    q are one `addmv`. Where the CUDA kernels run, all of it is one launch.
     """
 
     def __init__(self, num_partitions: int, zeta: float, clamp: tuple[float, float] | None) -> None:
@@ -161,6 +164,7 @@ class MovingPartitions:
         self.nu = torch.ones((), **like)
         tiny = 1e-150 if dtype.itemsize == 8 else 1e-30
         self._tiny = torch.full((), tiny, **like)
+        self._constants = (REACH, BANDWIDTH, EVEN, MEAN_ABS, RESOLUTION, tiny)
         # Views are made once: a view is an operator too.
         self._mean, self._deviation, self._mean_slope = self._state[:3].unbind()
         self._to_mean, self._to_deviation, self._slope = self._target[:3].unbind()
@@ -175,6 +179,10 @@ class MovingPartitions:
         """
         limit = LIMIT / MEAN_ABS if count > UNLIMITED else 1 / RESOLUTION
         rate = max(1 / count, 1 / MEMORY)
+        if uses_kernel("auto", self._state.device, self._state.dtype):
+            numbers = (rate, limit, *self.clamp, *self._constants)
+            cuda.take_energy(energy, valid, self._state, self.nu, *numbers)
+            return
         known = valid is True
         if count == 1:
             self._mean.copy_(energy if known else torch.where(valid, energy, 0.0))

@@ -4,6 +4,7 @@
 
 #include "two_loop.cuh"
 
+#include "histogram.cu"
 #include "lqn.cu"
 #include "noise.cu"
 
@@ -22,4 +23,11 @@ extern "C" void run_noise(unsigned block, Real* means, const Real* scales, const
                           long long rows) {
   launch_on_host(block, rows, add_covariance_noise, means, scales, quats, opacities, eta, lr, noise_scale, sharpness,
                  threshold, rows);
+}
+
+extern "C" void run_take_energy(unsigned block, const Real* energy, const unsigned char* valid, Real* state, Real* nu,
+                                long long partitions, Real rate, Real limit, Real low, Real high, Real reach,
+                                Real bandwidth, Real even, Real mean_abs, Real resolution, Real tiny) {
+  launch_on_host(block, 1, take_energy, energy, valid, state, nu, partitions, rate, limit, low, high, reach,
+                 bandwidth, even, mean_abs, resolution, tiny);
 }

@@ -43,6 +43,16 @@ int main(int, char** arguments) {
   run_noise(128, means.data(), scales.data(), quats.data(), opacities.data(), eta.data(), &lr, 2.0, 100.0, 0.005,
             static_cast<long long>(rows));
   give(out, means);
+  const Buffer lengths = take(in, 2);
+  Buffer state = take(in, static_cast<size_t>(lengths[1]) + 3), nu(1);
+  for (int step = 0; step < lengths[0]; ++step) {
+    const Buffer energy = take(in, 1), known = take(in, 1), n = take(in, 10);
+    const std::vector<unsigned char> valid(1, known[0] != 0);
+    run_take_energy(128, energy.data(), known[0] > 1 ? nullptr : valid.data(), state.data(), nu.data(),
+                    static_cast<long long>(lengths[1]), n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8], n[9]);
+  }
+  give(out, state);
+  give(out, nu);
   fclose(in);
   return fclose(out);
 }

@@ -12,14 +12,19 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
+import numpy as np
 import torch
 from torch import Tensor
 
 import opt3dgs_optim
+from opt3dgs_optim import cuda, partitions
 from opt3dgs_optim.covariance import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
 from opt3dgs_optim.cuda import BLOCK, macros
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
+from opt3dgs_optim.partitions import UNLIMITED, MovingPartitions
 
 HERE = Path(__file__).parent
 SOURCES = Path(opt3dgs_optim.__file__).parent / "cuda"
@@ -144,6 +149,22 @@ class HostKernels:
             check_guard(tensor, n)
         return tensors[0][:n]
 
+    def launch(self, kernel: str, like: Tensor, threads: int, *arguments: Any) -> None:
+        """As `cuda.launch` of a kernel that takes no rows."""
+        assert (like.dtype, threads) == (self.dtype, 1)
+        types = {
+            np.float32: ctypes.c_float,
+            np.float64: ctypes.c_double,
+            np.int64: ctypes.c_longlong,
+        }
+        values = [
+            ctypes.c_void_p(a.data_ptr() if isinstance(a, Tensor) else None)
+            if isinstance(a, (Tensor, int))
+            else types[type(a)](a.item())
+            for a in arguments
+        ]
+        getattr(self.library, f"run_{kernel}")(ctypes.c_uint(BLOCK), *values)
+
 
 def guarded(tensor: Tensor) -> Tensor:
     """A contiguous copy with rows behind it that nobody may write."""
@@ -260,3 +281,76 @@ def expected_noise(gaussians: dict[str, Tensor], eta: Tensor) -> Tensor:
     names = ("scales", "quats", "opacities")
     scales, quats, opacities = (gaussians[name] for name in names)
     return covariance_noise(scales, quats, opacities, eta)
+
+
+# -- the histogram ---------------------------------------------------------------------------------
+
+
+def energies(name: str, count: int = 3_000) -> Tensor:
+    """A script of energies, [count] in float64."""
+    g = torch.Generator().manual_seed(3)
+    z, k = torch.randn(count, generator=g, dtype=torch.float64), torch.arange(count)
+    result = {
+        "falling": 10 ** (-4 * k / count) * (0.2 * z).exp(),
+        "two levels": 5 + (z > 0) + 0.02 * z,
+        "spike": 5 + 0.3 * z + 300 * (k == count // 2),
+        "constant": torch.full_like(z, 0.25),
+        "broken": 5 + 0.3 * z,
+    }[name]
+    if name == "broken":
+        for start, value in enumerate((torch.nan, torch.inf, -torch.inf)):
+            result[7 + 5 * start :: 31] = value
+    return result
+
+
+def taken(values: Tensor) -> Tensor:
+    """Which energies change anything: most of those that are finite."""
+    return torch.isfinite(values) & (torch.arange(len(values)) % 40 != 9)
+
+
+def take_all(values: Tensor, dtype: torch.dtype, before: Tensor | None = None) -> Tensor:
+    """Nu and the state after each energy, [T, 1 + 3 + m], of a new law.
+
+    Args:
+        values: [T] energies; those of `taken` False are said not to be finite.
+        dtype: of the law; a CPU's is float64 otherwise.
+        before: the same of another run: every step is one from there.
+    """
+    law = MovingPartitions(48, 0.75, (-1.0, 3.0))
+    with mock.patch.object(torch, "float64", dtype):
+        law.allocate(torch.device("cpu"))
+    found = []
+    for count, (energy, valid) in enumerate(zip(values.to(dtype), taken(values), strict=True), 1):
+        if before is not None and count > 1:
+            row = before[count - 2]
+            law.nu.copy_(row[0])
+            law._state.copy_(row[1:])
+        law.take(energy, True if valid else valid, count)
+        found.append(torch.cat([law.nu.reshape(1), law._state]))
+    return torch.stack(found)
+
+
+def take_all_on_host(kernels: HostKernels, values: Tensor, before: Tensor | None = None) -> Tensor:
+    """`take_all` with the kernel in the place of the torch operators."""
+    with (
+        mock.patch.object(cuda, "launch", kernels.launch),
+        mock.patch.object(partitions, "uses_kernel", return_value=True),
+    ):
+        return take_all(values, kernels.dtype, before)
+
+
+def compare_energies(kernels: HostKernels, values: Tensor, *, free: bool = True) -> float:
+    """The largest difference from pure torch, free-running or of each single step.
+
+    Relative in what has a unit (mean, deviation). The first four energies are left out: up to 1e6
+    deviations from the mean, pure torch's sums cancel there.
+    """
+    reference = take_all(values, kernels.dtype)
+    result = take_all_on_host(kernels, values, None if free else reference)
+    counts, before = taken(values), result if free else reference
+    assert torch.equal(result[1:][~counts[1:]], before[:-1][~counts[1:]]), "one more was taken"
+    assert torch.equal(reference[1:][~counts[1:]], reference[:-1][~counts[1:]]), "and by torch"
+    size = torch.ones_like(reference)
+    size[:, 1:3] = reference[:, 1:3].abs()
+    gap = torch.where(result == reference, 0.0, (result - reference).abs() / size)
+    return float(gap[UNLIMITED:][counts[UNLIMITED:]].nan_to_num(nan=torch.inf).max())

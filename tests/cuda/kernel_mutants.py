@@ -18,9 +18,11 @@ import torch
 from kernel_host import (
     SOURCES,
     HostKernels,
+    compare_energies,
     compare_runs,
     compare_two_loops,
     compile_host,
+    energies,
     expected_noise,
     noise_case,
     relative_difference,
@@ -67,6 +69,10 @@ MUTANTS = (
         "length of the grafted step", "two_loop.cuh", "sqrt(dot(unit, unit)) / size", "T(1) / size"
     ),
     Mutant("conjugate quaternion", "noise.cu", "times(axis, T(-1))", "axis"),
+    Mutant("one thread", "histogram.cu", "if (blockIdx.x > 0 || threadIdx.x > 0) return;", ""),
+    Mutant("mean of the slope", "histogram.cu", "slope - state[2]", "slope"),
+    Mutant("energies that do not count", "histogram.cu", "(valid && !*valid)", "false"),
+    Mutant("limit of an energy", "histogram.cu", "-limit, limit)", "-limit, Real(9))"),
 )
 
 
@@ -74,12 +80,15 @@ def complaint(kernels: HostKernels) -> str | None:
     """What the comparison with pure torch says of these kernels; None if nothing."""
     try:
         difference = max(compare_runs(kernels, ROWS, SIZE), compare_two_loops(kernels, ROWS, SIZE))
+        gap = max(compare_energies(kernels, energies(name, 500)) for name in ("spike", "broken"))
         means, gaussians, eta = noise_case(ROWS, torch.float64)
         result = kernels.noise(means, gaussians, eta, 0.25, 2.0)
     except AssertionError as error:
         return str(error)
     if not difference < 1e-10:
         return f"lqn_direction or two_loop differs by {difference:.1e}"
+    if not gap < 1e-10:
+        return f"take_energy differs by {gap:.1e}"
     expected = means + expected_noise(gaussians, eta) * 0.5
     difference = relative_difference(result, expected)
     return None if difference < 1e-12 else f"add_covariance_noise differs by {difference:.1e}"

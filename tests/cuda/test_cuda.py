@@ -218,7 +218,7 @@ def test_the_histogram_has_the_cpus_numbers_without_synchronisation() -> None:
     values = (0.1 + 0.01 * torch.randn(600, generator=g)).tolist()
     values[300] = float("nan")
     here, there = EnergyHistogram(), EnergyHistogram()
-    there.observe(torch.tensor(values[0], device="cuda"))
+    there.observe(torch.tensor(values[0], device="cuda"))  # compiles
     energies = torch.tensor(values, device="cuda").unbind()
     here.observe(values[0])
     torch.cuda.set_sync_debug_mode("error")

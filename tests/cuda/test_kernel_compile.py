@@ -128,6 +128,7 @@ def test_float32_kernels(tool, arch: str, tmp_path: Path) -> None:
         compiled = tool("lqn.cu", arch, torch.float32, size, tmp_path)
         check(compiled, torch.float32, 2 * size)
     check(tool("noise.cu", arch, torch.float32, None, tmp_path), torch.float32, 1)
+    check(tool("histogram.cu", arch, torch.float32, None, tmp_path), torch.float32, 0)
 
 
 @pytest.mark.parametrize("tool", TOOLS)
@@ -135,6 +136,7 @@ def test_float64_kernels_for_tests(tool, tmp_path: Path) -> None:
     # Ten: two_loop alone has no use for the spare lanes, and reads z on its own.
     check(tool("lqn.cu", "80", torch.float64, 5, tmp_path), torch.float64, 10)
     check(tool("noise.cu", "80", torch.float64, None, tmp_path), torch.float64, 2)
+    check(tool("histogram.cu", "80", torch.float64, None, tmp_path), torch.float64, 0)
 
 
 @pytest.mark.skipif(not has_cuda_core(), reason="cuda.core is not installed (extra 'cuda')")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 from pathlib import Path
@@ -14,17 +15,22 @@ from kernel_host import (
     HostKernels,
     Problem,
     built,
+    compare_energies,
     compare_runs,
     compare_two_loops,
     compiler,
+    energies,
     expected_noise,
     host_kernels,
     noise_case,
     relative_difference,
+    taken,
 )
 from torch import Tensor
 
+from opt3dgs_optim import cuda
 from opt3dgs_optim.lbfgs import lqn_direction, new_history, two_loop
+from opt3dgs_optim.partitions import LIMIT, MEAN_ABS, MEMORY, MovingPartitions
 
 pytestmark = [
     pytest.mark.skipif(compiler() is None, reason="g++ is not installed"),
@@ -130,6 +136,31 @@ def test_noise(kernels: dict, rows: int, dtype: torch.dtype) -> None:
     assert relative_difference(result, means + noise) < tolerance
 
 
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+@pytest.mark.parametrize("name", ["falling", "two levels", "spike", "constant", "broken"])
+def test_energies(kernels: dict, name: str, dtype: torch.dtype) -> None:
+    """Free-running in float64; in float32 each step from the same state.
+
+    1e-5: pure torch's exponents are up to 100 in float32, before softmax takes the largest away.
+    """
+    exact = dtype == torch.float64
+    difference = compare_energies(kernels[5, dtype], energies(name), free=exact)
+    assert difference < (1e-10 if exact else 1e-5)
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_an_energy_that_is_not_finite_changes_nothing(
+    kernels: dict, value: float, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever is said of it: it may be a large one of float64, in float32."""
+    state, nu = (torch.full((n,), 0.25, dtype=dtype) for n in (51, 1))
+    numbers = (0.01, 5.0, -1.0, 3.0, 6.0, 0.4, 0.05, 0.8, 1e-6, 1e-30)
+    monkeypatch.setattr(cuda, "launch", kernels[5, dtype].launch)
+    cuda.take_energy(torch.tensor(value), True, state, nu, *numbers)
+    assert bool((torch.cat([state, nu]) == 0.25).all())
+
+
 # -- the same under the sanitizers -----------------------------------------------------------------
 
 
@@ -144,7 +175,9 @@ def test_under_address_and_undefined_sanitizers(tmp_path: Path, size: int) -> No
         run = subprocess.run(command, capture_output=True, text=True, check=False, env=_quiet())
         assert run.returncode == 0, run.stderr
         result = torch.from_numpy(np.fromfile(tmp_path / "out", dtype=np.float64))
-        result = result.reshape(len(expected), rows, 3)
+        *expected, learnt = expected
+        assert relative_difference(result[-len(learnt) :], learnt) < 1e-10
+        result = result[: -len(learnt)].reshape(len(expected), rows, 3)
         for part, reference in zip(result, expected, strict=True):
             assert relative_difference(part, reference) < 1e-10
 
@@ -154,7 +187,10 @@ def _quiet() -> dict[str, str]:
 
 
 def _write_input(path: Path, rows: int, size: int) -> list[Tensor]:
-    """Steps as the program reads them; what it should write: directions and noisy means."""
+    """Steps as the program reads them; what it should write.
+
+    That is directions, noisy means, and what the histogram has learnt.
+    """
     states = recorded_steps(rows, size)
     means, gaussians, eta = noise_case(rows, torch.float64)
     history = new_history(means, size, contiguous=True)
@@ -167,5 +203,21 @@ def _write_input(path: Path, rows: int, size: int) -> list[Tensor]:
         expected.append(lqn_direction(x, grad, history, size, **OPTIONS)[0])  # pyright: ignore
         expected.append(two_loop(x, history, size))
     parts += [means, gaussians["scales"], gaussians["quats"], gaussians["opacities"], eta]
+    learnt = _add_energies(parts)
     torch.cat([part.flatten() for part in parts]).numpy().tofile(path)
-    return [*expected, means + expected_noise(gaussians, eta) * 0.5]
+    return [*expected, means + expected_noise(gaussians, eta) * 0.5, learnt]
+
+
+def _add_energies(parts: list[Tensor], m: int = 24) -> Tensor:
+    """Put 100 energies into the program's input; the state and nu after them."""
+    law = MovingPartitions(m, 0.75, (-1.0, 3.0))
+    law.allocate(torch.device("cpu"))
+    values = energies("broken", 104)[4:]  # from the fifth on they have a limit
+    parts += [torch.tensor([100, m], dtype=torch.float64), law._state.clone()]
+    for k, (energy, valid) in enumerate(zip(values, taken(values), strict=True)):
+        known = 1 + k % 3 % 2 if valid else 0  # 2: a null pointer
+        numbers = (max(1 / (k + 5), 1 / MEMORY), LIMIT / MEAN_ABS, *law.clamp, *law._constants)
+        parts.append(torch.tensor([energy, known, *numbers], dtype=torch.float64))
+        if valid:
+            law.take(energy, True, k + 5)
+    return torch.cat([law._state, law.nu.reshape(1)])

@@ -22,6 +22,7 @@ KERNELS = {  # the kernel: its file
     "lqn_direction": "lqn.cu",
     "two_loop": "lqn.cu",
     "add_covariance_noise": "noise.cu",
+    "take_energy": "histogram.cu",
 }
 
 
@@ -190,6 +191,17 @@ def add_covariance_noise(
     launch("add_covariance_noise", means, rows, target, *tensors, rate, *numbers, np.int64(rows))
     if target is not means:
         means.copy_(target)
+
+
+def take_energy(
+    energy: Tensor, valid: Tensor | bool, state: Tensor, nu: Tensor, *numbers: float
+) -> None:
+    """`MovingPartitions.take` on the GPU; `numbers` as in the kernel. Never synchronises."""
+    # A 0 is a null pointer.
+    known = 0 if valid is True else torch.as_tensor(valid, dtype=torch.bool, device=state.device)
+    reals = map(_real(state.dtype), numbers)
+    tensors = (energy.to(state), known, state, nu)
+    launch("take_energy", state, 1, *tensors, np.int64(len(state) - 3), *reals)
 
 
 @functools.cache
