@@ -35,13 +35,14 @@ from studies.scenes.arms import (
 from studies.scenes.decisions import decide, settings_of
 from studies.scenes.long_tables import (
     cells_of,
+    difference,
     differences_table,
     headline_table,
     metrics_table,
     reach_table,
 )
 from studies.scenes.plots import plot_curves, plot_gains, plot_metrics
-from studies.scenes.records import COSTS, FOLDER, gather, merge, read, read_costs, write
+from studies.scenes.records import COSTS, FOLDER, Setting, gather, merge, read, read_costs, write
 from studies.scenes.tables import (
     front_table,
     gains_table,
@@ -59,6 +60,13 @@ FRONT = (  # what it is, arm, control
     ("the paper's preset, all parts", "paper", BASELINE),
     ("AW-SGLD against a constant multiplier of its mean", "awsgld", "constant"),
     ("L-BFGS against the same last phase without", "l2+reset+lqn@1/30", "l2+reset@1/30"),
+)
+PAPER = (  # what the README says of the paper's parts: what, arm, control, what that is
+    ("AW-SGLD", STABLE, f"{STABLE}-constant", "a constant of its mean"),
+    ("L2 in the last thirtieth", "l2@1/30", BASELINE, "stock"),
+    ("fresh moments there", "l1+reset@1/30", BASELINE, "stock"),
+    ("L-BFGS directions there", "l2+reset+lqn@1/30", "l2+reset@1/30", "L2, fresh moments"),
+    ("the whole preset", "paper", BASELINE, "stock"),
 )
 SHORT = 3_000
 ALONE = ("mcmc", "faded", "annealed-4-0.4", "annealed-8-0.4")
@@ -131,6 +139,7 @@ def rotated_tables(study: Study) -> dict[str, str]:
     long, brief = settings_of(study, LONG), settings_of(study, BRIEF)
     made["headline"] = headline_table(study, long, BRIEF)
     made["reach"] = reach_table(study, long, REACH_ARMS, BRIEF)
+    made["paper"] = paper_table(study, long)
     aside = {arm for kind in ASIDE for arm in names(kind)}
     shown = [arm for arm in STUDY_ARMS if arm not in aside]
     for count, settings in ((LONG, long), (BRIEF, brief)):
@@ -169,6 +178,17 @@ def decisions_table(study: Study) -> str:
             shown = f"{decision.iterations:,} | {count} | {' | '.join(cells_of(found))}"
         on = "on" if decision.on else "off"
         lines.append(f"| {part} | {by} | {shown} | {on} ({decision.verdict}) |")
+    return "\n".join(lines)
+
+
+def paper_table(study: Study, settings: Sequence[Setting]) -> str:
+    """One line per part of the paper: what it gains over the same training without it."""
+    lines = ["| part | against | scenes | PSNR | SSIM | LPIPS |", "|---|---|---|---:|---:|---:|"]
+    for what, arm, control, words in PAPER:
+        found = difference(study, settings, arm, control)
+        if found.count:
+            cells = " | ".join(cells_of(found))
+            lines.append(f"| {what} | {words} | {', '.join(found.pairs)} | {cells} |")
     return "\n".join(lines)
 
 
