@@ -2,8 +2,7 @@
 
 Fits 3D Gaussians to a small scene that it draws itself, once with stock 3DGS-MCMC and once with the
 same trainer whose optimizers a `PhaseScheduler` has upgraded, and draws photo, both renders and
-the error over time. So short a training anneals besides fading. What is left of the gain in long
-trainings: docs/evidence.md.
+the error over time. What is left of the gain in long trainings: docs/evidence.md.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-from splatting.arms import SHORT_ARM, find_arm
+from splatting.arms import DEFAULT_ARM, find_arm
 from splatting.embedded import embedded_scene
 from splatting.fit import Fit, FitOptions
 from splatting.scenes import Scene
@@ -25,7 +24,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 ITERATIONS, POINTS, LOOKS = 600, 1_500, 15
-ARMS = {"stock 3DGS-MCMC": "mcmc", "upgraded": SHORT_ARM}
+ARMS = {"stock 3DGS-MCMC": "mcmc", "upgraded": DEFAULT_ARM}
 COLOURS = ("#333333", "#0072b2")
 
 

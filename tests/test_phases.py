@@ -342,7 +342,7 @@ def test_presets() -> None:
     warmup = short.part(EnergyHistogram)
     assert warmup is not None
     assert (short.switch_step, warmup.warmup) == (2_900, 250)
-    assert PhaseScheduler(10).parts == [*DEFAULTS] == [Fading()]
+    assert PhaseScheduler(10).parts == [*DEFAULTS] == [Annealing(), Fading()]
     assert PhaseScheduler(10, parts=[]).parts == []
     assert PhaseScheduler(10, parts=[*DEFAULTS, Pooling()]).parts[-1] == Pooling()
 

@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import torch
 from hosts.trials import ITERATIONS, TRIALS, Done, Nerfstudio, Outcome, Trial
 
-from opt3dgs_optim import __version__
+from opt3dgs_optim import DEFAULTS, __version__
 from opt3dgs_optim.hosts import diff
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "hosts" / "survey.md"
@@ -93,6 +93,7 @@ def keep(trial: Trial, trainers: Path, scene: str, got: Outcome) -> None:
     row: dict[str, Any] = {"name": trial.name, "commit": commit_of(trainers / trial.trainer)}
     row |= {"date": datetime.date.today().isoformat(), "torch": torch.__version__}
     row |= {"stock": _shown(got.stock), "ours": _shown(got.ours)}
+    row["parts"] = ", ".join(type(part).__name__ for part in DEFAULTS)
     row |= {"checkpoint": "yes" if got.checkpoint else "-", "resume": "-"}
     if got.own and got.theirs:
         row["resume"] = f"own: {_shown(got.own)}; stock's: {_shown(got.theirs)}"
@@ -135,7 +136,7 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
         f"{trials['iterations']} iterations of the real script on a CPU through `on_cpu.py`, "
         f"on {trials['scene']}, stock and with the lines; PSNR of the test views at the end. "
         "So short a run shows that the lines work, not what they gain. "
-        f"{_span(trials, 'date')}, torch {_span(trials, 'torch')}, {trials['machine']}.",
+        f"Parts: {_span(trials, 'parts')}. {_span(trials, 'date')}, torch {_span(trials, 'torch')}, {trials['machine']}.",
         "",
         "| trainer and options | commit | lines of `diff` | stock | edited | checkpoint | resume "
         "| what is different |",

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from opt3dgs_optim import (
     DEFAULTS,
-    Annealing,
     ConstantMultiplier,
     Curvature,
     EnergyHistogram,
@@ -28,7 +27,6 @@ NOISE_LR = 5e5  # 3DGS-MCMC
 SETTLING = 100  # iterations after which restarted moments are of use
 HISTOGRAM_ARM = "mcmc+awsgld"
 DEFAULT_ARM = "defaults"
-SHORT_ARM = "defaults+annealed"
 
 # (iterations, mean nu of the arm in `needs` or None) -> what the steps have
 MakeParts = Callable[[int, float | None], list[Part]]
@@ -113,11 +111,10 @@ _ARMS = (
         "every part of the paper, its settings",
         lambda iterations, _nu: paper_parts(iterations),
     ),
-    Arm(DEFAULT_ARM, "the package's: faded moments", lambda _iterations, _nu: [*DEFAULTS]),
     Arm(
-        SHORT_ARM,
-        "shapes, opacities and colours annealed besides, for fewer than 10,000 iterations",
-        lambda _iterations, _nu: [*DEFAULTS, Annealing()],
+        DEFAULT_ARM,
+        "the package's: all but the positions annealed, moments faded",
+        lambda _iterations, _nu: [*DEFAULTS],
     ),
 )
 ARMS = {arm.name: arm for arm in _ARMS}

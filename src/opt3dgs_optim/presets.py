@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from opt3dgs_optim.part import Part
+from opt3dgs_optim.parts.annealing import Annealing
 from opt3dgs_optim.parts.curvature import Curvature
 from opt3dgs_optim.parts.fading import Fading
 from opt3dgs_optim.parts.histogram import EnergyHistogram
@@ -11,7 +12,7 @@ from opt3dgs_optim.parts.last_phase import FreshMoments, SquaredLoss
 PAPER_STEPS = 30_000
 PAPER_SWITCH = 29_000 / PAPER_STEPS
 PAPER_WARMUP = 2_500 / PAPER_STEPS
-DEFAULTS: tuple[Part, ...] = (Fading(),)  # what paid: docs/evidence.md
+DEFAULTS: tuple[Part, ...] = (Annealing(), Fading())  # what paid: docs/evidence.md
 
 
 def paper_parts(total_steps: int = PAPER_STEPS) -> list[Part]:

@@ -33,8 +33,9 @@ from studies.scenes.parts.keep_unseen import KeepUnseen
 from studies.scenes.parts.own_step import OwnStep
 
 BASELINE = "mcmc"
-DEFAULTS = "faded"  # what `PhaseScheduler(total_steps)` is
+FADED = "faded"  # fading alone
 MEANS_LEFT = "annealed-all-but-means+faded"
+DEFAULTS = MEANS_LEFT  # what `PhaseScheduler(total_steps)` is
 ALL_ANNEALED = "annealed-4-0.4+faded"
 ANNEALED = "annealed-4-opacities-1+faded"  # the defaults until the views rotated
 SHORT_LABEL = "annealed+faded"

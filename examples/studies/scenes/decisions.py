@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from studies.scenes.analysis import Study
-from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, MEANS_LEFT, POOLED, STABLE
+from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, FADED, POOLED, STABLE
 from studies.scenes.long_tables import Difference, difference
 from studies.scenes.records import Setting
 
@@ -13,9 +13,9 @@ LENGTHS = (30_000, 7_500)
 MIN_SCENES = 3  # with forty training views or more
 # part -> (the arm with it, the arm without it)
 COMPARISONS = {
-    "Fading": (DEFAULTS, BASELINE),
-    "Annealing": (MEANS_LEFT, DEFAULTS),
-    "Annealing of the positions": (ANNEALED, MEANS_LEFT),
+    "Fading": (FADED, BASELINE),
+    "Annealing": (DEFAULTS, FADED),
+    "Annealing of the positions": (ANNEALED, DEFAULTS),
     "Pooling": (POOLED, ANNEALED),
     "EnergyHistogram": (STABLE, f"{STABLE}-constant"),
     "SquaredLoss": ("l2@1/30", BASELINE),

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from statistics import fmean, stdev
 
 from studies.scenes.analysis import Study
-from studies.scenes.arms import BASELINE, DEFAULTS, MEANS_LEFT, STUDY_ARMS, label
+from studies.scenes.arms import BASELINE, DEFAULTS, FADED, STUDY_ARMS, label
 from studies.scenes.records import Record, Setting
 
 METRICS = {"psnr": (1.0, 2), "ssim": (1.0, 4), "lpips": (-1.0, 4)}  # sign of better, digits
@@ -137,8 +137,8 @@ def headline_table(study: Study, long: Sequence[Setting], short: int) -> str:
         for count in ((long[0].iterations, short) if long else ())
         for what, arm in (
             ("stock", BASELINE),
+            ("fading alone", FADED),
             ("**defaults**", DEFAULTS),
-            ("and `Annealing()`", MEANS_LEFT),
         )
     ]
     lines = [

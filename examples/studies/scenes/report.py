@@ -24,8 +24,8 @@ from studies.scenes.arms import (
     ANNEALED,
     BASELINE,
     DEFAULTS,
+    FADED,
     GROUPS,
-    MEANS_LEFT,
     POOLED,
     STABLE,
     STUDY_ARMS,
@@ -84,7 +84,7 @@ CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4
 ROTATED = "rotated.json"  # records whose held-out views rotate with the seed
 LONG, BRIEF = 30_000, 7_500
 ASIDE = ("explorations", "unseen", "adaptive")  # groups with a table of their own
-REACH_ARMS = (DEFAULTS, MEANS_LEFT)
+REACH_ARMS = (FADED, DEFAULTS)
 MARKER = re.compile(r"(<!-- study:([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -272,7 +272,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         (FOLDER / "decisions.json").write_text(text, encoding="utf-8")
         drawn = plots(study, FOLDER)
         if many := settings_of(rotating, LONG):
-            arms = (BASELINE, DEFAULTS, MEANS_LEFT)
+            arms = (BASELINE, FADED, DEFAULTS)
             plot_metrics(rotating, many, arms, FOLDER / "rotated.png")
             drawn.append(FOLDER / "rotated.png")
     except (OSError, ValueError) as error:
