@@ -136,7 +136,8 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
         f"{trials['iterations']} iterations of the real script on a CPU through `on_cpu.py`, "
         f"on {trials['scene']}, stock and with the lines; PSNR of the test views at the end. "
         "So short a run shows that the lines work, not what they gain. "
-        f"Parts: {_span(trials, 'parts')}. {_span(trials, 'date')}, torch {_span(trials, 'torch')}, {trials['machine']}.",
+        f"Parts: {_span(trials, 'parts')}. {_span(trials, 'date')}, "
+        f"torch {_span(trials, 'torch')}, {trials['machine']}.",
         "",
         "| trainer and options | commit | lines of `diff` | stock | edited | checkpoint | resume "
         "| what is different |",
