@@ -562,7 +562,7 @@ def test_an_energy_that_stops_coming() -> None:
     splats, phases = make_splats(), PhaseScheduler(500)
     optimizers = phases.upgrade(gsplat_optimizers(splats))
     train(splats, optimizers, phases, 0, 5)
-    with pytest.warns(UserWarning, match="without an energy: Fading stand still"):
+    with pytest.warns(UserWarning, match="without an energy: Annealing, Fading stand still"):
         train(splats, optimizers, None, 5, 30)
 
 
