@@ -551,7 +551,7 @@ def test_optimizers_that_step_without_an_energy() -> None:
     splats = make_splats()
     optimizers = PhaseScheduler(500).upgrade(gsplat_optimizers(splats))
     train(splats, optimizers, None, 0, 20)
-    with pytest.warns(UserWarning, match=r"20 times without an energy: Fad") as told:
+    with pytest.warns(UserWarning, match=r"20 times without an energy: Annealing, Fad") as told:
         train(splats, optimizers, None, 20, 21)
     (warning,) = told
     assert warning.filename.endswith("trainers.py")  # the user's line, not ours or torch's
