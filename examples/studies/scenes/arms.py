@@ -36,6 +36,7 @@ BASELINE = "mcmc"
 FADED = "faded"  # fading alone
 MEANS_LEFT = "annealed-all-but-means+faded"
 DEFAULTS = MEANS_LEFT  # what `PhaseScheduler(total_steps)` is
+EARLY = (f"{FADED}-to-1/4", f"{DEFAULTS}-to-1/4")  # fading ends after that share of the run
 ALL_ANNEALED = "annealed-4-0.4+faded"
 ANNEALED = "annealed-4-opacities-1+faded"  # the defaults until the views rotated
 SHORT_LABEL = "annealed+faded"
@@ -56,7 +57,6 @@ ANNEALING = annealing(4.0, 0.4)
 ANNEALING_OF_REST = Annealing(4.0, 0.4, 1.0, names=("scales", "quats", "opacities", "sh0", "shN"))
 FADING = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=300)
 FADING_EARLY = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=140, stop=0.25)
-UNTIL = "-to-1/4"  # of the run
 # What the arms beyond the paper are made of, by the arm's name; what a table calls them; and the
 # names of the arms that add a last phase.
 TRUNKS: dict[str, list[Part]] = {
@@ -266,13 +266,13 @@ def long_runs() -> list[StudyArm]:
             control=ANNEALED,
         ),
         StudyArm(
-            f"faded{UNTIL}",
+            EARLY[0],
             "faded as often, but only in the first quarter",
             of(FADING_EARLY),
             control="faded",
         ),
         StudyArm(
-            f"{MEANS_LEFT}{UNTIL}",
+            EARLY[1],
             "the same, and all but the positions annealed",
             of(ANNEALING_OF_REST, FADING_EARLY),
             control=MEANS_LEFT,

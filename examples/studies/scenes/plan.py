@@ -10,8 +10,10 @@ from typing import Any
 from studies.scenes.arms import (
     ALL_ANNEALED,
     ANNEALED,
+    DEFAULTS,
+    EARLY,
+    FADED,
     GROUPS,
-    MEANS_LEFT,
     POOLED,
     STABLE,
     STUDY_ARMS,
@@ -26,11 +28,12 @@ QUICK_SCENES = ("banana", "embedded")  # for the options of a part
 MANY_VIEWS_SCENES = ("bonsai", "lego", "plush")
 ROTATED_SCENES = (*MANY_VIEWS_SCENES, "embedded", "banana", "lund_door", "brighton_beach")
 ROTATED_ARMS = (
-    *("mcmc", "faded", MEANS_LEFT, ANNEALED, "paper", "paper-constant"),
+    *("mcmc", FADED, DEFAULTS, ANNEALED, "paper", "paper-constant"),
     *("faded-3000", "rates-x2", POOLED, "annealed-2", "own-step"),
     *(STABLE, f"{STABLE}-constant"),
+    *("l2@1/30", "l1+reset@1/30", "l2+reset@1/30", "l2+reset+lqn@1/30"),
 )
-BRIEF_ARMS = ("mcmc", "faded", MEANS_LEFT, ANNEALED)
+BRIEF_ARMS = ("mcmc", FADED, DEFAULTS, ANNEALED, *EARLY)
 LONG_ARMS = tuple(arm.name for arm in long_runs())
 FULL_PARTS_SCENES = ("brighton_beach", "lund_door")  # where the defaults lose
 POINTS = 4_000
@@ -87,9 +90,17 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
             *cross(MANY_VIEWS_SCENES, BRIEF_ARMS, seeds, 7_500, rotated=True),
             *cross(("bonsai",), arms["schedules"] + arms["detail"], 1, 7_500, rotated=True),
         ],
-        "explorations": cross(("plush", "embedded"), arms["explorations"], 1, 30_000, rotated=True),
+        "explorations": [
+            *cross(("plush",), [STABLE, *arms["explorations"]], 1, 7_500, rotated=True),
+            *cross(("plush", "embedded"), arms["explorations"], 1, 30_000, rotated=True),
+        ],
         "unseen": cross(
-            ("bonsai",), ["mcmc", "faded", *arms["unseen"]], 1, 7_500, rotated=True, tiled=True
+            ("bonsai",),
+            ["mcmc", FADED, DEFAULTS, *arms["unseen"]],
+            1,
+            7_500,
+            rotated=True,
+            tiled=True,
         ),
         "adaptive": cross(MANY_VIEWS_SCENES, arms["adaptive"], 1, 30_000, rotated=True),
         "rotated": [
