@@ -214,10 +214,12 @@ def test_what_is_not_certain_is_refused(
 def test_other_files_and_folders(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """Where there is no script there are no lines to add by hand either."""
     saved(tmp_path, INRIA)
-    saved(tmp_path, "int main() {}", "trainer.cpp")
+    saved(tmp_path, "", "trainer.cpp")
+    saved(tmp_path, "", "train.rs")
     for name, said in {
-        "trainer.cpp": "cannot be read as Python",
-        ".": "Is a directory",
+        "trainer.cpp": "LichtFeld Studio (C++) and Brush (Rust)",
+        "train.rs": "LichtFeld Studio (C++) and Brush (Rust)",
+        ".": "name the training script (train.py)",
         "none.py": "cannot be read",
     }.items():
         assert main(["diff", str(tmp_path / name)]) == 1

@@ -349,6 +349,13 @@ def test_methods_keep_what_nerfstudio_set(ours: Any) -> None:
         _ = ours.nerfacto
 
 
+def test_without_nerfstudio_the_import_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "opt3dgs_optim.hosts.nerfstudio", raising=False)
+    monkeypatch.setitem(sys.modules, "nerfstudio.engine.optimizers", None)
+    with pytest.raises(ImportError, match="pip install nerfstudio"):
+        importlib.import_module("opt3dgs_optim.hosts.nerfstudio")
+
+
 def test_entry_points_name_what_there_is(ours: Any) -> None:
     text = (Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8")
     found = dict(

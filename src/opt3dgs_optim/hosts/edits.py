@@ -31,6 +31,7 @@ IMPORTS = {  # where it is refused, and why
     "nerfstudio": "nerfstudio needs no change: ns-train splatfacto-opt3dgs "
     "(docs/hosts/nerfstudio.md)",
 }
+NOT_PYTHON = {".cpp", ".cu", ".cuh", ".cc", ".h", ".hpp", ".rs"}
 
 
 class Edited(NamedTuple):
@@ -49,6 +50,15 @@ def diff(path: Path) -> Edited:
     Raises:
         ValueError: the file is not one that can be edited with certainty.
     """
+    if path.suffix in NOT_PYTHON:
+        raise ValueError(
+            "no Python: the optimizers of LichtFeld Studio (C++) and Brush (Rust) are not "
+            "torch.optim's, and there is nothing here for them"
+        )
+    if path.is_dir():
+        known = [p for p in sorted(path.glob("**/*.py")) if p.match("*train*.py")]
+        names = ", ".join(str(p.relative_to(path)) for p in known[:10])
+        raise ValueError(f"it is a folder; name the training script ({names or 'no *train*.py'})")
     try:
         source = path.read_bytes()
         text, tree = source.decode(), ast.parse(source)

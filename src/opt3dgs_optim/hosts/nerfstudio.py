@@ -16,14 +16,21 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from nerfstudio.models.splatfacto import (  # pyright: ignore
-    SplatfactoModel,
-    SplatfactoModelConfig,
-)
 from torch import Tensor
 
 from opt3dgs_optim.phases import PhaseScheduler
 from opt3dgs_optim.presets import PAPER_SWITCH
+
+try:
+    from nerfstudio.models.splatfacto import (  # pyright: ignore
+        SplatfactoModel,
+        SplatfactoModelConfig,
+    )
+except ImportError as error:
+    raise ImportError(
+        "opt3dgs_optim.hosts.nerfstudio needs nerfstudio and gsplat: pip install nerfstudio "
+        f"(the import said: {error})"
+    ) from error
 
 METHODS = {"splatfacto_opt3dgs": "splatfacto", "splatfacto_mcmc_opt3dgs": "splatfacto-mcmc"}
 

@@ -25,7 +25,7 @@ from studies.scenes.long_tables import reach_table
 from studies.scenes.parts.chosen_fading import chosen_rows
 from studies.scenes.parts.own_step import OwnStep
 from studies.scenes.parts.step_lengths import StepLengths
-from studies.scenes.plan import plan
+from studies.scenes.plan import plan, stages
 from studies.scenes.records import COLUMNS, Record, Setting, gather, merge, read, write
 from studies.scenes.run import main as run_study
 from studies.scenes.tables import machines_line
@@ -64,6 +64,14 @@ def test_the_defaults_are_what_the_page_concludes() -> None:
     assert {type(part).__name__ for part in DEFAULTS} == {
         part for part, on in decided.items() if on
     }
+
+
+def test_every_rotated_training_is_of_a_stage() -> None:
+    planned = {replace(spec, seed=0) for specs in stages().values() for spec in specs}
+    for (setting, arm), _ in report.rotating_study()._of.items():
+        kind = {name: getattr(setting, name) for name in ("rotated", "size", "views", "tiled")}
+        spec = Spec(setting.scene, arm, 0, setting.iterations, setting.points, **kind)
+        assert spec in planned, spec
 
 
 def test_the_defaults_are_the_measured_arm() -> None:
