@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from opt3dgs_optim.lbfgs.history import header, stored_pairs
-from opt3dgs_optim.lbfgs.pairs import columns, dot
+from opt3dgs_optim.lbfgs.pairs import columns, dot, largest
 from opt3dgs_optim.lbfgs.two_loop import direction as direction_of_columns
 from opt3dgs_optim.lbfgs.two_loop import take_pairs
 
@@ -28,7 +28,7 @@ def record(
 def direction(grad: Tensor, history: Tensor, history_size: int, *, graft: bool) -> Tensor:
     """What Adam is fed, [N, D], from the pairs that are there."""
     head, rows = header(history, history_size), columns(grad, history.dtype)
-    return direction_of_columns(rows, history, head, history_size, graft).T
+    return direction_of_columns(rows, largest(rows), history, head, history_size, graft).T
 
 
 def newest_gamma(history: Tensor, history_size: int) -> Tensor:

@@ -8,7 +8,7 @@ from torch import Tensor
 from opt3dgs_optim import cuda
 from opt3dgs_optim.backend import uses_kernel
 from opt3dgs_optim.lbfgs.history import Header, check_history, header, push, stored_pairs
-from opt3dgs_optim.lbfgs.pairs import columns, dot, length, normalised_pair, row_chunks
+from opt3dgs_optim.lbfgs.pairs import columns, dot, largest, length, normalised_pair, row_chunks
 
 
 def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
@@ -42,15 +42,11 @@ def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
         return cuda.two_loop(grad, history, history_size)
     result = torch.empty_like(grad)
     for rows in row_chunks(grad):
-        unit, scale = scaled(columns(grad[rows], history.dtype))
-        result[rows] = (recursion(unit, *stored_pairs(history[rows], history_size)) * scale).T
+        g = columns(grad[rows], history.dtype)
+        scale = torch.threshold(largest(g), 0.0, 1.0)  # keeps s.q finite
+        found = recursion(g / scale, *stored_pairs(history[rows], history_size))
+        result[rows] = found.mul_(scale).T
     return result
-
-
-def scaled(grad: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients [D, N] over their largest component, and that [N]: keeps s.q finite."""
-    scale = torch.threshold(grad.abs().amax(0), 0.0, 1.0)
-    return grad / scale, scale
 
 
 def recursion(grad: Tensor, s: Tensor, y: Tensor) -> Tensor:
@@ -58,20 +54,17 @@ def recursion(grad: Tensor, s: Tensor, y: Tensor) -> Tensor:
 
     |y| = 1 where there is a pair, and s = y = 0 where there is none.
     """
-    sy = dot(s, y)
-    inverses = torch.threshold(sy, 0.0, torch.inf).reciprocal()  # no pair: 1 / inf = 0
-    pairs = list(zip(s.unbind(), y.unbind(), inverses.unbind(), strict=True))
-    q, alphas = grad.clone(), []
-    for s_j, y_j, inverse in pairs:  # the first loop, newest to oldest
-        alpha = dot(s_j, q) * inverse
-        q.addcmul_(alpha, y_j, value=-1)
-        alphas.append(alpha)
+    product, r, memory = torch.empty_like(grad), grad.clone(), []  # r is q at first
+    for s_j, y_j in zip(s.unbind(), y.unbind(), strict=True):  # newest to oldest
+        sy = dot(s_j, y_j, product)
+        inverse = torch.threshold(sy, 0.0, torch.inf).reciprocal_()  # no pair: 1 / inf = 0
+        alpha = dot(s_j, r, product).mul_(inverse)
+        r.addcmul_(alpha, y_j, value=-1)
+        memory.append((s_j, y_j, sy, inverse, alpha))
     # |y| = 1, hence gamma = s.y / y.y = s.y. No pair: gamma = 1, and r stays the gradient.
-    r = q.mul_(torch.threshold(sy[0], 0.0, 1.0))
-    # The second loop, oldest to newest.
-    for (s_j, y_j, inverse), alpha in zip(reversed(pairs), reversed(alphas), strict=True):
-        beta = dot(y_j, r).mul_(inverse)
-        r.addcmul_(alpha.sub_(beta), s_j)
+    r.mul_(torch.threshold(memory[0][2], 0.0, 1.0))
+    for s_j, y_j, _, inverse, alpha in reversed(memory):  # oldest to newest
+        r.addcmul_(alpha.addcmul_(dot(y_j, r, product), inverse, value=-1), s_j)
     return r
 
 
@@ -123,12 +116,12 @@ def lqn_direction(
     for rows in row_chunks(grad):  # while a chunk is in the cache
         part, x = history[rows], columns(position[rows], history.dtype)
         g = columns(grad[rows], history.dtype)
-        largest = g.abs().amax(0)  # NaN where the gradient has one, which is not < inf
-        visible = (largest > 0) & (largest < torch.inf)
+        size = largest(g)  # NaN where the gradient has one, which is not < inf
+        visible = (size > 0) & (size < torch.inf)
         head = header(part, history_size)
         taken = take_pairs(part, head, history_size, x, g, visible, min_cosine)
         accepted[rows], candidates[rows] = taken
-        fed[rows] = direction(g, part, head, history_size, graft).T
+        fed[rows] = direction(g, size, part, head, history_size, graft).T
     return fed, accepted, candidates
 
 
@@ -159,17 +152,18 @@ def take_pairs(
 
 
 def direction(
-    grad: Tensor, history: Tensor, head: Header, history_size: int, graft: bool
+    grad: Tensor, scale: Tensor, history: Tensor, head: Header, history_size: int, graft: bool
 ) -> Tensor:
-    """What Adam is fed, [D, N] of gradients [D, N]; see `lqn_direction`."""
-    unit, scale = scaled(grad)
+    """What Adam is fed, [D, N] of gradients [D, N] and their largest component [N]."""
+    scale = torch.threshold(scale, 0.0, 1.0)
+    unit = grad / scale  # keeps s.q finite
     result = recursion(unit, *stored_pairs(history, history_size))
     size = length(result)
     # Zero where the gradient is, NaN where the result is not finite.
     descent = dot(unit, result / size)
     usable = (head.counter > 1) & (descent > 0)
     if graft:
-        result = result * (dot(unit, unit).sqrt() / size)
-    result = result * scale
-    usable = usable & (result.abs().amax(0) < torch.inf)
+        result.mul_(dot(unit, unit).sqrt_().div_(size))
+    result.mul_(scale)
+    usable &= largest(result) < torch.inf
     return torch.where(usable, result, grad)
