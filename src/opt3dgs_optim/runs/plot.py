@@ -62,9 +62,16 @@ def _figure(comparison: Comparison, footer: str) -> Any:
     panels[0].set_ylabel(metric)
     lines = [Line2D([], [], lw=2.4, **_look(arm)) for arm in comparison.arms]
     # " ": a label may begin with "_", which would hide it
-    figure.legend(lines, [f" {la}" for la in labels], ncols=columns, loc="outside upper left")
+    legend = figure.legend(
+        lines,
+        [f" {la}" for la in labels],
+        ncols=columns,
+        alignment="left",
+        loc="outside upper left",
+    )
     scene = "" if comparison.scene is None else f", {comparison.scene}"
-    figure.suptitle(_cut(f"{metric} against run time and iterations{scene}", 85), weight="bold")
+    title = _cut(f"{metric} against run time and iterations{scene}", 85)
+    legend.set_title(title, {"size": 13, "weight": "bold"})  # a suptitle would lie below it
     better = "higher" if higher_is_better(comparison.metric) else "lower"
     caption = f"Lines: mean over seeds; bands: least to greatest; {better} is better. Dashed: "
     caption += f"the baseline's final mean. Dotted: next phase. {footer}"
