@@ -10,7 +10,9 @@ from studies.scenes.long_tables import Difference, difference
 from studies.scenes.records import Setting
 
 LENGTHS = (30_000, 7_500)
-MIN_SCENES = 3  # with forty training views or more
+QUARTER = "images_4"
+MANY_VIEWS_SCENES = ("bonsai", "lego", "plush")  # forty training views or more
+MIN_SCENES = 3
 # part -> (the arm with it, the arm without it)
 COMPARISONS = {
     "Fading": (FADED, BASELINE),
@@ -45,9 +47,19 @@ class Decision:
 
 
 def settings_of(study: Study, iterations: int) -> list[Setting]:
-    """The scenes of the rotated trainings at a quarter of their size, all views, stock rates."""
-    every = study.all_settings()
-    return [s for s in every if s == Setting(s.scene, s.points, iterations, "sfm", rotated=True)]
+    """The rule's scenes, with rotated views at a quarter of their size."""
+    every = every_scene(study, iterations)
+    return [s for s in every if s.scene in MANY_VIEWS_SCENES and s.size == QUARTER]
+
+
+def every_scene(study: Study, iterations: int) -> list[Setting]:
+    """Every scene and size of the rotated trainings of all views at the trainer's rates."""
+
+    def whole(s: Setting) -> bool:
+        plain = Setting(s.scene, s.points, iterations, "sfm", rotated=True, size=s.size)
+        return s == plain
+
+    return [setting for setting in study.all_settings() if whole(setting)]
 
 
 def decide(study: Study) -> dict[str, Decision]:

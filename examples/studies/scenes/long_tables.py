@@ -152,6 +152,23 @@ def headline_table(study: Study, long: Sequence[Setting], short: int) -> str:
     return "\n".join(lines)
 
 
+def scenes_gain_table(study: Study, settings: Sequence[Setting], arm: str, control: str) -> str:
+    """One line per scene and size: the arm and its control at their ends, and the gain."""
+    lines = [
+        f"| scene | Gaussians, images | `{label(control)}` | `{label(arm)}` | gain, dB |",
+        "|---|---|---|---|---:|",
+    ]
+    for setting in settings:
+        found = difference(study, [setting], arm, control)
+        if not found.count:
+            continue
+        ours, theirs, _ = zip(*found.pairs[setting.scene], strict=True)
+        size = {"images_4": "quarter", "images_2": "half"}.get(setting.size, setting.size)
+        cells = f"{_cell(theirs)} | {_cell(ours, seeds=False)} | {cells_of(found)[0]}"
+        lines.append(f"| {setting.scene} | {setting.points:,}, {size} | {cells} |")
+    return "\n".join(lines)
+
+
 def reach_table(study: Study, long: Sequence[Setting], arms: Sequence[str], short: int) -> str:
     """When an arm has the PSNR that stock has after its last iteration, as a share of its seconds.
 

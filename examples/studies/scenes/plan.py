@@ -21,11 +21,11 @@ from studies.scenes.arms import (
     V_ONLY,
     long_runs,
 )
+from studies.scenes.decisions import MANY_VIEWS_SCENES
 from studies.scenes.training import Spec
 
 SCENES = ("plush", "banana", "lund_door", "brighton_beach", "embedded")
 QUICK_SCENES = ("banana", "embedded")  # for the options of a part
-MANY_VIEWS_SCENES = ("bonsai", "lego", "plush")
 ROTATED_SCENES = (*MANY_VIEWS_SCENES, "embedded", "banana", "lund_door", "brighton_beach")
 ROTATED_ARMS = (
     *("mcmc", FADED, DEFAULTS, ANNEALED, "paper", "paper-constant"),
@@ -34,6 +34,7 @@ ROTATED_ARMS = (
     *("l2@1/30", "l1+reset@1/30", "l2+reset@1/30", "l2+reset+lqn@1/30"),
 )
 BRIEF_ARMS = ("mcmc", FADED, DEFAULTS, ANNEALED, *EARLY)
+HALF_ARMS = ("mcmc", DEFAULTS, "paper", "paper-constant")  # with 50,000 Gaussians
 LONG_ARMS = tuple(arm.name for arm in long_runs())
 FULL_PARTS_SCENES = ("brighton_beach", "lund_door")  # where the defaults lose
 POINTS = 4_000
@@ -110,6 +111,10 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
             for arm in ROTATED_ARMS
             for spec in cross(scenes, [arm], seeds, 30_000, rotated=True)
             if spec.seed == seed
+        ],
+        "half-size": [
+            *cross(("bonsai", "lego"), HALF_ARMS, 1, 30_000, 5, rotated=True, size="images_2"),
+            *cross(("plush",), HALF_ARMS, 1, 30_000, 12.5, rotated=True, size="images_2"),
         ],
         "full-parts": cross(FULL_PARTS_SCENES, [UNFADED_OPACITIES], 1, 30_000),
         "rest": cross(QUICK_SCENES, later, seeds, 3_000),

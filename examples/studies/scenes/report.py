@@ -32,7 +32,7 @@ from studies.scenes.arms import (
     UNFADED_OPACITIES,
     label,
 )
-from studies.scenes.decisions import decide, settings_of
+from studies.scenes.decisions import QUARTER, decide, every_scene, settings_of
 from studies.scenes.long_tables import (
     cells_of,
     difference,
@@ -40,6 +40,7 @@ from studies.scenes.long_tables import (
     headline_table,
     metrics_table,
     reach_table,
+    scenes_gain_table,
 )
 from studies.scenes.plots import plot_curves, plot_gains, plot_metrics
 from studies.scenes.records import COSTS, FOLDER, Setting, gather, merge, read, read_costs, write
@@ -137,10 +138,13 @@ def rotated_tables(study: Study) -> dict[str, str]:
         "decisions": decisions_table(study),
     }
     long, brief = settings_of(study, LONG), settings_of(study, BRIEF)
+    every = every_scene(study, LONG)
+    quarter = [setting for setting in every if setting.size == QUARTER]
+    made["every-scene"] = scenes_gain_table(study, every, DEFAULTS, BASELINE)
     made["headline"] = headline_table(study, long, BRIEF)
     made["reach"] = reach_table(study, long, REACH_ARMS, BRIEF)
-    made["paper"] = paper_table(study, long)
-    made["paper-brief"] = paper_table(study, long, brief=True)
+    made["paper"] = paper_table(study, quarter)
+    made["paper-brief"] = paper_table(study, quarter, brief=True)
     aside = {arm for kind in ASIDE for arm in names(kind)}
     shown = [arm for arm in STUDY_ARMS if arm not in aside]
     for count, settings in ((LONG, long), (BRIEF, brief)):
