@@ -20,8 +20,8 @@ from studies.scenes import report, steps
 from studies.scenes.analysis import Study
 from studies.scenes.arms import BASELINE, STUDY_ARMS, find_study_arm
 from studies.scenes.arms import DEFAULTS as DEFAULT_ARM
-from studies.scenes.decisions import decide
-from studies.scenes.long_tables import reach_table
+from studies.scenes.decisions import MANY_VIEWS_SCENES, decide, every_scene
+from studies.scenes.long_tables import reach_table, scenes_gain_table
 from studies.scenes.parts.chosen_fading import chosen_rows
 from studies.scenes.parts.own_step import OwnStep
 from studies.scenes.parts.step_lengths import StepLengths
@@ -103,11 +103,13 @@ def rotated_record(arm: str, scene: str, seed: int, **metrics: float) -> Record:
 def test_a_part_is_on_if_one_metric_gains_and_none_loses(
     better: dict[str, float], verdict: str
 ) -> None:
-    costs = {(scene, "images_4", 7_500, "faded"): better.get("cost", 1.0) for scene in "abc"}
+    costs = {
+        (scene, "images_4", 7_500, "faded"): better.get("cost", 1.0) for scene in MANY_VIEWS_SCENES
+    }
     better = {name: value for name, value in better.items() if name != "cost"}
     records = [
         rotated_record(arm, scene, 0, **(better if arm != BASELINE else {}))
-        for scene in "abc"
+        for scene in MANY_VIEWS_SCENES
         for arm in (BASELINE, "faded")
     ]
     decision = decide(Study(records, costs))["Fading"]
@@ -120,7 +122,7 @@ def test_a_part_is_on_if_one_metric_gains_and_none_loses(
 def test_the_longest_trainings_decide() -> None:
     records = [
         rotated_record(arm, scene, 0, psnr=20.0 + (arm != BASELINE))
-        for scene in "abc"
+        for scene in MANY_VIEWS_SCENES
         for arm in (BASELINE, "faded")
     ]
     longer = [
@@ -129,6 +131,19 @@ def test_the_longest_trainings_decide() -> None:
     ]
     decision = decide(Study([*records, *longer]))["Fading"]
     assert (decision.iterations, decision.verdict) == (30_000, "loses PSNR")
+
+
+def test_every_scene_and_size_has_its_line() -> None:
+    arms = ((BASELINE, 20.0), (DEFAULT_ARM, 20.5))
+    quarter = [rotated_record(arm, "banana", 0, psnr=psnr) for arm, psnr in arms]
+    half = [replace(r, setting=replace(r.setting, size="images_2", points=5_000)) for r in quarter]
+    other = rotated_record(BASELINE, "plush", 0)  # has no pair
+    study = Study([*quarter, *half, other])
+    table = scenes_gain_table(study, every_scene(study, 7_500), DEFAULT_ARM, BASELINE)
+    assert table.splitlines()[2:] == [
+        "| banana | 100, quarter | 20.00 / 0.700 / 0.200 | 20.50 / 0.700 / 0.200 | +0.50 |",
+        "| banana | 5,000, half | 20.00 / 0.700 / 0.200 | 20.50 / 0.700 / 0.200 | +0.50 |",
+    ]
 
 
 def test_when_stocks_quality_is_reached() -> None:
