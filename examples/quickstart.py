@@ -74,7 +74,7 @@ def draw(scene: Scene, trainings: Sequence[Training], path: Path) -> None:
     axes["psnr"].legend(frameon=False, loc="lower right")
     axes["psnr"].grid(alpha=0.3)
     axes["psnr"].spines[["top", "right"]].set_visible(False)
-    figure.savefig(path)
+    figure.savefig(path, format="png")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
