@@ -140,7 +140,8 @@ def _in_child(
     sys.dont_write_bytecode = True
     os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
     known = set(sys.modules)
-    options = ["-x", "-q", "-p", "no:cacheprovider", "-k", LEFT_OUT]
+    # -n 0: in this process, whatever the project's own options are.
+    options = ["-x", "-q", "-n", "0", "-p", "no:cacheprovider", "-k", LEFT_OUT]
     # Hypothesis is imported before pytest could rewrite its assertions; it has none to rewrite.
     options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
     status = pytest.main([*options, *map(str, tests)], [plugin])
