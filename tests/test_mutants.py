@@ -63,6 +63,7 @@ def examined(
         "little/__init__.py": "",
         "little/sums.py": SOURCE,
         "tests/test_sums.py": test,
+        "pytest.ini": "[pytest]\naddopts = -n 2\n",  # as the project's: in workers if it could
     }.items():
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8")
