@@ -35,6 +35,7 @@ OTHERS = re.compile(
     r"(^|/)(submodules|tests?|scripts|docs|utils?|preprocess|ext|internal|Tracking[^/]*)/"
 )
 MORE = ("sugar_trainers/*.py", "nerfstudio/engine/trainer.py", "internal/gaussian_splatting.py")
+GROUPS = re.compile(r" \(all: [^)]*\)")  # the names of an optimizer's groups: long
 NEVER = "the lines to add by hand are printed"
 
 
@@ -136,7 +137,7 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
         f"{trials['iterations']} iterations of the real script on a CPU through `on_cpu.py`, "
         f"on {trials['scene']}, stock and with the lines; PSNR of the test views at the end. "
         "So short a run shows that the lines work, not what they gain. "
-        f"Parts: {_span(trials, 'parts')}. {_span(trials, 'date')}, "
+        f"Parts of these runs: {_span(trials, 'parts')}. {_span(trials, 'date')}, "
         f"torch {_span(trials, 'torch')}, {trials['machine']}.",
         "",
         "| trainer and options | commit | lines of `diff` | stock | edited | checkpoint | resume "
@@ -162,14 +163,17 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
         "(each result compiles and defines every name it uses), the others are refused; "
         f"for these {NEVER}.",
         "",
-        "<details markdown><summary>All scripts</summary>",
+        "<details markdown><summary>All scripts, with their commits</summary>",
         "",
-        "| trainer | script | commit | lines | notes, or why it is refused |",
-        "|---|---|---|---|---|",
+        "| scripts | what `diff` says |",
+        "|---|---|",
     ]
+    said: dict[str, list[str]] = {}
     for row in rows:
-        said = row.said if row.edited else f"**refused**: {row.said}"
-        text.append(_row(row.trainer, row.path, row.commit, str(row.lines or "-"), said))
+        what = row.said or "nothing" if row.edited else f"**refused**: {row.said}"
+        script = f"`{row.trainer}/{row.path}@{row.commit.split()[0]}`"
+        said.setdefault(GROUPS.sub("", what), []).append(script)
+    text += [_row(" ".join(scripts), what) for what, scripts in said.items()]
     return "\n".join([*text, "", "</details>", ""])
 
 
