@@ -36,6 +36,7 @@ OTHERS = re.compile(
 )
 MORE = ("sugar_trainers/*.py", "nerfstudio/engine/trainer.py", "internal/gaussian_splatting.py")
 GROUPS = re.compile(r" \(all: [^)]*\)")  # the names of an optimizer's groups: long
+STOPS = re.compile(r"(?<=stops: )(\w+):.*")  # what an exception says after its name
 NEVER = "the lines to add by hand are printed"
 
 
@@ -140,22 +141,24 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
         f"Parts of these runs: {_span(trials, 'parts')}. {_span(trials, 'date')}, "
         f"torch {_span(trials, 'torch')}, {trials['machine']}.",
         "",
-        "| trainer and options | commit | lines of `diff` | stock | edited | checkpoint | resume "
+        "| trainer and options | commit | lines of `diff` | stock | edited | resume "
         "| what is different |",
-        "|---|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|",
     ]
     trained = {row["name"]: row for row in trials["rows"]}
     for trial in TRIALS:
         if row := trained.get(trial.name):
             none = "none needed" if isinstance(trial, Nerfstudio) else "-"
             count = lines.get((trial.trainer, trial.script), none)
-            done = (row[key] for key in ("stock", "ours", "checkpoint", "resume"))
+            done = (STOPS.sub(r"\1", row[key]) for key in ("stock", "ours", "resume"))
             text.append(_row(trial.name, row["commit"], count, *done, trial.different))
+    saved = sum(row["checkpoint"] == "yes" for row in trials["rows"])
     text += [
         "",
         f"{len(trials['rows'])} of the {len(TRIALS)} trials in `examples/hosts/trials.py` have "
-        "been run for this table. Resume: from the edited trainer's own checkpoint, and "
-        "from the stock one's; gsplat's scripts evaluate a checkpoint and do not go on from one.",
+        f"been run for this table; {saved} of them left a checkpoint. Resume: from the edited "
+        "trainer's own, and from the stock one's; gsplat's scripts evaluate a checkpoint and do "
+        "not go on from one.",
         "",
         "## `hosts diff` over public trainers",
         "",

@@ -22,7 +22,7 @@ def test_the_table_comes_first_and_the_scripts_are_folded() -> None:
     ]
     text = page(rows, TRIED)
     tried, folded = text.split("<details")
-    for column in ("commit", "lines of `diff`", "stock", "edited", "checkpoint", "resume"):
+    for column in ("commit", "lines of `diff`", "stock", "edited", "resume"):
         assert f"| {column} |" in tried
     (mcmc,) = [line for line in tried.splitlines() if line.startswith("| 3dgs-mcmc")]
     assert "| 7b4fc9f (2025-01-01) | 5 |" in mcmc
