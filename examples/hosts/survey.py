@@ -35,6 +35,8 @@ OTHERS = re.compile(
     r"(^|/)(submodules|tests?|scripts|docs|utils?|preprocess|ext|internal|Tracking[^/]*)/"
 )
 MORE = ("sugar_trainers/*.py", "nerfstudio/engine/trainer.py", "internal/gaussian_splatting.py")
+GROUPS = re.compile(r" \(all: [^)]*\)")  # the names of an optimizer's groups: long
+STOPS = re.compile(r"(?<=stops: )(\w+):.*")  # what an exception says after its name
 NEVER = "the lines to add by hand are printed"
 
 
@@ -136,25 +138,27 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
         f"{trials['iterations']} iterations of the real script on a CPU through `on_cpu.py`, "
         f"on {trials['scene']}, stock and with the lines; PSNR of the test views at the end. "
         "So short a run shows that the lines work, not what they gain. "
-        f"Parts: {_span(trials, 'parts')}. {_span(trials, 'date')}, "
+        f"Parts of these runs: {_span(trials, 'parts')}. {_span(trials, 'date')}, "
         f"torch {_span(trials, 'torch')}, {trials['machine']}.",
         "",
-        "| trainer and options | commit | lines of `diff` | stock | edited | checkpoint | resume "
+        "| trainer and options | commit | lines of `diff` | stock | edited | resume "
         "| what is different |",
-        "|---|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|",
     ]
     trained = {row["name"]: row for row in trials["rows"]}
     for trial in TRIALS:
         if row := trained.get(trial.name):
             none = "none needed" if isinstance(trial, Nerfstudio) else "-"
             count = lines.get((trial.trainer, trial.script), none)
-            done = (row[key] for key in ("stock", "ours", "checkpoint", "resume"))
+            done = (STOPS.sub(r"\1", row[key]) for key in ("stock", "ours", "resume"))
             text.append(_row(trial.name, row["commit"], count, *done, trial.different))
+    saved = sum(row["checkpoint"] == "yes" for row in trials["rows"])
     text += [
         "",
         f"{len(trials['rows'])} of the {len(TRIALS)} trials in `examples/hosts/trials.py` have "
-        "been run for this table. Resume: from the edited trainer's own checkpoint, and "
-        "from the stock one's; gsplat's scripts evaluate a checkpoint and do not go on from one.",
+        f"been run for this table; {saved} of them left a checkpoint. Resume: from the edited "
+        "trainer's own, and from the stock one's; gsplat's scripts evaluate a checkpoint and do "
+        "not go on from one.",
         "",
         "## `hosts diff` over public trainers",
         "",
@@ -162,14 +166,17 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
         "(each result compiles and defines every name it uses), the others are refused; "
         f"for these {NEVER}.",
         "",
-        "<details markdown><summary>All scripts</summary>",
+        "<details markdown><summary>All scripts, with their commits</summary>",
         "",
-        "| trainer | script | commit | lines | notes, or why it is refused |",
-        "|---|---|---|---|---|",
+        "| scripts | what `diff` says |",
+        "|---|---|",
     ]
+    said: dict[str, list[str]] = {}
     for row in rows:
-        said = row.said if row.edited else f"**refused**: {row.said}"
-        text.append(_row(row.trainer, row.path, row.commit, str(row.lines or "-"), said))
+        what = row.said or "nothing" if row.edited else f"**refused**: {row.said}"
+        script = f"`{row.trainer}/{row.path}@{row.commit.split()[0]}`"
+        said.setdefault(GROUPS.sub("", what), []).append(script)
+    text += [_row(" ".join(scripts), what) for what, scripts in said.items()]
     return "\n".join([*text, "", "</details>", ""])
 
 

@@ -30,7 +30,7 @@ Optimizers = TypeVar("Optimizers", bound="Optimizer | Mapping[str, Optimizer]")
 class PhaseScheduler(Course):
     """Put parts into the steps of a 3DGS trainer's optimizers, in two phases.
 
-    By default fading: what paid against a control (docs/evidence.md); with
+    By default annealing and fading, what paid against a control (docs/evidence.md); with
     `PhaseScheduler.paper`, Opt3DGS. What is left out costs nothing.
 
     Args:

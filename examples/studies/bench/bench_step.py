@@ -104,17 +104,16 @@ def cpu_name() -> str:
 
 
 def table(results: dict[int, dict[str, dict[str, float]]]) -> str:
-    """Markdown: a row per subject, and per number of points ns per point (quartiles) and ratio."""
+    """Markdown: a row per subject, and per number of points ns per point and ratio."""
     counts = list(results)
-    head = "| | " + " | ".join(f"{n:,} points: ns per point | ratio" for n in counts) + " |"
-    rule = "|---|" + "---:|---:|" * len(counts)
+    head = "| ns per point | " + " | ".join(f"{n:,} points" for n in counts) + " |"
+    rule = "|---|" + "---:|" * len(counts)
     lines = [head, rule]
     for name in results[counts[0]]:
         cells = []
         for n in counts:
             row = results[n][name]
-            cells.append(f"{row['ns_per_point']:.1f} ({row['ns_low']:.1f}..{row['ns_high']:.1f})")
-            cells.append(f"{row['per_adam']:.2f} ({row['adam_low']:.2f}..{row['adam_high']:.2f})")
+            cells.append(f"{row['ns_per_point']:.0f} (x{row['per_adam']:.2f})")
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -196,8 +195,8 @@ def write(record: dict[str, Any], results: dict[int, Any], stem: Path) -> None:
     told = {key: value for key, value in record.items() if key != "results"}
     lines = [f"- {key}: {value}" for key, value in told.items()]
     note = (
-        f"Median (quartiles) of {record['repeats']} rounds. The ratio is to "
-        f'"{record["baseline"]}" in the same round.'
+        f"Median of {record['repeats']} rounds, and of the ratio to "
+        f'"{record["baseline"]}" in the same round. The JSON beside this has the quartiles.'
     )
     text = "\n".join(["# Cost of a step", "", *lines, "", note, "", table(results), ""])
     print(text)

@@ -74,8 +74,8 @@ def slow_block(result: dict[str, Any]) -> str:
         f"Last run {about['date']} ({about['machine']}, which had other work too): {passed} of "
         f"{len(tests)} passed, in {minutes:.0f} minutes together.\n\n"
     )
-    rows = [(f"`{t['test']}`", t["outcome"], f"{t['seconds']:.0f}") for t in tests]
-    return said + table(("test", "outcome", "seconds"), rows)
+    bad = [(f"`{t['test']}`", t["outcome"]) for t in tests if t["outcome"] != "passed"]
+    return said + table(("test", "outcome"), bad) if bad else said.rstrip("\n") + "\n"
 
 
 def share(part: float, whole: float) -> float:
@@ -106,15 +106,9 @@ def coverage_block(result: dict[str, Any]) -> str:
         f"{branch_share(whole):.1f} % of the {whole['num_branches']} branches of `src` were taken, "
         f"{line_share(whole):.1f} % of its {whole['num_statements']} statements ran.\n"
     )
-    low = [
-        (f"`{name}`", f"{branch_share(entry):.0f} %", f"{line_share(entry):.0f} %")
-        for name, entry in modules.items()
-        if min(branch_share(entry), line_share(entry)) < LEAST_COVERAGE
-    ]
-    if not low:
-        return said
-    rest = table(("module", "branches", "statements"), low)
-    return f"{said}\nModules below {LEAST_COVERAGE:.0f} %:\n\n{rest}"
+    shares = {name: min(branch_share(e), line_share(e)) for name, e in modules.items()}
+    low = [f"`{name}` {least:.0f} %" for name, least in shares.items() if least < LEAST_COVERAGE]
+    return said + (f"Below {LEAST_COVERAGE:.0f} %: {', '.join(low)}.\n" if low else "")
 
 
 def mutants_block(result: dict[str, Any]) -> str:
@@ -122,26 +116,18 @@ def mutants_block(result: dict[str, Any]) -> str:
     many = sum(entry["mutants"] for entry in modules.values())
     dead = sum(entry["killed"] for entry in modules.values())
     why = reasons()
-    survivors = [
-        (
-            f"`{name}` {one['function'].rpartition('.')[2]}",
-            _code(one["before"]),
-            _code(one["after"]),
-            one.get("why") or why.get((name, *survivor_key(one)), "a gap"),
-        )
+    gaps = [
+        (f"`{name}` {one['function']}", _code(one["before"]), _code(one["after"]))
         for name, entry in modules.items()
         for one in entry["survivors"]
+        if not (one.get("why") or why.get((name, *survivor_key(one))))
     ]
-    rows = [(f"`{name}`", entry["mutants"], entry["killed"]) for name, entry in modules.items()]
     text = (
         f"Last run {about['date']} ({about['machine']}): {many} places were changed, one at a "
-        f"time, and the tests noticed {dead} ({share(dead, many):.1f} %). The others count as not "
-        "noticed, whatever the reason.\n\n"
+        f"time, and the tests noticed {dead} ({share(dead, many):.1f} %). Of the others "
+        f"{many - dead - len(gaps)} change nothing that a test could see, {len(gaps)} are gaps.\n"
     )
-    text += table(("module", "mutants", "noticed"), rows)
-    if not survivors:
-        return text
-    return text + "\n" + table(("where", "was", "became", "why nothing notices"), survivors)
+    return text + ("\n" + table(("where", "was", "became"), gaps) if gaps else "")
 
 
 def _code(text: str) -> str:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +55,25 @@ def test_every_arm_is_measured_over_iterations_and_seconds() -> None:
             assert min(errors) > 0
     for name in ("iterations", "seconds", "conditions"):
         assert (FOLDER / f"{name}.png").stat().st_size > 10_000
+
+
+@pytest.mark.processes
+def test_the_command_finds_the_tests_problems() -> None:
+    """Started by itself: pytest has more folders on its path."""
+    words = [sys.executable, stability.__file__, "--help"]
+    assert "--tables" in subprocess.run(words, capture_output=True, text=True, check=True).stdout
+
+
+def test_what_failed_and_gaps_are_listed() -> None:
+    slow, mutants = result("slow"), result("mutants")
+    slow["tests"][0]["outcome"] = "failure"
+    assert f"| `{slow['tests'][0]['test']}` | failure |" in stability_page.slow_block(slow)
+    name, entry = next((n, e) for n, e in mutants["modules"].items() if e["survivors"])
+    entry["survivors"][0] |= {"before": "x < nowhere", "after": "x > nowhere", "why": ""}
+    text = stability_page.mutants_block(mutants)
+    assert "1 are gaps" in text
+    assert f"| `{name}` " in text
+    assert "| `x < nowhere` | `x > nowhere` |" in text
 
 
 def test_long_tests_passed() -> None:
