@@ -49,7 +49,6 @@ from studies.scenes.tables import (
     gains_table,
     goals_table,
     machines_line,
-    nu_table,
     scenes_table,
 )
 
@@ -92,25 +91,15 @@ MARKER = re.compile(r"(<!-- study:([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTA
 def tables(study: Study) -> dict[str, str]:
     """Every generated piece of the page, by the name in its marker."""
     short = study.settings(SHORT)
-    gains = {kind: study.gains(short, names(kind)) for kind in GROUPS}
     long = {
         "7,500 iterations": study.settings(7_500),
         "30,000 iterations": study.settings(30_000),
     }
     few = [s for s in long["7,500 iterations"] if s.scene in FEW_VIEWS_SCENES]
     made = {
-        "machines": machines_line(study.records()),
-        "core": gains_table(gains["core"]),
-        "with-nu": gains_table(gains["with-nu"]),
-        "scenes": scenes_table(study, short, [*names("core"), *names("with-nu")]),
-        "nu": nu_table(study, short, [*names("core"), *names("with-nu"), *names("options")]),
-        "tails": gains_table(gains["tails"]),
-        "on-top": gains_table(gains["on-top"]),
-        "options": gains_table(gains["options"]) if gains["options"] else _missing("options"),
-        "leads": gains_table(gains["leads"]) if gains["leads"] else _missing("leads"),
+        "core": gains_table(study.gains(short, names("core"))),
         "long": goals_table(study, {"3,000 iterations": short, **long}, BEST, BASELINE),
         "pooled": goals_table(study, {"3,000 iterations": short, **long}, POOLED, BASELINE),
-        "long-scenes": scenes_table(study, long["7,500 iterations"], LONG_ARMS),
         "few-views": scenes_table(study, few, FEW_VIEWS_ARMS),
         "full-scenes": scenes_table(study, long["30,000 iterations"], LONG_ARMS),
         "front": front_table(study, {n: study.settings(n) for n in (SHORT, 7_500, 30_000)}, FRONT),

@@ -111,23 +111,6 @@ def front_table(
     return "\n".join(lines)
 
 
-def nu_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) -> str:
-    """Mean of nu by scene, of the arms that have one."""
-    lines = [
-        f"| arm | {' | '.join(setting.scene for setting in settings)} |",
-        f"|---|{'---:|' * len(settings)}",
-    ]
-    for arm in arms:
-        cells = []
-        for setting in settings:
-            records: list[Record] = list(study.runs(setting, arm).values())
-            values = [r.mean_nu for r in records if r.mean_nu is not None]
-            cells.append(_mean_and_spread(values))
-        if any(cell != "-" for cell in cells):
-            lines.append(f"| `{label(arm)}` | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
 def _gain_and_spread(gain: Gain) -> str:
     """At equal seconds; one seed has no spread."""
     spread = f" ± {gain.spread:.2f}" if gain.seeds > 1 else ""
