@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from opt3dgs_optim.version import __version__
 
-MODULES = {"doctor": "doctor", "report": "runs.report", "hosts": "hosts.cli"}
+MODULES = {"doctor": "doctor", "report": "runs.report", "hosts": "hosts.edits"}
 USAGE = f"""opt3dgs_optim {__version__}
 
 opt3dgs COMMAND ...

@@ -25,8 +25,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.checks import LOGGER, check_count
-from opt3dgs_optim.runs.lines import LineFile, encoded, number
-from opt3dgs_optim.runs.read import read_run
+from opt3dgs_optim.runs.lines import LineFile, encoded, number, read_run
 
 RESERVED = ("kind", "iteration", "seconds", "phase", "event")
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from opt3dgs_optim.runs.read import Run
+from opt3dgs_optim.runs.lines import Run
 from opt3dgs_optim.runs.stats import Arm, Comparison, higher_is_better
 
 # Okabe and Ito's colour-blind-safe palette, without the yellow that white swallows.
