@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 from torch.optim import Adam
 
-from opt3dgs_optim.checkpoint import take_loaded
 from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import SLOT, canonical_name, group_name
@@ -64,7 +63,7 @@ def take(found: Found, course: Course) -> None:
     vars(optimizer).pop("step", None)  # a learning-rate scheduler's wrapper of the old class's
     optimizer.__class__ = StepAdam
     optimizer.follow(course, found.base)
-    take_loaded(optimizer)
+    course.take_loaded(optimizer)
 
 
 def _base_of(optimizer: Any, shown: str) -> type[Adam]:
