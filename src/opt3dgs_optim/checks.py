@@ -27,12 +27,8 @@ def check_number(
 ) -> float:
     """Return `value` as a float, or raise ValueError if it lies outside the interval."""
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    inside = (
-        number
-        and (value > low if open_low else value >= low)
-        and (value < high if open_high else value <= high)
-    )
-    if not inside or not math.isfinite(value):
+    outside = not number or not low <= value <= high or not math.isfinite(value)
+    if outside or (open_low and value == low) or (open_high and value == high):
         left, right = ("(" if open_low else "["), (")" if open_high else "]")
         raise ValueError(
             f"{call}: {name}={value!r}, but a finite number in {left}{low}, {high}{right} is needed"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -30,27 +31,23 @@ MEAN_ABS = math.sqrt(2 / math.pi)  # mean absolute deviation of a Gaussian of de
 RESOLUTION = 1e-6  # smallest deviation, as a share of the present distance from the mean
 
 
+@dataclass(eq=False)
 class FixedPartitions:
     """Eq. 7, 13, 14 and 16 as the paper has them; options as in `EnergyHistogram`."""
 
-    def __init__(
-        self,
-        num_partitions: int,
-        energy_range: tuple[float, float],
-        zeta: float,
-        temperature: float,
-        warmup: int,
-        clamp: tuple[float, float] | None,
-    ) -> None:
-        self.num_partitions, self.energy_range, self.zeta = num_partitions, energy_range, zeta
-        self.tau, self.warmup, self.clamp = temperature, warmup, clamp
+    num_partitions: int
+    energy_range: tuple[float, float]
+    zeta: float
+    temperature: float
+    warmup: int
+    clamp: tuple[float, float] | None
 
     def allocate(self, device: torch.device) -> None:
         """Begin anew on a device."""
         # MPS has no float64.
         dtype = torch.float32 if device.type == "mps" else torch.float64
         m, (low, high) = self.num_partitions, self.energy_range
-        scalars = [low, (high - low) / m, self.tau, 0, 1]
+        scalars = [low, (high - low) / m, self.temperature, 0, 1]
         self._scalars = torch.tensor(scalars, dtype=dtype, device=device)
         self._low, self._width, self._tau, self._count, self.nu = self._scalars.unbind()
         self.weights = torch.full((m,), 1.0 / m, dtype=dtype, device=device)
@@ -121,18 +118,13 @@ class MovingPartitions:
 
         Theta ~ q^(1 / (1 - zeta)),    nu = 1 + zeta tau dlog Theta/du = 1 + dlog q/dz / 2
 
-    That Theta is where eq. 16 converges to (its field is p_i theta_i^zeta - theta_i times a sum,
-    zero at theta_i^(1 - zeta) ~ p_i). With tau = (1 - zeta) / (2 zeta) deviations zeta drops out:
-    a Gaussian energy has the slope -z, so |nu - 1| = 1 two deviations out, and nu's deviation is
-    1/2. Smoothing by k twice widens a Gaussian's variance to 1 + 2 * 0.4^2, and the slope is
-    corrected by that. Its own recent mean is taken away: a smoothed density's is not 0 for a
-    skewed energy, nor while the energy falls, and nu's mean of 1 is no change of learning rate.
+    with tau = (1 - zeta) / (2 zeta) deviations. Smoothing by k twice widens a Gaussian's variance
+    to 1 + 2 * 0.4^2, by which the slope is corrected, and its own recent mean is taken away.
+    docs/algorithms/awsgld.md has the reasons.
 
     All means are of the last 100 energies, weighed exponentially. The deviation is the mean
-    absolute one, and an energy counts for at most four deviations: a spike moves them by 4 %.
-
-    Few operators: one packed state follows one packed target by one `lerp_`, and all products with
-    q are one `addmv`. Where the CUDA kernels run, all of it is one launch.
+    absolute one. Few operators: one packed state follows one packed target by one `lerp_`, and all
+    products with q are one `addmv`. Where the CUDA kernels run, all of it is one launch.
     """
 
     def __init__(self, num_partitions: int, zeta: float, clamp: tuple[float, float] | None) -> None:
