@@ -1,7 +1,5 @@
 """The commands: `opt3dgs`, or `python -m opt3dgs_optim`."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Which implementation runs, the CUDA kernels or pure torch, and why."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Option checks whose messages name the call, the value and what is allowed."""
 
-from __future__ import annotations
-
 import logging
 import math
 import os

@@ -1,7 +1,5 @@
 """The course of a training: its clock, its parts, and the energy observed last."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar

@@ -1,7 +1,5 @@
 """3DGS-MCMC's covariance-shaped position noise (eq. 2)."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

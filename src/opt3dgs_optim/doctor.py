@@ -3,8 +3,6 @@
 The self-test asks what an installation can break: torch's Adam under ours, and the kernels.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib.metadata
 import platform

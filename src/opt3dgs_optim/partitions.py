@@ -6,8 +6,6 @@ smoothed density of the recent visits. Equation numbers are those of the Opt3DGS
 displayed equation counted; 7 partition, 13 index, 14 multiplier, 16 update of the weights).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Whose rows they are: what parts keep per row, against trainers that add, drop and move rows."""
 
-from __future__ import annotations
-
 import weakref
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The only Adam: torch's own step, with the parts of a course before, in and after it."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable
 from typing import Any, cast

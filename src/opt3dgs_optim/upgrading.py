@@ -1,7 +1,5 @@
 """How a trainer's optimizer gets the parts of a course, in place."""
 
-from __future__ import annotations
-
 import inspect
 import logging
 import sys

@@ -5,8 +5,6 @@ device it is launched on, once per machine (cuda.core's disk cache) and loaded o
 Only the float32 and float64 tensors of one CUDA device get here; see `opt3dgs_optim.backend`.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib
 from importlib.resources import files

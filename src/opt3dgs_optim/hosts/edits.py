@@ -5,8 +5,6 @@ What is written is at most: the import, `PhaseScheduler(...)` and `upgrade` abov
 `backward`. The result must compile, and each name it uses must be bound where it stands.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import builtins

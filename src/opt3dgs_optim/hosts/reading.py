@@ -5,8 +5,6 @@ it: gsplat's `for optimizer in self.optimizers.values()`, or INRIA's `gaussians.
 under whatever names the file uses.
 """
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from dataclasses import dataclass, field

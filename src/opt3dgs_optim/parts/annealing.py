@@ -1,7 +1,5 @@
 """Annealing: learning rates start above the trainer's own and end below them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

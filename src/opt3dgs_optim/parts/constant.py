@@ -1,7 +1,5 @@
 """A constant multiplier: the control that every claim for the flat histogram needs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Fading: Adam's moments of random points are shrunk, so that their next steps are longer."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

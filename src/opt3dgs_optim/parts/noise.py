@@ -1,7 +1,5 @@
 """Langevin noise: covariance-shaped for Gaussians, isotropic for anything else."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

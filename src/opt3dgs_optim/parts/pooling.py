@@ -1,7 +1,5 @@
 """Pooling: one second moment for all coordinates of a point."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

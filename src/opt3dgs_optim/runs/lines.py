@@ -1,7 +1,5 @@
 """The lines of a run log: JSON, appended whole by one writer at a time, and read as columns."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

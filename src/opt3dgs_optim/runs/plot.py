@@ -1,7 +1,5 @@
 """A report as a picture: the metric over seconds and over iterations."""
 
-from __future__ import annotations
-
 import textwrap
 import warnings
 from pathlib import Path

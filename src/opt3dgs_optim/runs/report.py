@@ -4,8 +4,6 @@ Writes `report.md` and, with matplotlib (the extra `opt3dgs_optim[report]`), `re
 `report-SCENE.png` for each of several scenes.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import re
