@@ -1,5 +1,6 @@
 """3DGS-MCMC's covariance-shaped position noise (eq. 2)."""
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -52,11 +53,24 @@ def add_covariance_noise(
         RuntimeError: `backend="cuda"` where the kernel cannot run.
         ValueError: the shapes or dtypes do not fit (the kernel's; torch has its own words).
     """
-    if uses_kernel(backend, means.device, means.dtype, means.shape[1]):
-        gate = GATE_SHARPNESS, GATE_OPACITY
-        cuda.add_covariance_noise(means, scales, quats, opacities, eta, lr, noise_scale, *gate)
+    if not uses_kernel(backend, means.device, means.dtype, means.shape[1]):
+        means += covariance_noise(scales, quats, opacities, eta) * (lr * noise_scale)
         return
-    means += covariance_noise(scales, quats, opacities, eta) * (lr * noise_scale)
+    rows = means.shape[0]
+    vectors = {"scales": (scales, (rows, 3)), "quats": (quats, (rows, 4)), "eta": (eta, (rows, 3))}
+    logits = opacities.reshape(-1), (rows,)
+    cuda.check_alike("add_covariance_noise", means, opacities=logits, **vectors)
+    if isinstance(lr, Tensor) and lr.is_cuda:
+        rate, factor = lr.to(torch.float32), noise_scale
+    else:
+        rate, factor = 0, noise_scale * float(lr)  # a null pointer
+    target = means.contiguous()
+    tensors = (tensor.contiguous() for tensor in (scales, quats, opacities, eta))
+    numbers = map(cuda.real(means.dtype), (factor, GATE_SHARPNESS, GATE_OPACITY))
+    count = np.int64(rows)
+    cuda.launch("add_covariance_noise", means, rows, target, *tensors, rate, *numbers, count)
+    if target is not means:
+        means.copy_(target)
 
 
 def largest_noise(scales: Tensor, opacities: Tensor, noise_scale: float) -> Tensor:

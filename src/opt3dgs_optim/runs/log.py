@@ -59,17 +59,6 @@ class RunLog:
         ValueError: `path` is no run log.
         TypeError: metadata that JSON cannot hold.
         BlockingIOError: another RunLog has the file open (noticed where files can be locked).
-
-    Examples:
-        >>> import os, tempfile
-        >>> path = os.path.join(tempfile.mkdtemp(), "mcmc-0.jsonl")
-        >>> with RunLog(path, metadata={"arm": "mcmc", "seed": 0}) as log:
-        ...     log.step(1, phase="exploration", loss=torch.tensor(0.25), nu=1.5)
-        ...     with log.paused():
-        ...         psnr = 21.5  # evaluate here
-        ...     log.evaluation(1, psnr=psnr)
-        >>> read_run(path).evaluations["psnr"]
-        array([21.5])
     """
 
     def __init__(
