@@ -31,7 +31,10 @@ RESOLUTION = 1e-6  # smallest deviation, as a share of the present distance from
 
 @dataclass(eq=False)
 class FixedPartitions:
-    """Eq. 7, 13, 14 and 16 as the paper has them; options as in `EnergyHistogram`."""
+    """Eq. 7, 13, 14 and 16 as the paper has them.
+
+    Options as in `EnergyHistogram`, methods as in `MovingPartitions`.
+    """
 
     num_partitions: int
     energy_range: tuple[float, float]
@@ -41,7 +44,6 @@ class FixedPartitions:
     clamp: tuple[float, float] | None
 
     def allocate(self, device: torch.device) -> None:
-        """Begin anew on a device."""
         # MPS has no float64.
         dtype = torch.float32 if device.type == "mps" else torch.float64
         m, (low, high) = self.num_partitions, self.energy_range
@@ -51,7 +53,7 @@ class FixedPartitions:
         self.weights = torch.full((m,), 1.0 / m, dtype=dtype, device=device)
 
     def take(self, energy: Tensor, valid: Tensor | bool, count: int) -> None:
-        """Nu from the present weights, then their update; as `MovingPartitions.take`."""
+        """Nu from the present weights, then their update."""
         valid = torch.as_tensor(valid, device=energy.device)
         value = torch.where(valid, energy.to(self.weights.dtype), 0.0)
         # J of eq. 13, counted from 0: u[J-1] < energy <= u[J], the end partitions open.
@@ -86,12 +88,10 @@ class FixedPartitions:
         self.weights.copy_(torch.where(valid, theta / theta.sum(), self.weights))
 
     def coordinates(self) -> tuple[float, float, float]:
-        """Low and high end of the range, and tau. Synchronises."""
         low, width, tau, *_ = self._scalars.tolist()
         return low, low + width * self.num_partitions, tau
 
     def state(self) -> dict[str, Any]:
-        """Plain floats and lists. Synchronises."""
         return {"weights": self.weights.tolist(), "scalars": self._scalars.tolist()}
 
     def check(self, call: str, state: Mapping[str, Any]) -> None:
@@ -103,7 +103,6 @@ class FixedPartitions:
             raise ValueError(f"{call}: scalars={state['scalars']!r}, but width > 0 is needed")
 
     def load(self, state: Mapping[str, Any]) -> None:
-        """Restore `state()`."""
         self.weights.copy_(torch.tensor(state["weights"], dtype=torch.float64))
         self._scalars.copy_(torch.tensor(state["scalars"], dtype=torch.float64))
 

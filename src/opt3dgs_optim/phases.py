@@ -30,8 +30,8 @@ Optimizers = TypeVar("Optimizers", bound="Optimizer | Mapping[str, Optimizer]")
 class PhaseScheduler(Course):
     """Put parts into the steps of a 3DGS trainer's optimizers, in two phases.
 
-    By default fading: what paid against a control (docs/evidence.md); with
-    `PhaseScheduler.paper`, Opt3DGS. What is left out costs nothing.
+    By default annealing and fading, what paid (docs/evidence.md); with `PhaseScheduler.paper`,
+    Opt3DGS. What is left out costs nothing.
 
     Args:
         total_steps: iterations of the training.
@@ -54,20 +54,16 @@ class PhaseScheduler(Course):
     Examples:
         >>> import torch
         >>> from opt3dgs_optim import PhaseScheduler
-        >>> splats = {"means": torch.nn.Parameter(torch.ones(4, 3)),
-        ...           "scales": torch.nn.Parameter(torch.zeros(4, 3))}
-        >>> optimizers = {k: torch.optim.Adam([{"params": p, "lr": 0.01, "name": k}], eps=1e-15)
-        ...               for k, p in splats.items()}
+        >>> means = torch.nn.Parameter(torch.ones(4, 3))
+        >>> adam = torch.optim.Adam([{"params": means, "lr": 0.01, "name": "means"}], eps=1e-15)
         >>> phases = PhaseScheduler(total_steps=60, switch=50)
-        >>> optimizers = phases.upgrade(optimizers)
+        >>> adam = phases.upgrade(adam)
         >>> for _ in range(60):
-        ...     render = splats["means"] * splats["scales"].exp()
-        ...     loss = phases.pixel_loss(render, torch.zeros(4, 3))
+        ...     loss = phases.pixel_loss(means, torch.zeros(4, 3))
         ...     loss.backward()
         ...     phases.observe(loss)
-        ...     for optimizer in optimizers.values():
-        ...         optimizer.step()
-        ...         optimizer.zero_grad()
+        ...     adam.step()
+        ...     adam.zero_grad()
         >>> phases.phase
         <Phase.EXPLOITATION: 'exploitation'>
 
