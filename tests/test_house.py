@@ -13,8 +13,8 @@ import pytest
 
 import opt3dgs_optim
 from opt3dgs_optim import EnergyHistogram, LQNAdam, Phase, PhaseScheduler, two_loop
-from opt3dgs_optim.covariance import covariance_noise
 from opt3dgs_optim.names import GAUSSIAN_NAMES
+from opt3dgs_optim.parts.noise import covariance_noise
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "opt3dgs_optim"
