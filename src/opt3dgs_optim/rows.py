@@ -79,7 +79,6 @@ class Frozen:
     """
 
     def __init__(self, moving: Tensor, param: Tensor, state: dict[str, Any]) -> None:
-        self._state = state
         tensors = {key: value for key, value in state.items() if isinstance(value, Tensor)}
         if moving.dim() > 0:
             tensors.pop("step", None)
