@@ -56,8 +56,11 @@ TARGETS = {
     "lbfgs/pairs.py": CURVATURE,
     "lbfgs/history.py": CURVATURE,
     "lbfgs/foresight.py": CURVATURE,
-    "parts/noise.py": ["parts/test_noise.py", "test_options.py"],
-    "covariance.py": ["test_covariance.py"],
+    "parts/noise.py": [
+        "parts/test_noise.py",
+        "parts/test_noise_covariance.py",
+        "test_options.py",
+    ],
 }
 
 

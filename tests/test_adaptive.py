@@ -16,7 +16,7 @@ from ranks import free_port
 from torch import Tensor, distributed
 
 from opt3dgs_optim import Course, Part, PhaseScheduler, PositionNoise
-from opt3dgs_optim.covariance import covariance_noise
+from opt3dgs_optim.parts.noise import covariance_noise
 
 HISTORY = "history"
 USELESS = {"Curvature": Scene(views_disagree=1.0), "PositionNoise": Scene(opacity=2.0)}

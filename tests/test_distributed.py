@@ -12,7 +12,7 @@ from torch import distributed
 from trainers import everything, gsplat_optimizers, make_splats, view_loss
 
 from opt3dgs_optim import EnergyHistogram, PhaseScheduler
-from opt3dgs_optim.ranks import RankMean
+from opt3dgs_optim.phases import RankMean
 
 WORLD, TOTAL, BAD = 2, 40, 25
 

@@ -1,14 +1,12 @@
 """The commands: `opt3dgs`, or `python -m opt3dgs_optim`."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Sequence
 
 from opt3dgs_optim.version import __version__
 
-MODULES = {"doctor": "doctor", "report": "runs.report", "hosts": "hosts.cli"}
+MODULES = {"doctor": "doctor", "report": "runs.report", "hosts": "hosts.edits"}
 USAGE = f"""opt3dgs_optim {__version__}
 
 opt3dgs COMMAND ...

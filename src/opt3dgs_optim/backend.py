@@ -1,7 +1,5 @@
 """Which implementation runs, the CUDA kernels or pure torch, and why."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 
@@ -49,11 +47,6 @@ def backend_info(
     Raises:
         ValueError: `backend` is none of these.
         RuntimeError: `backend="cuda"`, and the kernels cannot run.
-
-    Examples:
-        >>> from opt3dgs_optim import backend_info
-        >>> backend_info("cpu")
-        BackendInfo('torch' runs on cpu in float32: the kernels need a CUDA device)
     """
     check_choice("backend_info", "backend", backend, BACKENDS)
     if device is None:

@@ -1,7 +1,5 @@
 """Option checks whose messages name the call, the value and what is allowed."""
 
-from __future__ import annotations
-
 import logging
 import math
 import os
@@ -27,12 +25,8 @@ def check_number(
 ) -> float:
     """Return `value` as a float, or raise ValueError if it lies outside the interval."""
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    inside = (
-        number
-        and (value > low if open_low else value >= low)
-        and (value < high if open_high else value <= high)
-    )
-    if not inside or not math.isfinite(value):
+    outside = not number or not low <= value <= high or not math.isfinite(value)
+    if outside or (open_low and value == low) or (open_high and value == high):
         left, right = ("(" if open_low else "["), (")" if open_high else "]")
         raise ValueError(
             f"{call}: {name}={value!r}, but a finite number in {left}{low}, {high}{right} is needed"

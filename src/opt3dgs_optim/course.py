@@ -1,7 +1,5 @@
 """The course of a training: its clock, its parts, and the energy observed last."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
@@ -15,6 +13,7 @@ from opt3dgs_optim.part import Part, Phase, overrides
 HOOKS = ("observe", "pixel_loss", "factor", "before", "after", "numbers")
 CHECK_STEPS = 100  # iterations between two looks at the parts' evidence
 FORMAT = 2  # of a checkpoint
+STATE_KEY = "opt3dgs"  # in param_groups[0] of an optimizer's state_dict: the course's state
 P = TypeVar("P", bound=Part)
 
 
@@ -45,6 +44,7 @@ class Course:
                 raise TypeError(f"{type(self).__name__}: parts has {part!r}, but a Part is needed")
         self.total_steps, self.switch_step = total_steps, switch_step or 0
         self._has_phases = switch_step is not None
+        self.keeps_state = self._has_phases or bool(self.parts)  # for a checkpoint
         self.adaptive = adaptive
         self.switched_off: dict[str, str] = {}  # part's name -> why
         self.current = -1  # the iteration observed last, whose step comes next
@@ -69,11 +69,6 @@ class Course:
     def iteration(self) -> int:
         """The iteration whose loss comes next, from 0."""
         return self.current + 1
-
-    @property
-    def keeps_state(self) -> bool:
-        """Whether a checkpoint must hold anything of it."""
-        return self._has_phases or bool(self.parts)
 
     @property
     def progress(self) -> float:
@@ -119,10 +114,8 @@ class Course:
     def take(self, energy: Tensor) -> None:
         """Tell the parts that act of the energy of the iteration `current`, 0-d, detached."""
         self.num_observed += 1
-        if energy.device.type == "cpu":
-            self.valid = math.isfinite(energy)
-        else:
-            self.valid = torch.isfinite(energy)
+        is_finite = math.isfinite if energy.device.type == "cpu" else torch.isfinite
+        self.valid = is_finite(energy)
         for part in self.hooks("observe"):
             part.observe(energy, self.valid, self)
 
@@ -187,6 +180,15 @@ class Course:
             "switched_off": dict(self.switched_off),
             "parts": {n: state for n, part in self.named().items() if (state := part.state_dict())},
         }
+
+    def take_loaded(self, optimizer: Any) -> None:
+        """Take the state out of an optimizer's groups, where a checkpoint has put it."""
+        shared = optimizer.param_groups[0].pop(STATE_KEY, None)
+        if shared is not None:
+            self.load_state_dict(shared)
+        else:
+            steps = [float(state["step"]) for state in optimizer.state.values() if "step" in state]
+            self.expect(int(max(steps, default=0)))
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore `state_dict()`; parts that it does not know begin anew.

@@ -3,8 +3,6 @@
 The self-test asks what an installation can break: torch's Adam under ours, and the kernels.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib.metadata
 import platform
@@ -17,9 +15,9 @@ from torch import Tensor
 
 from opt3dgs_optim.awsgld import AWSGLD
 from opt3dgs_optim.backend import Backend, backend_info
-from opt3dgs_optim.covariance import add_covariance_noise
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, two_loop
 from opt3dgs_optim.lqnadam import LQNAdam
+from opt3dgs_optim.parts.noise import add_covariance_noise
 from opt3dgs_optim.version import __version__
 
 ROWS, HISTORY_SIZE = 1000, 5

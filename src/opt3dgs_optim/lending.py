@@ -1,7 +1,5 @@
 """What a step lends to torch's Adam, and takes back whatever happens."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 import math

@@ -1,7 +1,5 @@
 """Which parameter group is which Gaussian parameter, in the names trainers use."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 

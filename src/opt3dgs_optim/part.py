@@ -34,22 +34,12 @@ class Part:
     and so does `state_dict()` of the part.
 
     Parts know nothing of masks, of GradScaler or of `maximize`: they get the gradient of what is
-    minimised, unscaled, zero in rows that a mask holds back.
+    minimised, unscaled, zero in rows that a mask holds back. Examples: docs/write-a-part.md.
 
     Attributes:
         during: the phase in which the part acts; None: in both.
         names: the Gaussian parameters that it acts on, gsplat's names; None: every group.
         keys: what it keeps per row in `optimizer.state[param]`.
-
-    Examples:
-        A coordinate whose gradient disagrees with the mean of the last ones is not stepped:
-
-        >>> import torch
-        >>> from opt3dgs_optim import Part, PhaseScheduler
-        >>> class SignAgreement(Part):
-        ...     def before(self, group, param, grad, state, course):
-        ...         return torch.where(grad * state["exp_avg"] < 0, 0.0, grad)
-        >>> phases = PhaseScheduler(total_steps=30_000, parts=[SignAgreement()])
     """
 
     during: ClassVar[Phase | None] = None

@@ -6,10 +6,9 @@ smoothed density of the recent visits. Equation numbers are those of the Opt3DGS
 displayed equation counted; 7 partition, 13 index, 14 multiplier, 16 update of the weights).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -30,33 +29,31 @@ MEAN_ABS = math.sqrt(2 / math.pi)  # mean absolute deviation of a Gaussian of de
 RESOLUTION = 1e-6  # smallest deviation, as a share of the present distance from the mean
 
 
+@dataclass(eq=False)
 class FixedPartitions:
-    """Eq. 7, 13, 14 and 16 as the paper has them; options as in `EnergyHistogram`."""
+    """Eq. 7, 13, 14 and 16 as the paper has them.
 
-    def __init__(
-        self,
-        num_partitions: int,
-        energy_range: tuple[float, float],
-        zeta: float,
-        temperature: float,
-        warmup: int,
-        clamp: tuple[float, float] | None,
-    ) -> None:
-        self.num_partitions, self.energy_range, self.zeta = num_partitions, energy_range, zeta
-        self.tau, self.warmup, self.clamp = temperature, warmup, clamp
+    Options as in `EnergyHistogram`, methods as in `MovingPartitions`.
+    """
+
+    num_partitions: int
+    energy_range: tuple[float, float]
+    zeta: float
+    temperature: float
+    warmup: int
+    clamp: tuple[float, float] | None
 
     def allocate(self, device: torch.device) -> None:
-        """Begin anew on a device."""
         # MPS has no float64.
         dtype = torch.float32 if device.type == "mps" else torch.float64
         m, (low, high) = self.num_partitions, self.energy_range
-        scalars = [low, (high - low) / m, self.tau, 0, 1]
+        scalars = [low, (high - low) / m, self.temperature, 0, 1]
         self._scalars = torch.tensor(scalars, dtype=dtype, device=device)
         self._low, self._width, self._tau, self._count, self.nu = self._scalars.unbind()
         self.weights = torch.full((m,), 1.0 / m, dtype=dtype, device=device)
 
     def take(self, energy: Tensor, valid: Tensor | bool, count: int) -> None:
-        """Nu from the present weights, then their update; as `MovingPartitions.take`."""
+        """Nu from the present weights, then their update."""
         valid = torch.as_tensor(valid, device=energy.device)
         value = torch.where(valid, energy.to(self.weights.dtype), 0.0)
         # J of eq. 13, counted from 0: u[J-1] < energy <= u[J], the end partitions open.
@@ -91,12 +88,10 @@ class FixedPartitions:
         self.weights.copy_(torch.where(valid, theta / theta.sum(), self.weights))
 
     def coordinates(self) -> tuple[float, float, float]:
-        """Low and high end of the range, and tau. Synchronises."""
         low, width, tau, *_ = self._scalars.tolist()
         return low, low + width * self.num_partitions, tau
 
     def state(self) -> dict[str, Any]:
-        """Plain floats and lists. Synchronises."""
         return {"weights": self.weights.tolist(), "scalars": self._scalars.tolist()}
 
     def check(self, call: str, state: Mapping[str, Any]) -> None:
@@ -108,7 +103,6 @@ class FixedPartitions:
             raise ValueError(f"{call}: scalars={state['scalars']!r}, but width > 0 is needed")
 
     def load(self, state: Mapping[str, Any]) -> None:
-        """Restore `state()`."""
         self.weights.copy_(torch.tensor(state["weights"], dtype=torch.float64))
         self._scalars.copy_(torch.tensor(state["scalars"], dtype=torch.float64))
 
@@ -121,18 +115,13 @@ class MovingPartitions:
 
         Theta ~ q^(1 / (1 - zeta)),    nu = 1 + zeta tau dlog Theta/du = 1 + dlog q/dz / 2
 
-    That Theta is where eq. 16 converges to (its field is p_i theta_i^zeta - theta_i times a sum,
-    zero at theta_i^(1 - zeta) ~ p_i). With tau = (1 - zeta) / (2 zeta) deviations zeta drops out:
-    a Gaussian energy has the slope -z, so |nu - 1| = 1 two deviations out, and nu's deviation is
-    1/2. Smoothing by k twice widens a Gaussian's variance to 1 + 2 * 0.4^2, and the slope is
-    corrected by that. Its own recent mean is taken away: a smoothed density's is not 0 for a
-    skewed energy, nor while the energy falls, and nu's mean of 1 is no change of learning rate.
+    with tau = (1 - zeta) / (2 zeta) deviations. Smoothing by k twice widens a Gaussian's variance
+    to 1 + 2 * 0.4^2, by which the slope is corrected, and its own recent mean is taken away.
+    docs/algorithms/awsgld.md has the reasons.
 
     All means are of the last 100 energies, weighed exponentially. The deviation is the mean
-    absolute one, and an energy counts for at most four deviations: a spike moves them by 4 %.
-
-    Few operators: one packed state follows one packed target by one `lerp_`, and all products with
-    q are one `addmv`. Where the CUDA kernels run, all of it is one launch.
+    absolute one. Few operators: one packed state follows one packed target by one `lerp_`, and all
+    products with q are one `addmv`. Where the CUDA kernels run, all of it is one launch.
     """
 
     def __init__(self, num_partitions: int, zeta: float, clamp: tuple[float, float] | None) -> None:

@@ -11,12 +11,10 @@ from torch.optim import Optimizer
 
 from opt3dgs_optim.checks import check_count, check_flag, check_number, warn_user
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.names import GAUSSIAN_NAMES, block, canonical_name
+from opt3dgs_optim.names import block
 from opt3dgs_optim.part import Part, Phase
 from opt3dgs_optim.presets import DEFAULTS, PAPER_STEPS, PAPER_SWITCH, paper_parts
-from opt3dgs_optim.ranks import RankMean
-from opt3dgs_optim.upgrading import look_at, say, take
-from opt3dgs_optim.version import __version__
+from opt3dgs_optim.upgrading import upgrade
 
 if TYPE_CHECKING:
     from opt3dgs_optim.runs import RunLog
@@ -30,8 +28,8 @@ Optimizers = TypeVar("Optimizers", bound="Optimizer | Mapping[str, Optimizer]")
 class PhaseScheduler(Course):
     """Put parts into the steps of a 3DGS trainer's optimizers, in two phases.
 
-    By default annealing and fading, what paid against a control (docs/evidence.md); with
-    `PhaseScheduler.paper`, Opt3DGS. What is left out costs nothing.
+    By default annealing and fading, what paid (docs/evidence.md); with `PhaseScheduler.paper`,
+    Opt3DGS. What is left out costs nothing.
 
     Args:
         total_steps: iterations of the training.
@@ -54,20 +52,16 @@ class PhaseScheduler(Course):
     Examples:
         >>> import torch
         >>> from opt3dgs_optim import PhaseScheduler
-        >>> splats = {"means": torch.nn.Parameter(torch.ones(4, 3)),
-        ...           "scales": torch.nn.Parameter(torch.zeros(4, 3))}
-        >>> optimizers = {k: torch.optim.Adam([{"params": p, "lr": 0.01, "name": k}], eps=1e-15)
-        ...               for k, p in splats.items()}
+        >>> means = torch.nn.Parameter(torch.ones(4, 3))
+        >>> adam = torch.optim.Adam([{"params": means, "lr": 0.01, "name": "means"}], eps=1e-15)
         >>> phases = PhaseScheduler(total_steps=60, switch=50)
-        >>> optimizers = phases.upgrade(optimizers)
+        >>> adam = phases.upgrade(adam)
         >>> for _ in range(60):
-        ...     render = splats["means"] * splats["scales"].exp()
-        ...     loss = phases.pixel_loss(render, torch.zeros(4, 3))
+        ...     loss = phases.pixel_loss(means, torch.zeros(4, 3))
         ...     loss.backward()
         ...     phases.observe(loss)
-        ...     for optimizer in optimizers.values():
-        ...         optimizer.step()
-        ...         optimizer.zero_grad()
+        ...     adam.step()
+        ...     adam.zero_grad()
         >>> phases.phase
         <Phase.EXPLOITATION: 'exploitation'>
 
@@ -149,37 +143,7 @@ class PhaseScheduler(Course):
             TypeError: an optimizer of Gaussian parameters is no Adam, or has another owner.
             ValueError: nothing holds a Gaussian parameter, or a name occurs twice.
         """
-        if isinstance(optimizers, Optimizer):
-            found = [(None, optimizers, "the optimizer")]
-        elif isinstance(optimizers, Mapping):
-            found = [(key, each, f"optimizers[{key!r}]") for key, each in optimizers.items()]
-        else:
-            raise TypeError(
-                f"{CALL}.upgrade: optimizers is a {type(optimizers).__name__}, but a dict of "
-                "optimizers, or one optimizer with named groups, is needed"
-            )
-        known = [each for each in found if each[0] is None or canonical_name(each[0]) is not None]
-        # All are looked at before the first is changed.
-        plans = [look_at(optimizer, self, shown, key) for key, optimizer, shown in known]
-        taken = [name for plan in plans for name in plan.names]
-        left = [str(key) for key, *_ in found if key is not None and canonical_name(key) is None]
-        left += [name for plan in plans for name in plan.left]
-        if not taken:
-            names = sorted(alias for aliases in GAUSSIAN_NAMES.values() for alias in aliases)
-            raise ValueError(
-                f"{CALL}.upgrade: none of the names {left} is a Gaussian parameter's; allowed are "
-                f"{', '.join(names)}"
-            )
-        for plan in plans:
-            take(plan, self)
-            self._num_optimizers += plan.base is not None
-        parts = ", ".join(str(part) for part in self.parts) or "none"
-        others = f"; left alone: {', '.join(left)}" if left else ""
-        again = f" from iteration {self.iteration}" if self.iteration else ""
-        say(
-            f"opt3dgs_optim {__version__}: total_steps={self.total_steps}{again}, parts {parts}, "
-            f"in the steps of {', '.join(taken)}{others}"
-        )
+        self._num_optimizers += upgrade(optimizers, self)
         return optimizers
 
     def observe(self, loss: Tensor | float, *, iteration: int | None = None) -> None:
@@ -286,3 +250,37 @@ class PhaseScheduler(Course):
             off = self.switched_off.get(name)
             lines.append(str(part) + ("" if off is None else f": switched off, {off}"))
         return block(CALL, lines)
+
+
+class RankMean:
+    """Averages tensors over a process group, every rank weighing the same.
+
+    ValueError for `call` where there is none, or this process is not in it.
+    """
+
+    def __init__(self, call: str, process_group: Any) -> None:
+        # Imported here: many builds of torch and most trainings are without it.
+        from torch import distributed
+
+        if not (distributed.is_available() and distributed.is_initialized()):
+            raise ValueError(
+                f"{call}: process_group={process_group!r}, but torch.distributed is not "
+                "initialised; call torch.distributed.init_process_group first, or leave "
+                "process_group at None"
+            )
+        if distributed.get_rank(process_group) < 0:
+            raise ValueError(f"{call}: this process does not belong to {process_group!r}")
+        self._group = process_group
+        self._reduce = distributed.all_reduce
+        self._size = distributed.get_world_size(process_group)
+
+    def __call__(self, values: Tensor) -> Tensor:
+        """The means over the ranks, of the shape of `values`; every rank must call as often."""
+        half = values.dtype in (torch.float16, torch.bfloat16)
+        total = values.detach().to(torch.float32 if half else values.dtype, copy=True)
+        self._reduce(total, group=self._group)
+        return total / self._size
+
+    def __deepcopy__(self, memo: Any) -> RankMean:
+        """A process group is one, however often an optimizer is copied."""
+        return self

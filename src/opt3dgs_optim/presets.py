@@ -1,7 +1,5 @@
 """What is on: the parts that paid, and those of the paper."""
 
-from __future__ import annotations
-
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.parts.annealing import Annealing
 from opt3dgs_optim.parts.curvature import Curvature

@@ -1,7 +1,5 @@
 """Whose rows they are: what parts keep per row, against trainers that add, drop and move rows."""
 
-from __future__ import annotations
-
 import weakref
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
@@ -9,6 +7,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
+
+from opt3dgs_optim.checks import check_keys, warn_user
 
 MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # torch's names of Adam's, the last amsgrad's
 
@@ -79,7 +79,6 @@ class Frozen:
     """
 
     def __init__(self, moving: Tensor, param: Tensor, state: dict[str, Any]) -> None:
-        self._state = state
         tensors = {key: value for key, value in state.items() if isinstance(value, Tensor)}
         if moving.dim() > 0:
             tensors.pop("step", None)
@@ -117,6 +116,32 @@ def check_mask(call: str, masks: list[Any], num_points: int | None) -> Tensor:
             f"{call}.step: num_points={num_points}, but the mask has {mask.numel()} rows"
         )
     return mask if mask.dtype == torch.bool else mask != 0
+
+
+def check_rows(call: str, params: list[Tensor], keys: Iterable[str], state: Any) -> None:
+    """ValueError unless loaded moments fit the parameters; what parts kept of other rows goes.
+
+    The number of rows may differ: some trainers load the optimizer first, the points afterwards.
+    """
+    for param in params:
+        own = state.get(param)
+        if not own and isinstance(own, (Mapping, type(None))):
+            continue
+        check_keys(call, own, ("step", "exp_avg", "exp_avg_sq"))
+        for key in ("exp_avg", "exp_avg_sq"):
+            value = own[key]
+            if not isinstance(value, Tensor) or value.shape[1:] != param.shape[1:]:
+                shape = tuple(value.shape) if isinstance(value, Tensor) else value
+                raise ValueError(
+                    f"{call}: {key} has shape {shape}, but the parameter has {tuple(param.shape)}"
+                )
+        for key in keys:
+            if key in own and own[key].shape[0] != rows_of(param):
+                warn_user(
+                    f"{call}: {key} of {own[key].shape[0]} rows for a parameter of "
+                    f"{rows_of(param)}: dropped, and collected anew"
+                )
+                del own[key]
 
 
 def reset_points(optimizers: Any, rows: Tensor) -> None:

@@ -1,7 +1,5 @@
 """The only Adam: torch's own step, with the parts of a course before, in and after it."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable
 from typing import Any, cast
@@ -11,12 +9,11 @@ from torch import Tensor
 from torch._compile import _disable_dynamo
 from torch.optim import Adam
 
-from opt3dgs_optim.checkpoint import STATE_KEY, check_rows, loading
-from opt3dgs_optim.course import Course
+from opt3dgs_optim.course import STATE_KEY, Course
 from opt3dgs_optim.lending import Lent, guard, own_step, refuse_capture, use_fused
 from opt3dgs_optim.names import SLOT, block, canonical_name, group_name
 from opt3dgs_optim.part import Group, Part
-from opt3dgs_optim.rows import Frozen, Ledger, check_mask, shaped
+from opt3dgs_optim.rows import Frozen, Ledger, check_mask, check_rows, shaped
 
 # Unwrapped: torch's step hooks and its profiler are around our step already.
 ADAM_STEP = inspect.unwrap(Adam.step)
@@ -276,8 +273,18 @@ class StepAdam(Adam):
         Raises:
             ValueError: it does not fit; then nothing has been loaded.
         """
-        with loading(self):
-            super().load_state_dict(state_dict)
+        before = self.state, self.param_groups
+        super().load_state_dict(state_dict)
+        try:
+            self.course.take_loaded(self)
+        except ValueError:
+            self.state, self.param_groups = before
+            raise
+        for group, old in zip(self.param_groups, before[1], strict=True):
+            group[SLOT] = old.get(SLOT)  # a plain Adam's checkpoint does not say it
+        if self.base is Adam and self.defaults["fused"]:
+            use_fused(self)
+        self.trust_rows()
 
     def __repr__(self) -> str:
         lines = [str(part) for part in self.course.parts]

@@ -1,35 +1,73 @@
 """How a trainer's optimizer gets the parts of a course, in place."""
 
-from __future__ import annotations
-
 import inspect
 import logging
 import sys
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
-from torch.optim import Adam
+from torch.optim import Adam, Optimizer
 
-from opt3dgs_optim.checkpoint import take_loaded
 from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.names import SLOT, canonical_name, group_name
+from opt3dgs_optim.names import GAUSSIAN_NAMES, SLOT, canonical_name, group_name
 from opt3dgs_optim.stepadam import StepAdam
+from opt3dgs_optim.version import __version__
 
 CALL = "PhaseScheduler.upgrade"
 
 
-class Found(NamedTuple):
-    """An optimizer that can have the parts of a course."""
+def upgrade(optimizers: Any, course: Course) -> int:
+    """Put the parts of `course` into optimizers, in place; how many did not have them.
 
-    optimizer: Any
-    base: type[Adam] | None  # whose step the parts surround; None: it has them already
-    slots: list[str | None]  # the Gaussian parameter that each group holds
-    names: list[str]  # of the groups that hold one, as the trainer calls them
-    left: list[str]  # of the others
+    Arguments and errors are those of `PhaseScheduler.upgrade`.
+    """
+    if isinstance(optimizers, Optimizer):
+        found = [(None, optimizers, "the optimizer")]
+    elif isinstance(optimizers, Mapping):
+        found = [(key, each, f"optimizers[{key!r}]") for key, each in optimizers.items()]
+    else:
+        raise TypeError(
+            f"{CALL}: optimizers is a {type(optimizers).__name__}, but a dict of optimizers, or "
+            "one optimizer with named groups, is needed"
+        )
+    taken, left, plans = [], [], []
+    for key, optimizer, shown in found:  # all are looked at before the first is changed
+        if key is not None and canonical_name(key) is None:
+            left.append(str(key))
+            continue
+        base, slots = _look_at(optimizer, course, shown, key)
+        for i, (group, slot) in enumerate(zip(optimizer.param_groups, slots, strict=True)):
+            (left if slot is None else taken).append(key or group_name(i, group))
+        if base is not None and any(slots):
+            plans.append((optimizer, base, slots))
+    if not taken:
+        names = sorted(alias for aliases in GAUSSIAN_NAMES.values() for alias in aliases)
+        raise ValueError(
+            f"{CALL}: none of the names {left} is a Gaussian parameter's; allowed are "
+            f"{', '.join(names)}"
+        )
+    for optimizer, base, slots in plans:
+        for group, slot in zip(optimizer.param_groups, slots, strict=True):
+            group[SLOT] = slot
+        vars(optimizer).pop("step", None)  # a learning-rate scheduler's wrapper of the old class's
+        optimizer.__class__ = StepAdam
+        optimizer.follow(course, base)
+        course.take_loaded(optimizer)
+    parts = ", ".join(str(part) for part in course.parts) or "none"
+    others = f"; left alone: {', '.join(left)}" if left else ""
+    again = f" from iteration {course.iteration}" if course.iteration else ""
+    _say(
+        f"opt3dgs_optim {__version__}: total_steps={course.total_steps}{again}, parts {parts}, "
+        f"in the steps of {', '.join(taken)}{others}"
+    )
+    return len(plans)
 
 
-def look_at(optimizer: Any, course: Course, shown: str, key: str | None) -> Found:
-    """What an optimizer holds; it is not changed. Raises as `PhaseScheduler.upgrade`.
+def _look_at(
+    optimizer: Any, course: Course, shown: str, key: str | None
+) -> tuple[type[Adam] | None, list[str | None]]:
+    """Whose step the parts surround (None: it has them already); what each group holds.
 
     `shown` is how messages call it, `key` what a dict of optimizers says that it holds; None: its
     groups' names say.
@@ -44,27 +82,10 @@ def look_at(optimizer: Any, course: Course, shown: str, key: str | None) -> Foun
     slots = [canonical_name(key or group.get("name")) for group in groups]
     if base is None:
         slots = [group.get(SLOT) for group in groups]
-    known = [name for name in slots if name is not None]
-    twice = sorted({name for name in known if known.count(name) > 1})
+    twice = sorted({name for name in slots if name is not None and slots.count(name) > 1})
     if twice:
         raise ValueError(f"{CALL}: two groups of {shown} hold {twice[0]!r}")
-    called = [key or group_name(i, group) for i, group in enumerate(groups)]
-    names = [name for name, slot in zip(called, slots, strict=True) if slot is not None]
-    left = [name for name, slot in zip(called, slots, strict=True) if slot is None]
-    return Found(optimizer, base if known else None, slots, names, left)
-
-
-def take(found: Found, course: Course) -> None:
-    """Put the parts of `course` into an optimizer, in place."""
-    if found.base is None:
-        return
-    optimizer = found.optimizer
-    for group, name in zip(optimizer.param_groups, found.slots, strict=True):
-        group[SLOT] = name
-    vars(optimizer).pop("step", None)  # a learning-rate scheduler's wrapper of the old class's
-    optimizer.__class__ = StepAdam
-    optimizer.follow(course, found.base)
-    take_loaded(optimizer)
+    return base, slots
 
 
 def _base_of(optimizer: Any, shown: str) -> type[Adam]:
@@ -86,7 +107,7 @@ def _base_of(optimizer: Any, shown: str) -> type[Adam]:
     )
 
 
-def say(message: str) -> None:
+def _say(message: str) -> None:
     """A log line (INFO); on stderr where nobody has set logging up, as in most trainers."""
     if LOGGER.hasHandlers():
         LOGGER.info(message)

@@ -21,10 +21,10 @@ from torch import Tensor
 
 import opt3dgs_optim
 from opt3dgs_optim import cuda, partitions
-from opt3dgs_optim.covariance import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
 from opt3dgs_optim.cuda import BLOCK, macros
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
 from opt3dgs_optim.partitions import UNLIMITED, MovingPartitions
+from opt3dgs_optim.parts.noise import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
 
 HERE = Path(__file__).parent
 SOURCES = Path(opt3dgs_optim.__file__).parent / "cuda"

@@ -21,9 +21,9 @@ from opt3dgs_optim import (
     PositionNoise,
     backend_info,
 )
-from opt3dgs_optim.covariance import add_covariance_noise
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
 from opt3dgs_optim.names import GAUSSIAN
+from opt3dgs_optim.parts.noise import add_covariance_noise
 
 REASON = "torch sees no CUDA device"
 if torch.cuda.is_available():

@@ -12,7 +12,7 @@ import pytest
 from trainer_files import GSPLAT, INRIA, MINI_SPLATTING, SYNTHETIC, TAMING, added
 
 from opt3dgs_optim.hosts import diff, write
-from opt3dgs_optim.hosts.cli import main
+from opt3dgs_optim.hosts.edits import main
 
 IMPORT = "from opt3dgs_optim import PhaseScheduler"
 OURS = [

@@ -13,8 +13,8 @@ from oracles import covariance
 from trainers import edit_rows, gsplat_optimizers, make_splats, only, train, values_of
 
 from opt3dgs_optim import Annealing, Course, IsotropicNoise, Phase, PositionNoise
-from opt3dgs_optim.covariance import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
 from opt3dgs_optim.names import GAUSSIAN
+from opt3dgs_optim.parts.noise import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
 
 
 def gaussians(n: int, seed: int = 0) -> dict[str, torch.Tensor]:

@@ -19,9 +19,9 @@ from opt3dgs_optim import (
     SquaredLoss,
     two_loop,
 )
-from opt3dgs_optim.covariance import add_covariance_noise
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history
 from opt3dgs_optim.lbfgs.history import laid_out
+from opt3dgs_optim.parts.noise import add_covariance_noise
 
 HISTORY_SIZE = 5
 NOISE_LR = 5e5

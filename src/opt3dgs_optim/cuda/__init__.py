@@ -5,8 +5,6 @@ device it is launched on, once per machine (cuda.core's disk cache) and loaded o
 Only the float32 and float64 tensors of one CUDA device get here; see `opt3dgs_optim.backend`.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib
 from importlib.resources import files
@@ -125,7 +123,8 @@ def check_alike(call: str, like: Tensor, **others: tuple[Tensor, tuple[int, ...]
             )
 
 
-def _real(dtype: torch.dtype) -> Any:
+def real(dtype: torch.dtype) -> Any:
+    """The numpy type of a number that a kernel for tensors of `dtype` takes."""
     return np.float64 if dtype == torch.float64 else np.float32
 
 
@@ -138,7 +137,7 @@ def lqn_direction(
     graft: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`lbfgs.lqn_direction` on the GPU, for points of three coordinates. Never synchronises."""
-    rows, real = grad.shape[0], _real(grad.dtype)
+    rows = grad.shape[0]
     whole = history, tuple(history.shape)
     check_alike("lqn_direction", grad, position=(position, tuple(grad.shape)), history=whole)
     fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
@@ -146,7 +145,7 @@ def lqn_direction(
     candidates = torch.empty_like(accepted)
     cells = history.contiguous()
     tensors = (position.contiguous(), grad.contiguous(), cells, fed, accepted, candidates)
-    numbers = (np.int64(rows), real(min_cosine), np.int32(graft))
+    numbers = (np.int64(rows), real(grad.dtype)(min_cosine), np.int32(graft))
     launch("lqn_direction", grad, rows, *tensors, *numbers, history_size=history_size)
     if cells is not history:  # laid out for torch, e.g. loaded from a checkpoint of a CPU run
         history.copy_(cells)
@@ -162,44 +161,13 @@ def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
     return result
 
 
-def add_covariance_noise(
-    means: Tensor,
-    scales: Tensor,
-    quats: Tensor,
-    opacities: Tensor,
-    eta: Tensor,
-    lr: float | Tensor,
-    noise_scale: float,
-    sharpness: float,
-    threshold: float,
-) -> None:
-    """Add `covariance.covariance_noise`, times lr * noise_scale, to `means` in place.
-
-    A learning rate on the GPU is read there, when the kernel runs; one on the CPU is passed on.
-    """
-    rows, real = means.shape[0], _real(means.dtype)
-    vectors = {"scales": (scales, (rows, 3)), "quats": (quats, (rows, 4)), "eta": (eta, (rows, 3))}
-    logits = opacities.reshape(-1), (rows,)
-    check_alike("add_covariance_noise", means, opacities=logits, **vectors)
-    if isinstance(lr, Tensor) and lr.is_cuda:
-        rate, factor = lr.to(torch.float32), noise_scale
-    else:
-        rate, factor = 0, noise_scale * float(lr)  # a null pointer
-    target = means.contiguous()
-    tensors = (tensor.contiguous() for tensor in (scales, quats, opacities, eta))
-    numbers = (real(value) for value in (factor, sharpness, threshold))
-    launch("add_covariance_noise", means, rows, target, *tensors, rate, *numbers, np.int64(rows))
-    if target is not means:
-        means.copy_(target)
-
-
 def take_energy(
     energy: Tensor, valid: Tensor | bool, state: Tensor, nu: Tensor, *numbers: float
 ) -> None:
     """`MovingPartitions.take` on the GPU; `numbers` as in the kernel. Never synchronises."""
     # A 0 is a null pointer.
     known = 0 if valid is True else torch.as_tensor(valid, dtype=torch.bool, device=state.device)
-    reals = map(_real(state.dtype), numbers)
+    reals = map(real(state.dtype), numbers)
     tensors = (energy.to(state), known, state, nu)
     launch("take_energy", state, 1, *tensors, np.int64(len(state) - 3), *reals)
 

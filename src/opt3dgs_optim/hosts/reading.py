@@ -5,8 +5,6 @@ it: gsplat's `for optimizer in self.optimizers.values()`, or INRIA's `gaussians.
 under whatever names the file uses.
 """
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -44,33 +42,20 @@ def values(own: list[Spot], name: str) -> Iterator[tuple[int, ast.expr | None]]:
 
 @dataclass
 class Trainer:
-    """The places and names in a training script.
+    """The places and names in a training script."""
 
-    Args:
-        function: the one that holds the loop.
-        spots: every node of it.
-        loop: the training loop.
-        loss: the name of the loss.
-        backwards: the statements `loss.backward()`; several only in branches of an `if`.
-        total: how many iterations.
-        count: the iteration, from 0, where the loop may start later; else empty.
-        optimizers: the expressions of the optimizers, the positions' first.
-        setups: statements in the loop that make the model's optimizers anew.
-        pixel: the L1 terms: what to replace, and its two arguments.
-        notes: what a user should know of this file.
-    """
-
-    function: ast.FunctionDef
-    spots: list[Spot]
+    function: ast.FunctionDef  # that holds the loop
+    spots: list[Spot]  # every node of it
     loop: ast.For
-    loss: str
-    backwards: list[ast.stmt]
-    total: ast.expr
-    count: str
-    optimizers: list[str] = field(default_factory=list)
-    setups: list[ast.stmt] = field(default_factory=list)
+    loss: str  # its name
+    backwards: list[ast.stmt]  # `loss.backward()`; several only in branches of an `if`
+    total: ast.expr  # how many iterations
+    count: str  # the iteration, from 0, where the loop may start later; else empty
+    optimizers: list[str] = field(default_factory=list)  # expressions, the positions' first
+    setups: list[ast.stmt] = field(default_factory=list)  # in the loop: they make them anew
+    # The L1 terms: what to replace, and its two arguments.
     pixel: list[tuple[ast.expr, list[ast.expr]]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # what a user should know of this file
 
 
 def read_trainer(tree: ast.Module, folder: Path | None = None) -> Trainer:

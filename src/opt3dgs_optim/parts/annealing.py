@@ -1,7 +1,5 @@
 """Annealing: learning rates start above the trainer's own and end below them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -24,13 +22,8 @@ class Annealing(Part):
     iterations, too large to settle in the last. The factor comes on top of the trainer's own
     schedule; the learning rates in `param_groups` stay as they are. It costs no memory.
 
-    The positions are left alone: their rate falls to 1 % already, and at four times the rate many
-    points lose the detail that the sparse points had placed (docs/evidence.md).
-
-    The opacities have a peak of their own. 3DGS-MCMC's regularisers pull at every point, and Adam
-    makes a full step of that where a view does not reach: at four times the rate, points which few
-    views see are transparent and relocated within a hundred iterations, and a scene with few views
-    is over-fitted.
+    The positions are left alone, and the opacities have a peak of their own, since either would
+    lose detail at four times its rate: docs/evidence.md, "Annealing" and "Few views".
 
     Args:
         peak: factor at the first iteration, above 0, of all parameters but the opacities.
@@ -67,7 +60,6 @@ class Annealing(Part):
         return peak ** (1.0 - t) * self.final**t
 
     def factor(self, group: Group, course: Course) -> float:
-        """The factor on the group's next step."""
         return self.at(group.get(SLOT), course.progress)
 
     def numbers(self, course: Course) -> Mapping[str, float]:

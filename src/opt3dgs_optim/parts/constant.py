@@ -1,7 +1,5 @@
 """A constant multiplier: the control that every claim for the flat histogram needs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -14,9 +12,8 @@ from opt3dgs_optim.part import Group, Part, Phase
 class ConstantMultiplier(Part):
     """nu = `value`, whatever the energy: a plain change of all learning rates while exploring.
 
-    While the loss falls, the flat histogram's nu is above 1 on average; part of any gain is then
-    just a larger step. Compare with a constant of the same mean
-    (`EnergyHistogram.mean_multiplier`) before crediting the histogram.
+    Compare with a constant of the same mean (`EnergyHistogram.mean_multiplier`) before crediting
+    the histogram: part of any gain may be just a larger step.
 
     Args:
         value: the multiplier, any finite number.
@@ -36,7 +33,6 @@ class ConstantMultiplier(Part):
         check_count("ConstantMultiplier", "warmup", self.warmup, 0)
 
     def factor(self, group: Group, course: Course) -> float:
-        """The multiplier of the next step."""
         return 1.0 if course.num_observed <= self.warmup else self.value
 
     def numbers(self, course: Course) -> Mapping[str, float]:

@@ -1,7 +1,5 @@
 """Fading: Adam's moments of random points are shrunk, so that their next steps are longer."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -25,10 +23,8 @@ APART = 4  # iterations between two events; in 600, events 1 apart lose half of 
 class Fading(Part):
     """Shrink Adam's state of a random share of the points, again and again (after AdamW-GS).
 
-    A point's step is lr * exp_avg / sqrt(exp_avg_sq). With the default factors it keeps its
-    length at first (0.2 / sqrt(0.04) = 1); within ten iterations exp_avg is that of new gradients,
-    while exp_avg_sq needs a thousand to recover: until then the point's steps are up to five times
-    longer. So fading is a larger learning rate for single points, for a while.
+    A point's step is lr * exp_avg / sqrt(exp_avg_sq): with the default factors as long as before
+    at first, then up to five times longer until exp_avg_sq has recovered, a thousand iterations.
 
     The same points are faded in all these parameters. Which ones depends on `seed`, the event
     and the number of points alone: a resumed run repeats them. It costs no memory.

@@ -51,16 +51,6 @@ class EnergyHistogram(Part):
 
     Raises:
         ValueError: an option is outside what is allowed.
-
-    Examples:
-        >>> import torch
-        >>> from opt3dgs_optim import EnergyHistogram
-        >>> histogram = EnergyHistogram(warmup=100)
-        >>> draw = torch.Generator().manual_seed(0)
-        >>> for _ in range(2_000):
-        ...     _ = histogram.observe(0.1 + 0.01 * torch.randn((), generator=draw))
-        >>> 0.9 < float(histogram.mean_multiplier) < 1.1
-        True
     """
 
     during = Phase.EXPLORATION

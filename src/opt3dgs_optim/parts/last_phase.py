@@ -1,7 +1,5 @@
 """What changes at the switch besides the positions' direction: the loss, and Adam's moments."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

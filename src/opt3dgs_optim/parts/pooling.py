@@ -1,7 +1,5 @@
 """Pooling: one second moment for all coordinates of a point."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,11 +16,9 @@ class Pooling(Part):
 
         v_ij <- mean_j v_ij,    point i, coordinate j of one parameter
 
-    Adam divides every coordinate's gradient by the size of that coordinate's own gradients, so
-    that it makes a full step along an axis that the images hardly constrain: a Gaussian's extent
-    along the line of sight, which few views see and the scale regulariser pulls at. With one
-    second moment the step has the direction of `exp_avg`, whatever the axes: short along such an
-    axis, up to the root of the number of coordinates longer along one with large gradients.
+    Adam makes a full step even along an axis that the images hardly constrain. With one second
+    moment the step has the direction of `exp_avg`, whatever the axes: short along such an axis, up
+    to the root of the number of coordinates longer along one with large gradients.
 
     Applied after every step, so that the first step of a point is Adam's own. The state keeps its
     shapes, [N, ..] with equal coordinates, because trainers edit it by rows. It costs no memory.

@@ -3,7 +3,7 @@
 Nothing here needs the optimizers. `opt3dgs report` is `runs.report`.
 """
 
+from opt3dgs_optim.runs.lines import Run, read_run
 from opt3dgs_optim.runs.log import RunLog
-from opt3dgs_optim.runs.read import Run, read_run
 
 __all__ = ["Run", "RunLog", "read_run"]

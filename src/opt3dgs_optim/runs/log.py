@@ -25,8 +25,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.checks import LOGGER, check_count
-from opt3dgs_optim.runs.lines import LineFile, encoded, number
-from opt3dgs_optim.runs.read import read_run
+from opt3dgs_optim.runs.lines import LineFile, encoded, number, read_run
 
 RESERVED = ("kind", "iteration", "seconds", "phase", "event")
 
@@ -60,17 +59,6 @@ class RunLog:
         ValueError: `path` is no run log.
         TypeError: metadata that JSON cannot hold.
         BlockingIOError: another RunLog has the file open (noticed where files can be locked).
-
-    Examples:
-        >>> import os, tempfile
-        >>> path = os.path.join(tempfile.mkdtemp(), "mcmc-0.jsonl")
-        >>> with RunLog(path, metadata={"arm": "mcmc", "seed": 0}) as log:
-        ...     log.step(1, phase="exploration", loss=torch.tensor(0.25), nu=1.5)
-        ...     with log.paused():
-        ...         psnr = 21.5  # evaluate here
-        ...     log.evaluation(1, psnr=psnr)
-        >>> read_run(path).evaluations["psnr"]
-        array([21.5])
     """
 
     def __init__(

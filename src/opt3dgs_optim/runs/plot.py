@@ -1,7 +1,5 @@
 """A report as a picture: the metric over seconds and over iterations."""
 
-from __future__ import annotations
-
 import textwrap
 import warnings
 from pathlib import Path
@@ -9,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from opt3dgs_optim.runs.read import Run
+from opt3dgs_optim.runs.lines import Run
 from opt3dgs_optim.runs.stats import Arm, Comparison, higher_is_better
 
 # Okabe and Ito's colour-blind-safe palette, without the yellow that white swallows.

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from opt3dgs_optim.runs.read import Run
+from opt3dgs_optim.runs.lines import Run
 
 NO_NUMBERS = ("iteration", "seconds", "phase")  # of the columns, not of interest
 KNOWN = ("psnr", "ssim", "train_psnr", "lpips")  # listed first

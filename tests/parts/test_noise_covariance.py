@@ -9,10 +9,10 @@ import pytest
 import torch
 from oracles import covariance
 
-from opt3dgs_optim import covariance as module
 from opt3dgs_optim import cuda
-from opt3dgs_optim.covariance import add_covariance_noise, covariance_noise, largest_noise
 from opt3dgs_optim.lbfgs import pairs
+from opt3dgs_optim.parts import noise as module
+from opt3dgs_optim.parts.noise import add_covariance_noise, covariance_noise, largest_noise
 
 
 def gaussians(n: int, seed: int = 0) -> dict[str, Any]:
