@@ -23,7 +23,7 @@ class Annealing(Part):
     schedule; the learning rates in `param_groups` stay as they are. It costs no memory.
 
     The positions are left alone, and the opacities have a peak of their own, since either would
-    lose detail at four times its rate: docs/evidence.md, "Annealing" and "Few views".
+    lose detail at four times its rate (docs/evidence.md).
 
     Args:
         peak: factor at the first iteration, above 0, of all parameters but the opacities.
