@@ -1,7 +1,5 @@
 """Whether the curvature pairs of a training know anything, as numbers on the device."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -16,8 +16,6 @@ history that torch computes on is transposed (strides of a [slots, lanes, N] ten
 CUDA kernel computes on is contiguous; every function here takes both.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

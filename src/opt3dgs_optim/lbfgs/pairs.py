@@ -4,8 +4,6 @@ Everything here works on [D, N] tensors whose rows are contiguous: component by 
 several times faster on them than on [N, D].
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

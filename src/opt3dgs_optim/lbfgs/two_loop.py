@@ -1,7 +1,5 @@
 """The two-loop recursion on the pairs of every point, and one step of it for Adam."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Curvature: a per-point L-BFGS direction as the gradient that Adam is fed (eq. 17)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
