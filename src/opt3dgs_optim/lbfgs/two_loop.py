@@ -52,17 +52,20 @@ def recursion(grad: Tensor, s: Tensor, y: Tensor) -> Tensor:
 
     |y| = 1 where there is a pair, and s = y = 0 where there is none.
     """
-    product, r, memory = torch.empty_like(grad), grad.clone(), []  # r is q at first
-    for s_j, y_j in zip(s.unbind(), y.unbind(), strict=True):  # newest to oldest
-        sy = dot(s_j, y_j, product)
-        inverse = torch.threshold(sy, 0.0, torch.inf).reciprocal_()  # no pair: 1 / inf = 0
-        alpha = dot(s_j, r, product).mul_(inverse)
-        r.addcmul_(alpha, y_j, value=-1)
-        memory.append((s_j, y_j, sy, inverse, alpha))
+    q, product, alphas = grad.clone(), torch.empty_like(grad), []
+    pairs = list(zip(s.unbind(), y.unbind(), strict=True))
+    sy = [dot(s_j, y_j, product) for s_j, y_j in pairs]
+    inverses = [torch.threshold(each, 0.0, torch.inf).reciprocal_() for each in sy]  # no pair: 0
+    for (s_j, y_j), inverse in zip(pairs, inverses, strict=True):  # newest to oldest
+        alpha = dot(s_j, q, product).mul_(inverse)
+        q.addcmul_(alpha, y_j, value=-1)
+        alphas.append(alpha)
     # |y| = 1, hence gamma = s.y / y.y = s.y. No pair: gamma = 1, and r stays the gradient.
-    r.mul_(torch.threshold(memory[0][2], 0.0, 1.0))
-    for s_j, y_j, _, inverse, alpha in reversed(memory):  # oldest to newest
-        r.addcmul_(alpha.addcmul_(dot(y_j, r, product), inverse, value=-1), s_j)
+    r = q.mul_(torch.threshold(sy[0], 0.0, 1.0))
+    found = list(zip(pairs, inverses, alphas, strict=True))
+    for (s_j, y_j), inverse, alpha in reversed(found):  # oldest to newest
+        beta = dot(y_j, r, product).mul_(inverse)
+        r.addcmul_(alpha.sub_(beta), s_j)
     return r
 
 
