@@ -69,7 +69,8 @@ def _figure(comparison: Comparison, footer: str) -> Any:
     )
     scene = "" if comparison.scene is None else f", {comparison.scene}"
     title = _cut(f"{metric} against run time and iterations{scene}", 85)
-    legend.set_title(title, {"size": 13, "weight": "bold"})  # a suptitle would lie below it
+    legend.set_title(title)  # a suptitle would lie below it
+    legend.get_title().set(size=13, weight="bold")
     better = "higher" if higher_is_better(comparison.metric) else "lower"
     caption = f"Lines: mean over seeds; bands: least to greatest; {better} is better. Dashed: "
     caption += f"the baseline's final mean. Dotted: next phase. {footer}"
