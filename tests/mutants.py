@@ -39,7 +39,7 @@ from mutations import Mutant, mutants  # noqa: E402
 PACKAGE = ROOT / "src/opt3dgs_optim"
 EQUIVALENT = ROOT / "tests/mutants_equivalent.json"
 RESULT = ROOT / "docs/results/stability/mutants.json"
-ENERGY = ["parts/test_histogram.py", "parts/test_histogram_extremes.py"]
+ENERGY = ["test_partitions.py", "parts/test_histogram.py", "parts/test_histogram_extremes.py"]
 CURVATURE = [
     f"lbfgs/test_{name}.py" for name in ("history", "two_loop", "lqn_direction", "foresight")
 ]

@@ -40,7 +40,6 @@ class FixedPartitions:
     energy_range: tuple[float, float]
     zeta: float
     temperature: float
-    warmup: int
     clamp: tuple[float, float] | None
 
     def allocate(self, device: torch.device) -> None:
@@ -59,18 +58,18 @@ class FixedPartitions:
         # J of eq. 13, counted from 0: u[J-1] < energy <= u[J], the end partitions open.
         index = torch.ceil((value - self._low) / self._width) - 1
         index = index.clamp(0, self.num_partitions - 1).long().reshape(1)
-        nu = torch.where(self._count < self.warmup, 1.0, self._multiplier(index))
         # In place: a CUDA graph of a step reads nu where it was captured.
-        self.nu.copy_(torch.where(valid, nu, self.nu))
+        self.nu.copy_(torch.where(valid, self._multiplier(index), self.nu))
         self._update(index, valid)
         self._count.add_(valid)
 
     def _multiplier(self, index: Tensor) -> Tensor:
-        """Nu of eq. 14 for partition `index`, before the warm-up is considered."""
+        """Nu of eq. 14 for partition `index`."""
         log_weights = self.weights.log()
         # "theta(J - 1) v 1" in the paper is a clamp of the index (its source, CSGLD, Deng et al.
-        # 2020); read as max(theta, 1) it would give nu = -3973 at the first step.
-        difference = log_weights[index] - log_weights[(index - 1).clamp(min=0)]
+        # 2020); read as max(theta, 1) it would give nu = -3973 at the first step. Where it would
+        # clamp, nu is 1.
+        difference = log_weights[index] - log_weights[index - 1]
         nu = 1 + self.zeta * self._tau * difference.reshape(()) / self._width
         if self.clamp is not None:
             nu = nu.clamp(*self.clamp)
@@ -82,7 +81,7 @@ class FixedPartitions:
         """Eq. 16, with a floor: theta += lambda theta_J^zeta (1[i = J] - theta)."""
         theta = self.weights
         step_size = (10 / (self._count**0.8 + 100)).clamp(max=1e-2)  # not in the paper
-        rate = step_size * theta[index] ** self.zeta * valid
+        rate = step_size * theta[index] ** self.zeta
         theta = theta - rate * theta
         theta = theta.index_add(0, index, rate).clamp(min=FLOOR)
         self.weights.copy_(torch.where(valid, theta / theta.sum(), self.weights))

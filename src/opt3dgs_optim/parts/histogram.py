@@ -82,7 +82,7 @@ class EnergyHistogram(Part):
         else:
             self.energy_range = check_interval(CALL, "energy_range", energy_range)
             self.temperature = check_number(CALL, "temperature", temperature, 0.0)
-            fixed = (self.energy_range, self.zeta, self.temperature, self.warmup, self.clamp)
+            fixed = (self.energy_range, self.zeta, self.temperature, self.clamp)
             self._law = FixedPartitions(self.num_partitions, *fixed)
         self._allocate(torch.device("cpu"))
 

@@ -1,0 +1,70 @@
+"""The partitions by themselves: what the histogram's tests do not reach."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from opt3dgs_optim import EnergyHistogram
+from opt3dgs_optim.partitions import FLOOR, FixedPartitions
+
+CPU = torch.device("cpu")
+
+
+def fixed(num_partitions: int = 10) -> FixedPartitions:
+    law = FixedPartitions(num_partitions, (0.0, 1.0), 0.75, 0.1, None)
+    law.allocate(CPU)
+    return law
+
+
+@pytest.mark.parametrize("make", [EnergyHistogram, EnergyHistogram.paper])
+def test_nothing_is_known_before_the_first_energy(make: Any) -> None:
+    histogram = make(clamp=(0.5, 3.0))
+    assert histogram.multiplier == 1
+    state = histogram.state_dict()
+    assert state["num_observed"] == state["num_taken"] == 0
+    assert state.get("scalars", [0.0] * 4)[3] == 0.0
+
+
+def test_a_weight_below_the_floor_is_lifted() -> None:
+    law = fixed()
+    law.weights[3] = 1e-300
+    law.take(torch.tensor(0.95), True, 1)
+    assert float(law.weights[3]) == pytest.approx(FLOOR, rel=0.2)
+    assert float(law.weights.sum()) == pytest.approx(1.0, abs=1e-15)
+
+
+def test_an_energy_that_is_not_finite_leaves_weights_and_count() -> None:
+    law = fixed()
+    law.take(torch.tensor(0.35), True, 1)
+    before = law.state()
+    law.take(torch.tensor(float("nan")), torch.tensor(False), 2)
+    assert law.state() == before
+
+
+WEIGHTS, SCALARS = [0.1] * 10, [0.0, 0.1, 0.1, 0.0, 1.0]
+
+
+@pytest.mark.parametrize("scalars", [SCALARS, [0.0, 0.1, 0.0, 7.0, 1.0]])
+def test_what_a_checkpoint_may_hold(scalars: list[float]) -> None:
+    fixed().check("call", {"weights": WEIGHTS, "scalars": scalars})
+
+
+@pytest.mark.parametrize(
+    ("weights", "scalars", "message"),
+    [
+        ([-0.1, 0.3, *WEIGHTS[2:]], SCALARS, "positive with sum 1"),
+        ([0.0, 0.2, *WEIGHTS[2:]], SCALARS, "positive with sum 1"),
+        ([0.11, *WEIGHTS[1:]], SCALARS, "positive with sum 1"),
+        (WEIGHTS, [0.0, 0.0, 0.1, 0.0, 1.0], "width > 0 is needed"),
+        (WEIGHTS, [0.0, 0.1, -0.1, 0.0, 1.0], "width > 0 is needed"),
+        (WEIGHTS, [0.0, 0.1, 0.1, -1.0, 1.0], "width > 0 is needed"),
+    ],
+)
+def test_what_a_checkpoint_may_not_hold(
+    weights: list[float], scalars: list[float], message: str
+) -> None:
+    with pytest.raises(ValueError, match=f"call: .*{message}"):
+        fixed().check("call", {"weights": weights, "scalars": scalars})
