@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from statistics import fmean, stdev
 
 from studies.scenes.analysis import Study
-from studies.scenes.arms import BASELINE, DEFAULTS, FADED, STUDY_ARMS, label
+from studies.scenes.arms import BASELINE, DEFAULTS, STUDY_ARMS, label
 from studies.scenes.records import Record, Setting
 
 METRICS = {"psnr": (1.0, 2), "ssim": (1.0, 4), "lpips": (-1.0, 4)}  # sign of better, digits
@@ -135,11 +135,7 @@ def headline_table(study: Study, long: Sequence[Setting], short: int) -> str:
     rows = [
         (f"{what}, {count:,}", arm, count)
         for count in ((long[0].iterations, short) if long else ())
-        for what, arm in (
-            ("stock", BASELINE),
-            ("fading alone", FADED),
-            ("**defaults**", DEFAULTS),
-        )
+        for what, arm in (("stock", BASELINE), ("**defaults**", DEFAULTS))
     ]
     lines = [
         f"| iterations | {' | '.join(setting.scene for setting in long)} |",
