@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import error_vs_time
 import pytest
 from PIL import Image
 
@@ -127,3 +128,9 @@ def test_bad_options_are_one_line(words: list[str], message: str) -> None:
     assert result.returncode == 2
     assert message in result.stderr
     assert result.stderr.count("\n") == 1
+
+
+def test_the_readme_says_where_the_report_lies() -> None:
+    args = error_vs_time._parser().parse_args([])
+    readme = (Path(__file__).resolve().parents[2] / "README.md").read_text(encoding="utf-8")
+    assert f"`runs/{args.scene}-{args.size}/report.png`" in readme
