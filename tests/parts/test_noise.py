@@ -10,21 +10,11 @@ import numpy as np
 import pytest
 import torch
 from oracles import covariance
-from trainers import edit_rows, gsplat_optimizers, make_splats, only, train, values_of
+from trainers import edit_rows, gaussians, gsplat_optimizers, make_splats, only, train, values_of
 
 from opt3dgs_optim import Annealing, Course, IsotropicNoise, Phase, PositionNoise
 from opt3dgs_optim.names import GAUSSIAN
 from opt3dgs_optim.parts.noise import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
-
-
-def gaussians(n: int, seed: int = 0) -> dict[str, torch.Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    draw = {
-        "scales": torch.randn(n, 3, generator=generator, dtype=torch.float64),
-        "quats": 3 * torch.randn(n, 4, generator=generator, dtype=torch.float64),
-        "opacities": 6 * torch.randn(n, generator=generator, dtype=torch.float64) - 4,
-    }
-    return draw
 
 
 def test_added_noise_has_the_covariance_squared() -> None:

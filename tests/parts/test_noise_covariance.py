@@ -8,21 +8,12 @@ import numpy as np
 import pytest
 import torch
 from oracles import covariance
+from trainers import gaussians
 
 from opt3dgs_optim import cuda
 from opt3dgs_optim.lbfgs import pairs
 from opt3dgs_optim.parts import noise as module
 from opt3dgs_optim.parts.noise import add_covariance_noise, covariance_noise, largest_noise
-
-
-def gaussians(n: int, seed: int = 0) -> dict[str, Any]:
-    generator = torch.Generator().manual_seed(seed)
-    draw = {
-        "scales": torch.randn(n, 3, generator=generator, dtype=torch.float64),
-        "quats": 3 * torch.randn(n, 4, generator=generator, dtype=torch.float64),
-        "opacities": 6 * torch.randn(n, generator=generator, dtype=torch.float64) - 4,
-    }
-    return draw
 
 
 def test_is_gate_times_covariance_times_eta() -> None:

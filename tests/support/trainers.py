@@ -78,6 +78,17 @@ def only(total_steps: int, *parts: Part, switch: float | int = PAPER_SWITCH) -> 
     return PhaseScheduler(total_steps, switch, list(parts))
 
 
+def gaussians(n: int, seed: int = 0) -> dict[str, torch.Tensor]:
+    """Gaussians to be moved, in float64: log scales, quaternions, opacity logits."""
+    generator = torch.Generator().manual_seed(seed)
+    like: dict[str, Any] = {"generator": generator, "dtype": torch.float64}
+    return {
+        "scales": torch.randn(n, 3, **like),
+        "quats": 3 * torch.randn(n, 4, **like),
+        "opacities": 6 * torch.randn(n, **like) - 4,
+    }
+
+
 def make_splats(n: int = 12, seed: int = 0) -> dict[str, Parameter]:
     """Random Gaussians under gsplat's names."""
     generator = torch.Generator().manual_seed(seed)
