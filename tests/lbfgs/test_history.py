@@ -14,7 +14,14 @@ from points_first import direction, newest_gamma, record
 from torch import Tensor
 
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
-from opt3dgs_optim.lbfgs.history import MAX_HISTORY, header, history_shape, laid_out, stored_pairs
+from opt3dgs_optim.lbfgs.history import (
+    MAX_HISTORY,
+    header,
+    history_shape,
+    laid_out,
+    push,
+    stored_pairs,
+)
 from opt3dgs_optim.lbfgs.pairs import length, normalised_pair
 
 F64 = torch.float64
@@ -245,3 +252,19 @@ def test_what_does_not_fit_is_named() -> None:
     two_loop(wide, new_history(wide, 5), 5)
     assert new_history(wide, 5).dtype == F64
     assert new_history(g.half(), 5).dtype == torch.float32
+
+
+@pytest.mark.parametrize("accepted", [False, True])
+def test_pairs_move_down_whatever_their_size(accepted: bool) -> None:
+    """Their difference may leave float32."""
+    s = torch.tensor([[[-3e38, 0.0, 0.0]], [[3e38, 0.0, 0.0]], [[-3e38, 0.0, 0.0]]])
+    history = history_from_pairs(torch.ones(3, 1, 3), torch.ones(3, 1, 3))
+    for slot, vector in enumerate(s):
+        history[:, slot, :3] = vector
+    before = history.clone()
+    new = normalised_pair(torch.ones(3, 1), torch.ones(3, 1))
+    push(history, 3, new, torch.tensor([accepted]))
+    if not accepted:
+        assert torch.equal(history, before)
+    else:
+        assert torch.equal(history[:, 1:3, :3], before[:, :2, :3])

@@ -91,9 +91,8 @@ def push(history: Tensor, history_size: int, pair: Pair, accept: Tensor) -> None
     dim = pair.s.shape[0]
     halves = history[:, :history_size].permute(1, 2, 0).unflatten(1, (2, dim + 1))
     slots = halves[:, :, :dim].unbind()  # s and y of each pair, [2, D, N]
-    share = accept.to(history.dtype)
     for slot in range(history_size - 1, 0, -1):
-        slots[slot].lerp_(slots[slot - 1], share)  # by 0 or 1, exact: many times as fast as where
+        torch.where(accept, slots[slot - 1], slots[slot], out=slots[slot])
     for new, old in zip((pair.s, pair.y), slots[0].unbind(), strict=True):
         torch.where(accept, new, old, out=old)
 
