@@ -44,6 +44,8 @@ POOLED = f"{ANNEALED}+pooled"
 STABLE = "awsgld-stable"  # its histogram follows the energy; that of the arms before it did not
 UNFADED_OPACITIES = f"{ANNEALED}-opacities-unfaded"
 V_ONLY = f"{ANNEALED}-v-only"
+# Fading makes the trainer's pull on opacities up to five times as strong: what spares the points.
+SPARED = tuple(f"{MEANS_LEFT}-{what}" for what in ("opacities-unfaded", "100-events"))
 EVENT_STEPS = 10  # iterations for one event of fading in a run of 3,000, where it was chosen
 
 
@@ -56,6 +58,7 @@ def annealing(peak: float, final: float, opacity_peak: float = 1.0) -> Annealing
 ANNEALING = annealing(4.0, 0.4)
 ANNEALING_OF_REST = Annealing(4.0, 0.4, 1.0, names=("scales", "quats", "opacities", "sh0", "shN"))
 FADING = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=300)
+FADING_OF_REST = Fading(events=300, names=("means", "scales", "quats", "sh0", "shN"))
 FADING_EARLY = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=140, stop=0.25)
 # What the arms beyond the paper are made of, by the arm's name; what a table calls them; and the
 # names of the arms that add a last phase.
@@ -221,7 +224,6 @@ def on_top() -> list[StudyArm]:
 
 def leads() -> list[StudyArm]:
     """What else an optimizer can do without touching the representation."""
-    no_opacities = Fading(events=300, names=("means", "scales", "quats", "sh0", "shN"))
     v_only = Fading(events=300, exp_avg=1.0)
     ratio = "the points whose exp_avg^2 / exp_avg_sq is"
     return [
@@ -235,7 +237,7 @@ def leads() -> list[StudyArm]:
         StudyArm(
             UNFADED_OPACITIES,
             "annealed and faded, opacities not faded",
-            of(ANNEALING, no_opacities),
+            of(ANNEALING, FADING_OF_REST),
             control=ANNEALED,
         ),
         StudyArm("faded-stale", f"{ratio} smallest", of(ChosenFading("stale")), control="faded"),
@@ -275,6 +277,18 @@ def long_runs() -> list[StudyArm]:
             EARLY[1],
             "the same, and all but the positions annealed",
             of(ANNEALING_OF_REST, FADING_EARLY),
+            control=MEANS_LEFT,
+        ),
+        StudyArm(
+            SPARED[0],
+            "all but the positions annealed, all but the opacities faded",
+            of(ANNEALING_OF_REST, FADING_OF_REST),
+            control=MEANS_LEFT,
+        ),
+        StudyArm(
+            SPARED[1],
+            "all but the positions annealed, faded a third as often",
+            of(ANNEALING_OF_REST, Fading(events=100)),
             control=MEANS_LEFT,
         ),
     ]
