@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -45,7 +45,7 @@ STABLE = "awsgld-stable"  # its histogram follows the energy; that of the arms b
 UNFADED_OPACITIES = f"{ANNEALED}-opacities-unfaded"
 V_ONLY = f"{ANNEALED}-v-only"
 # Fading makes the trainer's pull on opacities up to five times as strong: what spares the points.
-SPARED = tuple(f"{MEANS_LEFT}-{what}" for what in ("opacities-unfaded", "100-events"))
+SPARED = tuple(f"{MEANS_LEFT}-{what}" for what in ("opacities-unfaded", "100-events", "30-events"))
 EVENT_STEPS = 10  # iterations for one event of fading in a run of 3,000, where it was chosen
 
 
@@ -285,11 +285,14 @@ def long_runs() -> list[StudyArm]:
             of(ANNEALING_OF_REST, FADING_OF_REST),
             control=MEANS_LEFT,
         ),
-        StudyArm(
-            SPARED[1],
-            "all but the positions annealed, faded a third as often",
-            of(ANNEALING_OF_REST, Fading(events=100)),
-            control=MEANS_LEFT,
+        *(
+            StudyArm(
+                name,
+                f"all but the positions annealed, faded {events} times instead of 300",
+                of(ANNEALING_OF_REST, replace(FADING, events=events)),
+                control=MEANS_LEFT,
+            )
+            for name, events in zip(SPARED[1:], (100, 30), strict=True)
         ),
     ]
 
