@@ -21,7 +21,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.lbfgs.pairs import Pair, columns, normalised_pair
+from opt3dgs_optim.lbfgs.pairs import Pair, columns, normalised_pair, overwrite
 
 MAX_HISTORY = 16
 
@@ -90,11 +90,9 @@ def push(history: Tensor, history_size: int, pair: Pair, accept: Tensor) -> None
     """Put a pair in front of the others, in the rows of `accept` [N] (bool), in place."""
     dim = pair.s.shape[0]
     halves = history[:, :history_size].permute(1, 2, 0).unflatten(1, (2, dim + 1))
-    slots = halves[:, :, :dim].unbind()  # s and y of each pair, [2, D, N]
-    for slot in range(history_size - 1, 0, -1):
-        torch.where(accept, slots[slot - 1], slots[slot], out=slots[slot])
-    for new, old in zip((pair.s, pair.y), slots[0].unbind(), strict=True):
-        torch.where(accept, new, old, out=old)
+    pairs = halves[:, :, :dim]  # [K, 2, D, N]
+    first = pairs[0].unbind()
+    overwrite(accept, (pairs[1:], pairs[:-1]), (first[0], pair.s), (first[1], pair.y))
 
 
 def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:

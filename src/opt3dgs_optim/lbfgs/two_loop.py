@@ -6,7 +6,16 @@ from torch import Tensor
 from opt3dgs_optim import cuda
 from opt3dgs_optim.backend import uses_kernel
 from opt3dgs_optim.lbfgs.history import Header, check_history, header, push, stored_pairs
-from opt3dgs_optim.lbfgs.pairs import columns, dot, largest, length, normalised_pair, row_chunks
+from opt3dgs_optim.lbfgs.pairs import (
+    columns,
+    dot,
+    largest,
+    length,
+    normalised_pair,
+    overwrite,
+    put,
+    row_chunks,
+)
 
 
 def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
@@ -43,7 +52,7 @@ def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
         g = columns(grad[rows], history.dtype)
         scale = torch.threshold(largest(g), 0.0, 1.0)  # keeps s.q finite
         found = recursion(g / scale, *stored_pairs(history[rows], history_size))
-        result[rows] = found.mul_(scale).T
+        put(result[rows], found.mul_(scale))
     return result
 
 
@@ -52,19 +61,19 @@ def recursion(grad: Tensor, s: Tensor, y: Tensor) -> Tensor:
 
     |y| = 1 where there is a pair, and s = y = 0 where there is none.
     """
-    q, product, alphas = grad.clone(), torch.empty_like(grad), []
-    pairs = list(zip(s.unbind(), y.unbind(), strict=True))
-    sy = [dot(s_j, y_j, product) for s_j, y_j in pairs]
-    inverses = [torch.threshold(each, 0.0, torch.inf).reciprocal_() for each in sy]  # no pair: 0
-    for (s_j, y_j), inverse in zip(pairs, inverses, strict=True):  # newest to oldest
-        alpha = dot(s_j, q, product).mul_(inverse)
-        q.addcmul_(alpha, y_j, value=-1)
-        alphas.append(alpha)
+    sy = dot(s.unbind(1), y.unbind(1))  # [K, N]
     # |y| = 1, hence gamma = s.y / y.y = s.y. No pair: gamma = 1, and r stays the gradient.
-    r = q.mul_(torch.threshold(sy[0], 0.0, 1.0))
-    found = list(zip(pairs, inverses, alphas, strict=True))
-    for (s_j, y_j), inverse, alpha in reversed(found):  # oldest to newest
-        beta = dot(y_j, r, product).mul_(inverse)
+    gamma = torch.threshold(sy[0], 0.0, 1.0)
+    inverses = torch.threshold_(sy, 0.0, torch.inf).reciprocal_().unbind()  # no pair: 0
+    r, alphas = grad.clone(), []
+    rows, pairs = r.unbind(), list(zip(s.unbind(), y.unbind(), inverses, strict=True))
+    for s_j, y_j, inverse in pairs:  # newest to oldest
+        alpha = dot(s_j.unbind(), rows).mul_(inverse)
+        r.addcmul_(alpha, y_j, value=-1)
+        alphas.append(alpha)
+    r.mul_(gamma)
+    for (s_j, y_j, inverse), alpha in zip(reversed(pairs), reversed(alphas), strict=True):
+        beta = dot(y_j.unbind(), rows).mul_(inverse)
         r.addcmul_(alpha.sub_(beta), s_j)
     return r
 
@@ -122,7 +131,7 @@ def lqn_direction(
         head = header(part, history_size)
         taken = take_pairs(part, head, history_size, x, g, visible, min_cosine)
         accepted[rows], candidates[rows] = taken
-        fed[rows] = direction(g, size, part, head, history_size, graft).T
+        put(fed[rows], direction(g, size, part, head, history_size, graft))
     return fed, accepted, candidates
 
 
@@ -145,8 +154,7 @@ def take_pairs(
     candidates = visible & (counter > 0)
     accepted = candidates & (pair.cosine > min_cosine)  # false where the pair is not finite
     push(history, history_size, pair, accepted)
-    torch.where(visible, position, last_position, out=last_position)
-    torch.where(visible, gradient, last_gradient, out=last_gradient)
+    overwrite(visible, (last_position, position), (last_gradient, gradient))
     count = counter.maximum(visible.to(history.dtype)) + accepted
     counter.copy_(count.clamp(max=history_size + 1))
     return accepted, candidates
