@@ -44,8 +44,9 @@ POOLED = f"{ANNEALED}+pooled"
 STABLE = "awsgld-stable"  # its histogram follows the energy; that of the arms before it did not
 UNFADED_OPACITIES = f"{ANNEALED}-opacities-unfaded"
 V_ONLY = f"{ANNEALED}-v-only"
-# Fading makes the trainer's pull on opacities up to five times as strong: what spares the points.
-SPARED = tuple(f"{MEANS_LEFT}-{what}" for what in ("opacities-unfaded", "100-events", "30-events"))
+# Where points are many, fading kills a great part of them again and again: what may spare them.
+UNFADED = tuple(f"{MEANS_LEFT}-{name}-unfaded" for name in ("means", "opacities"))
+SELDOM_FADED = tuple(f"{MEANS_LEFT}-{events}-events" for events in (100, 30))
 EVENT_STEPS = 10  # iterations for one event of fading in a run of 3,000, where it was chosen
 
 
@@ -54,11 +55,15 @@ def annealing(peak: float, final: float, opacity_peak: float = 1.0) -> Annealing
     return Annealing(peak, final, opacity_peak, GAUSSIAN)
 
 
+def fading_but(left: str) -> Fading:
+    """Of all parameters but one."""
+    return Fading(events=300, names=tuple(name for name in GAUSSIAN if name != left))
+
+
 # As measured, so that a change of the package's defaults does not change what an arm was.
 ANNEALING = annealing(4.0, 0.4)
 ANNEALING_OF_REST = Annealing(4.0, 0.4, 1.0, names=("scales", "quats", "opacities", "sh0", "shN"))
 FADING = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=300)
-FADING_OF_REST = Fading(events=300, names=("means", "scales", "quats", "sh0", "shN"))
 FADING_EARLY = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=140, stop=0.25)
 # What the arms beyond the paper are made of, by the arm's name; what a table calls them; and the
 # names of the arms that add a last phase.
@@ -237,7 +242,7 @@ def leads() -> list[StudyArm]:
         StudyArm(
             UNFADED_OPACITIES,
             "annealed and faded, opacities not faded",
-            of(ANNEALING, FADING_OF_REST),
+            of(ANNEALING, fading_but("opacities")),
             control=ANNEALED,
         ),
         StudyArm("faded-stale", f"{ratio} smallest", of(ChosenFading("stale")), control="faded"),
@@ -279,11 +284,14 @@ def long_runs() -> list[StudyArm]:
             of(ANNEALING_OF_REST, FADING_EARLY),
             control=MEANS_LEFT,
         ),
-        StudyArm(
-            SPARED[0],
-            "all but the positions annealed, all but the opacities faded",
-            of(ANNEALING_OF_REST, FADING_OF_REST),
-            control=MEANS_LEFT,
+        *(
+            StudyArm(
+                name,
+                f"all but the positions annealed, all but the {left} faded",
+                of(ANNEALING_OF_REST, fading_but(left)),
+                control=MEANS_LEFT,
+            )
+            for name, left in zip(UNFADED, ("means", "opacities"), strict=True)
         ),
         *(
             StudyArm(
@@ -292,7 +300,7 @@ def long_runs() -> list[StudyArm]:
                 of(ANNEALING_OF_REST, replace(FADING, events=events)),
                 control=MEANS_LEFT,
             )
-            for name, events in zip(SPARED[1:], (100, 30), strict=True)
+            for name, events in zip(SELDOM_FADED, (100, 30), strict=True)
         ),
     ]
 

@@ -15,9 +15,10 @@ from studies.scenes.arms import (
     FADED,
     GROUPS,
     POOLED,
-    SPARED,
+    SELDOM_FADED,
     STABLE,
     STUDY_ARMS,
+    UNFADED,
     UNFADED_OPACITIES,
     V_ONLY,
     long_runs,
@@ -29,13 +30,20 @@ SCENES = ("plush", "banana", "lund_door", "brighton_beach", "embedded")
 QUICK_SCENES = ("banana", "embedded")  # for the options of a part
 ROTATED_SCENES = (*MANY_VIEWS_SCENES, "embedded", "banana", "lund_door", "brighton_beach")
 ROTATED_ARMS = (
-    *("mcmc", FADED, DEFAULTS, ANNEALED, *SPARED, "paper", "paper-constant"),
+    *("mcmc", FADED, DEFAULTS, ANNEALED, *UNFADED, *SELDOM_FADED, "paper", "paper-constant"),
     *("faded-3000", "rates-x2", POOLED, "annealed-2", "own-step"),
     *(STABLE, f"{STABLE}-constant"),
     *("l2@1/30", "l1+reset@1/30", "l2+reset@1/30", "l2+reset+lqn@1/30"),
 )
 BRIEF_ARMS = ("mcmc", FADED, DEFAULTS, ANNEALED, *EARLY)
-HALF_ARMS = ("mcmc", DEFAULTS, *SPARED, "paper", "paper-constant")  # with 50,000 Gaussians
+HALF_ARMS = (
+    "mcmc",
+    DEFAULTS,
+    *UNFADED,
+    *SELDOM_FADED,
+    "paper",
+    "paper-constant",
+)  # with 50,000 Gaussians
 LONG_ARMS = tuple(arm.name for arm in long_runs())
 FULL_PARTS_SCENES = ("brighton_beach", "lund_door")  # where the defaults lose
 POINTS = 4_000
