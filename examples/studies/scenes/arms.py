@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -31,6 +31,7 @@ from studies.scenes.parts.chosen_fading import ChosenFading
 from studies.scenes.parts.exploring import NuOfNoise, NuPerPoint, RestartedHistogram, ViewHistogram
 from studies.scenes.parts.keep_unseen import KeepUnseen
 from studies.scenes.parts.own_step import OwnStep
+from studies.scenes.parts.share_kept import ShareKept
 
 BASELINE = "mcmc"
 FADED = "faded"  # fading alone
@@ -46,6 +47,7 @@ UNFADED_OPACITIES = f"{ANNEALED}-opacities-unfaded"
 V_ONLY = f"{ANNEALED}-v-only"
 # Where points are many, fading kills a great part of them again and again: what may spare them.
 UNFADED = tuple(f"{MEANS_LEFT}-{name}-unfaded" for name in ("means", "opacities"))
+SHARE_KEPT = f"{MEANS_LEFT}-share-kept"  # the defaults before Fading counted the points
 SELDOM_FADED = tuple(f"{MEANS_LEFT}-{events}-events" for events in (100, 30))
 EVENT_STEPS = 10  # iterations for one event of fading in a run of 3,000, where it was chosen
 
@@ -57,7 +59,7 @@ def annealing(peak: float, final: float, opacity_peak: float = 1.0) -> Annealing
 
 def fading_but(left: str) -> Fading:
     """Of all parameters but one."""
-    return Fading(events=300, names=tuple(name for name in GAUSSIAN if name != left))
+    return ShareKept(events=300, names=tuple(name for name in GAUSSIAN if name != left))
 
 
 # As measured, so that a change of the package's defaults does not change what an arm was.
@@ -293,11 +295,17 @@ def long_runs() -> list[StudyArm]:
             )
             for name, left in zip(UNFADED, ("means", "opacities"), strict=True)
         ),
+        StudyArm(
+            SHARE_KEPT,
+            "all but the positions annealed, the same share faded however many the points",
+            of(ANNEALING_OF_REST, ShareKept(events=300)),
+            control=MEANS_LEFT,
+        ),
         *(
             StudyArm(
                 name,
                 f"all but the positions annealed, faded {events} times instead of 300",
-                of(ANNEALING_OF_REST, replace(FADING, events=events)),
+                of(ANNEALING_OF_REST, ShareKept(events=events)),
                 control=MEANS_LEFT,
             )
             for name, events in zip(SELDOM_FADED, (100, 30), strict=True)

@@ -16,6 +16,7 @@ from studies.scenes.arms import (
     GROUPS,
     POOLED,
     SELDOM_FADED,
+    SHARE_KEPT,
     STABLE,
     STUDY_ARMS,
     UNFADED,
@@ -36,14 +37,10 @@ ROTATED_ARMS = (
     *("l2@1/30", "l1+reset@1/30", "l2+reset@1/30", "l2+reset+lqn@1/30"),
 )
 BRIEF_ARMS = ("mcmc", FADED, DEFAULTS, ANNEALED, *EARLY)
-HALF_ARMS = (
-    "mcmc",
-    DEFAULTS,
-    *UNFADED,
-    *SELDOM_FADED,
-    "paper",
-    "paper-constant",
-)  # with 50,000 Gaussians
+HALF_ARMS = (  # with 50,000 Gaussians
+    *("mcmc", DEFAULTS, SHARE_KEPT, SELDOM_FADED[0], *UNFADED),
+    *("paper", "paper-constant"),
+)
 LONG_ARMS = tuple(arm.name for arm in long_runs())
 FULL_PARTS_SCENES = ("brighton_beach", "lund_door")  # where the defaults lose
 POINTS = 4_000

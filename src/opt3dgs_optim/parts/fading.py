@@ -16,6 +16,7 @@ from opt3dgs_optim.rows import shaped
 CALL = "Fading"
 DONE = "faded"  # of a group: events that its parameter has had
 MOST = 32  # events made up for at once, where a trainer's iteration count jumps
+MANY = 10_000  # points from which on an event fades a smaller share of them
 APART = 4  # iterations between two events; in 600, events 1 apart lose half of what 4 apart gain
 
 
@@ -29,8 +30,11 @@ class Fading(Part):
     The same points are faded in all these parameters. Which ones depends on `seed`, the event
     and the number of points alone: a resumed run repeats them. It costs no memory.
 
+    Where points are many and small, so many longer steps lose detail (docs/evidence.md): of
+    N > 10,000 points an event fades (10,000 / N)^(2/3) times `share`.
+
     Args:
-        share: of the points in each event, chance per point in (0, 1].
+        share: of the points in each event, chance per point in (0, 1]; see above.
         exp_avg, exp_avg_sq: factors on the moments, in [0, 1]. exp_avg^2 <= exp_avg_sq keeps the
             next step from being longer than the last.
         events: how many over the run, but never less than 4 iterations apart.
@@ -67,12 +71,18 @@ class Fading(Part):
         share = (iteration / total_steps - self.start) / length
         return int(min(max(share, 0.0), 1.0) * min(self.events, length * total_steps / APART))
 
+    def share_of(self, num_points: int) -> float:
+        """The share of so many points that an event fades."""
+        return self.share * min(1.0, MANY / max(num_points, 1)) ** (2 / 3)
+
     def chosen(self, event: int, num_points: int, device: torch.device) -> Tensor:
         """Which points an event fades, [num_points] bool: the same in every parameter."""
         # A CPU's generator reads 32 bits; consecutive seeds are far apart in them.
         seed = (event + self.seed * 0x9E3779B1) % 2**32
         generator = torch.Generator(device).manual_seed(seed)
-        return torch.rand(num_points, generator=generator, device=device) < self.share
+        return torch.rand(num_points, generator=generator, device=device) < self.share_of(
+            num_points
+        )
 
     def before(
         self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
@@ -97,7 +107,7 @@ class Fading(Part):
         return grad
 
     def numbers(self, course: Course) -> Mapping[str, float]:
-        """`faded`: the share of the points that the present iteration's events fade."""
+        """`faded`: the share of up to 10,000 points that the present iteration's events fade."""
         now, total = course.iteration, course.total_steps
         events = self.events_before(now, total) - self.events_before(now - 1, total)
         return {"faded": 1.0 - (1.0 - self.share) ** events}
