@@ -226,13 +226,6 @@ class StepAdam(Adam):
                 "mask of their first dimension is needed"
             )
 
-    def reset_points(self, rows: Tensor) -> None:
-        """See the function `reset_points`."""
-        groups = [g for g in self.param_groups if self.any_group or g.get(SLOT) is not None]
-        states = [(p, self.state.get(p, {})) for group in groups for p in group["params"]]
-        call = f"{type(self).__name__}.reset_points"
-        self._ledger.forget(call, states, self.course.keys, rows)
-
     # -- copies and checkpoints ----------------------------------------------------------------
 
     def trust_rows(self) -> None:
