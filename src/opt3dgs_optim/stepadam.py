@@ -58,8 +58,6 @@ class StepAdam(Adam):
         name = group.get(SLOT)
         return part.names is None or name in part.names or (name is None and self.any_group)
 
-    # -- the step ------------------------------------------------------------------------------
-
     # Under torch.compile a step runs as it is, like those of torch's own optimizers.
     @_disable_dynamo
     def step(  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -225,8 +223,6 @@ class StepAdam(Adam):
                 f"{call}: the mask has {rows} rows, but the parameters have shapes {shapes}; a "
                 "mask of their first dimension is needed"
             )
-
-    # -- copies and checkpoints ----------------------------------------------------------------
 
     def trust_rows(self) -> None:
         """Take what the parts have kept as that of the parameters' present rows."""
