@@ -2,7 +2,7 @@
 
 import weakref
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,13 +11,6 @@ from torch.utils.weak import WeakIdKeyDictionary
 from opt3dgs_optim.checks import check_keys, warn_user
 
 MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # torch's names of Adam's, the last amsgrad's
-
-
-class _Seen(NamedTuple):
-    """What a part's tensor belonged to after a parameter's last step."""
-
-    param: weakref.ref[Tensor]
-    rows: int
 
 
 class Ledger:
@@ -30,20 +23,20 @@ class Ledger:
     """
 
     def __init__(self) -> None:
-        self._seen: Any = WeakIdKeyDictionary()  # a part's tensor -> _Seen
+        self._seen: Any = WeakIdKeyDictionary()  # a part's tensor -> (weak parameter, rows)
 
     def drop_strangers(self, param: Tensor, state: dict[str, Any], keys: Iterable[str]) -> None:
         """Remove the tensors under `keys` that are of other rows than the parameter's present."""
         for key in [key for key in keys if key in state]:
-            seen = self._seen.get(state[key])
-            if seen is None or seen.param() is not param or seen.rows != rows_of(param):
+            owner, rows = self._seen.get(state[key], (None, 0))
+            if owner is None or owner() is not param or rows != rows_of(param):
                 del state[key]
 
     def remember(self, param: Tensor, state: dict[str, Any], keys: Iterable[str]) -> None:
         """Take the tensors under `keys` as those of the parameter's present rows."""
         for key in keys:
             if key in state:
-                self._seen[state[key]] = _Seen(weakref.ref(param), rows_of(param))
+                self._seen[state[key]] = weakref.ref(param), rows_of(param)
 
 
 class Frozen:
