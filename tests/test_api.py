@@ -42,7 +42,6 @@ def test_the_names_that_must_stay() -> None:
         "IsotropicNoise",
         "PositionNoise",
         "DEFAULTS",
-        "reset_points",
         "backend_info",
         "__version__",
     ]

@@ -21,7 +21,6 @@ from opt3dgs_optim import (
     EnergyHistogram,
     Part,
     PhaseScheduler,
-    reset_points,
 )
 
 TOTAL, SWITCH, POINTS = 60, 30, 40
@@ -228,30 +227,3 @@ def test_sparse_adam_style_steps_through_edits() -> None:
                 model.reset_opacity()
     assert len(model._xyz) == POINTS + 7
     assert bool(torch.isfinite(model._xyz).all())
-
-
-@pytest.mark.parametrize("grown", [0, 2])
-def test_reset_points_after_an_edit_that_left_the_pairs_behind(grown: int) -> None:
-    """The trainer names the rows, but the pairs are of other rows: dropped all the same."""
-    model = make_model("simulated")
-    phases = upgrade(model)
-    run(model, phases, 0, SWITCH + 8, edits=False)
-    assert bool(model.optimizer.state[model._xyz]["history"].any())
-    model.prune_points(torch.arange(POINTS) < 2)
-    model.append(torch.arange(2 + grown))
-    reset_points(model.optimizer, torch.arange(POINTS + grown) >= POINTS - 2)
-    assert "history" not in model.optimizer.state[model._xyz]
-    run(model, phases, SWITCH + 8, SWITCH + 10, edits=False)
-
-
-def test_reset_points_after_a_relocation_keeps_the_other_pairs() -> None:
-    model = make_model("simulated")
-    phases = upgrade(model)
-    run(model, phases, 0, SWITCH + 8, edits=False)
-    held = model.optimizer.state[model._xyz]["history"].clone()
-    dead = torch.arange(POINTS) == 4
-    model.relocate_gs(dead)
-    reset_points(model.optimizer, dead)
-    history = model.optimizer.state[model._xyz]["history"]
-    assert not bool(history[4].any())
-    assert torch.equal(history[~dead], held[~dead])

@@ -62,18 +62,18 @@ class RowEdits(RuleBasedStateMachine):
         self.trainer.step([1.0] * len(self.trainer), masked=False)
 
     @precondition(lambda self: len(self.trainer) < ROWS)
-    @rule(many=st.integers(1, 2), told=st.booleans())
-    def grow(self, many: int, told: bool) -> None:
+    @rule(many=st.integers(1, 2))
+    def grow(self, many: int) -> None:
         new = self.trainer.random(min(many, ROWS - len(self.trainer)))
-        self.trainer.replace(list(range(len(self.trainer))), new, told=self.tells(told))
+        self.trainer.replace(list(range(len(self.trainer))), new)
         self.edited()
 
     @precondition(lambda self: len(self.trainer) > 1)
-    @rule(chosen=picks, told=st.booleans())
-    def prune(self, chosen: list[int], told: bool) -> None:
+    @rule(chosen=picks)
+    def prune(self, chosen: list[int]) -> None:
         gone = self.rows(chosen)[: len(self.trainer) - 1]
         keep = [i for i in range(len(self.trainer)) if i not in gone]
-        self.trainer.replace(keep, {}, told=self.tells(told))
+        self.trainer.replace(keep, {})
         self.edited()
 
     @precondition(lambda self: len(self.trainer) > 1)
@@ -92,12 +92,11 @@ class RowEdits(RuleBasedStateMachine):
         self.trainer.replace(order, {})
         self.edited()
 
-    @rule(chosen=picks, told=st.booleans())
-    def relocate(self, chosen: list[int], told: bool) -> None:
+    @rule(chosen=picks)
+    def relocate(self, chosen: list[int]) -> None:
         """3DGS-MCMC: the state of the sampled rows is zeroed, in new Parameters of one size."""
         everything = list(range(len(self.trainer)))
-        zeroed = self.rows(chosen)
-        self.trainer.replace(everything, {}, zeroed=zeroed, told=self.tells(told))
+        self.trainer.replace(everything, {}, zeroed=self.rows(chosen))
         self.edited()
 
     @rule()
@@ -109,11 +108,6 @@ class RowEdits(RuleBasedStateMachine):
     @rule(load_first=st.booleans())
     def resume(self, load_first: bool) -> None:
         self.trainer.resume(load_first=load_first)
-
-    def tells(self, told: bool) -> bool:
-        # INRIA's edits leave the pairs behind in their old rows: such a trainer must not tell. And
-        # reset_points speaks for all edits since the last step: tell of each of them, or of none.
-        return told and self.trainer.kind == "gsplat" and not self.trainer.untold
 
     @invariant()
     def every_row_is_where_it_would_be_alone(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 import pytest
@@ -11,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import Parameter
-from trainers import edit_rows, everything, gsplat_optimizers, make_splats, train
+from trainers import edit_rows, gsplat_optimizers, make_splats, train
 
-from opt3dgs_optim import LQNAdam, Part, PhaseScheduler, reset_points
+from opt3dgs_optim import LQNAdam, Part, PhaseScheduler
 from opt3dgs_optim.lbfgs.history import header
 
 LR, SIZE = 0.01, 3
@@ -141,45 +140,28 @@ def test_zeroed_row_is_an_empty_history() -> None:
     assert sorted(counters.bool().tolist()) == [False, True]
 
 
-# -- reset_points -----------------------------------------------------------------------------
-
-
-def exploited(steps: int = 8) -> tuple[dict, Any, PhaseScheduler]:
-    splats, phases = make_splats(), everything(40, 0)
-    optimizers = phases.upgrade(gsplat_optimizers(splats))
-    train(splats, optimizers, phases, 0, steps)
-    return splats, optimizers, phases
-
-
-def exchange(splats: dict, optimizers: Any) -> None:
-    edit_rows(splats, optimizers, torch.arange(12), 0)
-
-
-@pytest.mark.parametrize("rows", [torch.arange(12) == 4, torch.tensor([4])], ids=["mask", "index"])
-def test_reset_points_keeps_the_pairs_of_the_others(rows: Tensor) -> None:
-    splats, optimizers, phases = exploited()
-    held = optimizers["means"].state[splats["means"]]["history"].clone()
-    exchange(splats, optimizers)  # a new Parameter: unknown rows
-    reset_points(optimizers, rows)
-    train(splats, optimizers, phases, 8, 9)
-    counters = optimizers["means"].state[splats["means"]]["history"]
-    assert bool(held[4].any())
-    others = torch.arange(12) != 4
-    kept = (counters[others] != 0).flatten(1).sum(1) >= (held[others] != 0).flatten(1).sum(1)
-    assert bool(kept.all())
-    splats2, optimizers2, phases2 = exploited()
-    exchange(splats2, optimizers2)  # nothing said: all pairs are dropped
-    train(splats2, optimizers2, phases2, 8, 9)
-    dropped = optimizers2["means"].state[splats2["means"]]["history"]
-    assert int((dropped != 0).sum()) < int((counters != 0).sum())
-
-
-def test_reset_points_of_another_number() -> None:
-    _, optimizers, _ = exploited()
-    with pytest.raises(ValueError, match=re.escape("rows has shape (5,)")):
-        reset_points(optimizers, torch.zeros(5, dtype=torch.bool))
-    with pytest.raises(ValueError, match="reset_points"):
-        optimizers["means"].reset_points(torch.zeros(5, dtype=torch.bool))
+@pytest.mark.parametrize("zeroed", [True, False])
+def test_a_point_moved_in_place_begins_anew_where_its_row_is_zeroed(zeroed: bool) -> None:
+    """Otherwise it keeps its pairs, and gets one taken over the jump."""
+    trainer = Trainer(3)
+    for _ in range(6):
+        trainer.edit("step", 0)
+    state, new = trainer.optimizer.state[trainer.x], torch.tensor([0.4, -0.3, 0.2])
+    others = state["history"][:2].clone()
+    with torch.no_grad():
+        trainer.x[2] = new
+    for key in ("exp_avg", "exp_avg_sq", *["history"] * zeroed):
+        state[key][2] = 0
+    assert torch.equal(state["history"][:2], others)
+    trainer.twins[2] = Twin(new)  # a new point, which joins the others' bias correction
+    trainer.twins[2].step(torch.zeros(3))
+    trainer.twins[2].optimizer.state[trainer.twins[2].x]["step"] = state["step"].clone()
+    trainer.twins[2].forget(("history",))
+    for _ in range(4):
+        trainer.edit("step", 0)
+    expected = torch.cat([twin.x.detach() for twin in trainer.twins])
+    torch.testing.assert_close(trainer.x.detach()[:2], expected[:2], rtol=2e-5, atol=2e-6)
+    assert torch.allclose(trainer.x.detach()[2], expected[2], rtol=2e-5, atol=2e-6) == zeroed
 
 
 # -- a part's own rows ----------------------------------------------------------------------------
@@ -207,15 +189,7 @@ def aged(steps: int = 5) -> tuple[dict[str, Parameter], Any, Any, Any]:
     return splats, optimizers, phases, optimizers["means"]
 
 
-def test_rows_follow_gsplats_edits_where_they_are_told() -> None:
-    splats, optimizers, phases, means = aged()
-    edit_rows(splats, optimizers, torch.arange(6), 2)
-    reset_points(optimizers, torch.tensor([6, 7]))
-    train(splats, optimizers, phases, 5, 6)
-    assert means.state[splats["means"]]["age"].tolist() == [6.0] * 6 + [1.0] * 2
-
-
-def test_rows_begin_anew_where_nobody_tells() -> None:
+def test_rows_begin_anew_after_gsplats_edits() -> None:
     """Also where the number of rows is what it was: other rows, for all that is known."""
     for keep, new in ((torch.arange(6), 2), (torch.arange(11), 1), (torch.arange(12).flip(0), 0)):
         splats, optimizers, phases, means = aged()
@@ -242,10 +216,3 @@ def test_a_checkpoint_of_other_rows_is_said() -> None:
         other.load_state_dict(saved)
     assert "age" not in other.state[x]
     assert "exp_avg" in other.state[x]
-
-
-def test_reset_points_leaves_other_optimizers_alone() -> None:
-    splats, optimizers, _, _ = aged()
-    pose = torch.optim.Adam([Parameter(torch.ones(3))])
-    reset_points({**optimizers, "pose": pose}, torch.tensor([0]))
-    assert float(optimizers["means"].state[splats["means"]]["age"][0]) == 0.0

@@ -25,7 +25,7 @@ from torch.optim import Adam, Optimizer
 from opt3dgs_optim import (
     AWSGLD, DEFAULTS, Annealing, ConstantMultiplier, Curvature, EnergyHistogram, Fading,
     FreshMoments, IsotropicNoise, LQNAdam, Part, Phase, PhaseScheduler, Pooling, PositionNoise,
-    SquaredLoss, backend_info, reset_points, two_loop,
+    SquaredLoss, backend_info, two_loop,
 )
 
 
@@ -56,7 +56,6 @@ class Gaussians:
 
 adams: dict[str, Adam] = {}
 upgraded: dict[str, Adam] = PhaseScheduler(10).upgrade(adams)
-reset_points(upgraded, torch.tensor([1]))
 
 
 class SignAgreement(Part):

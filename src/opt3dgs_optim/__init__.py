@@ -16,7 +16,6 @@ from opt3dgs_optim.parts.noise import IsotropicNoise, PositionNoise
 from opt3dgs_optim.parts.pooling import Pooling
 from opt3dgs_optim.phases import PhaseScheduler
 from opt3dgs_optim.presets import DEFAULTS, paper_parts
-from opt3dgs_optim.rows import reset_points
 from opt3dgs_optim.runs import RunLog
 from opt3dgs_optim.stepadam import StepAdam
 from opt3dgs_optim.version import __version__
@@ -44,6 +43,5 @@ __all__ = [
     "__version__",
     "backend_info",
     "paper_parts",
-    "reset_points",
     "two_loop",
 ]

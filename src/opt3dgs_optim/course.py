@@ -63,8 +63,6 @@ class Course:
                 self._hooks[phase, hook] = [part for part in acting if overrides(part, hook)]
         self.keys = tuple({key: None for part in self.parts for key in part.keys})
 
-    # -- where the training is -----------------------------------------------------------------
-
     @property
     def iteration(self) -> int:
         """The iteration whose loss comes next, from 0."""
@@ -108,8 +106,6 @@ class Course:
             again = sum(name.split("#")[0] == kind for name in named)
             named[f"{kind}#{again + 1}" if again else kind] = part
         return named
-
-    # -- one iteration -------------------------------------------------------------------------
 
     def take(self, energy: Tensor) -> None:
         """Tell the parts that act of the energy of the iteration `current`, 0-d, detached."""
@@ -168,8 +164,6 @@ class Course:
         for event, name, why in changes:
             LOGGER.info("iteration %d: %s %s: %s", self.current, name, event.replace("_", " "), why)
         return changes
-
-    # -- state -----------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
         """Clock, parts and what is switched off, as plain numbers, strings, lists and dicts."""

@@ -52,19 +52,15 @@ class Part:
         shown = [f.name for f in options if f.name != "names" or self.names != f.default]
         return f"{type(self).__name__}({', '.join(f'{n}={getattr(self, n)!r}' for n in shown)})"
 
-    # -- once per iteration; nothing here may read a GPU's number back --------------------------
-
     def observe(self, energy: Tensor, valid: Tensor | bool, course: Course) -> None:
         """Take the loss of an iteration in which the part acts, 0-d, finite where `valid`.
 
-        That is a 0-d bool tensor where the loss lives on a GPU.
+        That is a 0-d bool tensor where the loss lives on a GPU, whose numbers are not to be read.
         """
 
     def pixel_loss(self, error: Tensor) -> Tensor:
         """The photometric term, 0-d, of `render - target`; the last part that has one wins."""
         raise NotImplementedError
-
-    # -- in the step of a group ---------------------------------------------------------------
 
     def factor(self, group: Group, course: Course) -> float | Tensor | None:
         """The factor on the group's step, 0-d; None is 1. The factors of all parts multiply."""
@@ -82,8 +78,6 @@ class Part:
     def after(self, group: Group, param: Tensor, state: dict[str, Any], course: Course) -> None:
         """After the parameter has moved. The group's learning rate is the trainer's own again."""
 
-    # -- what it says and keeps ---------------------------------------------------------------
-
     def numbers(self, course: Course) -> Mapping[str, float | Tensor]:
         """Columns of the run log for the iteration observed last: numbers or 0-d tensors."""
         return {}
@@ -95,12 +89,10 @@ class Part:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore `state_dict()`; ValueError where it is damaged, and then nothing is changed."""
 
-    # -- leaving out, with `adaptive=True` ------------------------------------------------------
-
     def evidence(self, course: Course) -> Tensor | None:
         """What it did to this training, [k] numbers on the device; None: nothing to judge by.
 
-        Read with that of all parts every 100 iterations, averaged over the ranks.
+        With `adaptive=True` read every 100 iterations, all parts' at once, averaged over the ranks.
         """
 
     def useless(self, evidence: list[float], course: Course) -> str | None:

@@ -126,8 +126,6 @@ class PhaseScheduler(Course):
         assert phase is not None
         return phase
 
-    # -- the lines in a trainer ----------------------------------------------------------------
-
     def upgrade(self, optimizers: Optimizers) -> Optimizers:
         """Put the parts into the trainer's optimizer(s), in place; return the argument.
 
@@ -191,8 +189,6 @@ class PhaseScheduler(Course):
         """The part whose photometric term holds for the iteration whose loss comes next."""
         parts = self._hooks[self.phase, "pixel_loss"]
         return parts[-1] if parts else None
-
-    # -- mistakes of a set-up, said early ------------------------------------------------------
 
     def stepping(self, closure_value: Any) -> bool:
         """As `Course.stepping`; before the first energy the steps are plain Adam's."""

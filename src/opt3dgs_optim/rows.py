@@ -2,7 +2,7 @@
 
 import weakref
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,14 +11,6 @@ from torch.utils.weak import WeakIdKeyDictionary
 from opt3dgs_optim.checks import check_keys, warn_user
 
 MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # torch's names of Adam's, the last amsgrad's
-
-
-class _Seen(NamedTuple):
-    """What belonged together after a parameter's last step: an edit of one alone shows."""
-
-    param: weakref.ref[Tensor]
-    rows: int
-    moment: weakref.ref[Tensor]  # exp_avg
 
 
 class Ledger:
@@ -31,45 +23,20 @@ class Ledger:
     """
 
     def __init__(self) -> None:
-        self._seen: Any = WeakIdKeyDictionary()  # a part's tensor -> _Seen
+        self._seen: Any = WeakIdKeyDictionary()  # a part's tensor -> (weak parameter, rows)
 
     def drop_strangers(self, param: Tensor, state: dict[str, Any], keys: Iterable[str]) -> None:
         """Remove the tensors under `keys` that are of other rows than the parameter's present."""
         for key in [key for key in keys if key in state]:
-            seen = self._seen.get(state[key])
-            if seen is None or seen.param() is not param or seen.rows != rows_of(param):
+            owner, rows = self._seen.get(state[key], (None, 0))
+            if owner is None or owner() is not param or rows != rows_of(param):
                 del state[key]
 
     def remember(self, param: Tensor, state: dict[str, Any], keys: Iterable[str]) -> None:
         """Take the tensors under `keys` as those of the parameter's present rows."""
         for key in keys:
             if key in state:
-                seen = _Seen(weakref.ref(param), rows_of(param), weakref.ref(state["exp_avg"]))
-                self._seen[state[key]] = seen
-
-    def forget(
-        self, call: str, states: list[tuple[Tensor, Any]], keys: Iterable[str], rows: Tensor
-    ) -> None:
-        """Zero these rows under `keys`; see `reset_points`."""
-        is_mask = rows.dtype == torch.bool
-        fitting = [
-            s for s in states if s[0].dim() and (not is_mask or rows.shape == s[0].shape[:1])
-        ]
-        if states and not fitting:
-            raise ValueError(
-                f"{call}: rows has shape {tuple(rows.shape)}, but a mask of the first dimension "
-                f"of {[tuple(param.shape) for param, _ in states]} is needed"
-            )
-        for param, state in fitting:
-            for key in [key for key in keys if key in state]:
-                seen = self._seen.get(state[key])
-                # Edited by rows with the moments: not where they alone were.
-                left_behind = seen is not None and seen.moment() is not state["exp_avg"]
-                if left_behind or state[key].shape[0] != rows_of(param):
-                    del state[key]
-                else:
-                    state[key][rows.to(param.device)] = 0
-            self.remember(param, state, keys)
+                self._seen[state[key]] = weakref.ref(param), rows_of(param)
 
 
 class Frozen:
@@ -142,23 +109,3 @@ def check_rows(call: str, params: list[Tensor], keys: Iterable[str], state: Any)
                     f"{rows_of(param)}: dropped, and collected anew"
                 )
                 del own[key]
-
-
-def reset_points(optimizers: Any, rows: Tensor) -> None:
-    """Say which points have moved by other means than the optimizers: what parts kept of them goes.
-
-    Call it after each edit of the parameters: curvature pairs of all other points stay in use,
-    where they would otherwise be dropped with the exchanged Parameter object. The state's rows must
-    have been edited along (gsplat does; INRIA's edits leave the pairs behind: they are dropped).
-
-    Args:
-        optimizers: an upgraded optimizer, or a dict of them (others in it are left alone).
-        rows: [N] bool mask or a vector of indices, of the points as they are now.
-
-    Raises:
-        ValueError: a mask fits no parameter.
-    """
-    every = optimizers.values() if isinstance(optimizers, Mapping) else [optimizers]
-    for optimizer in every:
-        if hasattr(optimizer, "reset_points"):
-            optimizer.reset_points(rows)

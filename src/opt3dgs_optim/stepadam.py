@@ -58,8 +58,6 @@ class StepAdam(Adam):
         name = group.get(SLOT)
         return part.names is None or name in part.names or (name is None and self.any_group)
 
-    # -- the step ------------------------------------------------------------------------------
-
     # Under torch.compile a step runs as it is, like those of torch's own optimizers.
     @_disable_dynamo
     def step(  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -225,15 +223,6 @@ class StepAdam(Adam):
                 f"{call}: the mask has {rows} rows, but the parameters have shapes {shapes}; a "
                 "mask of their first dimension is needed"
             )
-
-    def reset_points(self, rows: Tensor) -> None:
-        """See the function `reset_points`."""
-        groups = [g for g in self.param_groups if self.any_group or g.get(SLOT) is not None]
-        states = [(p, self.state.get(p, {})) for group in groups for p in group["params"]]
-        call = f"{type(self).__name__}.reset_points"
-        self._ledger.forget(call, states, self.course.keys, rows)
-
-    # -- copies and checkpoints ----------------------------------------------------------------
 
     def trust_rows(self) -> None:
         """Take what the parts have kept as that of the parameters' present rows."""

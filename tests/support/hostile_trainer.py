@@ -7,7 +7,6 @@ be. Everything is float64, so that rounding in vectors of another length stays a
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -85,7 +84,6 @@ class HostileTrainer:
 
     def __init__(self, kind: str, rows: int) -> None:
         self.kind, self.iteration = kind, 0
-        self.untold = False  # rows were edited since the last step without a reset_points
         self.generator = torch.Generator().manual_seed(rows)
         self.phases, self.twin_phases = make_phases(), make_phases()
         self.ours = Splats(kind, self.random(rows), self.phases)
@@ -115,7 +113,6 @@ class HostileTrainer:
         rows = torch.tensor(weights, dtype=torch.float64)
         mask = rows != 0 if masked else None
         self.observe(loss)
-        self.untold = self.untold and not math.isfinite(loss)
         self.ours.step(rows, mask)
         for i, twin in enumerate(self.twins):
             twin.step(rows[i : i + 1], None if mask is None else mask[i : i + 1])
@@ -143,7 +140,6 @@ class HostileTrainer:
         added: dict[str, Tensor],
         *,
         zeroed: Iterable[int] = (),
-        told: bool = False,
         only: str | None = None,
     ) -> None:
         """New Parameters of the rows `keep` and `added`; the state as this family edits it.
@@ -152,11 +148,9 @@ class HostileTrainer:
             keep: rows to keep, in their new order.
             added: values of new rows, which have zero state.
             zeroed: rows (as kept) whose state is set to zero, as relocation does.
-            told: whether the trainer calls `reset_points` for the new and the zeroed rows.
             only: edit this parameter only (a reset of the opacities).
         """
         many = len(next(iter(added.values()))) if added else 0
-        self.untold = self.untold or not (told or only)
         for name in [only] if only else list(self.ours.params):
             self.exchange(name, keep, added.get(name), many, list(zeroed))
         if only is None:
@@ -166,10 +160,7 @@ class HostileTrainer:
             ]
         for name in [only] if only else list(self.ours.params):
             for i, twin in enumerate(self.twins):
-                self.follow(name, twin, new=i >= len(keep), zeroed=i in set(zeroed), told=told)
-        if told and self.ours.params["means"] in self.ours.optimizer("means").state:
-            moved = torch.tensor([*zeroed, *range(len(keep), len(self))], dtype=torch.long)
-            self.ours.optimizer("means").reset_points(moved)
+                self.follow(name, twin, new=i >= len(keep), zeroed=i in set(zeroed))
 
     def exchange(
         self, name: str, keep: list[int], added: Tensor | None, many: int, zeroed: list[int]
@@ -188,7 +179,7 @@ class HostileTrainer:
         self.ours.group(name)["params"] = [fresh]
         self.ours.params[name] = fresh
 
-    def follow(self, name: str, twin: Splats, *, new: bool, zeroed: bool, told: bool) -> None:
+    def follow(self, name: str, twin: Splats, *, new: bool, zeroed: bool) -> None:
         """What the edit means for one row: its pairs are gone, and the moments where they are 0."""
         optimizer, param = twin.optimizer(name), twin.params[name]
         twin.group(name)[FRESH] = self.ours.group(name).get(FRESH)
@@ -202,8 +193,7 @@ class HostileTrainer:
         if zeroed:
             for key in MOMENTS:
                 state[key].zero_()
-        if new or zeroed or not told:
-            state.pop(PAIRS, None)
+        state.pop(PAIRS, None)
 
     # -- checkpoints -----------------------------------------------------------------------------
 

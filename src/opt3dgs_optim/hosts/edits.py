@@ -61,8 +61,7 @@ def diff(path: Path) -> Edited:
             "torch.optim's, and there is nothing here for them"
         )
     if path.is_dir():
-        known = [p for p in sorted(path.glob("**/*.py")) if p.match("*train*.py")]
-        names = ", ".join(str(p.relative_to(path)) for p in known[:10])
+        names = ", ".join(str(p.relative_to(path)) for p in sorted(path.rglob("*train*.py"))[:10])
         raise ValueError(f"it is a folder; name the training script ({names or 'no *train*.py'})")
     try:
         source = path.read_bytes()
@@ -89,7 +88,7 @@ def write(path: Path) -> Path:
     """Apply the lines to the file at `path`; returns the backup's path.
 
     Raises:
-        ValueError: as `edited`, there is a backup already, or the file cannot be written; it and
+        ValueError: as `diff`, there is a backup already, or the file cannot be written; it and
             its folder are then as they were.
     """
     backup = path.with_name(path.name + ".orig")
@@ -153,11 +152,9 @@ def _insert(lines: list[bytes], node: ast.stmt, new: list[str], *, above: bool =
     if indent.strip() or (rest and not rest.startswith(b"#")):
         raise ValueError(f"line {at + 1} has several statements: {lines[at].decode().strip()}")
     end = lines[at][len(lines[at].rstrip(b"\r\n")) :]
-    text = [indent + line.encode() for line in new]
-    if above:
-        lines[at] = b"".join(line + (end or b"\n") for line in text) + lines[at]
-    else:  # the file's last line may have no end
-        lines[at] = (end or b"\n").join([lines[at].removesuffix(end), *text]) + end
+    own, text = lines[at].removesuffix(end), [indent + line.encode() for line in new]
+    # The file's last line may have no end.
+    lines[at] = (end or b"\n").join([*text, own] if above else [own, *text]) + end
 
 
 def _upgrade_point(trainer: Trainer) -> ast.stmt:

@@ -58,7 +58,7 @@ class Trainer:
     notes: list[str] = field(default_factory=list)  # what a user should know of this file
 
 
-def read_trainer(tree: ast.Module, folder: Path | None = None) -> Trainer:
+def read_trainer(tree: ast.Module, folder: Path) -> Trainer:
     """The training loop of a file.
 
     Args:
@@ -136,7 +136,7 @@ def _range(loop: ast.For, own: list[Spot]) -> tuple[ast.expr, str]:
     return end, "" if isinstance(start, ast.Constant) else count
 
 
-def _find_optimizers(trainer: Trainer, inside: list[Spot], folder: Path | None) -> None:
+def _find_optimizers(trainer: Trainer, inside: list[Spot], folder: Path) -> None:
     """Set `optimizers`, `setups` and what is to be said of them."""
     stepped = list(dict.fromkeys(text for spot in inside if (text := _stepped(spot))))
     dicts = [text for text in stepped if text.split(".")[-1] == "optimizers"]
@@ -198,11 +198,11 @@ def _stepped(spot: Spot) -> str | None:
     return ast.unparse(loops[-1].iter).removesuffix(".values()") if loops else name
 
 
-def _model(folder: Path | None) -> tuple[set[str], set[str]]:
+def _model(folder: Path) -> tuple[set[str], set[str]]:
     """The names of the parameter groups, and of all attributes set, in the classes of `scene/`."""
     groups: set[str] = set()
     made: set[str] = set()
-    for path in sorted((folder / "scene").glob("*model*.py")) if folder else []:
+    for path in sorted((folder / "scene").glob("*model*.py")):
         try:
             tree = ast.parse(path.read_bytes())
         except (OSError, SyntaxError, ValueError):

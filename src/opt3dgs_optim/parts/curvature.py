@@ -30,7 +30,7 @@ class Curvature(Part):
     Each point keeps its last `history_size` curvature pairs, taken between two consecutive steps in
     which its gradient was not exactly zero, and the L-BFGS two-loop recursion turns its gradient
     into a pseudo-gradient. There is no line search: Adam takes the step. A point without a usable
-    pair is stepped by plain Adam, bit for bit. After density control's edits see `reset_points`.
+    pair is stepped by plain Adam, bit for bit.
 
     Memory: 32 K bytes per point beyond Adam's (K > 3, D = 3, float32), from the switch on.
 

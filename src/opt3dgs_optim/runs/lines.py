@@ -18,7 +18,6 @@ except ImportError:  # Windows
 
 START = b'{"kind":"start"'  # how the first line of every session begins
 KINDS = ("start", "step", "evaluation", "event")
-NON_FINITE = {"NaN": "nan", "Infinity": "inf", "-Infinity": "-inf"}  # Python's names: ours
 
 Columns = dict[str, np.ndarray]
 
@@ -73,7 +72,7 @@ def encoded(value: Any) -> str:
         return json.dumps(value, separators=(",", ":"), allow_nan=False, default=_plain)
     except ValueError:  # a number that is not finite
         loose = json.dumps(value, default=_plain)
-        return encoded(json.loads(loose, parse_constant=NON_FINITE.__getitem__))
+        return encoded(json.loads(loose, parse_constant=lambda name: str(float(name))))
 
 
 def _plain(value: Any) -> Any:
@@ -136,10 +135,9 @@ def read_run(path: str | os.PathLike[str]) -> Run:
         ValueError: any other line that is no line of a run log; names the file and the line.
     """
     path = Path(path)
-    starts, records = [], []
-    for line in _lines(path):
-        if line["kind"] == "start":
-            starts.append(line)
+    lines, records = _lines(path), []
+    starts = [line for line in lines if line["kind"] == "start"]
+    for line in lines:
         if line["kind"] == "event" and line["event"] == "resumed":
             records = [r for r in records if r["iteration"] <= line["iteration"]]
         records.append(line)
@@ -191,8 +189,7 @@ def _parse(raw: bytes) -> dict[str, Any]:
 def _columns(lines: list[dict[str, Any]]) -> Columns:
     names = dict.fromkeys(key for line in lines for key in line if key not in ("kind", "phase"))
     names = dict.fromkeys(("iteration", "seconds", *names))
-    nan = float("nan")
-    columns = {name: np.array([line.get(name, nan) for line in lines], float) for name in names}
+    columns = {name: np.array([line.get(name, np.nan) for line in lines], float) for name in names}
     columns["iteration"] = columns["iteration"].astype(np.int64)  # below 2**53: exact
     if any("phase" in line for line in lines):
         columns["phase"] = np.array([str(line.get("phase", "")) for line in lines], str)

@@ -52,39 +52,39 @@ def _figure(comparison: Comparison, footer: str) -> Any:
     columns = max(1, min(4, 150 // (max(map(len, labels)) + 8)))  # of the legend
     height = 5 + 0.25 * -(-len(labels) // columns)  # inches
     figure = Figure(figsize=(11, height), dpi=150, facecolor="white", layout="constrained")
-    metric = _cut(LABELS.get(comparison.metric, comparison.metric), 40)
+    metric = printable(LABELS.get(comparison.metric, comparison.metric))[:40]
     panels = figure.subplots(1, len(AXES), sharey=True)
     for panel, (axis, name) in zip(panels, AXES.items(), strict=True):
         _panel(panel, comparison, axis)
         panel.set_xlabel(name)
     panels[0].set_ylabel(metric)
     lines = [Line2D([], [], lw=2.4, **_look(arm)) for arm in comparison.arms]
-    # " ": a label may begin with "_", which would hide it
-    legend = figure.legend(
+    scene = "" if comparison.scene is None else f", {comparison.scene}"
+    # " ": a label may begin with "_", which would hide it. A suptitle would lie below the legend.
+    figure.legend(
         lines,
         [f" {la}" for la in labels],
         ncols=columns,
         alignment="left",
         loc="outside upper left",
+        title=printable(f"{metric} against run time and iterations{scene}")[:85],
+        title_fontproperties={"size": 13, "weight": "bold"},
     )
-    scene = "" if comparison.scene is None else f", {comparison.scene}"
-    title = _cut(f"{metric} against run time and iterations{scene}", 85)
-    legend.set_title(title)  # a suptitle would lie below it
-    legend.get_title().set(size=13, weight="bold")
     better = "higher" if higher_is_better(comparison.metric) else "lower"
     caption = f"Lines: mean over seeds; bands: least to greatest; {better} is better. Dashed: "
     caption += f"the baseline's final mean. Dotted: next phase. {footer}"
-    figure.supxlabel(textwrap.fill(_cut(caption, 520), 175), fontsize=7.5, color="#666666")
+    figure.supxlabel(textwrap.fill(printable(caption)[:520], 175), fontsize=7.5, color="#666666")
     return figure
 
 
 def _label(arm: Arm, comparison: Comparison) -> str:
     seeds = f"{len(arm.runs)} seeds" if len(arm.runs) > 1 else "1 seed"
-    return f"{_cut(arm.name, 60)} ({seeds}{', baseline' * (arm.name == comparison.baseline)})"
+    return f"{printable(arm.name)[:60]} ({seeds}{', baseline' * (arm.name == comparison.baseline)})"
 
 
-def _cut(text: str, length: int) -> str:
-    return "".join(c if c.isprintable() else " " for c in text[:length])
+def printable(text: str) -> str:
+    """`text` on one line, with spaces in place of what cannot be printed."""
+    return "".join(c if c.isprintable() else " " for c in text)
 
 
 def _look(arm: Arm) -> dict[str, Any]:
@@ -114,7 +114,7 @@ def _panel(panel: Any, comparison: Comparison, axis: str) -> None:
     low, high = float(np.concatenate(shown).min()), float(np.concatenate(shown).max())
     room = 0.06 * (high - low) or 0.05 * abs(high) or 1.0
     panel.set_ylim(low - room, high + room)
-    if comparison.target is not None and low < comparison.target < high:
+    if low < comparison.target < high:
         panel.axhline(comparison.target, lw=0.8, ls="--", color=FAINT, zorder=1)
 
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from opt3dgs_optim.runs.lines import Run, read_run
-from opt3dgs_optim.runs.plot import draw
+from opt3dgs_optim.runs.plot import draw, printable
 from opt3dgs_optim.runs.stats import Comparison, Stat, compare
 
 NO_PICTURE = (
@@ -113,9 +113,8 @@ def as_markdown(
 
 def escaped(text: str) -> str:
     """`text` on one line, without a meaning in Markdown or HTML; `_` inside a word has none."""
-    text = "".join(c if c.isprintable() else " " for c in text)
     special = r"[\\`*\[\]<>|~&$#]|(?<![^\W_])_|_(?![^\W_])"
-    return re.sub(special, lambda found: f"&#{ord(found[0])};", text)
+    return re.sub(special, lambda found: f"&#{ord(found[0])};", printable(text))
 
 
 def _table(comparison: Comparison) -> str:
@@ -172,11 +171,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         runs = [read_run(path) for path in logs]
         written = write_report(runs, options.out, metric=options.metric, baseline=options.baseline)
     except (OSError, ValueError) as error:
-        line = "".join(c if c.isprintable() else " " for c in str(error))  # names from logs in it
-        print("report:", line, file=sys.stderr)
+        print("report:", printable(str(error)), file=sys.stderr)  # names from logs in it
         return 2
-    for path in written:
-        print(path)
+    print(*written, sep="\n")
     if not any(path.suffix == ".png" for path in written):
         print(NO_PICTURE, file=sys.stderr)
     return 0

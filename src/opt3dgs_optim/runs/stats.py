@@ -52,7 +52,7 @@ class Comparison:
     scene: str | None
     metric: str
     baseline: str | None  # None: it did not run on this scene
-    target: float | None  # the baseline's mean final metric
+    target: float  # the baseline's mean final metric; NaN where it has none that is finite
     arms: list[Arm]
 
 
@@ -96,11 +96,10 @@ def _compare_scene(
     columns = [name for name in found if name not in NO_NUMBERS and higher_is_better(name)]
     references = runs.get(order[0], [])
     final = _stat(references, metric, _last)
-    target = final.mean if final and np.isfinite(final.mean) else None
+    target = final.mean if final and np.isfinite(final.mean) else np.nan
     arms = []
     for colour, name in enumerate(order):
-        own = runs.get(name, [])
-        if not own:
+        if not (own := runs.get(name)):
             continue
         numbers = {f"final {m}": _stat(own, m, _last) for m in metrics}
         seconds = [max((r["seconds"] for r in run.records), default=0.0) for run in own]
@@ -109,9 +108,8 @@ def _compare_scene(
         numbers |= {"seconds": Stat.of(seconds), "iterations": Stat.of(iterations)}
         numbers |= {"iterations/s": Stat.of(rates)}
         numbers |= {f"mean {c}": _stat(own, c, _finite_mean, "step") for c in columns}
-        reached = [_first_time(run, metric, target) for run in own]
-        known = [seconds for seconds in reached if seconds is not None]
-        numbers[f"seconds to baseline {metric}"] = Stat.of(known)
+        reached = [t for run in own if (t := _first_time(run, metric, target)) is not None]
+        numbers[f"seconds to baseline {metric}"] = Stat.of(reached)
         gains = [] if name == order[0] else _gains(own, references, metric)
         numbers[f"{metric} gain at equal seconds"] = Stat.of(gains)
         arms.append(Arm(name, own, colour, numbers))
@@ -121,8 +119,8 @@ def _compare_scene(
 def metric_names(runs: Sequence[Run]) -> list[str]:
     """Every metric the runs evaluated, PSNR, SSIM and training PSNR first."""
     found = dict.fromkeys(name for run in runs for name in run.evaluations)
-    named = [*(name for name in KNOWN if name in found), *found]
-    return [name for name in dict.fromkeys(named) if name not in NO_NUMBERS]
+    named = dict.fromkeys([*KNOWN, *found])
+    return [name for name in named if name in found and name not in NO_NUMBERS]
 
 
 def higher_is_better(metric: str) -> bool:
@@ -148,10 +146,8 @@ def _curve(run: Run, metric: str) -> tuple[np.ndarray, np.ndarray]:
     return seconds, values if higher_is_better(metric) else -values
 
 
-def _first_time(run: Run, metric: str, target: float | None) -> float | None:
+def _first_time(run: Run, metric: str, target: float) -> float | None:
     """Seconds until the metric first reaches `target`, linear between evaluations."""
-    if target is None:
-        return None
     seconds, values = _curve(run, metric)
     goal = target if higher_is_better(metric) else -target
     reached = np.flatnonzero(values >= goal)
