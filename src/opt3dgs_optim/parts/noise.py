@@ -3,13 +3,10 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from opt3dgs_optim import cuda
-from opt3dgs_optim.backend import BACKENDS, Backend, uses_kernel
-from opt3dgs_optim.checks import check_choice, check_number, warn_user
+from opt3dgs_optim.checks import check_number, warn_user
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.lbfgs.pairs import columns, row_chunks
 from opt3dgs_optim.part import Group, Part, Phase
@@ -35,7 +32,6 @@ class PositionNoise(Part):
         scale: noise_lr of 3DGS-MCMC.
         during: the phase in which it is added; None: both.
         generator: random generator of the parameters' device, or None for torch's own.
-        backend: `"auto"`, `"cuda"` or `"torch"`; see `backend_info`.
 
     Raises:
         ValueError: an option is outside what is allowed; in a step, a tensor is missing among the
@@ -51,15 +47,11 @@ class PositionNoise(Part):
         *,
         during: Phase | None = None,
         generator: torch.Generator | None = None,
-        backend: Backend = "auto",
     ) -> None:
         self.gaussians = gaussians
         self.scale = check_number("PositionNoise", "scale", scale, 0.0)
         self.during = during  # pyright: ignore[reportAttributeAccessIssue]
         self.generator = generator
-        self.backend: Backend = check_choice(  # pyright: ignore[reportAttributeAccessIssue]
-            "PositionNoise", "backend", backend, BACKENDS
-        )
         self._left = (0, 0)  # where the positions lay after the last step, and how often written
         self._moved = 0
 
@@ -108,14 +100,9 @@ class PositionNoise(Part):
         """Add the noise to `means` [N, 3] in place; lr is their present learning rate."""
         source = self.tensors(means.shape[0])
         rate = torch.where(valid, lr, 0.0) if isinstance(valid, Tensor) else lr
-        add_covariance_noise(
-            means,
-            *(source[name].detach() for name in ("scales", "quats", "opacities")),
-            eta=_normal_like(means, self.generator),
-            lr=rate,
-            noise_scale=self.scale,
-            backend=self.backend,
-        )
+        tensors = (source[name] for name in ("scales", "quats", "opacities"))
+        noise = covariance_noise(*tensors, eta=_normal_like(means, self.generator))
+        means += noise * (rate * self.scale)
 
     def evidence(self, course: Course) -> Tensor:
         """[1]: the largest noise of any Gaussian, in learning rates of the positions."""
@@ -204,50 +191,11 @@ def covariance_noise(scales: Tensor, quats: Tensor, opacities: Tensor, eta: Tens
     return noise
 
 
-def add_covariance_noise(
-    means: Tensor,
-    scales: Tensor,
-    quats: Tensor,
-    opacities: Tensor,
-    eta: Tensor,
-    lr: float | Tensor,
-    *,
-    noise_scale: float,
-    backend: str = "auto",
-) -> None:
-    """Add `lr * noise_scale * covariance_noise(...)` to `means` [N, 3] in place.
-
-    lr is a number, or 0-d; on a GPU it is read there, when the step runs.
-
-    Raises:
-        RuntimeError: `backend="cuda"` where the kernel cannot run.
-        ValueError: the shapes or dtypes do not fit (the kernel's; torch has its own words).
-    """
-    if not uses_kernel(backend, means.device, means.dtype, means.shape[1]):
-        means += covariance_noise(scales, quats, opacities, eta) * (lr * noise_scale)
-        return
-    rows = means.shape[0]
-    vectors = {"scales": (scales, (rows, 3)), "quats": (quats, (rows, 4)), "eta": (eta, (rows, 3))}
-    logits = opacities.reshape(-1), (rows,)
-    cuda.check_alike("add_covariance_noise", means, opacities=logits, **vectors)
-    if isinstance(lr, Tensor) and lr.is_cuda:
-        rate, factor = lr.to(torch.float32), noise_scale
-    else:
-        rate, factor = 0, noise_scale * float(lr)  # a null pointer
-    target = means.contiguous()
-    tensors = (tensor.contiguous() for tensor in (scales, quats, opacities, eta))
-    numbers = map(cuda.real(means.dtype), (factor, GATE_SHARPNESS, GATE_OPACITY))
-    count = np.int64(rows)
-    cuda.launch("add_covariance_noise", means, rows, target, *tensors, rate, *numbers, count)
-    if target is not means:
-        means.copy_(target)
-
-
 def largest_noise(scales: Tensor, opacities: Tensor, noise_scale: float) -> Tensor:
     """The largest noise of any Gaussian, in learning rates of the positions, 0-d.
 
     Along a Gaussian's longest axis its deviation is lr * noise_scale * gate * s^2 (eq. 2), and an
-    Adam step is about lr. Arguments as in `add_covariance_noise`.
+    Adam step is about lr. Scales and opacities as in `covariance_noise`.
     """
     if scales.numel() == 0:
         return scales.new_zeros(())
