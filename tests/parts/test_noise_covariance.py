@@ -9,7 +9,7 @@ from oracles import covariance
 from trainers import gaussians
 
 from opt3dgs_optim.lbfgs import pairs
-from opt3dgs_optim.parts.noise import covariance_noise, largest_noise
+from opt3dgs_optim.parts.noise import covariance_noise
 
 
 def test_is_gate_times_covariance_times_eta() -> None:
@@ -61,11 +61,3 @@ def test_chunks_of_rows_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = covariance_noise(**g, eta=eta)
     monkeypatch.setattr(pairs, "CHUNK", 8)
     assert torch.equal(covariance_noise(**g, eta=eta), whole)
-
-
-def test_largest_noise_is_that_of_the_longest_axis() -> None:
-    scales = torch.tensor([[0.0, 1.0, -1.0], [2.0, 0.0, 0.0]], dtype=torch.float64)
-    opacity = torch.tensor([0.005, 0.5], dtype=torch.float64)  # half open, and shut
-    found = largest_noise(scales, opacity.logit(), 10.0)
-    assert float(found) == pytest.approx(10.0 * 0.5 * np.exp(2.0), rel=1e-9)
-    assert float(largest_noise(scales[:0], opacity[:0], 10.0)) == 0.0
