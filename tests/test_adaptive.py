@@ -15,11 +15,10 @@ from adaptive_scene import CHECK, SWITCH, TOTAL, Scene, Training, shorten
 from ranks import free_port
 from torch import Tensor, distributed
 
-from opt3dgs_optim import Course, Part, PhaseScheduler, PositionNoise
-from opt3dgs_optim.parts.noise import covariance_noise
+from opt3dgs_optim import Course, Part, PhaseScheduler
 
 HISTORY = "history"
-USELESS = {"Curvature": Scene(views_disagree=1.0), "PositionNoise": Scene(opacity=2.0)}
+USELESS = {"Curvature": Scene(views_disagree=1.0), "GatedNoise": Scene(opacity=2.0)}
 
 
 @pytest.fixture(autouse=True)
@@ -73,26 +72,8 @@ def test_a_short_history_is_judged_as_well() -> None:
     assert "Curvature" not in useful.phases.switched_off
 
 
-def test_the_size_of_the_noise_is_that_of_the_noise() -> None:
-    draw = torch.Generator().manual_seed(0)
-    scales = torch.randn(50, 3, generator=draw) * 0.3 - 2
-    quats, opacities = torch.randn(50, 4, generator=draw), torch.randn(50, generator=draw) - 5
-    eta = torch.randn(4000, 50, 3, generator=draw)
-    noise = torch.stack([covariance_noise(scales, quats, opacities, each) for each in eta])
-    covariance = torch.einsum("snd,sne->nde", noise, noise) / len(eta)
-    longest = torch.linalg.eigvalsh(covariance)[:, -1].sqrt().max()
-    part = PositionNoise({"scales": scales, "quats": quats, "opacities": opacities}, 10.0)
-    # 4,000 draws: the deviation is known to 1 / sqrt(8000) = 1.1 %, its largest of 50 to 5 %.
-    assert float(part.evidence(Course())) == pytest.approx(10 * float(longest), rel=0.05)
-
-
-def test_no_gaussian_has_no_noise() -> None:
-    empty = {"scales": torch.zeros(0, 3), "quats": torch.zeros(0, 4), "opacities": torch.zeros(0)}
-    assert PositionNoise(empty).evidence(Course()).tolist() == [0.0]
-
-
 def test_noise_comes_back_with_the_first_transparent_point() -> None:
-    training = Training(USELESS["PositionNoise"]).run(50)
+    training = Training(USELESS["GatedNoise"]).run(50)
     assert training.phases.switched_off
     with torch.no_grad():  # it drifts there: seen at the next look
         training.splats["opacities"][3] = -5.3
@@ -179,13 +160,13 @@ class Log:
 def test_the_reason_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     log: Any = Log()
     with caplog.at_level(logging.INFO, "opt3dgs_optim"):
-        training = Training(USELESS["PositionNoise"], log=log).run(50)
+        training = Training(USELESS["GatedNoise"], log=log).run(50)
         with torch.no_grad():
             training.splats["opacities"].fill_(-5.3)
         training.run(64)
     assert [event[:3] for event in log.events] == [
-        ("switched_off", "PositionNoise", 19),
-        ("switched_on", "PositionNoise", 59),
+        ("switched_off", "GatedNoise", 19),
+        ("switched_on", "GatedNoise", 59),
     ]
     assert "opacity gate" in log.events[0][3]
     assert [record.levelname for record in caplog.records] == ["INFO"] * 3  # and the upgrade's
@@ -200,7 +181,7 @@ def test_the_reason_is_logged(caplog: pytest.LogCaptureFixture) -> None:
         *(("all", cut, "dict") for cut in (19, 50, 109, 125, 165)),
         *(("none", cut, "single") for cut in (50, 125)),
         *(("all", cut, "single") for cut in (50, 125)),
-        ("PositionNoise", 21, "dict"),
+        ("GatedNoise", 21, "dict"),
     ],
 )
 def test_a_resumed_run_is_the_same_bit_for_bit(part: str, cut: int, layout: str) -> None:
@@ -233,7 +214,7 @@ def test_rewinding_brings_parts_back() -> None:
 
 
 def test_copies_go_on_alike() -> None:
-    training = Training(USELESS["PositionNoise"]).run(50)
+    training = Training(USELESS["GatedNoise"]).run(50)
     other = copy.deepcopy(training)
     assert training.phases.switched_off is not other.phases.switched_off
     for each in (training, other):
@@ -271,5 +252,5 @@ def test_ranks_decide_alike(tmp_path: Path) -> None:
     mp.spawn(rank_main, args=(free_port(), str(tmp_path)), nprocs=2)  # pyright: ignore
     a, b = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2))
     assert a == b
-    assert "PositionNoise" not in a[0]  # one rank's transparent point is reason enough for all
+    assert "GatedNoise" not in a[0]  # one rank's transparent point is reason enough for all
     assert SWITCH < TOTAL

@@ -9,7 +9,7 @@ import re
 import pytest
 import torch
 
-from opt3dgs_optim import Curvature, LQNAdam, PositionNoise, backend_info, cuda
+from opt3dgs_optim import Curvature, LQNAdam, backend_info, cuda
 from opt3dgs_optim.backend import uses_kernel
 
 
@@ -96,10 +96,9 @@ def test_torch_can_be_insisted_on(machine) -> None:
     [
         lambda: backend_info("cpu", backend="triton"),  # pyright: ignore
         lambda: Curvature(backend="triton"),  # pyright: ignore
-        lambda: PositionNoise({}, backend="triton"),  # pyright: ignore
         lambda: LQNAdam([torch.zeros(1, 3)], backend="triton"),  # pyright: ignore
     ],
-    ids=["backend_info", "Curvature", "PositionNoise", "LQNAdam"],
+    ids=["backend_info", "Curvature", "LQNAdam"],
 )
 def test_unknown_backend_is_a_value_error(call) -> None:
     with pytest.raises(ValueError, match="backend='triton', but one of 'auto', 'cuda', 'torch'"):

@@ -157,7 +157,6 @@ TABLE: dict[str, tuple[Callable[..., Any], type, dict[str, Any]]] = {
             "scale": [*NOT_NUMBERS, -1.0],
             "during": FREE,
             "generator": FREE,
-            "backend": CHOICES,
         },
     ),
 }

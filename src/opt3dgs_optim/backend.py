@@ -34,7 +34,7 @@ def backend_info(
     *,
     backend: Backend = "auto",
 ) -> BackendInfo:
-    """Which backend a `backend` option chooses for the curvature and the noise, and why.
+    """Which backend a `backend` option chooses for the curvature, and why.
 
     Args:
         device, dtype: of the parameters; None for the GPU, if torch sees one, else the CPU.

@@ -6,7 +6,6 @@
 
 #include "histogram.cu"
 #include "lqn.cu"
-#include "noise.cu"
 
 extern "C" void run_lqn(unsigned block, const Real* positions, const Real* grads, Real* histories, Real* directions,
                         unsigned char* accepted, unsigned char* candidates, long long rows, Real min_cosine, int graft) {
@@ -16,13 +15,6 @@ extern "C" void run_lqn(unsigned block, const Real* positions, const Real* grads
 
 extern "C" void run_two_loop(unsigned block, const Real* grads, Real* histories, Real* results, long long rows) {
   launch_on_host(block, rows, two_loop, grads, histories, results, rows);
-}
-
-extern "C" void run_noise(unsigned block, Real* means, const Real* scales, const Real* quats, const Real* opacities,
-                          const Real* eta, const float* lr, Real noise_scale, Real sharpness, Real threshold,
-                          long long rows) {
-  launch_on_host(block, rows, add_covariance_noise, means, scales, quats, opacities, eta, lr, noise_scale, sharpness,
-                 threshold, rows);
 }
 
 extern "C" void run_take_energy(unsigned block, const Real* energy, const unsigned char* valid, Real* state, Real* nu,

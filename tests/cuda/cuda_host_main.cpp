@@ -36,13 +36,6 @@ int main(int, char** arguments) {
     run_two_loop(128, position.data(), history.data(), result.data(), static_cast<long long>(rows));
     give(out, result);
   }
-  Buffer means = take(in, 3 * rows);
-  const Buffer scales = take(in, 3 * rows), quats = take(in, 4 * rows), opacities = take(in, rows),
-               eta = take(in, 3 * rows);
-  const float lr = 0.25f;
-  run_noise(128, means.data(), scales.data(), quats.data(), opacities.data(), eta.data(), &lr, 2.0, 100.0, 0.005,
-            static_cast<long long>(rows));
-  give(out, means);
   const Buffer lengths = take(in, 2);
   Buffer state = take(in, static_cast<size_t>(lengths[1]) + 3), nu(1);
   for (int step = 0; step < lengths[0]; ++step) {

@@ -24,7 +24,6 @@ from opt3dgs_optim import cuda, partitions
 from opt3dgs_optim.cuda import BLOCK, macros
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
 from opt3dgs_optim.partitions import UNLIMITED, MovingPartitions
-from opt3dgs_optim.parts.noise import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
 
 HERE = Path(__file__).parent
 SOURCES = Path(opt3dgs_optim.__file__).parent / "cuda"
@@ -135,19 +134,6 @@ class HostKernels:
             check_guard(tensor, n)
         assert torch.equal(tensors[1][:n], history.to(self.dtype))
         return tensors[2][:n]
-
-    def noise(
-        self, means: Tensor, gaussians: dict[str, Tensor], eta: Tensor, lr: float, scale: float
-    ) -> Tensor:
-        """The means with the noise added."""
-        n = means.shape[0]
-        rate = torch.tensor([lr], dtype=torch.float32)
-        names = ("scales", "quats", "opacities")
-        tensors = [guarded(t) for t in (means, *(gaussians[name] for name in names), eta)]
-        self._call("run_noise", [*tensors, rate], n, scale, GATE_SHARPNESS, GATE_OPACITY)
-        for tensor in tensors:
-            check_guard(tensor, n)
-        return tensors[0][:n]
 
     def launch(self, kernel: str, like: Tensor, threads: int, *arguments: Any) -> None:
         """As `cuda.launch` of a kernel that takes no rows."""
@@ -263,24 +249,6 @@ def relative_difference(result: Tensor, reference: Tensor) -> float:
     size = size.amax(dim=-1, keepdim=True).clamp(min=1e-300) if size.dim() > 1 else size + 1e-300
     gap = torch.where(same, 0.0, (result - reference).abs() / size)
     return float(gap.nan_to_num(nan=torch.inf).max())
-
-
-def noise_case(n: int, dtype: torch.dtype) -> tuple[Tensor, dict[str, Tensor], Tensor]:
-    """Means, Gaussians whose gate is half open, and eta."""
-    g = torch.Generator().manual_seed(2)
-
-    def draw(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=g, dtype=torch.float64).to(dtype)
-
-    gaussians = {"scales": draw(n, 3) - 1, "quats": 3 * draw(n, 4), "opacities": draw(n) - 5.3}
-    return draw(n, 3), gaussians, draw(n, 3)
-
-
-def expected_noise(gaussians: dict[str, Tensor], eta: Tensor) -> Tensor:
-    """Pure torch's noise for a `noise_case`."""
-    names = ("scales", "quats", "opacities")
-    scales, quats, opacities = (gaussians[name] for name in names)
-    return covariance_noise(scales, quats, opacities, eta)
 
 
 # -- the histogram ---------------------------------------------------------------------------------

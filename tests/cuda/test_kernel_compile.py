@@ -127,7 +127,6 @@ def test_float32_kernels(tool, arch: str, tmp_path: Path) -> None:
     for size in SIZES if tool is with_nvrtc else (5,):  # nvcc takes a second for each
         compiled = tool("lqn.cu", arch, torch.float32, size, tmp_path)
         check(compiled, torch.float32, 2 * size)
-    check(tool("noise.cu", arch, torch.float32, None, tmp_path), torch.float32, 1)
     check(tool("histogram.cu", arch, torch.float32, None, tmp_path), torch.float32, 0)
 
 
@@ -135,7 +134,6 @@ def test_float32_kernels(tool, arch: str, tmp_path: Path) -> None:
 def test_float64_kernels_for_tests(tool, tmp_path: Path) -> None:
     # Ten: two_loop alone has no use for the spare lanes, and reads z on its own.
     check(tool("lqn.cu", "80", torch.float64, 5, tmp_path), torch.float64, 10)
-    check(tool("noise.cu", "80", torch.float64, None, tmp_path), torch.float64, 2)
     check(tool("histogram.cu", "80", torch.float64, None, tmp_path), torch.float64, 0)
 
 

@@ -121,8 +121,6 @@ def test_a_scale_of_a_half_or_none() -> None:
         assert PositionNoise({}, scale=scale).scale == scale
     with pytest.raises(ValueError, match=r"scale=-0\.5"):
         PositionNoise({}, scale=-0.5)
-    with pytest.raises(ValueError, match="backend='fast'"):
-        PositionNoise({}, backend="fast")  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("rows", [3, 5])

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.nn import Parameter
 from trainers import INRIA_NAMES, every_one
 
-from opt3dgs_optim import Curvature, Part, PhaseScheduler, PositionNoise
+from opt3dgs_optim import Course, Curvature, Part, PhaseScheduler, PositionNoise
 
 POINTS, TOTAL, SWITCH = 120, 170, 110
 RATES = {"means": 2e-2, "scales": 1e-4, "quats": 1e-4, "opacities": 1e-2}
@@ -25,6 +26,17 @@ def shorten(monkeypatch: Any) -> None:
 
     monkeypatch.setattr(course, "CHECK_STEPS", CHECK)
     monkeypatch.setattr(curvature, "PROBE_STEPS", PROBE)
+
+
+class GatedNoise(PositionNoise):
+    """A part of a trainer's own: useless while no point is near the opacity gate."""
+
+    def evidence(self, course: Course) -> Tensor:
+        source: Any = self.gaussians() if callable(self.gaussians) else self.gaussians
+        return (source["opacities"].detach() < 0).any().float().reshape(1)
+
+    def useless(self, evidence: list[float], course: Course) -> str | None:
+        return None if evidence[0] else "no point is near the opacity gate"
 
 
 @dataclass(frozen=True)
@@ -59,7 +71,7 @@ class Training:
         }
         with torch.no_grad():
             self.splats["opacities"].fill_(scene.opacity)
-        self.noise = PositionNoise(lambda: self.splats, scene.noise_scale)
+        self.noise = GatedNoise(lambda: self.splats, scene.noise_scale)
         self.curvature = Curvature(scene.history_size)
         parts: list[Part] = [*others]
         parts += [self.curvature] if scene.curvature else []

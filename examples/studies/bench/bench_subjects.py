@@ -16,12 +16,12 @@ from opt3dgs_optim import (
     EnergyHistogram,
     Part,
     PhaseScheduler,
+    PositionNoise,
     SquaredLoss,
     two_loop,
 )
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history
 from opt3dgs_optim.lbfgs.history import laid_out
-from opt3dgs_optim.parts.noise import add_covariance_noise
 
 HISTORY_SIZE = 5
 NOISE_LR = 5e5
@@ -138,15 +138,10 @@ def upgraded(case: Case, parts: list[Part], *, exploit: bool = False) -> Callabl
 
 
 def noise_alone(case: Case) -> Callable[[], Any]:
-    splats = {name: param.detach() for name, param in case.splats().items()}
+    splats = case.splats()
+    noise = PositionNoise(splats, NOISE_LR)
     lr = torch.tensor(LEARNING_RATES["means"], device=case.device)
-
-    def add() -> None:
-        eta = torch.randn_like(splats["means"])
-        tensors = (splats[name] for name in ("means", "scales", "quats", "opacities"))
-        add_covariance_noise(*tensors, eta=eta, lr=lr, noise_scale=NOISE_LR)
-
-    return add
+    return lambda: noise.add_to(splats["means"], lr)
 
 
 def curvature_alone(case: Case) -> Callable[[], Any]:

@@ -19,7 +19,6 @@ HEADER = "two_loop.cuh"
 KERNELS = {  # the kernel: its file
     "lqn_direction": "lqn.cu",
     "two_loop": "lqn.cu",
-    "add_covariance_noise": "noise.cu",
     "take_energy": "histogram.cu",
 }
 
@@ -109,20 +108,6 @@ def launch(
         core.launch(stream, config, function, *values)
 
 
-def check_alike(call: str, like: Tensor, **others: tuple[Tensor, tuple[int, ...]]) -> None:
-    """ValueError unless each tensor has its shape, and dtype and device of `like`.
-
-    A kernel reads memory by these.
-    """
-    for name, (tensor, shape) in others.items():
-        alike = tensor.dtype == like.dtype and tensor.device == like.device
-        if tuple(tensor.shape) != shape or not alike:
-            raise ValueError(
-                f"{call}: {name} is {tuple(tensor.shape)} {tensor.dtype} on {tensor.device}, but "
-                f"{shape} {like.dtype} on {like.device} is needed"
-            )
-
-
 def real(dtype: torch.dtype) -> Any:
     """The numpy type of a number that a kernel for tensors of `dtype` takes."""
     return np.float64 if dtype == torch.float64 else np.float32
@@ -138,8 +123,14 @@ def lqn_direction(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`lbfgs.lqn_direction` on the GPU, for points of three coordinates. Never synchronises."""
     rows = grad.shape[0]
-    whole = history, tuple(history.shape)
-    check_alike("lqn_direction", grad, position=(position, tuple(grad.shape)), history=whole)
+    # The kernel reads memory by the gradient's dtype and these shapes.
+    needed = {"position": (position, grad.shape), "history": (history, history.shape)}
+    for name, (given, shape) in needed.items():
+        if (given.shape, given.dtype, given.device) != (shape, grad.dtype, grad.device):
+            raise ValueError(
+                f"lqn_direction: {name} is {tuple(given.shape)} {given.dtype} on {given.device}, "
+                f"but {tuple(shape)} {grad.dtype} on {grad.device} is needed"
+            )
     fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
     accepted = torch.empty(rows, dtype=torch.bool, device=grad.device)
     candidates = torch.empty_like(accepted)

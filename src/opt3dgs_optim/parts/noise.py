@@ -3,13 +3,10 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from opt3dgs_optim import cuda
-from opt3dgs_optim.backend import BACKENDS, Backend, uses_kernel
-from opt3dgs_optim.checks import check_choice, check_number, warn_user
+from opt3dgs_optim.checks import check_number, warn_user
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.lbfgs.pairs import columns, row_chunks
 from opt3dgs_optim.part import Group, Part, Phase
@@ -18,7 +15,6 @@ GaussianTensors = Mapping[str, Tensor]
 GATE_SHARPNESS = 100.0  # k of eq. 2's gate
 GATE_OPACITY = 0.005  # t of eq. 2's gate: the opacity under which a Gaussian counts as dead
 TWICE = 5  # steps in a row with positions changed by somebody else before it is said
-EFFECT = 1e-3  # of the noise's deviation along a Gaussian's longest axis, in learning rates
 
 
 class PositionNoise(Part):
@@ -35,7 +31,6 @@ class PositionNoise(Part):
         scale: noise_lr of 3DGS-MCMC.
         during: the phase in which it is added; None: both.
         generator: random generator of the parameters' device, or None for torch's own.
-        backend: `"auto"`, `"cuda"` or `"torch"`; see `backend_info`.
 
     Raises:
         ValueError: an option is outside what is allowed; in a step, a tensor is missing among the
@@ -51,36 +46,17 @@ class PositionNoise(Part):
         *,
         during: Phase | None = None,
         generator: torch.Generator | None = None,
-        backend: Backend = "auto",
     ) -> None:
         self.gaussians = gaussians
         self.scale = check_number("PositionNoise", "scale", scale, 0.0)
         self.during = during  # pyright: ignore[reportAttributeAccessIssue]
         self.generator = generator
-        self.backend: Backend = check_choice(  # pyright: ignore[reportAttributeAccessIssue]
-            "PositionNoise", "backend", backend, BACKENDS
-        )
         self._left = (0, 0)  # where the positions lay after the last step, and how often written
         self._moved = 0
 
     def __repr__(self) -> str:
         during = "" if self.during is None else f", during={self.during.value}"
         return f"PositionNoise(scale={self.scale:g}{during})"
-
-    def tensors(self, rows: int | None = None) -> GaussianTensors:
-        """The Gaussians' present tensors; ValueError unless they are those of `rows` points."""
-        source = self.gaussians() if callable(self.gaussians) else self.gaussians
-        missing = [name for name in ("scales", "quats", "opacities") if name not in source]
-        if missing:
-            raise ValueError(
-                f"PositionNoise: {missing} are not among the Gaussians' tensors {sorted(source)}"
-            )
-        if rows is not None and source["scales"].shape[0] != rows:
-            raise ValueError(
-                f"PositionNoise: {source['scales'].shape[0]} scales for {rows} means; the dict "
-                "must hold the tensors that belong to the means being stepped"
-            )
-        return source
 
     def before(
         self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
@@ -106,31 +82,21 @@ class PositionNoise(Part):
     @torch.no_grad()
     def add_to(self, means: Tensor, lr: float | Tensor, valid: Tensor | bool = True) -> None:
         """Add the noise to `means` [N, 3] in place; lr is their present learning rate."""
-        source = self.tensors(means.shape[0])
+        source = self.gaussians() if callable(self.gaussians) else self.gaussians
+        missing = [name for name in ("scales", "quats", "opacities") if name not in source]
+        if missing:
+            raise ValueError(
+                f"PositionNoise: {missing} are not among the Gaussians' tensors {sorted(source)}"
+            )
+        scales, quats, opacities = source["scales"], source["quats"], source["opacities"]
+        if len(scales) != len(means):
+            raise ValueError(
+                f"PositionNoise: {len(scales)} scales for {len(means)} means; the dict must hold "
+                "the tensors that belong to the means being stepped"
+            )
         rate = torch.where(valid, lr, 0.0) if isinstance(valid, Tensor) else lr
-        add_covariance_noise(
-            means,
-            *(source[name].detach() for name in ("scales", "quats", "opacities")),
-            eta=_normal_like(means, self.generator),
-            lr=rate,
-            noise_scale=self.scale,
-            backend=self.backend,
-        )
-
-    def evidence(self, course: Course) -> Tensor:
-        """[1]: the largest noise of any Gaussian, in learning rates of the positions."""
-        source = self.tensors()
-        scales, opacities = source["scales"].detach(), source["opacities"].detach()
-        return largest_noise(scales, opacities, self.scale).reshape(1)
-
-    def useless(self, evidence: list[float], course: Course) -> str | None:
-        """Where no Gaussian is near the opacity gate; looked at again at every check."""
-        if evidence[0] >= EFFECT:
-            return None
-        return (
-            "no Gaussian is near the opacity gate: the largest noise is "
-            f"{evidence[0]:.1g} learning rates (threshold {EFFECT:g})"
-        )
+        noise = covariance_noise(scales, quats, opacities, _normal_like(means, self.generator))
+        means += noise * (rate * self.scale)
 
 
 class IsotropicNoise(Part):
@@ -200,76 +166,17 @@ def covariance_noise(scales: Tensor, quats: Tensor, opacities: Tensor, eta: Tens
     """
     noise = torch.empty_like(eta)
     for rows in row_chunks(eta):
-        noise[rows] = _noise(scales[rows], quats[rows], opacities[rows], eta[rows]).T
+        q = columns(quats[rows], quats.dtype)
+        # clamp: as torch.nn.functional.normalize
+        w, *axis = (q / (q * q).sum(0).sqrt().clamp(min=1e-12)).unbind()
+        # R^T eta: rotation by the conjugate quaternion; then the variances; then R.
+        local = _rotate(w, [-a for a in axis], list(columns(eta[rows], eta.dtype).unbind()))
+        variance = (2 * columns(scales[rows], scales.dtype)).exp().unbind()
+        shaped = [a * b for a, b in zip(variance, local, strict=True)]
+        opacity = torch.sigmoid(opacities[rows].reshape(-1))
+        gate = torch.sigmoid(-GATE_SHARPNESS * (opacity - GATE_OPACITY))
+        noise[rows] = torch.stack([v * gate for v in _rotate(w, axis, shaped)]).T
     return noise
-
-
-def add_covariance_noise(
-    means: Tensor,
-    scales: Tensor,
-    quats: Tensor,
-    opacities: Tensor,
-    eta: Tensor,
-    lr: float | Tensor,
-    *,
-    noise_scale: float,
-    backend: str = "auto",
-) -> None:
-    """Add `lr * noise_scale * covariance_noise(...)` to `means` [N, 3] in place.
-
-    lr is a number, or 0-d; on a GPU it is read there, when the step runs.
-
-    Raises:
-        RuntimeError: `backend="cuda"` where the kernel cannot run.
-        ValueError: the shapes or dtypes do not fit (the kernel's; torch has its own words).
-    """
-    if not uses_kernel(backend, means.device, means.dtype, means.shape[1]):
-        means += covariance_noise(scales, quats, opacities, eta) * (lr * noise_scale)
-        return
-    rows = means.shape[0]
-    vectors = {"scales": (scales, (rows, 3)), "quats": (quats, (rows, 4)), "eta": (eta, (rows, 3))}
-    logits = opacities.reshape(-1), (rows,)
-    cuda.check_alike("add_covariance_noise", means, opacities=logits, **vectors)
-    if isinstance(lr, Tensor) and lr.is_cuda:
-        rate, factor = lr.to(torch.float32), noise_scale
-    else:
-        rate, factor = 0, noise_scale * float(lr)  # a null pointer
-    target = means.contiguous()
-    tensors = (tensor.contiguous() for tensor in (scales, quats, opacities, eta))
-    numbers = map(cuda.real(means.dtype), (factor, GATE_SHARPNESS, GATE_OPACITY))
-    count = np.int64(rows)
-    cuda.launch("add_covariance_noise", means, rows, target, *tensors, rate, *numbers, count)
-    if target is not means:
-        means.copy_(target)
-
-
-def largest_noise(scales: Tensor, opacities: Tensor, noise_scale: float) -> Tensor:
-    """The largest noise of any Gaussian, in learning rates of the positions, 0-d.
-
-    Along a Gaussian's longest axis its deviation is lr * noise_scale * gate * s^2 (eq. 2), and an
-    Adam step is about lr. Arguments as in `add_covariance_noise`.
-    """
-    if scales.numel() == 0:
-        return scales.new_zeros(())
-    return noise_scale * (_gate(opacities) * (2 * scales.amax(1)).exp()).amax()
-
-
-def _gate(opacities: Tensor) -> Tensor:
-    opacity = torch.sigmoid(opacities.reshape(-1))
-    return torch.sigmoid(-GATE_SHARPNESS * (opacity - GATE_OPACITY))
-
-
-def _noise(scales: Tensor, quats: Tensor, opacities: Tensor, eta: Tensor) -> Tensor:
-    """`covariance_noise` as [3, N]."""
-    q = columns(quats, quats.dtype)
-    # clamp: as torch.nn.functional.normalize
-    w, *axis = (q / (q * q).sum(0).sqrt().clamp(min=1e-12)).unbind()
-    # R^T eta: rotation by the conjugate quaternion; then the variances; then R.
-    local = _rotate(w, [-a for a in axis], list(columns(eta, eta.dtype).unbind()))
-    variance = (2 * columns(scales, scales.dtype)).exp().unbind()
-    shaped = [a * b for a, b in zip(variance, local, strict=True)]
-    gate = _gate(opacities)
-    return torch.stack([v * gate for v in _rotate(w, axis, shaped)])
 
 
 def _rotate(w: Tensor, q: list[Tensor], v: list[Tensor]) -> list[Tensor]:
