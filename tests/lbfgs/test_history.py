@@ -22,7 +22,7 @@ from opt3dgs_optim.lbfgs.history import (
     push,
     stored_pairs,
 )
-from opt3dgs_optim.lbfgs.pairs import length, normalised_pair
+from opt3dgs_optim.lbfgs.pairs import length, normalised_pair, overwrite
 
 F64 = torch.float64
 
@@ -268,3 +268,16 @@ def test_pairs_move_down_whatever_their_size(accepted: bool) -> None:
         assert torch.equal(history, before)
     else:
         assert torch.equal(history[:, 1:3, :3], before[:, :2, :3])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_rows_are_overwritten_bit_for_bit(dtype: torch.dtype) -> None:
+    numbers = [0.0, -0.0, 1.5, torch.inf, -torch.inf, torch.nan, 1e-310, 3e38]
+    every = torch.tensor(numbers, dtype=torch.float64).to(dtype)
+    old, new = torch.cartesian_prod(every, every).T.contiguous()
+    mask = torch.arange(len(old)) % 3 == 0
+    found = torch.stack([old, old])
+    overwrite(mask, (found, torch.stack([new, old])))
+    bits = torch.int32 if dtype == torch.float32 else torch.int64
+    assert torch.equal(found[0].view(bits), torch.where(mask, new.view(bits), old.view(bits)))
+    assert torch.equal(found[1].view(bits), old.view(bits))

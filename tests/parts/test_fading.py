@@ -69,6 +69,15 @@ def _ratio(after: dict[str, Any], before: dict[str, Any], key: str) -> torch.Ten
     return (after[key].reshape(old.shape) * old).sum(1) / (old * old).sum(1)
 
 
+def test_of_more_than_ten_thousand_points_a_smaller_share_fades() -> None:
+    fading = Fading(share=0.5)
+    assert [fading.share_of(n) for n in (0, 1, 9_999, 10_000)] == [0.5] * 4
+    assert fading.share_of(80_000) == pytest.approx(0.125)  # 8^(2/3) = 4
+    for num_points, share in ((10_000, 0.5), (80_000, 0.125)):
+        chosen = fading.chosen(3, num_points, CPU).float().mean()
+        assert float(chosen) == pytest.approx(share, abs=5 * (0.25 / num_points) ** 0.5)
+
+
 @pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
 def test_only_the_named_parameters_fade(make: Any) -> None:
     after: list[dict[str, torch.Tensor]] = []

@@ -11,6 +11,8 @@ from studies.scenes.records import Setting
 
 LENGTHS = (30_000, 7_500)
 QUARTER = "images_4"
+POINTS = 4_000
+NUM_POINTS = {"embedded": 2_000, "bonsai": 10_000, "lego": 10_000}
 MANY_VIEWS_SCENES = ("bonsai", "lego", "plush")  # forty training views or more
 MIN_SCENES = 3
 # part -> (the arm with it, the arm without it)
@@ -46,10 +48,15 @@ class Decision:
         return self.verdict == "pays"
 
 
+def points_of(scene: str) -> int:
+    """The most Gaussians of a scene, where a stage says nothing else."""
+    return NUM_POINTS.get(scene, POINTS)
+
+
 def settings_of(study: Study, iterations: int) -> list[Setting]:
-    """The rule's scenes, with rotated views at a quarter of their size."""
-    every = every_scene(study, iterations)
-    return [s for s in every if s.scene in MANY_VIEWS_SCENES and s.size == QUARTER]
+    """The rule's scenes, with rotated views at a quarter of their size and their own points."""
+    every = [s for s in every_scene(study, iterations) if s.scene in MANY_VIEWS_SCENES]
+    return [s for s in every if s.size == QUARTER and s.points == points_of(s.scene)]
 
 
 def every_scene(study: Study, iterations: int) -> list[Setting]:

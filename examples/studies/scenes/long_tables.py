@@ -12,6 +12,8 @@ from studies.scenes.arms import BASELINE, DEFAULTS, STUDY_ARMS, label
 from studies.scenes.records import Record, Setting
 
 METRICS = {"psnr": (1.0, 2), "ssim": (1.0, 4), "lpips": (-1.0, 4)}  # sign of better, digits
+SIZES = {"images_4": "quarter", "images_2": "half"}
+MIN_ARMS = 3  # in a line of a table that compares them
 MIN_PAIRS = 3  # of scene and seed, for a spread that means something
 
 
@@ -159,9 +161,26 @@ def scenes_gain_table(study: Study, settings: Sequence[Setting], arm: str, contr
         if not found.count:
             continue
         ours, theirs, _ = zip(*found.pairs[setting.scene], strict=True)
-        size = {"images_4": "quarter", "images_2": "half"}.get(setting.size, setting.size)
+        size = SIZES.get(setting.size, setting.size)
         cells = f"{_cell(theirs)} | {_cell(ours, seeds=False)} | {cells_of(found)[0]}"
         lines.append(f"| {setting.scene} | {setting.points:,}, {size} | {cells} |")
+    return "\n".join(lines)
+
+
+def sizes_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) -> str:
+    """One line per scene, points, size and length with three of the arms: seed 0."""
+    heads = " | ".join(f"`{label(arm)}`" for arm in arms)
+    lines = [
+        f"| scene | Gaussians, images, iterations | {heads} |",
+        f"|---|---|{'---|' * len(arms)}",
+    ]
+    for setting in settings:
+        found = [[r for r in (study.runs(setting, arm).get(0),) if r] for arm in arms]
+        if sum(map(len, found)) < MIN_ARMS:
+            continue
+        size = SIZES.get(setting.size, setting.size)
+        what = f"{setting.points:,}, {size}, {setting.iterations:,}"
+        lines.append(f"| {setting.scene} | {what} | {' | '.join(map(_cell, found))} |")
     return "\n".join(lines)
 
 

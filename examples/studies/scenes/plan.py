@@ -24,7 +24,7 @@ from studies.scenes.arms import (
     V_ONLY,
     long_runs,
 )
-from studies.scenes.decisions import MANY_VIEWS_SCENES
+from studies.scenes.decisions import MANY_VIEWS_SCENES, points_of
 from studies.scenes.training import Spec
 
 SCENES = ("plush", "banana", "lund_door", "brighton_beach", "embedded")
@@ -41,10 +41,9 @@ HALF_ARMS = (  # with 50,000 Gaussians
     *("mcmc", DEFAULTS, SHARE_KEPT, SELDOM_FADED[0], *UNFADED),
     *("paper", "paper-constant"),
 )
+CROWDED_ARMS = ("mcmc", DEFAULTS, SHARE_KEPT, UNFADED[0])
 LONG_ARMS = tuple(arm.name for arm in long_runs())
 FULL_PARTS_SCENES = ("brighton_beach", "lund_door")  # where the defaults lose
-POINTS = 4_000
-NUM_POINTS = {"embedded": 2_000, "bonsai": 10_000, "lego": 10_000}
 CONFIRMED = ("faded-v-only", V_ONLY)  # what gained most among the other leads
 FIRST_ARMS = ("mcmc", "rates-x2", "annealed-8-0.4", "faded")
 
@@ -95,7 +94,17 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         "full": cross(SCENES, [*two, POOLED], 1, 30_000),
         "rotated-brief": [
             *cross(MANY_VIEWS_SCENES, BRIEF_ARMS, seeds, 7_500, rotated=True),
-            *cross(("bonsai",), arms["schedules"] + arms["detail"], 1, 7_500, rotated=True),
+            *cross(
+                ("bonsai",),
+                [*arms["schedules"], *arms["detail"], SELDOM_FADED[0]],
+                1,
+                7_500,
+                rotated=True,
+            ),
+        ],
+        "crowded": [  # 40,000 Gaussians on images of a quarter of their size
+            *cross(("bonsai",), CROWDED_ARMS, 1, 7_500, 4, rotated=True),
+            *cross(("plush",), CROWDED_ARMS, 1, 7_500, 10, rotated=True),
         ],
         "explorations": [
             *cross(("plush",), [STABLE, *arms["explorations"]], 1, 7_500, rotated=True),
@@ -132,11 +141,6 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         "rest-all": cross(SCENES, later, seeds, 3_000),
         "long-all": cross(SCENES, longer, seeds, 7_500),
     }
-
-
-def points_of(scene: str) -> int:
-    """The most Gaussians of a scene."""
-    return NUM_POINTS.get(scene, POINTS)
 
 
 def plan(root: Path, out: Path, only: list[str] | None = None, seeds: int = 3) -> list[Training]:

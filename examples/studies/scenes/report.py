@@ -27,8 +27,11 @@ from studies.scenes.arms import (
     FADED,
     GROUPS,
     POOLED,
+    SELDOM_FADED,
+    SHARE_KEPT,
     STABLE,
     STUDY_ARMS,
+    UNFADED,
     UNFADED_OPACITIES,
     label,
 )
@@ -41,6 +44,7 @@ from studies.scenes.long_tables import (
     metrics_table,
     reach_table,
     scenes_gain_table,
+    sizes_table,
 )
 from studies.scenes.plots import plot_curves, plot_gains, plot_metrics
 from studies.scenes.records import COSTS, FOLDER, Setting, gather, merge, read, read_costs, write
@@ -84,6 +88,7 @@ CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4
 ROTATED = "rotated.json"  # records whose held-out views rotate with the seed
 LONG, BRIEF = 30_000, 7_500
 ASIDE = ("explorations", "unseen", "adaptive")  # groups with a table of their own
+OFTEN_ARMS = (BASELINE, SHARE_KEPT, SELDOM_FADED[0], *UNFADED, DEFAULTS)
 REACH_ARMS = (FADED, DEFAULTS)
 MARKER = re.compile(r"(<!-- study:([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -139,6 +144,8 @@ def rotated_tables(study: Study) -> dict[str, str]:
     for count, settings in ((LONG, long), (BRIEF, brief)):
         made[f"rotated-{count}"] = metrics_table(study, settings, shown)
         made[f"rotated-{count}-gains"] = differences_table(study, settings, shown)
+    often = [s for s in study.all_settings() if s.rotated and not s.tiled and not s.views]
+    made["often"] = sizes_table(study, often, OFTEN_ARMS)
     made["explorations"] = differences_table(study, brief, (STABLE, *names("explorations")))
     made["adaptive"] = metrics_table(study, brief, names("adaptive"), gaussians=True)
     tiled = [s for s in study.all_settings() if s.tiled]

@@ -20,8 +20,8 @@ from studies.scenes import report, steps
 from studies.scenes.analysis import Study
 from studies.scenes.arms import BASELINE, STUDY_ARMS, find_study_arm
 from studies.scenes.arms import DEFAULTS as DEFAULT_ARM
-from studies.scenes.decisions import MANY_VIEWS_SCENES, decide, every_scene
-from studies.scenes.long_tables import reach_table, scenes_gain_table
+from studies.scenes.decisions import MANY_VIEWS_SCENES, decide, every_scene, points_of
+from studies.scenes.long_tables import reach_table, scenes_gain_table, sizes_table
 from studies.scenes.parts.chosen_fading import chosen_rows
 from studies.scenes.parts.own_step import OwnStep
 from studies.scenes.parts.step_lengths import StepLengths
@@ -86,7 +86,8 @@ def rotated_record(arm: str, scene: str, seed: int, **metrics: float) -> Record:
     for name, value in ({"ssim": 0.7, "lpips": 0.2} | metrics).items():
         made.curve[name] = np.array([0.0, value])
     made.curve["iteration"][1] = 7_500
-    return replace(made, setting=replace(made.setting, iterations=7_500, rotated=True))
+    setting = Setting(scene, points_of(scene), 7_500, "sfm", rotated=True)
+    return replace(made, setting=setting)
 
 
 @pytest.mark.parametrize(
@@ -115,6 +116,8 @@ def test_a_part_is_on_if_one_metric_gains_and_none_loses(
     decision = decide(Study(records, costs))["Fading"]
     assert (decision.iterations, decision.verdict) == (7_500, verdict)
     assert decision.on == (verdict == "pays")
+    crowded = [replace(r, setting=replace(r.setting, points=40_000)) for r in reversed(records)]
+    assert decide(Study([*records, *crowded], costs))["Fading"] == decision
     two = decide(Study(records[:4]))["Fading"]
     assert (two.iterations, two.verdict, two.on) == (None, "too few", False)
 
@@ -141,9 +144,20 @@ def test_every_scene_and_size_has_its_line() -> None:
     study = Study([*quarter, *half, other])
     table = scenes_gain_table(study, every_scene(study, 7_500), DEFAULT_ARM, BASELINE)
     assert table.splitlines()[2:] == [
-        "| banana | 100, quarter | 20.00 / 0.700 / 0.200 | 20.50 / 0.700 / 0.200 | +0.50 |",
+        "| banana | 4,000, quarter | 20.00 / 0.700 / 0.200 | 20.50 / 0.700 / 0.200 | +0.50 |",
         "| banana | 5,000, half | 20.00 / 0.700 / 0.200 | 20.50 / 0.700 / 0.200 | +0.50 |",
     ]
+
+
+def test_a_line_compares_arms_of_one_seed() -> None:
+    arms = (BASELINE, "faded", DEFAULT_ARM)
+    records = [rotated_record(arm, "banana", seed) for arm in arms for seed in (0, 1)]
+    others = [rotated_record(arm, "plush", 0) for arm in arms[:2]]
+    study = Study([*records, *others])
+    table = sizes_table(study, study.all_settings(), [*arms, "own-step"])
+    cell = "20.00 / 0.700 / 0.200"
+    line = f"| banana | 4,000, quarter, 7,500 | {cell} | {cell} | {cell} | - |"
+    assert table.splitlines()[2:] == [line]
 
 
 def test_when_stocks_quality_is_reached() -> None:
