@@ -83,7 +83,7 @@ def test_the_package_is_small() -> None:
     """5,500 is the aim, of 9,191; nothing a preset, a host or the study needs went for it."""
     kernels = (ROOT / "src" / PACKAGE / "cuda").glob("*.cu*")
     lines = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in kernels)
-    assert sum(LENGTHS.values()) + lines <= 5_800
+    assert sum(LENGTHS.values()) + lines <= 5_600
 
 
 # -- imports ---------------------------------------------------------------------------------------
