@@ -84,11 +84,14 @@ def test_points_without_a_pair_or_a_gradient_do_not_count() -> None:
     pairs = torch.randn(2, 6, 3, generator=torch.Generator().manual_seed(2))
     history = history_from_pairs(pairs, pairs)
     history[1] = 0.0
+    head = header(history, 2)
+    head.gradient.copy_(torch.full((6, 3), -1.0))
+    head.counter[4] = 1.0  # visible once
     gradient = torch.ones(6, 3)
     gradient[2] = 0.0
     gradient[3] = torch.nan
     _, points = foresight(history, 2, torch.ones(6, 3), gradient)
-    assert float(points) == 3
+    assert float(points) == 2
 
 
 def test_rows_are_taken_a_chunk_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:

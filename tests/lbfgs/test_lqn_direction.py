@@ -16,10 +16,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import opt3dgs_optim
 from opt3dgs_optim import cuda
 from opt3dgs_optim.backend import uses_kernel
-from opt3dgs_optim.lbfgs import lqn_direction, new_history, two_loop
+from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
 from opt3dgs_optim.lbfgs import pairs as columns_of
 from opt3dgs_optim.lbfgs.foresight import foresight
-from opt3dgs_optim.lbfgs.history import laid_out
+from opt3dgs_optim.lbfgs.history import header, laid_out
 
 # inductor imports parts of torch that torch itself has deprecated
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
@@ -195,3 +195,27 @@ def test_two_loop_is_the_kernels_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> No
     flat, _, other = points(7, dim=2)
     assert two_loop(flat, other, 5).shape == (7, 2)
     assert two_loop(grad.double(), history, 5).dtype == torch.float64  # not the history's
+
+
+def test_the_kernel_where_there_is_none() -> None:
+    x, grad, history = points(5)
+    with pytest.raises(RuntimeError, match="backend='cuda' was asked for"):
+        lqn_direction(x, grad, history, 5, min_cosine=1e-6, graft=True, backend="cuda")
+
+
+def test_gradients_too_small_for_products() -> None:
+    _, grad, history = points(20)
+    expected = two_loop(grad.double(), history.double(), 5)
+    found = two_loop(grad * 1e-36, history, 5).double() * 1e36
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_a_direction_beyond_float32_leaves_the_gradient() -> None:
+    """Long along x, and as long as a gradient of three components of 3e38."""
+    y = torch.eye(3)[:2, None]
+    s = y * torch.tensor([1e3, 1e-3]).reshape(2, 1, 1)
+    history = history_from_pairs(torch.cat([s[:1], s]), torch.cat([y[:1], y]))
+    header(history, 3).gradient.fill_(3e38)
+    grad = torch.full((1, 3), 3e38)
+    fed, *_ = lqn_direction(grad, grad, history, 3, min_cosine=1e-6, graft=True)
+    assert torch.equal(fed, grad)

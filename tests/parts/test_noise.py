@@ -185,6 +185,45 @@ def test_noise_of_a_trainer_that_nobody_told_us_of(host_adds_noise: bool) -> Non
     assert len(said) == host_adds_noise
 
 
+@pytest.mark.parametrize("writes", [(5,), (3, 4, 5), (6,)])
+def test_six_writes_in_a_row_are_one_too_many(writes: tuple[int, ...]) -> None:
+    """Between two steps each; a step without one begins anew."""
+    splats = make_splats()
+    phases = only(200, PositionNoise(splats, 1.0))
+    upgraded = phases.upgrade(gsplat_optimizers(splats))
+    iteration = 0
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        for count in writes:
+            for written in [False, *[True] * count]:
+                if written:
+                    with torch.no_grad():
+                        splats["means"].add_(0.01)
+                train(splats, upgraded, phases, iteration, iteration + 1)
+                iteration += 1
+    assert any("noise_lr to 0" in str(warning.message) for warning in told) == (writes == (6,))
+
+
+def test_a_step_that_only_the_device_may_drop() -> None:
+    splats = make_splats()
+    splats["opacities"].data.fill_(-9.0)
+    start = splats["means"].detach().clone()
+    ends = []
+    for lr, valid in ((0.01, True), (0.01, torch.tensor(True)), (0.01, torch.tensor(False))):
+        noise = PositionNoise(splats, 1e4, generator=torch.Generator().manual_seed(5))
+        means = start.clone()
+        noise.add_to(means, lr, valid)
+        ends.append(means)
+    assert not torch.equal(ends[0], start)
+    torch.testing.assert_close(ends[1], ends[0])
+    assert torch.equal(ends[2], start)
+    for valid in (True, False):
+        course, point = Course(), start.clone()
+        course.valid = torch.tensor(valid)
+        IsotropicNoise(std=0.5).after({"lr": 0.02}, point, {}, course)
+        assert torch.equal(point, start) != valid
+
+
 def test_a_trainers_noise_is_fine_where_ours_is_off() -> None:
     splats, phases = make_splats(), only(60, Annealing(names=GAUSSIAN))
     upgraded = phases.upgrade(gsplat_optimizers(splats))
