@@ -81,7 +81,7 @@ class PositionNoise(Part):
 
     @torch.no_grad()
     def add_to(self, means: Tensor, lr: float | Tensor, valid: Tensor | bool = True) -> None:
-        """Add the noise to `means` [N, 3] in place; lr is their present rate. ValueError: see above."""
+        """Add the noise to `means` [N, 3] in place; lr is their rate. ValueError: see the class."""
         source = self.gaussians() if callable(self.gaussians) else self.gaussians
         missing = [name for name in ("scales", "quats", "opacities") if name not in source]
         if missing:
