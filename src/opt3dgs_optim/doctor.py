@@ -103,7 +103,7 @@ def kernels_against_torch(device: torch.device) -> str:
             given = position, grad, history_from_pairs(s, y), HISTORY_SIZE
             fed, *_ = lqn_direction(*given, min_cosine=1e-6, graft=True, backend=backend)
             found.append(fed)
-        said.append(_within(*found, limit, f"torch in {dtype}"))
+        said.append(_within(found[0], found[1], limit, f"torch in {dtype}"))
     return "; ".join(said)
 
 
