@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from opt3dgs_optim import EnergyHistogram
-from opt3dgs_optim.partitions import FLOOR, FixedPartitions
+from opt3dgs_optim.partitions import FLOOR, FixedPartitions, MovingPartitions
 
 CPU = torch.device("cpu")
 
@@ -68,3 +68,14 @@ def test_what_a_checkpoint_may_not_hold(
 ) -> None:
     with pytest.raises(ValueError, match=f"call: .*{message}"):
         fixed().check("call", {"weights": weights, "scalars": scalars})
+
+
+def test_a_hundred_energies_are_remembered() -> None:
+    """An energy that swings by 1 and rises by half of that: the mean follows by 1 % of the rest."""
+    law = MovingPartitions(48, 0.75, None)
+    law.allocate(CPU)
+    for count in range(1, 501):
+        swing = 1.0 if count % 2 else -1.0
+        law.take(torch.tensor(swing + 0.5 * (count > 400)), True, count)
+    low, high, _ = law.coordinates()
+    assert (low + high) / 2 == pytest.approx(0.5 * (1 - 0.99**100), abs=0.02)
