@@ -79,3 +79,27 @@ def test_a_hundred_energies_are_remembered() -> None:
         law.take(torch.tensor(swing + 0.5 * (count > 400)), True, count)
     low, high, _ = law.coordinates()
     assert (low + high) / 2 == pytest.approx(0.5 * (1 - 0.99**100), abs=0.02)
+
+
+def test_theta_is_a_power_of_the_density_and_an_even_share() -> None:
+    law = MovingPartitions(48, 0.75, None)
+    law.allocate(CPU)
+    for count in range(1, 40):
+        law.take(torch.tensor(float(count % 7)), True, count)
+    q = 0.95 * torch.tensor(law.state()["recent"][3:], dtype=torch.float64) + 0.05 / 48
+    torch.testing.assert_close(law.weights, q**4 / (q**4).sum(), rtol=1e-9, atol=0)
+
+
+def test_a_density_may_be_zero_and_so_may_the_deviation() -> None:
+    law = MovingPartitions(48, 0.75, None)
+    law.allocate(CPU)
+    state = law.state()
+    state["recent"][1], state["recent"][3], state["recent"][4] = 0.0, 0.0, 2 / 48
+    law.check("test", state)
+
+
+def test_every_energy_counts_once() -> None:
+    law = fixed()
+    for count in (1, 2, 3):
+        law.take(torch.tensor(0.5), True, count)
+    assert law.state()["scalars"][3] == 3.0
