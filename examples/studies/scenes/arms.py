@@ -46,9 +46,9 @@ STABLE = "awsgld-stable"  # its histogram follows the energy; that of the arms b
 UNFADED_OPACITIES = f"{ANNEALED}-opacities-unfaded"
 V_ONLY = f"{ANNEALED}-v-only"
 # Where points are many, fading kills a great part of them again and again: what may spare them.
-UNFADED = tuple(f"{MEANS_LEFT}-{name}-unfaded" for name in ("means", "opacities"))
+UNFADED = {name: f"{MEANS_LEFT}-{name}-unfaded" for name in ("means", "opacities")}
 SHARE_KEPT = f"{MEANS_LEFT}-share-kept"  # the defaults before Fading counted the points
-SELDOM_FADED = tuple(f"{MEANS_LEFT}-{events}-events" for events in (100, 30))
+SELDOM_FADED = f"{MEANS_LEFT}-100-events"
 EVENT_STEPS = 10  # iterations for one event of fading in a run of 3,000, where it was chosen
 
 
@@ -293,7 +293,7 @@ def long_runs() -> list[StudyArm]:
                 of(ANNEALING_OF_REST, fading_but(left)),
                 control=MEANS_LEFT,
             )
-            for name, left in zip(UNFADED, ("means", "opacities"), strict=True)
+            for left, name in UNFADED.items()
         ),
         StudyArm(
             SHARE_KEPT,
@@ -301,14 +301,11 @@ def long_runs() -> list[StudyArm]:
             of(ANNEALING_OF_REST, ShareKept(events=300)),
             control=MEANS_LEFT,
         ),
-        *(
-            StudyArm(
-                name,
-                f"all but the positions annealed, faded {events} times instead of 300",
-                of(ANNEALING_OF_REST, ShareKept(events=events)),
-                control=MEANS_LEFT,
-            )
-            for name, events in zip(SELDOM_FADED, (100, 30), strict=True)
+        StudyArm(
+            SELDOM_FADED,
+            "all but the positions annealed, faded 100 times instead of 300",
+            of(ANNEALING_OF_REST, ShareKept(events=100)),
+            control=MEANS_LEFT,
         ),
     ]
 

@@ -161,9 +161,8 @@ def scenes_gain_table(study: Study, settings: Sequence[Setting], arm: str, contr
         if not found.count:
             continue
         ours, theirs, _ = zip(*found.pairs[setting.scene], strict=True)
-        size = SIZES.get(setting.size, setting.size)
         cells = f"{_cell(theirs)} | {_cell(ours, seeds=False)} | {cells_of(found)[0]}"
-        lines.append(f"| {setting.scene} | {setting.points:,}, {size} | {cells} |")
+        lines.append(f"| {setting.scene} | {_crowd(setting)} | {cells} |")
     return "\n".join(lines)
 
 
@@ -175,11 +174,11 @@ def sizes_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) 
         f"|---|---|{'---|' * len(arms)}",
     ]
     for setting in settings:
-        found = [[r for r in (study.runs(setting, arm).get(0),) if r] for arm in arms]
+        runs = [study.runs(setting, arm) for arm in arms]
+        found = [[seeds[0]] if 0 in seeds else [] for seeds in runs]
         if sum(map(len, found)) < MIN_ARMS:
             continue
-        size = SIZES.get(setting.size, setting.size)
-        what = f"{setting.points:,}, {size}, {setting.iterations:,}"
+        what = f"{_crowd(setting)}, {setting.iterations:,}"
         lines.append(f"| {setting.scene} | {what} | {' | '.join(map(_cell, found))} |")
     return "\n".join(lines)
 
@@ -234,6 +233,11 @@ def _cell(records: Sequence[Record], *, gaussians: bool = False, seeds: bool = T
     count = fmean(float(r.curve["num_points"][-1]) for r in records)
     beside = f", {count:,.0f} Gaussians" if gaussians else ""
     return f"{psnr:.2f} / {ssim:.3f} / {lpips:.3f}{beside}{of}"
+
+
+def _crowd(setting: Setting) -> str:
+    """The most Gaussians, and the images' size."""
+    return f"{setting.points:,}, {SIZES.get(setting.size, setting.size)}"
 
 
 def _signed(mean: float, spread: float, digits: int) -> str:

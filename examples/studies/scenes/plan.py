@@ -31,17 +31,18 @@ SCENES = ("plush", "banana", "lund_door", "brighton_beach", "embedded")
 QUICK_SCENES = ("banana", "embedded")  # for the options of a part
 ROTATED_SCENES = (*MANY_VIEWS_SCENES, "embedded", "banana", "lund_door", "brighton_beach")
 ROTATED_ARMS = (
-    *("mcmc", FADED, DEFAULTS, ANNEALED, *UNFADED, *SELDOM_FADED, "paper", "paper-constant"),
+    *("mcmc", FADED, DEFAULTS, ANNEALED, "paper", "paper-constant"),
+    *(SELDOM_FADED, *UNFADED.values()),
     *("faded-3000", "rates-x2", POOLED, "annealed-2", "own-step"),
     *(STABLE, f"{STABLE}-constant"),
     *("l2@1/30", "l1+reset@1/30", "l2+reset@1/30", "l2+reset+lqn@1/30"),
 )
 BRIEF_ARMS = ("mcmc", FADED, DEFAULTS, ANNEALED, *EARLY)
 HALF_ARMS = (  # with 50,000 Gaussians
-    *("mcmc", DEFAULTS, SHARE_KEPT, SELDOM_FADED[0], *UNFADED),
+    *("mcmc", DEFAULTS, SHARE_KEPT, SELDOM_FADED, *UNFADED.values()),
     *("paper", "paper-constant"),
 )
-CROWDED_ARMS = ("mcmc", DEFAULTS, SHARE_KEPT, UNFADED[0])
+CROWDED_ARMS = ("mcmc", DEFAULTS, SHARE_KEPT, UNFADED["means"])
 LONG_ARMS = tuple(arm.name for arm in long_runs())
 FULL_PARTS_SCENES = ("brighton_beach", "lund_door")  # where the defaults lose
 CONFIRMED = ("faded-v-only", V_ONLY)  # what gained most among the other leads
@@ -96,7 +97,7 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
             *cross(MANY_VIEWS_SCENES, BRIEF_ARMS, seeds, 7_500, rotated=True),
             *cross(
                 ("bonsai",),
-                [*arms["schedules"], *arms["detail"], SELDOM_FADED[0]],
+                [*arms["schedules"], *arms["detail"], SELDOM_FADED],
                 1,
                 7_500,
                 rotated=True,

@@ -88,7 +88,7 @@ CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4
 ROTATED = "rotated.json"  # records whose held-out views rotate with the seed
 LONG, BRIEF = 30_000, 7_500
 ASIDE = ("explorations", "unseen", "adaptive")  # groups with a table of their own
-OFTEN_ARMS = (BASELINE, SHARE_KEPT, SELDOM_FADED[0], *UNFADED, DEFAULTS)
+OFTEN_ARMS = (BASELINE, SHARE_KEPT, SELDOM_FADED, *UNFADED.values(), DEFAULTS)
 REACH_ARMS = (FADED, DEFAULTS)
 MARKER = re.compile(r"(<!-- study:([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 

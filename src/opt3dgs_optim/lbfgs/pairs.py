@@ -76,7 +76,7 @@ def columns(points: Tensor, dtype: torch.dtype) -> Tensor:
     return torch.stack(points.to(dtype).unbind(1))  # three times as fast as a transposed copy
 
 
-def put(points: Tensor, found: Tensor) -> None:
-    """`points[:] = found.T`, of [N, D] and [D, N]: as fast as `columns`."""
+def put(points: Tensor, found: Iterable[Tensor]) -> None:
+    """Into `points` [N, D] what was found as [D, N] or its rows: as fast as `columns`."""
     for column, row in zip(points.unbind(1), found, strict=True):
         column.copy_(row)

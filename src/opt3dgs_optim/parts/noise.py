@@ -8,7 +8,7 @@ from torch import Tensor
 
 from opt3dgs_optim.checks import check_number, warn_user
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.lbfgs.pairs import columns, row_chunks
+from opt3dgs_optim.lbfgs.pairs import columns, put, row_chunks
 from opt3dgs_optim.part import Group, Part, Phase
 
 GaussianTensors = Mapping[str, Tensor]
@@ -175,7 +175,7 @@ def covariance_noise(scales: Tensor, quats: Tensor, opacities: Tensor, eta: Tens
         shaped = [a * b for a, b in zip(variance, local, strict=True)]
         opacity = torch.sigmoid(opacities[rows].reshape(-1))
         gate = torch.sigmoid(-GATE_SHARPNESS * (opacity - GATE_OPACITY))
-        noise[rows] = torch.stack([v * gate for v in _rotate(w, axis, shaped)]).T
+        put(noise[rows], [v * gate for v in _rotate(w, axis, shaped)])
     return noise
 
 
