@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from opt3dgs_optim import Curvature, LQNAdam, backend_info, cuda
-from opt3dgs_optim.backend import uses_kernel
+from opt3dgs_optim.backend import obstacle
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def test_a_gpu_with_everything_runs_the_kernels(machine) -> None:
     info = backend_info()
     assert (info.backend, info.device) == ("cuda", "cuda")
     assert backend_info("cuda:3", torch.float64, backend="cuda").backend == "cuda"
-    assert uses_kernel("auto", torch.device("cuda", 1), torch.float32)
+    assert obstacle("auto", torch.device("cuda", 1), torch.float32) is None
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_what_is_missing_is_named(machine, absent: dict, sentence: str) -> None:
     assert re.search(sentence, repr(info))
     with pytest.raises(RuntimeError, match=sentence):
         backend_info("cuda", backend="cuda")
-    assert not uses_kernel("auto", torch.device("cuda"), torch.float32)
+    assert obstacle("auto", torch.device("cuda"), torch.float32)
 
 
 def test_a_broken_cuda_core_is_named(machine, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -81,14 +81,15 @@ def test_other_devices_run_in_torch(device: str) -> None:
     info = backend_info(device)
     assert info.backend == "torch"
     assert repr(info) == (
-        f"BackendInfo('torch' runs on {device} in float32: the kernels need a CUDA device)"
+        f"BackendInfo(device='{device}', dtype=torch.float32, backend='torch', "
+        "reason='the kernels need a CUDA device')"
     )
 
 
 def test_torch_can_be_insisted_on(machine) -> None:
     machine()
     assert backend_info("cuda", backend="torch").reason == "backend='torch' was asked for"
-    assert not uses_kernel("torch", torch.device("cuda"), torch.float32)
+    assert obstacle("torch", torch.device("cuda"), torch.float32)
 
 
 @pytest.mark.parametrize(

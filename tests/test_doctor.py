@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -13,45 +12,23 @@ import torch
 from opt3dgs_optim import AWSGLD, __version__, cuda, doctor
 from opt3dgs_optim import __main__ as commands
 
-LBFGS = sys.modules["opt3dgs_optim.lbfgs.two_loop"]  # the package has a function of that name
-RECURSION, STEP = LBFGS.recursion, AWSGLD.step
+STEP = AWSGLD.step
 
 
-def turned(grad: Any, s: Any, y: Any) -> torch.Tensor:
-    return RECURSION(grad, s, y) * (1 + 1e-8)
-
-
-def not_a_number(grad: Any, s: Any, y: Any) -> torch.Tensor:
-    return RECURSION(grad, s, y) * float("nan")
-
-
-def farther(self: Any, closure: Any = None) -> None:
-    STEP(self, closure)
-    for param in self.param_groups[0]["params"]:
-        param.data *= 1 + 1e-6
-
-
-@pytest.mark.parametrize(
-    ("place", "name", "broken", "caught"),
-    [
-        (LBFGS, "recursion", turned, "two-loop recursion: ArithmeticError: relative difference 1"),
-        (LBFGS, "recursion", not_a_number, "two-loop recursion: ArithmeticError"),
-        (AWSGLD, "step", farther, "Adam with all off: ArithmeticError: AWSGLD with nothing on"),
-    ],
-)
-def test_a_broken_part_is_found(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    place: Any,
-    name: str,
-    broken: Callable[..., Any],
-    caught: str,
+@pytest.mark.parametrize("factor", [1 + 1e-6, float("nan")])
+def test_another_step_is_found(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], factor: float
 ) -> None:
-    monkeypatch.setattr(place, name, broken)
+    def farther(self: Any, closure: Any = None) -> None:
+        STEP(self, closure)
+        for param in self.param_groups[0]["params"]:
+            param.data *= factor
+
+    monkeypatch.setattr(AWSGLD, "step", farther)
     assert doctor.main(["--device", "cpu"]) == 1
     said = capsys.readouterr().out
-    assert f"  FAILED  {caught}" in said
-    assert "1 of 3 FAILED" in said
+    assert "  FAILED  Adam with all off: ArithmeticError: AWSGLD with nothing on differs" in said
+    assert "1 of 2 FAILED" in said
 
 
 @pytest.mark.cuda
@@ -68,7 +45,7 @@ def test_doctor_as_a_command() -> None:
     assert (done.returncode, done.stderr) == (0, "")
     for text in (__version__, torch.__version__, "the kernels need a CUDA device"):
         assert text in done.stdout
-    assert done.stdout.count("\n  ok ") == 2
+    assert done.stdout.count("\n  ok ") == 1
     assert "\n  --      CUDA kernels: not launched: the kernels need" in done.stdout
 
 

@@ -80,10 +80,10 @@ def test_no_file_is_long() -> None:
 
 
 def test_the_package_is_small() -> None:
-    """5,500 is the aim, of 9,191; nothing a preset, a host or the study needs went for it."""
+    """9,191 before the parts; nothing a preset, a host or the study needs went for it."""
     kernels = (ROOT / "src" / PACKAGE / "cuda").glob("*.cu*")
     lines = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in kernels)
-    assert sum(LENGTHS.values()) + lines <= 5_600
+    assert sum(LENGTHS.values()) + lines <= 5_500
 
 
 # -- imports ---------------------------------------------------------------------------------------

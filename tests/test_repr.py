@@ -39,7 +39,7 @@ def test_an_optimizer_says_its_parts_and_groups() -> None:
     optimizer = AWSGLD([points()], 0.5, noise=IsotropicNoise(temperature=0.0))
     assert repr(optimizer).splitlines() == [
         "AWSGLD(",
-        "  IsotropicNoise(temperature=0)",
+        "  IsotropicNoise(temperature=0.0)",
         "  group 0 [4, 3]: lr 0.5",
         ")",
     ]

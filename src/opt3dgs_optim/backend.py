@@ -23,10 +23,6 @@ class BackendInfo:
     backend: Literal["cuda", "torch"]
     reason: str
 
-    def __repr__(self) -> str:
-        kind = str(self.dtype).removeprefix("torch.")
-        return f"BackendInfo({self.backend!r} runs on {self.device} in {kind}: {self.reason})"
-
 
 def backend_info(
     device: torch.device | str | None = None,
@@ -52,27 +48,20 @@ def backend_info(
     if device is None:
         device = "cuda" if torch.cuda.is_available() else "cpu"
     place = torch.device(device)
-    obstacle = _obstacle(backend, place, dtype)
-    if obstacle is None:
+    why_not = obstacle(backend, place, dtype)
+    if why_not is None:
         return BackendInfo(str(place), dtype, "cuda", "cuda.core and a CUDA device are present")
-    return BackendInfo(str(place), dtype, "torch", obstacle)
+    return BackendInfo(str(place), dtype, "torch", why_not)
 
 
-def uses_kernel(
-    backend: str, device: torch.device, dtype: torch.dtype, dim: int = 3, history_size: int = 1
-) -> bool:
-    """Whether the kernels run for points of `dim` coordinates, with so many pairs of each.
-
-    Raises:
-        RuntimeError: they were asked for and cannot.
-    """
-    return _obstacle(backend, device, dtype, dim, history_size) is None
-
-
-def _obstacle(
+def obstacle(
     backend: str, device: torch.device, dtype: torch.dtype, dim: int = 3, history_size: int = 1
 ) -> str | None:
-    """Why pure torch runs, or None; RuntimeError as `uses_kernel`."""
+    """Why pure torch runs for so many pairs of points of `dim` coordinates; None: the kernels do.
+
+    Raises:
+        RuntimeError: the kernels were asked for and cannot.
+    """
     if backend == "torch":
         return "backend='torch' was asked for"
     if dim != 3 or history_size > KERNEL_HISTORY:

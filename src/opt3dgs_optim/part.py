@@ -47,10 +47,11 @@ class Part:
     names: Any = GAUSSIAN  # tuple[str, ...] | None
 
     def __repr__(self) -> str:
-        """The options; the parameters where they are not the part's usual ones."""
+        """The options that are given; the parameters where they are not the part's usual ones."""
         options = fields(self) if is_dataclass(self) else ()
         shown = [f.name for f in options if f.name != "names" or self.names != f.default]
-        return f"{type(self).__name__}({', '.join(f'{n}={getattr(self, n)!r}' for n in shown)})"
+        given = {name: getattr(self, name) for name in shown if getattr(self, name) is not None}
+        return f"{type(self).__name__}({', '.join(f'{n}={v!r}' for n, v in given.items())})"
 
     def observe(self, energy: Tensor, valid: Tensor | bool, course: Course) -> None:
         """Take the loss of an iteration in which the part acts, 0-d, finite where `valid`.

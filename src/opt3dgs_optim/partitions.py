@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim import cuda
-from opt3dgs_optim.backend import uses_kernel
+from opt3dgs_optim.backend import obstacle
 
 FLOOR = 1e-8  # smallest weight of a fixed range before renormalisation; log theta never sees 0
 # Of the moving partitions; lengths are in deviations of the energy.
@@ -167,7 +167,7 @@ class MovingPartitions:
         """
         limit = LIMIT / MEAN_ABS if count > UNLIMITED else 1 / RESOLUTION
         rate = max(1 / count, 1 / MEMORY)
-        if uses_kernel("auto", self._state.device, self._state.dtype):
+        if obstacle("auto", self._state.device, self._state.dtype) is None:
             numbers = (rate, limit, *self.clamp, *self._constants)
             cuda.take_energy(energy, valid, self._state, self.nu, *numbers)
             return

@@ -13,10 +13,6 @@ extern "C" void run_lqn(unsigned block, const Real* positions, const Real* grads
                  min_cosine, graft);
 }
 
-extern "C" void run_two_loop(unsigned block, const Real* grads, Real* histories, Real* results, long long rows) {
-  launch_on_host(block, rows, two_loop, grads, histories, results, rows);
-}
-
 extern "C" void run_take_energy(unsigned block, const Real* energy, const unsigned char* valid, Real* state, Real* nu,
                                 long long partitions, Real rate, Real limit, Real low, Real high, Real reach,
                                 Real bandwidth, Real even, Real mean_abs, Real resolution, Real tiny) {

@@ -23,7 +23,7 @@ int main(int, char** arguments) {
   const Buffer header = take(in, 2);
   const size_t rows = static_cast<size_t>(header[0]);
   const size_t row = 8 * History<double, HISTORY_SIZE>::slots;
-  Buffer history(rows * row), direction(3 * rows), result(3 * rows);
+  Buffer history(rows * row), direction(3 * rows);
   std::vector<unsigned char> accepted(rows), candidates(rows);
   for (int step = 0; step < header[1]; ++step) {
     const Buffer position = take(in, 3 * rows), grad = take(in, 3 * rows), reset = take(in, rows);
@@ -33,8 +33,6 @@ int main(int, char** arguments) {
     run_lqn(128, position.data(), grad.data(), history.data(), direction.data(), accepted.data(), candidates.data(),
             static_cast<long long>(rows), 1e-6, 1);
     give(out, direction);
-    run_two_loop(128, position.data(), history.data(), result.data(), static_cast<long long>(rows));
-    give(out, result);
   }
   const Buffer lengths = take(in, 2);
   Buffer state = take(in, static_cast<size_t>(lengths[1]) + 3), nu(1);

@@ -22,7 +22,7 @@ from torch import Tensor
 import opt3dgs_optim
 from opt3dgs_optim import cuda, partitions
 from opt3dgs_optim.cuda import BLOCK, macros
-from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
+from opt3dgs_optim.lbfgs import lqn_direction, new_history
 from opt3dgs_optim.partitions import UNLIMITED, MovingPartitions
 
 HERE = Path(__file__).parent
@@ -124,17 +124,6 @@ class HostKernels:
         history.copy_(cells[:n])
         return direction[:n], flags[0][:n].bool(), flags[1][:n].bool()
 
-    def two_loop(self, grad: Tensor, history: Tensor) -> Tensor:
-        """As `lbfgs.two_loop`; `history` must stay as it is."""
-        n = grad.shape[0]
-        tensors = [guarded(t.to(self.dtype).contiguous()) for t in (grad, history, 0 * grad)]
-        tensors[0][n:] *= -1  # H g = g in the rows beyond the last: let that not be the guard
-        self._call("run_two_loop", tensors, n)
-        for tensor in tensors[1:]:
-            check_guard(tensor, n)
-        assert torch.equal(tensors[1][:n], history.to(self.dtype))
-        return tensors[2][:n]
-
     def launch(self, kernel: str, like: Tensor, threads: int, *arguments: Any) -> None:
         """As `cuda.launch` of a kernel that takes no rows."""
         assert (like.dtype, threads) == (self.dtype, 1)
@@ -221,22 +210,6 @@ def compare_runs(kernels: HostKernels, n: int, size: int, **changed: object) -> 
     return max(map(relative_difference, result, reference), default=0.0)
 
 
-def compare_two_loops(kernels: HostKernels, n: int, size: int) -> float:
-    """The largest relative difference of the recursion alone, in float64.
-
-    Of gradients of all sizes, zeros among them, and with points that have no pair.
-    """
-    g = torch.Generator().manual_seed(n + size)
-    s = torch.randn(size, n, 3, generator=g, dtype=torch.float64)
-    hessian = torch.randn(n, 3, 3, generator=g, dtype=torch.float64)
-    hessian = hessian @ hessian.mT + torch.eye(3)
-    history = history_from_pairs(s, torch.einsum("nij,knj->kni", hessian, s))
-    grad = torch.randn(n, 3, generator=g, dtype=torch.float64)
-    grad *= 10.0 ** (60 * torch.rand(n, 1, generator=g, dtype=torch.float64) - 30)
-    history[::7], grad[::5] = 0, 0
-    return relative_difference(kernels.two_loop(grad, history), two_loop(grad, history, size))
-
-
 def relative_difference(result: Tensor, reference: Tensor) -> float:
     """Largest difference over the reference's row size; infinite where only one is NaN."""
     if reference.numel() == 0:
@@ -302,7 +275,7 @@ def take_all_on_host(kernels: HostKernels, values: Tensor, before: Tensor | None
     """`take_all` with the kernel in the place of the torch operators."""
     with (
         mock.patch.object(cuda, "launch", kernels.launch),
-        mock.patch.object(partitions, "uses_kernel", return_value=True),
+        mock.patch.object(partitions, "obstacle", return_value=None),
     ):
         return take_all(values, kernels.dtype, before)
 

@@ -21,7 +21,7 @@ from opt3dgs_optim import (
     PositionNoise,
     backend_info,
 )
-from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
+from opt3dgs_optim.lbfgs import lqn_direction, new_history
 from opt3dgs_optim.names import GAUSSIAN
 from opt3dgs_optim.parts.noise import covariance_noise
 
@@ -75,18 +75,6 @@ def test_single_step_in_float32(rows: int) -> None:
     same = (result[1].cpu() == expected[1]) & (result[2].cpu() == expected[2])
     assert bool(same.all()) or float((~same).float().mean()) < 1e-3
     assert relative_difference(result[0].cpu()[same], expected[0][same]) < 1e-5
-
-
-@pytest.mark.parametrize("size", [1, 3, 4, 5])
-@pytest.mark.parametrize("rows", ROWS)
-def test_recursion_alone(rows: int, size: int) -> None:
-    """`two_loop` of tensors on the GPU is the kernel's, in either layout of the history."""
-    s, g = torch.randn(size, rows, 3), torch.randn(rows, 3, dtype=torch.float64)
-    history = history_from_pairs(s.double(), s.double() * torch.tensor([1.0, 3.0, 9.0]))
-    expected = two_loop(g, history, size)
-    for cells in (history.cuda(), history.cuda().contiguous()):
-        result = two_loop(g.cuda(), cells, size)
-        assert relative_difference(result.cpu(), expected) < 1e-10
 
 
 def noise_case(n: int, dtype: torch.dtype) -> tuple[Tensor, dict[str, Tensor], Tensor]:

@@ -17,7 +17,6 @@ from kernel_host import (
     built,
     compare_energies,
     compare_runs,
-    compare_two_loops,
     compiler,
     energies,
     host_kernels,
@@ -27,7 +26,7 @@ from kernel_host import (
 from torch import Tensor
 
 from opt3dgs_optim import cuda
-from opt3dgs_optim.lbfgs import lqn_direction, new_history, two_loop
+from opt3dgs_optim.lbfgs import lqn_direction, new_history
 from opt3dgs_optim.partitions import LIMIT, MEAN_ABS, MEMORY, MovingPartitions
 
 pytestmark = [
@@ -50,13 +49,6 @@ def kernels() -> dict[tuple[int, torch.dtype], HostKernels]:
 def test_free_running_in_float64(kernels: dict, rows: int, size: int) -> None:
     """13 steps on its own state: rounding is 1e-16, its growth over the steps the rest of 1e-10."""
     assert compare_runs(kernels[size, torch.float64], rows, size) < 1e-10
-
-
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("rows", ROWS)
-def test_recursion_alone(kernels: dict, rows: int, size: int) -> None:
-    """Pairs of condition up to 1e3: rounding of ten updates."""
-    assert compare_two_loops(kernels[size, torch.float64], rows, size) < 1e-10
 
 
 @pytest.mark.parametrize(
@@ -187,7 +179,6 @@ def _write_input(path: Path, rows: int, size: int) -> list[Tensor]:
         parts += [x, grad, reset]
         history[reset.bool()] = 0
         expected.append(lqn_direction(x, grad, history, size, **OPTIONS)[0])  # pyright: ignore
-        expected.append(two_loop(x, history, size))
     learnt = _add_energies(parts)
     torch.cat([part.flatten() for part in parts]).numpy().tofile(path)
     return [*expected, learnt]

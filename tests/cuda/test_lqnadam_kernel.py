@@ -34,8 +34,8 @@ def on_the_host(patch: pytest.MonkeyPatch) -> Callable[..., LQNAdam]:
 
     patch.setattr(cuda, "lqn_direction", kernel)
     for name, module in list(sys.modules.items()):
-        if name.startswith("opt3dgs_optim.") and hasattr(module, "uses_kernel"):
-            patch.setattr(module, "uses_kernel", lambda *_: True)
+        if name.startswith("opt3dgs_optim.") and hasattr(module, "obstacle"):
+            patch.setattr(module, "obstacle", lambda *_: None)
     return partial(LQNAdam, backend="cuda")
 
 

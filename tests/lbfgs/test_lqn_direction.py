@@ -15,11 +15,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import opt3dgs_optim
 from opt3dgs_optim import cuda
-from opt3dgs_optim.backend import uses_kernel
+from opt3dgs_optim.backend import obstacle
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
 from opt3dgs_optim.lbfgs import pairs as columns_of
-from opt3dgs_optim.lbfgs.foresight import foresight
 from opt3dgs_optim.lbfgs.history import header, laid_out
+from opt3dgs_optim.parts.curvature import foresight
 
 # inductor imports parts of torch that torch itself has deprecated
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
@@ -162,7 +162,8 @@ def test_the_kernel_is_for_three_coordinates() -> None:
 def test_the_kernel_gets_what_it_can_read(spoiled: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """It reads by the gradient's dtype and shape: another one would be read beyond its end."""
     monkeypatch.setattr("opt3dgs_optim.backend.cuda.missing", lambda: None)
-    monkeypatch.setattr("opt3dgs_optim.backend._obstacle", lambda *_: None)
+    module = sys.modules["opt3dgs_optim.lbfgs.two_loop"]  # the package has a function of that name
+    monkeypatch.setattr(module, "obstacle", lambda *_: None)
     called = []
     monkeypatch.setattr(cuda, "launch", lambda *given, **_: called.append(given))
     x, grad, history = points(7, torch.float64)
@@ -179,22 +180,9 @@ def test_the_kernel_gets_what_it_can_read(spoiled: str, monkeypatch: pytest.Monk
 
 def test_more_pairs_than_a_thread_holds_are_torchs() -> None:
     gpu = torch.device("cuda")
-    assert not uses_kernel("auto", gpu, torch.float32, 3, 6)
+    assert obstacle("auto", gpu, torch.float32, 3, 6)
     with pytest.raises(RuntimeError, match="no kernel for 6 pairs of points of 3 coordinates"):
-        uses_kernel("cuda", gpu, torch.float32, 3, 6)
-
-
-def test_two_loop_is_the_kernels_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, grad, history = points(7)
-    asked = []
-    module = sys.modules["opt3dgs_optim.lbfgs.two_loop"]
-    monkeypatch.setattr(module, "uses_kernel", lambda *given: asked.append(given) or given[3] == 3)
-    monkeypatch.setattr(cuda, "two_loop", lambda *given: given)
-    assert two_loop(grad, history, 5) == (grad, history, 5)
-    assert asked == [("auto", grad.device, grad.dtype, 3, 5)]
-    flat, _, other = points(7, dim=2)
-    assert two_loop(flat, other, 5).shape == (7, 2)
-    assert two_loop(grad.double(), history, 5).dtype == torch.float64  # not the history's
+        obstacle("cuda", gpu, torch.float32, 3, 6)
 
 
 def test_the_kernel_where_there_is_none() -> None:

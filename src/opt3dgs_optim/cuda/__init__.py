@@ -16,11 +16,7 @@ from torch import Tensor
 
 BLOCK = 128  # threads; the .cu files promise it to the compiler
 HEADER = "two_loop.cuh"
-KERNELS = {  # the kernel: its file
-    "lqn_direction": "lqn.cu",
-    "two_loop": "lqn.cu",
-    "take_energy": "histogram.cu",
-}
+KERNELS = {"lqn_direction": "lqn.cu", "take_energy": "histogram.cu"}  # the kernel: its file
 
 
 def source(name: str) -> str:
@@ -141,15 +137,6 @@ def lqn_direction(
     if cells is not history:  # laid out for torch, e.g. loaded from a checkpoint of a CPU run
         history.copy_(cells)
     return fed, accepted, candidates
-
-
-def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
-    """`lbfgs.two_loop` on the GPU, for points of three coordinates. Never synchronises."""
-    rows = grad.shape[0]
-    result = torch.empty_like(grad, memory_format=torch.contiguous_format)
-    tensors = (grad.contiguous(), history.contiguous(), result)
-    launch("two_loop", grad, rows, *tensors, np.int64(rows), history_size=history_size)
-    return result
 
 
 def take_energy(

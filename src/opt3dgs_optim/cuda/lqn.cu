@@ -1,6 +1,5 @@
-// Per-point L-BFGS: the step (store the new pair, then the direction), and the recursion alone.
-// One thread per point. Compiled by NVRTC for one history size, -D HISTORY_SIZE=K; `two_loop.cuh`
-// goes in front.
+// Per-point L-BFGS: store the new pair, then the direction. One thread per point. Compiled by NVRTC
+// for one history size, -D HISTORY_SIZE=K; `two_loop.cuh` goes in front.
 #if !defined(HISTORY_SIZE) || HISTORY_SIZE > 5
 #error "HISTORY_SIZE, the number of pairs, must be 1 to 5: more do not fit into registers"
 #endif
@@ -20,11 +19,4 @@ extern "C" __global__ void __launch_bounds__(128, 1)
   write_row(directions, row, fed);
   accepted[row] = flags.accepted;
   candidates[row] = flags.candidate;
-}
-
-extern "C" __global__ void __launch_bounds__(128, 1)
-    two_loop(const Real* __restrict__ grads, Real* histories, Real* __restrict__ results, long long rows) {
-  const long long row = static_cast<long long>(blockIdx.x) * blockDim.x + threadIdx.x;
-  if (row >= rows) return;
-  write_row(results, row, two_loop_point<HISTORY_SIZE>(read_row(grads, row), histories + LANES * row));
 }

@@ -199,10 +199,3 @@ POINT Flags lqn_point(Vec3<T> position, Vec3<T> grad, T* row, T min_cosine, bool
   if (descent && finite(r)) *fed = r;
   return {accepted, candidate};
 }
-
-// H g of one point; its gradient where it has no pair.
-template <int K, typename T> POINT Vec3<T> two_loop_point(Vec3<T> grad, T* row) {
-  const T scale = largest(grad);
-  if (scale == T(0)) return grad;
-  return times(recursion(over(grad, scale), History<T, K>(row)), scale);
-}

@@ -95,6 +95,31 @@ def push(history: Tensor, history_size: int, pair: Pair, accept: Tensor) -> None
     overwrite(accept, (pairs[1:], pairs[:-1]), (first[0], pair.s), (first[1], pair.y))
 
 
+def take_pairs(
+    history: Tensor,
+    head: Header,
+    history_size: int,
+    position: Tensor,
+    gradient: Tensor,
+    visible: Tensor,
+    min_cosine: float,
+) -> tuple[Tensor, Tensor]:
+    """Accept a pair between two consecutive *visible* steps of each point; update the header.
+
+    History and `head`, the views of its header, are changed in place; position and gradient are
+    [D, N] before the step. Returns (accepted, candidates), [N] bool each.
+    """
+    last_position, last_gradient, counter = head.position.T, head.gradient.T, head.counter
+    pair = normalised_pair(position - last_position, gradient - last_gradient)
+    candidates = visible & (counter > 0)
+    accepted = candidates & (pair.cosine > min_cosine)  # false where the pair is not finite
+    push(history, history_size, pair, accepted)
+    overwrite(visible, (last_position, position), (last_gradient, gradient))
+    count = counter.maximum(visible.to(history.dtype)) + accepted
+    counter.copy_(count.clamp(max=history_size + 1))
+    return accepted, candidates
+
+
 def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:
     """A history for `two_loop(grad, history, K)` of K given pairs per point, oldest first.
 

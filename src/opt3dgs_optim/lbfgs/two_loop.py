@@ -4,18 +4,9 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim import cuda
-from opt3dgs_optim.backend import uses_kernel
-from opt3dgs_optim.lbfgs.history import Header, check_history, header, push, stored_pairs
-from opt3dgs_optim.lbfgs.pairs import (
-    columns,
-    dot,
-    largest,
-    length,
-    normalised_pair,
-    overwrite,
-    put,
-    row_chunks,
-)
+from opt3dgs_optim.backend import obstacle
+from opt3dgs_optim.lbfgs.history import Header, check_history, header, stored_pairs, take_pairs
+from opt3dgs_optim.lbfgs.pairs import columns, dot, largest, length, put, row_chunks
 
 
 def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
@@ -43,10 +34,6 @@ def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
         ValueError: the shapes do not fit.
     """
     check_history("two_loop", grad, history, history_size)
-    same = history.dtype == grad.dtype and history.device == grad.device
-    like = grad.device, grad.dtype, grad.shape[1], history_size
-    if same and uses_kernel("auto", *like):
-        return cuda.two_loop(grad, history, history_size)
     result = torch.empty_like(grad)
     for rows in row_chunks(grad):
         g = columns(grad[rows], history.dtype)
@@ -118,7 +105,7 @@ def lqn_direction(
     """
     check_history("lqn_direction", grad, history, history_size)
     like = grad.device, grad.dtype, grad.shape[1], history_size
-    if (grad.is_cuda or backend == "cuda") and uses_kernel(backend, *like):
+    if (grad.is_cuda or backend == "cuda") and obstacle(backend, *like) is None:
         return cuda.lqn_direction(position, grad, history, history_size, min_cosine, graft)
     fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
     accepted = torch.empty(grad.shape[0], dtype=torch.bool, device=grad.device)
@@ -133,31 +120,6 @@ def lqn_direction(
         accepted[rows], candidates[rows] = taken
         put(fed[rows], direction(g, size, part, head, history_size, graft))
     return fed, accepted, candidates
-
-
-def take_pairs(
-    history: Tensor,
-    head: Header,
-    history_size: int,
-    position: Tensor,
-    gradient: Tensor,
-    visible: Tensor,
-    min_cosine: float,
-) -> tuple[Tensor, Tensor]:
-    """Accept a pair between two consecutive *visible* steps of each point; update the header.
-
-    History and `head`, the views of its header, are changed in place; position and gradient are
-    [D, N] before the step. Returns (accepted, candidates), [N] bool each.
-    """
-    last_position, last_gradient, counter = head.position.T, head.gradient.T, head.counter
-    pair = normalised_pair(position - last_position, gradient - last_gradient)
-    candidates = visible & (counter > 0)
-    accepted = candidates & (pair.cosine > min_cosine)  # false where the pair is not finite
-    push(history, history_size, pair, accepted)
-    overwrite(visible, (last_position, position), (last_gradient, gradient))
-    count = counter.maximum(visible.to(history.dtype)) + accepted
-    counter.copy_(count.clamp(max=history_size + 1))
-    return accepted, candidates
 
 
 def direction(

@@ -6,12 +6,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.backend import BACKENDS, Backend, uses_kernel
+from opt3dgs_optim.backend import BACKENDS, Backend, obstacle
 from opt3dgs_optim.checks import check_choice, check_count, check_flag, check_number
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.lbfgs.foresight import foresight
-from opt3dgs_optim.lbfgs.history import MAX_HISTORY, history_shape, laid_out, new_history
-from opt3dgs_optim.lbfgs.two_loop import lqn_direction
+from opt3dgs_optim.lbfgs.history import MAX_HISTORY, header, history_shape, laid_out, new_history
+from opt3dgs_optim.lbfgs.pairs import columns, dot, length, row_chunks
+from opt3dgs_optim.lbfgs.two_loop import lqn_direction, two_loop
 from opt3dgs_optim.names import check_names
 from opt3dgs_optim.part import Group, Part, Phase
 
@@ -94,20 +94,18 @@ class Curvature(Part):
         if isinstance(course.valid, Tensor):  # a gradient of zero leaves no pair
             gradient = torch.where(course.valid, gradient, 0.0)
         history = self._history(state, position)
-        if course.adaptive and course.num_observed % PROBE_STEPS == 0:
-            foretold = foresight(history, self.history_size, position, gradient)
-            self._seen = self._seen.to(foretold.device)
-            self._seen[2:] += foretold
-            self._probes += 1
+        if course.adaptive:
+            self._seen = self._seen.to(grad.device)
+            if course.num_observed % PROBE_STEPS == 0:
+                self._seen[2:] += foresight(history, self.history_size, position, gradient)
+                self._probes += 1
+        given = position, gradient, history, self.history_size
         options = {"min_cosine": self.min_cosine, "graft": self.graft, "backend": self.backend}
-        fed, accepted, candidates = lqn_direction(
-            position, gradient, history, self.history_size, **options
-        )
+        fed, accepted, candidates = lqn_direction(*given, **options)
         tally = torch.stack([accepted.count_nonzero(), candidates.count_nonzero()])
         self._tally = tally if course.steps != self._step else self._tally + tally
         self._step = course.steps
         if course.adaptive:
-            self._seen = self._seen.to(tally.device)
             self._seen[:2] += tally
         return fed.reshape(grad.shape)
 
@@ -115,7 +113,7 @@ class Curvature(Part):
         shape = history_shape(position, self.history_size)
         like = position.device, position.dtype, position.shape[1], self.history_size
         asked = position.is_cuda or self.backend == "cuda"
-        kernel = asked and uses_kernel(self.backend, *like)
+        kernel = asked and obstacle(self.backend, *like) is None
         if HISTORY not in state or tuple(state[HISTORY].shape) != shape:
             state.pop(HISTORY, None)  # before the new one, or both would be in memory
             state[HISTORY] = new_history(position, self.history_size, contiguous=kernel)
@@ -153,3 +151,42 @@ class Curvature(Part):
                 f"gradient does (threshold {MIN_FORESIGHT}; accepted share {share:.2f})"
             )
         return None
+
+
+def foresight(history: Tensor, history_size: int, position: Tensor, gradient: Tensor) -> Tensor:
+    """How much better the stored pairs foretell the pair that comes next than gamma I would.
+
+    A pair (s, y) that a curvature matrix describes has H y = s. The pairs know something about a
+    point if H y, with H from the pairs before this one, is closer to the direction of s than y
+    itself is: cos(H y, s) - cos(y, s). Where y is mostly the difference between two views, or
+    where the curvature is the same in all directions, it is 0: then Adam fed with the gradient
+    does as well.
+
+    Args:
+        history: [N, slots, 2 (D + 1)] before the new pair is stored.
+        history_size: K.
+        position, gradient: [N, D] of this step; a point counts where its gradient is finite and
+            not 0.
+
+    Returns:
+        [2] float64 (float32 on MPS): sum of that difference over the points that hold a pair,
+        and their number.
+    """
+    widest = torch.float32 if history.device.type == "mps" else torch.float64
+    total = torch.zeros(2, dtype=widest, device=history.device)
+    for rows in row_chunks(gradient):
+        head = header(history[rows], history_size)
+        s = position[rows].to(history.dtype) - head.position
+        y = gradient[rows].to(history.dtype) - head.gradient
+        foretold = two_loop(y, history[rows], history_size)
+        vectors = (s, y, foretold, gradient[rows])
+        s, y, foretold, g = (columns(each, history.dtype) for each in vectors)
+        gain = _cosine(foretold, s) - _cosine(y, s)
+        known = torch.isfinite(g).all(0) & (g != 0).any(0) & (head.counter > 1)
+        known &= torch.isfinite(gain) & (s != 0).any(0) & (y != 0).any(0)
+        total += torch.stack([torch.where(known, gain, 0.0).sum(), known.sum().to(gain.dtype)])
+    return total
+
+
+def _cosine(a: Tensor, b: Tensor) -> Tensor:
+    return dot(a / length(a), b / length(b))

@@ -1,6 +1,7 @@
 """Langevin noise: covariance-shaped for Gaussians, isotropic for anything else."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -99,6 +100,7 @@ class PositionNoise(Part):
         means += noise * (rate * self.scale)
 
 
+@dataclass(frozen=True, repr=False, eq=False)
 class IsotropicNoise(Part):
     """Langevin noise of a landscape: `sqrt(2 lr temperature)`, or a fixed deviation, times eta.
 
@@ -112,26 +114,18 @@ class IsotropicNoise(Part):
         ValueError: not exactly one of temperature and std, or it is below 0.
     """
 
+    temperature: float | None = None
+    std: float | None = None
+    generator: torch.Generator | None = None
+
     names = None
 
-    def __init__(
-        self,
-        temperature: float | None = None,
-        std: float | None = None,
-        generator: torch.Generator | None = None,
-    ) -> None:
-        if (temperature is None) == (std is None):
-            raise ValueError(
-                f"IsotropicNoise: temperature={temperature!r} and std={std!r}, but exactly one of "
-                "the two is needed"
-            )
-        name = "std" if temperature is None else "temperature"
-        check_number("IsotropicNoise", name, std if temperature is None else temperature, 0.0)
-        self.temperature, self.std, self.generator = temperature, std, generator
-
-    def __repr__(self) -> str:
-        size = f"std={self.std:g}" if self.std is not None else f"temperature={self.temperature:g}"
-        return f"IsotropicNoise({size})"
+    def __post_init__(self) -> None:
+        if (self.temperature is None) == (self.std is None):
+            given = f"temperature={self.temperature!r} and std={self.std!r}"
+            raise ValueError(f"IsotropicNoise: {given}, but exactly one of the two is needed")
+        name = "std" if self.temperature is None else "temperature"
+        check_number("IsotropicNoise", name, getattr(self, name), 0.0)
 
     def after(self, group: Group, param: Tensor, state: dict[str, Any], course: Course) -> None:
         """Add the noise to the parameter (any shape) in place."""

@@ -15,7 +15,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from datetime import datetime, timezone
 from enum import Enum
 from pathlib import Path
@@ -39,7 +39,7 @@ class _Pending(NamedTuple):
     ready: Any = None  # torch.cuda.Event, recorded after the copy into `host`
 
 
-class RunLog:
+class RunLog(AbstractContextManager["RunLog"]):
     """Append the course of one training run to the JSON-lines file `path`.
 
     A killed process loses at most the line it was writing and, on a GPU, the few step lines whose
@@ -179,9 +179,6 @@ class RunLog:
             self._drain(wait=True)
         finally:
             self._file.close()
-
-    def __enter__(self) -> RunLog:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
