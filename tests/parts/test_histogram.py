@@ -337,6 +337,47 @@ def test_a_constant_other_than_one_stays() -> None:
     assert histogram.useless(seen.tolist(), course) is None
 
 
+@pytest.mark.parametrize(
+    ("evidence", "useless"),
+    [
+        ((1_000.0, 1.0, 0.0, 0.0), True),
+        ((999.0, 1.0, 0.0, 0.0), False),  # a thirtieth of 30,000
+        ((1_000.0, 1.0, 0.0, 0.5), True),
+        ((1_000.0, 1.0, 0.0, 0.51), False),  # most of Theta lies above the range
+        ((1_000.0, 1.09, 0.09, 0.0), True),
+        ((1_000.0, 1.09, 0.11, 0.0), False),
+        ((1_000.0, 0.89, 0.0, 0.0), False),
+    ],
+    ids=str,
+)
+def test_where_nu_does_nothing(evidence: tuple[float, ...], useless: bool) -> None:
+    """By count, mean and deviation of nu, and Theta's share in the open partition at the top."""
+    count, mean, deviation, above = evidence
+    sums = [count, count * mean, count * (mean * mean + deviation * deviation), above]
+    said = EnergyHistogram().useless(sums, Course([], total_steps=30_000))
+    assert (said is not None) == useless
+
+
+def test_before_anything_is_known() -> None:
+    histogram = EnergyHistogram()
+    assert (histogram.warmup, histogram.last_finite) == (250, True)
+    assert (float(histogram.mean_multiplier), float(histogram.multiplier_std)) == (1.0, 0.0)
+    histogram.observe(math.nan)
+    assert (histogram.factor({}), histogram.last_finite) == (1.0, False)
+
+
+def test_mean_and_deviation_of_few_and_of_equal_numbers() -> None:
+    histogram = having(uneven(), temperature=0.05)
+    nu = float(histogram.observe(0.3))
+    assert nu != 1.0
+    assert float(histogram.mean_multiplier) == pytest.approx(nu)
+    deviations = []
+    for equal in np.linspace(0.9, 1.1, 21):  # rounding leaves variances just below zero, too
+        histogram._sums = [sum([equal**power] * 10) for power in range(3)]
+        deviations.append(float(histogram.multiplier_std))
+    assert deviations == pytest.approx([0.0] * 21, abs=1e-7)
+
+
 # -- state -----------------------------------------------------------------------------------------
 
 BOTH = pytest.mark.parametrize("options", [{"warmup": 50}, FIXED], ids=["moving", "fixed"])
@@ -402,6 +443,18 @@ def test_what_has_been_learnt_moves_to_where_the_energy_is(options: dict[str, An
         there = value.as_subclass(Elsewhere) if k in (0, 10, 60, 61) else value
         assert float(here.observe(value)) == float(moved.observe(there))
     assert here.state_dict() == moved.state_dict()
+
+
+@BOTH
+def test_on_a_device_all_state_is_there(options: dict[str, Any]) -> None:
+    histogram = EnergyHistogram(**options)
+    nus_of(histogram, stream(10))
+    nu = histogram.observe(torch.empty((), device="meta"))  # a device without memory
+    state = (nu, histogram.multiplier, histogram.weights, histogram._sums)
+    assert {each.device.type for each in state} == {"meta"}
+    assert histogram._sums.shape == (3,)
+    assert histogram.factor({}) is histogram.multiplier
+    assert (histogram.num_observed, histogram._taken) == (11, 11)
 
 
 # -- options ---------------------------------------------------------------------------------------
