@@ -55,7 +55,6 @@ TARGETS = {
     "lbfgs/two_loop.py": CURVATURE,
     "lbfgs/pairs.py": CURVATURE,
     "lbfgs/history.py": CURVATURE,
-    "parts/curvature.py": [*CURVATURE, "parts/test_curvature.py"],
     "parts/noise.py": [
         "parts/test_noise.py",
         "parts/test_noise_covariance.py",

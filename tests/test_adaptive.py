@@ -42,7 +42,7 @@ def test_a_useless_part_alone_is_switched_off(part: str, layout: str) -> None:
     training = Training(USELESS[part], layout).run(TOTAL)
     assert set(training.phases.switched_off) == {part}
     assert len(training.phases.switched_off[part]) > 20  # a sentence
-    acting = [type(each).__name__ for each in training.phases.hooks("before")]
+    acting = [type(each).__name__ for each in training.phases.hooks["before"]]
     assert part not in acting
     assert len(acting) == 1
 
@@ -81,7 +81,7 @@ def test_noise_comes_back_with_the_first_transparent_point() -> None:
     assert training.phases.switched_off
     training.run(60)
     assert training.phases.switched_off == {}
-    assert training.noise in training.phases.hooks("after")
+    assert training.noise in training.phases.hooks["after"]
 
 
 # -- what a stranger's part has to say ------------------------------------------------------------
@@ -106,7 +106,7 @@ class Judged(Part):
 
 
 def factors(phases: PhaseScheduler) -> list[Any]:
-    return [part.factor({}, phases) for part in phases.hooks("factor")]
+    return [part.factor({}, phases) for part in phases.hooks["factor"]]
 
 
 def test_a_part_of_ones_own_is_switched_off_and_on() -> None:

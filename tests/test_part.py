@@ -168,7 +168,7 @@ def test_an_adaptive_training_switches_it_off() -> None:
         optimizers["means"].step()
     assert phases.switched_off == {"SignAgreement": "all agree"}
     assert "SignAgreement(): switched off, all agree" in repr(phases)
-    assert phases.hooks("before") == []
+    assert phases.hooks["before"] == []
     assert phases.numbers() == {}
 
 
@@ -239,7 +239,7 @@ def test_a_hook_that_is_not_overridden_is_never_called() -> None:
 
     phases = only(TOTAL, Quiet())
     for hook in ("observe", "pixel_loss", "factor", "before", "after"):
-        assert phases.hooks(hook) == []
+        assert phases.hooks[hook] == []
 
 
 # -- pooling: one short file, and nobody knows its name ------------------------------------------

@@ -56,11 +56,11 @@ class Course:
     def _plan(self) -> None:
         """Which parts have which hooks in which phase; a hook that nobody has is never called."""
         on = [part for name, part in self.named().items() if name not in self.switched_off]
-        self._hooks: dict[tuple[Phase | None, str], list[Part]] = {}
+        self._hooks: dict[Phase | None, dict[str, list[Part]]] = {}
         for phase in (None, *Phase):
             acting = [part for part in on if phase is None or part.during in (None, phase)]
-            for hook in HOOKS:
-                self._hooks[phase, hook] = [part for part in acting if overrides(part, hook)]
+            having = {hook: [part for part in acting if overrides(part, hook)] for hook in HOOKS}
+            self._hooks[phase] = having
         self.keys = tuple({key: None for part in self.parts for key in part.keys})
 
     @property
@@ -90,9 +90,10 @@ class Course:
             return None
         return Phase.EXPLOITATION if iteration >= self.switch_step else Phase.EXPLORATION
 
-    def hooks(self, name: str) -> list[Part]:
-        """The parts that have this hook and act in the step that comes next."""
-        return self._hooks[self.phase_of(self.current), name]
+    @property
+    def hooks(self) -> dict[str, list[Part]]:
+        """The parts that act in the step that comes next, by the hooks that they have."""
+        return self._hooks[self.phase_of(self.current)]
 
     def part(self, kind: type[P]) -> P | None:
         """The first part of a class, or None."""
@@ -112,7 +113,7 @@ class Course:
         self.num_observed += 1
         is_finite = math.isfinite if energy.device.type == "cpu" else torch.isfinite
         self.valid = is_finite(energy)
-        for part in self.hooks("observe"):
+        for part in self.hooks["observe"]:
             part.observe(energy, self.valid, self)
 
     def stepping(self, closure_value: Any) -> bool:
@@ -132,7 +133,7 @@ class Course:
     def numbers(self) -> dict[str, float | Tensor]:
         """What the parts that act say of themselves: columns of the run log."""
         columns: dict[str, float | Tensor] = {}
-        for part in self.hooks("numbers"):
+        for part in self.hooks["numbers"]:
             columns.update(part.numbers(self))
         return columns
 

@@ -187,7 +187,7 @@ class PhaseScheduler(Course):
 
     def pixel_part(self) -> Part | None:
         """The part whose photometric term holds for the iteration whose loss comes next."""
-        parts = self._hooks[self.phase, "pixel_loss"]
+        parts = self._hooks[self.phase]["pixel_loss"]
         return parts[-1] if parts else None
 
     def stepping(self, closure_value: Any) -> bool:

@@ -115,8 +115,8 @@ class StepAdam(Adam):
 
     def _step(self, mask: Tensor | None, acting: bool) -> None:
         """Lend the base's step what the parts say, if they act, and take it back."""
-        course, moved = self.course, []
-        hooks = [course.hooks(name) if acting else [] for name in ("before", "factor", "after")]
+        course, moved, of = self.course, [], self.course.hooks
+        hooks = [of[name] if acting else [] for name in ("before", "factor", "after")]
         if mask is not None:
             self._check_mask(mask)
         with Lent() as lent:

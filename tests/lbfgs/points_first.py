@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from opt3dgs_optim.lbfgs.history import header, stored_pairs
+from opt3dgs_optim.lbfgs.history import header, stored_pairs, take_pairs
 from opt3dgs_optim.lbfgs.pairs import columns, dot, largest
 from opt3dgs_optim.lbfgs.two_loop import direction as direction_of_columns
-from opt3dgs_optim.lbfgs.two_loop import take_pairs
 
 
 def record(

@@ -8,7 +8,7 @@ import torch
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history
 from opt3dgs_optim.lbfgs import pairs as columns_of
 from opt3dgs_optim.lbfgs.history import header
-from opt3dgs_optim.parts.curvature import foresight
+from opt3dgs_optim.lbfgs.two_loop import foresight
 
 POINTS, VIEWS, STEPS = 300, 30, 150
 MIN_FORESIGHT = 0.1  # below it, `adaptive` leaves the curvature out

@@ -19,7 +19,7 @@ from opt3dgs_optim.backend import obstacle
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
 from opt3dgs_optim.lbfgs import pairs as columns_of
 from opt3dgs_optim.lbfgs.history import header, laid_out
-from opt3dgs_optim.parts.curvature import foresight
+from opt3dgs_optim.lbfgs.two_loop import foresight
 
 # inductor imports parts of torch that torch itself has deprecated
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")

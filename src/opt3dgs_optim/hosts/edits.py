@@ -94,8 +94,7 @@ def write(path: Path) -> Path:
     backup = path.with_name(path.name + ".orig")
     if backup.exists():
         raise ValueError(f"its backup {backup} exists already; remove it or move it away")
-    new = diff(path).new
-    old = path.read_bytes()
+    new, old = diff(path).new, path.read_bytes()
     try:
         with path.open("r+b") as file:  # before there is a backup: can it be written at all?
             backup.write_bytes(old)

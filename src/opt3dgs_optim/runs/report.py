@@ -16,9 +16,7 @@ from opt3dgs_optim.runs.lines import Run, read_run
 from opt3dgs_optim.runs.plot import draw, printable
 from opt3dgs_optim.runs.stats import Comparison, Stat, compare
 
-NO_PICTURE = (
-    "report: no picture, since matplotlib is not installed: pip install 'opt3dgs_optim[report]'"
-)
+NO_PICTURE = "report: no picture without matplotlib: pip install 'opt3dgs_optim[report]'"
 READING = (
     "Mean ± sample standard deviation over the seeds; (k of n) where not all n runs have the "
     "value. *seconds to baseline*: until the arm first reaches the baseline's mean final value. "
