@@ -1,4 +1,4 @@
-"""The two-loop recursion on the pairs of every point, one step of it for Adam, and what it knows."""
+"""The two-loop recursion on the pairs of every point, one step of it for Adam, and its worth."""
 
 import torch
 from torch import Tensor
