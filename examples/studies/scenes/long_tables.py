@@ -21,6 +21,7 @@ MIN_PAIRS = 3  # of scene and seed, for a spread that means something
 class Difference:
     """An arm less its control, training by training: the same scene, seed and held-out views.
 
+    A multiplier and a constant of its mean are compared where the arm's exploitation begins.
     Equal seconds are equal costs: of an iteration's cost, measured in turns (`costs.py`), since
     the trainings' own clocks ran at different hours beside different work. An arm whose
     iterations cost 5 % more is looked at after 1/1.05 of them. Where the cost was not measured it
@@ -36,12 +37,20 @@ class Difference:
         """Pairs of trainings."""
         return sum(map(len, self.pairs.values()))
 
+    @property
+    def until(self) -> float:
+        """The share of the run after which they are compared."""
+        arm, control = STUDY_ARMS[self.arm], STUDY_ARMS[self.control]
+        return arm.switch if control.needs == self.arm else 1.0
+
     def of(self, metric: str) -> tuple[float, float]:
         """Gain at equal seconds: mean over the scenes, and its standard error over all pairs.
 
         `metric` is a key of `METRICS`; (nan, nan) without any pair.
         """
-        by_scene = [[_gain(*pair, metric) for pair in pairs] for pairs in self.pairs.values()]
+        by_scene = [
+            [_gain(*pair, metric, self.until) for pair in pairs] for pairs in self.pairs.values()
+        ]
         every = [value for values in by_scene for value in values]
         if not every:
             return float("nan"), float("nan")
@@ -69,8 +78,8 @@ class Difference:
         return "pays" if better else "no difference"
 
 
-def _gain(arm: Record, control: Record, cost: float, metric: str) -> float:
-    total = arm.setting.iterations
+def _gain(arm: Record, control: Record, cost: float, metric: str, until: float) -> float:
+    total = until * arm.setting.iterations
     ours = arm.at_iteration(total * min(1.0, 1.0 / cost), metric)
     return ours - control.at_iteration(total * min(1.0, cost), metric)
 

@@ -66,7 +66,8 @@ FRONT = (  # what it is, arm, control
     ("L-BFGS against the same last phase without", "l2+reset+lqn@1/30", "l2+reset@1/30"),
 )
 PAPER = (  # what the pages say of the paper's parts: what, arm, control
-    ("AW-SGLD (less a constant of its mean)", STABLE, f"{STABLE}-constant"),
+    ("AW-SGLD that follows the energy, less a constant of its mean", STABLE, f"{STABLE}-constant"),
+    ("AW-SGLD with the paper's settings, less a constant of its mean", "paper", "paper-constant"),
     ("L2 in the last thirtieth", "l2@1/30", BASELINE),
     ("fresh moments there", "l1+reset@1/30", BASELINE),
     ("L-BFGS directions with both", "l2+reset+lqn@1/30", "l2+reset@1/30"),
