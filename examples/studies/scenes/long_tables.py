@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean, stdev
 
+import numpy as np
+
 from studies.scenes.analysis import Study
 from studies.scenes.arms import BASELINE, DEFAULTS, STUDY_ARMS, label
 from studies.scenes.records import Record, Setting
@@ -190,6 +192,25 @@ def sizes_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) 
         what = f"{_crowd(setting)}, {setting.iterations:,}"
         lines.append(f"| {setting.scene} | {what} | {' | '.join(map(_cell, found))} |")
     return "\n".join(lines)
+
+
+def falls_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) -> str:
+    """How far the training PSNR was below its best before, at most, over evaluations and seeds."""
+    lines = [
+        f"| scene | {' | '.join(f'`{label(arm)}`' for arm in arms)} |",
+        f"|---|{'---:|' * len(arms)}",
+    ]
+    for setting in settings:
+        found = [[_fall(r) for r in study.runs(setting, arm).values()] for arm in arms]
+        if any(found[1:]):
+            cells = [f"{max(falls):.2f}" if falls else "-" for falls in found]
+            lines.append(f"| {setting.scene} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _fall(record: Record) -> float:
+    psnr = record.curve["train_psnr"]
+    return float((np.maximum.accumulate(psnr) - psnr).max())
 
 
 def reach_table(study: Study, long: Sequence[Setting], arms: Sequence[str], short: int) -> str:

@@ -40,6 +40,7 @@ from studies.scenes.long_tables import (
     cells_of,
     difference,
     differences_table,
+    falls_table,
     headline_table,
     metrics_table,
     reach_table,
@@ -58,7 +59,10 @@ from studies.scenes.tables import (
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 PAGE = REPOSITORY / "docs" / "evidence.md"
-PAGES = (PAGE, FOLDER / "tables.md", REPOSITORY / "README.md")  # that have tables
+PAGES = (  # that have tables
+    *(PAGE, FOLDER / "tables.md", REPOSITORY / "README.md"),
+    REPOSITORY / "docs" / "algorithms" / "awsgld.md",
+)
 FRONT = (  # what it is, arm, control
     ("annealing of all parameters, and fading", ANNEALED, BASELINE),
     ("the paper's preset, all parts", "paper", BASELINE),
@@ -145,6 +149,8 @@ def rotated_tables(study: Study) -> dict[str, str]:
     for count, settings in ((LONG, long), (BRIEF, brief)):
         made[f"rotated-{count}"] = metrics_table(study, settings, shown)
         made[f"rotated-{count}-gains"] = differences_table(study, settings, shown)
+    nus = (BASELINE, STABLE, f"{STABLE}-constant", "paper", "paper-constant")
+    made["falls"] = falls_table(study, quarter, nus)
     often = [s for s in study.all_settings() if s.rotated and not s.tiled and not s.views]
     made["often"] = sizes_table(study, often, OFTEN_ARMS)
     made["explorations"] = differences_table(study, brief, (STABLE, *names("explorations")))
