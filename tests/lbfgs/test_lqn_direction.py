@@ -151,7 +151,7 @@ def test_python_calls(dim: int) -> None:
 # -- which backend runs ----------------------------------------------------------------------------
 
 
-def test_the_kernel_is_for_three_coordinates() -> None:
+def test_cuda_is_for_three_coordinates() -> None:
     with pytest.raises(RuntimeError, match=r"points of 2 coordinates, .* at most 5 of 3"):
         lqn_direction(*points(7, dim=2), 5, min_cosine=0.0, graft=True, backend="cuda")
     with pytest.raises(RuntimeError, match=r"asked for on cpu in torch\.float32"):
@@ -159,7 +159,7 @@ def test_the_kernel_is_for_three_coordinates() -> None:
 
 
 @pytest.mark.parametrize("spoiled", ["position", "history", "shape"])
-def test_the_kernel_gets_what_it_can_read(spoiled: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cuda_gets_what_it_can_read(spoiled: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """It reads by the gradient's dtype and shape: another one would be read beyond its end."""
     monkeypatch.setattr("opt3dgs_optim.backend.cuda.missing", lambda: None)
     module = sys.modules["opt3dgs_optim.lbfgs.two_loop"]  # the package has a function of that name
@@ -185,7 +185,26 @@ def test_more_pairs_than_a_thread_holds_are_torchs() -> None:
         obstacle("cuda", gpu, torch.float32, 3, 6)
 
 
-def test_the_kernel_where_there_is_none() -> None:
+class There(Tensor):
+    """On a GPU, as far as it says."""
+
+    is_cuda = True  # pyright: ignore[reportAssignmentType]
+
+
+def test_points_on_a_gpu_are_one_launch(monkeypatch: pytest.MonkeyPatch) -> None:
+    x, grad, history = points(7)
+    module = sys.modules["opt3dgs_optim.lbfgs.two_loop"]
+    asked: list[Any] = []
+    monkeypatch.setattr(module, "obstacle", lambda *given: asked.append(given))
+    monkeypatch.setattr(cuda, "lqn_direction", lambda *_: "launched")
+    options = {"min_cosine": 0.0, "graft": True}
+    assert lqn_direction(x, grad.as_subclass(There), history, 5, **options) == "launched"
+    assert asked == [("auto", grad.device, grad.dtype, 3, 5)]
+    assert lqn_direction(x, grad, history, 5, **options) != "launched"
+    assert len(asked) == 1  # nobody asks for points on a host
+
+
+def test_cuda_where_there_is_none() -> None:
     x, grad, history = points(5)
     with pytest.raises(RuntimeError, match="backend='cuda' was asked for"):
         lqn_direction(x, grad, history, 5, min_cosine=1e-6, graft=True, backend="cuda")
