@@ -81,17 +81,22 @@ def test_exact_pairs_foretell_exactly() -> None:
 
 
 def test_points_without_a_pair_or_a_gradient_do_not_count() -> None:
-    pairs = torch.randn(2, 6, 3, generator=torch.Generator().manual_seed(2))
+    pairs = torch.randn(2, 10, 3, generator=torch.Generator().manual_seed(2))
     history = history_from_pairs(pairs, pairs)
     history[1] = 0.0
     head = header(history, 2)
-    head.gradient.copy_(torch.full((6, 3), -1.0))
-    head.counter[4] = 1.0  # visible once
-    gradient = torch.ones(6, 3)
+    head.gradient.copy_(torch.full((10, 3), -1.0))
+    position, gradient = torch.ones(2, 10, 3).unbind()
     gradient[2] = 0.0
     gradient[3] = torch.nan
-    _, points = foresight(history, 2, torch.ones(6, 3), gradient)
-    assert float(points) == 2
+    head.counter[4] = 1.0  # visible once
+    head.counter[5] = 2.0  # one pair is enough
+    head.position[6] = 1.0  # has not moved
+    head.gradient[7] = 1.0  # has the gradient that it had
+    head.position[8], position[8] = -3e38, 3e38  # has moved beyond float32
+    total, points = foresight(history, 2, position, gradient)
+    assert float(points) == 3
+    assert bool(torch.isfinite(total))
 
 
 def test_rows_are_taken_a_chunk_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
