@@ -54,7 +54,7 @@ class FixedPartitions:
     def take(self, energy: Tensor, valid: Tensor | bool, count: int) -> None:
         """Nu from the present weights, then their update."""
         valid = torch.as_tensor(valid, device=energy.device)
-        value = torch.where(valid, energy.to(self.weights.dtype), 0.0)
+        value = torch.where(valid, energy.to(self.weights.dtype), self._low)
         # J of eq. 13, counted from 0: u[J-1] < energy <= u[J], the end partitions open.
         index = torch.ceil((value - self._low) / self._width) - 1
         index = index.clamp(0, self.num_partitions - 1).long().reshape(1)
@@ -144,11 +144,11 @@ class MovingPartitions:
         rows[0, :m], rows[1, :m] = slope * center, 1.0
         rows[0, m], rows[2, m] = slope * even * MEAN_ABS, -slope * MEAN_ABS
         self._rows = rows.to(**like)
-        self._offsets = torch.tensor([0.0, even, 0.0], **like)
         self._products, self._sums = torch.zeros(m + 1, **like), torch.zeros(3, **like)
+        self._offsets = torch.zeros_like(self._sums)
+        self._offsets[1] = even
         # Mean, mean absolute deviation, mean of the slope, q; and what they are drawn to.
         self._state, self._target = torch.full((2, m + 3), 1.0 / m, **like).unbind()
-        self._state[:3] = torch.tensor([0.0, 1.0, 0.0])
         self.nu = torch.ones((), **like)
         tiny = 1e-150 if dtype.itemsize == 8 else 1e-30
         self._tiny = torch.full((), tiny, **like)
@@ -165,20 +165,19 @@ class MovingPartitions:
 
         `valid` is whether it is finite.
         """
-        limit = LIMIT / MEAN_ABS if count > UNLIMITED else 1 / RESOLUTION
+        limit = LIMIT / MEAN_ABS if count > UNLIMITED else math.inf
         rate = max(1 / count, 1 / MEMORY)
         if obstacle("auto", self._state.device, self._state.dtype) is None:
             numbers = (rate, limit, *self.clamp, *self._constants)
             cuda.take_energy(energy, valid, self._state, self.nu, *numbers)
             return
         known = valid is True
+        value = energy if known else torch.where(valid, energy, self._mean)
         if count == 1:
-            self._mean.copy_(energy if known else torch.where(valid, energy, 0.0))
+            self._mean.copy_(value)
         # t = z / MEAN_ABS: distance from the mean in mean absolute deviations. Where those have
         # vanished, as after a constant loss, they grow again by the second term.
-        distance = torch.sub(energy, self._mean)
-        if not known:
-            distance.nan_to_num_(0.0, 0.0, 0.0)
+        distance = torch.sub(value, self._mean)
         unit = torch.add(self._deviation, distance.abs(), alpha=RESOLUTION)
         t = torch.clamp(torch.div(distance, unit), -limit, limit, out=self._t)
         log_kernel = torch.addcmul(self._log_kernel, self._log_kernel_slope, t)

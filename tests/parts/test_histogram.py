@@ -16,7 +16,7 @@ from oracles import LoopHistogram, MovingHistogram
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from opt3dgs_optim import Course, EnergyHistogram
+from opt3dgs_optim import Course, EnergyHistogram, cuda, partitions
 
 FIXED: dict[str, Any] = {"energy_range": (0.0, 1.0), "temperature": 0.05, "warmup": 0}
 ENERGIES = st.one_of(
@@ -180,6 +180,23 @@ def test_the_default_is_its_loops(energies: list[float], clamp: tuple[float, flo
     low, high = histogram.coordinates[:2]
     assert (high - low) / 12 == pytest.approx(oracle.deviation, rel=1e-9)
     assert (high + low) / 2 == pytest.approx(oracle.mean, rel=1e-9, abs=1e-9 * (high - low))
+
+
+def test_the_default_is_its_loops_when_it_forgets() -> None:
+    """After a hundred energies the oldest weigh less and less."""
+    histogram, oracle = EnergyHistogram(), MovingHistogram(250, (-1.0, 3.0))
+    for energy in stream(400):
+        assert float(histogram.observe(energy)) == pytest.approx(oracle.observe(energy), abs=1e-9)
+
+
+def test_where_a_launch_takes_the_energy_torch_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    histogram, given = EnergyHistogram(), []
+    monkeypatch.setattr(partitions, "obstacle", lambda *_: None)
+    monkeypatch.setattr(cuda, "take_energy", lambda *all: given.append(all))
+    before = histogram.state_dict()
+    histogram.observe(0.5)
+    assert len(given) == 1
+    assert histogram.state_dict()["recent"] == before["recent"]
 
 
 @pytest.mark.parametrize("zeta", [0.25, 0.5, 0.75])
@@ -455,6 +472,8 @@ def test_on_a_device_all_state_is_there(options: dict[str, Any]) -> None:
     assert histogram._sums.shape == (3,)
     assert histogram.factor({}) is histogram.multiplier
     assert (histogram.num_observed, histogram._taken) == (11, 11)
+    if isinstance(histogram._law, partitions.MovingPartitions):
+        assert histogram._law._constants[-1] == 1e-30  # the smallest deviation in float32
 
 
 # -- options ---------------------------------------------------------------------------------------

@@ -209,10 +209,12 @@ def test_a_step_that_only_the_device_may_drop() -> None:
     splats["opacities"].data.fill_(-9.0)
     start = splats["means"].detach().clone()
     ends = []
-    for lr, valid in ((0.01, True), (0.01, torch.tensor(True)), (0.01, torch.tensor(False))):
+    for valid in (True, torch.tensor(True), torch.tensor(False)):
         noise = PositionNoise(splats, 1e4, generator=torch.Generator().manual_seed(5))
         means = start.clone()
-        noise.add_to(means, lr, valid)
+        course = Course()
+        course.valid = valid
+        noise.after({"lr": 0.01}, means, {}, course)
         ends.append(means)
     assert not torch.equal(ends[0], start)
     torch.testing.assert_close(ends[1], ends[0])

@@ -52,7 +52,10 @@ class PositionNoise(Part):
         self.scale = check_number("PositionNoise", "scale", scale, 0.0)
         self.during = during  # pyright: ignore[reportAttributeAccessIssue]
         self.generator = generator
-        self._left = (0, 0)  # where the positions lay after the last step, and how often written
+        self._left = (
+            None,
+            None,
+        )  # where the positions lay after the last step, and how often written
         self._moved = 0
 
     def __repr__(self) -> str:
@@ -77,11 +80,12 @@ class PositionNoise(Part):
 
     def after(self, group: Group, param: Tensor, state: dict[str, Any], course: Course) -> None:
         """Add the noise to the positions [N, 3] in place."""
-        self.add_to(param, group["lr"], course.valid)
+        lr, valid = group["lr"], course.valid
+        self.add_to(param, torch.where(valid, lr, 0.0) if isinstance(valid, Tensor) else lr)
         self._left = (param.data_ptr(), param._version)
 
     @torch.no_grad()
-    def add_to(self, means: Tensor, lr: float | Tensor, valid: Tensor | bool = True) -> None:
+    def add_to(self, means: Tensor, lr: float | Tensor) -> None:
         """Add the noise to `means` [N, 3] in place; lr is their rate. ValueError: see the class."""
         source = self.gaussians() if callable(self.gaussians) else self.gaussians
         missing = [name for name in ("scales", "quats", "opacities") if name not in source]
@@ -95,9 +99,8 @@ class PositionNoise(Part):
                 f"PositionNoise: {len(scales)} scales for {len(means)} means; the dict must hold "
                 "the tensors that belong to the means being stepped"
             )
-        rate = torch.where(valid, lr, 0.0) if isinstance(valid, Tensor) else lr
         noise = covariance_noise(scales, quats, opacities, _normal_like(means, self.generator))
-        means += noise * (rate * self.scale)
+        means += noise * (lr * self.scale)
 
 
 @dataclass(frozen=True, repr=False, eq=False)
