@@ -135,23 +135,29 @@ def recorded(
 
 
 def table(records: list[dict[str, Any]]) -> str:
-    """Markdown: a row per training."""
+    """Markdown: a row per scene and length, the worst of an arm's seeds in its cell."""
     lines = [
-        "| scene, iterations | arm | seed | largest fall, dB | looks > 1 dB below the best | "
-        "ν mean | ν deviation | at the clamp | test PSNR |",
-        "|---|---|---|---|---|---|---|---|---|",
+        f"| scene, iterations | {' | '.join(LABELS[arm] for arm in ARMS)} | test PSNR |",
+        f"|---|{'---|' * len(ARMS)}---|",
     ]
-    for r in sorted(records, key=lambda r: (r["scene"], r["iterations"], ARMS.index(r["arm"]),
-                                            r["seed"])):  # fmt: skip
-        nu = ["", "", ""]
-        if "nu_mean" in r:
-            nu = [f"{r['nu_mean']:.2f}", f"{r['nu_deviation']:.2f}", f"{r['at_clamp']:.1%}"]
-        lines.append(
-            f"| {r['scene']}, {r['iterations']:,} | {LABELS[r['arm']]} | {r['seed']} | "
-            f"{r['largest_fall']:.2f} | {r['looks_below_1_db']} of {LOOKS} | {' | '.join(nu)} | "
-            f"{r['psnr']:.2f} |"
-        )
+    for scene, length in sorted({(r["scene"], r["iterations"]) for r in records}):
+        of = {arm: [r for r in records if (r["scene"], r["iterations"], r["arm"])
+                    == (scene, length, arm)] for arm in ARMS}  # fmt: skip
+        psnr = [f"{np.mean([r['psnr'] for r in own]):.2f}" if own else "-" for own in of.values()]
+        cells = " | ".join(map(_cell, of.values()))
+        lines.append(f"| {scene}, {length:,} | {cells} | {' / '.join(psnr)} |")
     return "\n".join(lines) + "\n"
+
+
+def _cell(records: list[dict[str, Any]]) -> str:
+    """The largest fall; looks more than 1 dB below the best; share of nu at the clamp; seeds."""
+    if not records:
+        return "-"
+    fall, looks = (max(r[name] for r in records) for name in ("largest_fall", "looks_below_1_db"))
+    said = f"{fall:.2f} dB, {looks} of {LOOKS}"
+    if all("at_clamp" in r for r in records):
+        said += f", {max(r['at_clamp'] for r in records):.1%}"
+    return said + (f" ({len(records)} seeds)" if len(records) > 1 else "")
 
 
 def draw(records: list[dict[str, Any]], path: Path) -> None:

@@ -59,10 +59,7 @@ from studies.scenes.tables import (
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 PAGE = REPOSITORY / "docs" / "evidence.md"
-PAGES = (  # that have tables
-    *(PAGE, FOLDER / "tables.md", REPOSITORY / "README.md"),
-    REPOSITORY / "docs" / "algorithms" / "awsgld.md",
-)
+PAGES = (PAGE, FOLDER / "tables.md", REPOSITORY / "README.md")  # that have tables
 FRONT = (  # what it is, arm, control
     ("annealing of all parameters, and fading", ANNEALED, BASELINE),
     ("the paper's preset, all parts", "paper", BASELINE),
@@ -150,6 +147,7 @@ def rotated_tables(study: Study) -> dict[str, str]:
         made[f"rotated-{count}"] = metrics_table(study, settings, shown)
         made[f"rotated-{count}-gains"] = differences_table(study, settings, shown)
     nus = (BASELINE, STABLE, f"{STABLE}-constant", "paper", "paper-constant")
+    made["collapse"] = (FOLDER.parent / "histogram" / "collapse.md").read_text("utf-8").strip()
     made["falls"] = falls_table(study, quarter, nus)
     often = [s for s in study.all_settings() if s.rotated and not s.tiled and not s.views]
     made["often"] = sizes_table(study, often, OFTEN_ARMS)
