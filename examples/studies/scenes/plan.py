@@ -38,7 +38,7 @@ ROTATED_ARMS = (
     *("l2@1/30", "l1+reset@1/30", "l2+reset@1/30", "l2+reset+lqn@1/30"),
     *(f"l1+reset{x}@1/2" for x in ("", "+lqn", "+lqn-all")),
 )
-BRIEF_ARMS = ("mcmc", FADED, DEFAULTS, ANNEALED, *EARLY)
+BRIEF_ARMS = ("mcmc", FADED, DEFAULTS, ANNEALED, POOLED, *EARLY)
 HALF_ARMS = (  # with 50,000 Gaussians
     *("mcmc", DEFAULTS, SHARE_KEPT, SELDOM_FADED, *UNFADED.values()),
     *("paper", "paper-constant"),
