@@ -67,8 +67,8 @@ FRONT = (  # what it is, arm, control
     ("L-BFGS against the same last phase without", "l2+reset+lqn@1/30", "l2+reset@1/30"),
 )
 PAPER = (  # what the pages say of the paper's parts: what, arm, control
-    ("AW-SGLD that follows the energy, less a constant of its mean", STABLE, f"{STABLE}-constant"),
-    ("AW-SGLD with the paper's settings, less a constant of its mean", "paper", "paper-constant"),
+    ("AW-SGLD as here, less a constant of its mean", STABLE, f"{STABLE}-constant"),
+    ("AW-SGLD as in the paper, likewise", "paper", "paper-constant"),
     ("L2 in the last thirtieth", "l2@1/30", BASELINE),
     ("fresh moments there", "l1+reset@1/30", BASELINE),
     ("L-BFGS directions with both", "l2+reset+lqn@1/30", "l2+reset@1/30"),
@@ -191,16 +191,18 @@ def paper_table(study: Study, settings: Sequence[Setting], *, brief: bool = Fals
     """One line per part of the paper: what it gains over the same training without it.
 
     Args:
-        brief: the PSNR alone, for the README.
+        brief: the PSNR alone, without the scenes' names, for the README.
     """
-    shown = 1 if brief else 3
-    heads = ("PSNR, dB", "SSIM", "LPIPS")[:shown]
-    lines = [f"| part | scenes | {' | '.join(heads)} |", "|---|---|" + "---:|" * shown]
+    heads = ("PSNR, dB",) if brief else ("scenes", "PSNR, dB", "SSIM", "LPIPS")
+    lines = [
+        f"| part | {' | '.join(heads)} |",
+        "|---|" + ("" if brief else "---|---:|---:|") + "---:|",
+    ]
     for what, arm, control in PAPER:
         found = difference(study, settings, arm, control)
         if found.count:
-            scenes = str(len(found.pairs)) if brief else ", ".join(found.pairs)
-            lines.append(f"| {what} | {scenes} | {' | '.join(cells_of(found)[:shown])} |")
+            cells = cells_of(found)[:1] if brief else [", ".join(found.pairs), *cells_of(found)]
+            lines.append(f"| {what} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
