@@ -137,13 +137,15 @@ def recorded(
 def table(records: list[dict[str, Any]]) -> str:
     """Markdown: a row per scene and length, the worst of an arm's seeds in its cell."""
     lines = [
-        f"| scene, iterations | {' | '.join(LABELS[arm] for arm in ARMS)} | test PSNR |",
+        f"| scene, iterations | {' | '.join(LABELS[arm] for arm in ARMS)} | test PSNR, seed 0 |",
         f"|---|{'---|' * len(ARMS)}---|",
     ]
     for scene, length in sorted({(r["scene"], r["iterations"]) for r in records}):
         of = {arm: [r for r in records if (r["scene"], r["iterations"], r["arm"])
                     == (scene, length, arm)] for arm in ARMS}  # fmt: skip
-        psnr = [f"{np.mean([r['psnr'] for r in own]):.2f}" if own else "-" for own in of.values()]
+        psnr = [
+            next((f"{r['psnr']:.2f}" for r in own if r["seed"] == 0), "-") for own in of.values()
+        ]
         cells = " | ".join(map(_cell, of.values()))
         lines.append(f"| {scene}, {length:,} | {cells} | {' / '.join(psnr)} |")
     return "\n".join(lines) + "\n"
