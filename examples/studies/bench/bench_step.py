@@ -4,7 +4,9 @@
     python examples/studies/bench/bench_step.py --device cuda  # 1M and 5M, what only a GPU shows
 
 Every round times each subject once, in turn, so that a busy machine slows all of them alike; ratios
-are taken within a round. Prints a table and writes it, a JSON file and a plot to `--out`.
+are taken within a round. Where a subject's tensors lie in memory changes its time by a tenth, at
+10,000 points by more: all subjects are made anew five times, in another order, and one of them
+stands there twice. Prints a table and writes it, a JSON file and a plot to `--out`.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import platform
+import random
 import statistics
 import sys
 import time
@@ -34,19 +37,23 @@ from studies.bench.bench_subjects import (
 
 COMMAND = "python examples/studies/bench/bench_step.py"
 BASELINE = "six Adams"
+MAKES = 5  # times that the subjects are made
 Rounds = dict[str, list[float]]
 
 
 def measure(case: Case, repeats: int) -> Rounds:
     """Seconds per call of every subject, one list entry per round."""
-    calls = {name: make(case) for name, make in SUBJECTS.items()}
-    for call in calls.values():
-        for _ in range(3):
-            call()
-    rounds: Rounds = {name: [] for name in calls}
-    for _ in range(repeats):
-        for name, call in calls.items():
-            rounds[name].append(timed(call, case.device))
+    rounds: Rounds = {name: [] for name in SUBJECTS}
+    order, chance = list(SUBJECTS), random.Random(0)
+    for share in range(MAKES):
+        calls = {name: SUBJECTS[name](case) for name in order}
+        for name in order * 3:
+            calls[name]()
+        for _ in range(share, repeats, MAKES):
+            for name in order:
+                rounds[name].append(timed(calls[name], case.device))
+        calls.clear()  # before the next are made
+        chance.shuffle(order)
     return rounds
 
 

@@ -181,6 +181,7 @@ def copy_144(case: Case) -> Callable[[], Any]:
 
 SUBJECTS: dict[str, Callable[[Case], Callable[[], Any]]] = {
     "six Adams": six_adams,
+    "six Adams again": six_adams,  # other tensors, elsewhere in memory: how exact a ratio is
     "defaults": lambda case: upgraded(case, [*DEFAULTS]),
     "defaults + histogram": lambda case: upgraded(case, [*DEFAULTS, EnergyHistogram(warmup=4)]),
     "the paper's exploration": lambda case: upgraded(case, [EnergyHistogram.paper(warmup=4)]),
