@@ -119,6 +119,7 @@ class StepAdam(Adam):
         hooks = [of[name] if acting else [] for name in ("before", "factor", "after")]
         if mask is not None:
             self._check_mask(mask)
+        back = self._puts_back(mask)
         with Lent() as lent:
             for group in self.param_groups:
                 befores, factors, afters = (
@@ -126,13 +127,13 @@ class StepAdam(Adam):
                 )
                 masked = mask is not None and self._takes_mask(group, mask.numel())
                 # Another base's own step knows its mask; the parts' doing it does not.
-                masked = masked and (self.base is Adam or bool(befores or afters))
+                own = mask if masked and (self.base is Adam or befores or afters) else None
                 for param in group["params"]:
                     if param.grad is None or param.grad.is_sparse:
                         continue
                     self._told |= guard(param.grad, course, self._told)
-                    if masked or befores or self._puts_back(mask):
-                        self._lend_gradient(group, param, masked, befores, lent, mask)
+                    if own is not None or befores or back:
+                        self._lend_gradient(group, param, befores, lent, own, back)
                     moved.append((group, param, afters))
                 said = [part.factor(group, course) for part in factors]
                 lent.rate(group, [factor for factor in said if factor is not None], course.valid)
@@ -161,20 +162,18 @@ class StepAdam(Adam):
         step(self, mask, mask.numel()) if takes_number else step(self, mask)
 
     def _lend_gradient(
-        self,
-        group: Group,
-        param: Tensor,
-        masked: bool,
-        parts: list[Part],
-        lent: Lent,
-        mask: Tensor | None,
+        self, group: Group, param: Tensor, parts: list[Part], lent: Lent, mask: Any, back: bool
     ) -> None:
-        """Put what Adam is to be fed into `param.grad`; `masked`: zero in rows that stand still."""
+        """Put what Adam is to be fed into `param.grad`: zero in rows that a mask holds still.
+
+        `back`: whether the step is to be put back where it does not count.
+        """
         fed, state = cast(Tensor, param.grad), self.state[param]
         if not state:  # torch makes its moments only where there is nothing else yet
             self._init_group({**group, "params": [param]}, [], [], [], [], [], [])
-        self._ledger.drop_strangers(param, state, self.course.keys)
-        if masked and mask is not None:
+        if self.course.keys:
+            self._ledger.drop_strangers(param, state, self.course.keys)
+        if mask is not None:
             moving = mask.to(param.device)
             lent.frozen.append(Frozen(moving, param, state))
             fed = torch.where(shaped(moving, fed), fed, 0.0)
@@ -186,7 +185,7 @@ class StepAdam(Adam):
         for part in parts:
             fed = part.before(group, param, fed, state, self.course)
         fed = fed if plain else fed * unit
-        if self._puts_back(mask):  # what Adam does; the parts' doing is not the step's
+        if back:  # what Adam does; the parts' doing is not the step's
             lent.frozen.append(Frozen(cast(Tensor, self.course.valid), param, state))
         if fed is not param.grad:
             lent.attribute(param, "grad", fed)
