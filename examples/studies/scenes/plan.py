@@ -36,7 +36,7 @@ ROTATED_ARMS = (
     *("faded-3000", "rates-x2", POOLED, "annealed-2", "own-step"),
     *(STABLE, f"{STABLE}-constant"),
     *("l2@1/30", "l1+reset@1/30", "l2+reset@1/30", "l2+reset+lqn@1/30"),
-    *(f"l1+reset{x}@1/2" for x in ("", "+lqn", "+lqn-all")),
+    *(f"l1+reset{x}@1/{k}" for k in (4, 2) for x in ("", "+lqn", "+lqn-all")),
 )
 BRIEF_ARMS = ("mcmc", FADED, DEFAULTS, ANNEALED, POOLED, *EARLY)
 HALF_ARMS = (  # with 50,000 Gaussians
