@@ -42,6 +42,7 @@ ALL_ANNEALED = "annealed-4-0.4+faded"
 ANNEALED = "annealed-4-opacities-1+faded"  # the defaults until the views rotated
 SHORT_LABEL = "annealed+faded"
 POOLED = f"{ANNEALED}+pooled"
+DEFAULTS_POOLED = f"{DEFAULTS}+pooled"
 STABLE = "awsgld-stable"  # its histogram follows the energy; that of the arms before it did not
 UNFADED_OPACITIES = f"{ANNEALED}-opacities-unfaded"
 V_ONLY = f"{ANNEALED}-v-only"
@@ -285,6 +286,12 @@ def long_runs() -> list[StudyArm]:
             "the same, and all but the positions annealed",
             of(ANNEALING_OF_REST, FADING_EARLY),
             control=MEANS_LEFT,
+        ),
+        StudyArm(
+            DEFAULTS_POOLED,
+            "all but the positions annealed, faded, second moments pooled",
+            of(ANNEALING_OF_REST, FADING, Pooling()),
+            control=DEFAULTS,
         ),
         *(
             StudyArm(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from studies.scenes.analysis import Study
-from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, FADED, POOLED, STABLE
+from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, DEFAULTS_POOLED, FADED, STABLE
 from studies.scenes.long_tables import Difference, difference
 from studies.scenes.records import Setting
 
@@ -20,7 +20,7 @@ COMPARISONS = {
     "Fading": (FADED, BASELINE),
     "Annealing": (DEFAULTS, FADED),
     "Annealing of the positions": (ANNEALED, DEFAULTS),
-    "Pooling": (POOLED, ANNEALED),
+    "Pooling": (DEFAULTS_POOLED, DEFAULTS),
     "EnergyHistogram": (STABLE, f"{STABLE}-constant"),
     "SquaredLoss": ("l2@1/30", BASELINE),
     "FreshMoments": ("l1+reset@1/30", BASELINE),

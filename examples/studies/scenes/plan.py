@@ -11,6 +11,7 @@ from studies.scenes.arms import (
     ALL_ANNEALED,
     ANNEALED,
     DEFAULTS,
+    DEFAULTS_POOLED,
     EARLY,
     FADED,
     GROUPS,
@@ -33,7 +34,7 @@ ROTATED_SCENES = (*MANY_VIEWS_SCENES, "embedded", "banana", "lund_door", "bright
 ROTATED_ARMS = (
     *("mcmc", FADED, DEFAULTS, ANNEALED, "paper", "paper-constant"),
     *(SELDOM_FADED, *UNFADED.values()),
-    *("faded-3000", "rates-x2", POOLED, "annealed-2", "own-step"),
+    *("faded-3000", "rates-x2", DEFAULTS_POOLED, "annealed-2", "own-step"),
     *(STABLE, f"{STABLE}-constant"),
     *("l2@1/30", "l1+reset@1/30", "l2+reset@1/30", "l2+reset+lqn@1/30"),
     *(f"l1+reset{x}@1/{k}" for k in (4, 2) for x in ("", "+lqn", "+lqn-all")),
