@@ -57,9 +57,12 @@ class Study:
         """All of them."""
         return [record for runs in self._of.values() for record in runs.values()]
 
-    def cost(self, setting: Setting, arm: str) -> float:
-        """Seconds of an iteration of the arm, as a share of stock's; 1 where not measured."""
-        return self._costs.get((setting.scene, setting.size, setting.iterations, arm), 1.0)
+    def cost(self, setting: Setting, arm: str, control: str = BASELINE) -> float:
+        """Seconds of an iteration, as a share of the control's; 1 where not both were measured."""
+        where = (setting.scene, setting.size, setting.iterations)
+        shares = {(*where, BASELINE): 1.0} | self._costs
+        ours, theirs = (shares.get((*where, name)) for name in (arm, control))
+        return 1.0 if ours is None or theirs is None else ours / theirs
 
     def all_settings(self) -> list[Setting]:
         """In the order of their fields."""

@@ -96,7 +96,7 @@ def difference(
         ours, theirs = study.runs(setting, arm), study.runs(setting, control)
         shared = sorted(ours.keys() & theirs.keys())
         if shared:
-            cost = study.cost(setting, arm) / study.cost(setting, control)
+            cost = study.cost(setting, arm, control)
             pairs[setting.scene] = [(ours[seed], theirs[seed], cost) for seed in shared]
     return Difference(arm, control, pairs)
 

@@ -122,6 +122,14 @@ def test_a_part_is_on_if_one_metric_gains_and_none_loses(
     assert (two.iterations, two.verdict, two.on) == (None, "too few", False)
 
 
+def test_a_cost_that_was_not_measured_is_the_controls() -> None:
+    setting = rotated_record("faded", "plush", 0).setting
+    study = Study([], {("plush", "images_4", 7_500, "faded"): 1.25})
+    assert study.cost(setting, "faded") == 1.25
+    assert study.cost(setting, DEFAULT_ARM, "faded") == 1.0
+    assert study.cost(setting, DEFAULT_ARM) == 1.0
+
+
 def test_the_longest_trainings_decide() -> None:
     records = [
         rotated_record(arm, scene, 0, psnr=20.0 + (arm != BASELINE))
