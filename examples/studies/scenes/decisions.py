@@ -14,7 +14,7 @@ QUARTER = "images_4"
 POINTS = 4_000
 NUM_POINTS = {"embedded": 2_000, "bonsai": 10_000, "lego": 10_000}
 MANY_VIEWS_SCENES = ("bonsai", "lego", "plush")  # forty training views or more
-MIN_SCENES = 3
+MIN_SCENES, MIN_SEEDS = 3, 2
 # part -> (the arm with it, the arm without it)
 COMPARISONS = {
     "Fading": (FADED, BASELINE),
@@ -39,8 +39,11 @@ class Decision:
 
     @property
     def verdict(self) -> str:
-        """The rule's, or that there are too few trainings."""
-        return "too few" if self.found is None else self.found.verdict
+        """The rule's, or that there are too few trainings: one seed turns nothing on."""
+        if self.found is None:
+            return "too few"
+        verdict, seeds = self.found.verdict, min(map(len, self.found.pairs.values()))
+        return "pays, one seed" if verdict == "pays" and seeds < MIN_SEEDS else verdict
 
     @property
     def on(self) -> bool:

@@ -109,8 +109,9 @@ def test_a_part_is_on_if_one_metric_gains_and_none_loses(
     }
     better = {name: value for name, value in better.items() if name != "cost"}
     records = [
-        rotated_record(arm, scene, 0, **(better if arm != BASELINE else {}))
+        rotated_record(arm, scene, seed, **(better if arm != BASELINE else {}))
         for scene in MANY_VIEWS_SCENES
+        for seed in (0, 1)
         for arm in (BASELINE, "faded")
     ]
     decision = decide(Study(records, costs))["Fading"]
@@ -118,8 +119,11 @@ def test_a_part_is_on_if_one_metric_gains_and_none_loses(
     assert decision.on == (verdict == "pays")
     crowded = [replace(r, setting=replace(r.setting, points=40_000)) for r in reversed(records)]
     assert decide(Study([*records, *crowded], costs))["Fading"] == decision
-    two = decide(Study(records[:4]))["Fading"]
+    two = decide(Study(records[:8]))["Fading"]
     assert (two.iterations, two.verdict, two.on) == (None, "too few", False)
+    once = decide(Study(records[:-2], costs))["Fading"]
+    assert not once.on
+    assert once.verdict == (f"{verdict}, one seed" if verdict == "pays" else verdict)
 
 
 def test_a_cost_that_was_not_measured_is_the_controls() -> None:
