@@ -27,6 +27,7 @@ import numpy as np
 import torch
 
 from opt3dgs_optim import EnergyHistogram, Part
+from studies.scenes.analysis import falls
 
 OUT = Path(__file__).resolve().parents[2] / "docs" / "results" / "histogram"
 ARMS = ("stock", "frozen", "default")
@@ -108,14 +109,14 @@ def recorded(
 ) -> dict[str, Any]:
     """The figures of a training."""
     psnr = np.array([look["train_psnr"] for look in curve])
-    falls = np.maximum.accumulate(psnr) - psnr
+    fallen = falls(psnr)
     record = {
         "scene": scene,
         "arm": arm,
         "seed": seed,
         "iterations": iterations,
-        "largest_fall": round(float(falls.max()), 3),
-        "looks_below_1_db": int((falls > 1).sum()),
+        "largest_fall": round(float(fallen.max()), 3),
+        "looks_below_1_db": int((fallen > 1).sum()),
         "psnr": round(curve[-1]["psnr"], 3),
         "train_psnr": round(curve[-1]["train_psnr"], 3),
         "machine": f"{platform.system()} {platform.machine()}, torch {torch.__version__}",
@@ -141,12 +142,10 @@ def table(records: list[dict[str, Any]]) -> str:
         f"|---|{'---|' * len(ARMS)}---|",
     ]
     for scene, length in sorted({(r["scene"], r["iterations"]) for r in records}):
-        of = {arm: [r for r in records if (r["scene"], r["iterations"], r["arm"])
-                    == (scene, length, arm)] for arm in ARMS}  # fmt: skip
-        psnr = [
-            next((f"{r['psnr']:.2f}" for r in own if r["seed"] == 0), "-") for own in of.values()
-        ]
-        cells = " | ".join(map(_cell, of.values()))
+        here = [r for r in records if (r["scene"], r["iterations"]) == (scene, length)]
+        by_arm = [[r for r in here if r["arm"] == arm] for arm in ARMS]
+        psnr = [next((f"{r['psnr']:.2f}" for r in own if r["seed"] == 0), "-") for own in by_arm]
+        cells = " | ".join(map(_cell, by_arm))
         lines.append(f"| {scene}, {length:,} | {cells} | {' / '.join(psnr)} |")
     return "\n".join(lines) + "\n"
 

@@ -45,7 +45,7 @@ def measure(case: Case, repeats: int) -> Rounds:
     """Seconds per call of every subject, one list entry per round."""
     rounds: Rounds = {name: [] for name in SUBJECTS}
     order, chance = list(SUBJECTS), random.Random(0)
-    for share in range(MAKES):
+    for share in range(min(MAKES, repeats)):
         calls = {name: SUBJECTS[name](case) for name in order}
         for name in order * 3:
             calls[name]()
@@ -182,8 +182,7 @@ def main(arguments: list[str] | None = None) -> int:
             for points, rows in results.items()
         }
     record = {
-        "command": "python examples/studies/bench/bench_step.py "
-        + " ".join(arguments or sys.argv[1:]),
+        "command": f"{COMMAND} {' '.join(arguments or sys.argv[1:])}",
         "date": date.today().isoformat(),
         **machine(device),
         "repeats": options.repeats,

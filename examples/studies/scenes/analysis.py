@@ -8,6 +8,8 @@ from dataclasses import astuple, dataclass
 from statistics import fmean, stdev
 from typing import Literal
 
+import numpy as np
+
 from studies.scenes.arms import BASELINE, STUDY_ARMS
 from studies.scenes.records import Costs, Record, Setting
 
@@ -60,8 +62,9 @@ class Study:
     def cost(self, setting: Setting, arm: str, control: str = BASELINE) -> float:
         """Seconds of an iteration, as a share of the control's; 1 where not both were measured."""
         where = (setting.scene, setting.size, setting.iterations)
-        shares = {(*where, BASELINE): 1.0} | self._costs
-        ours, theirs = (shares.get((*where, name)) for name in (arm, control))
+        ours, theirs = (
+            1.0 if name == BASELINE else self._costs.get((*where, name)) for name in (arm, control)
+        )
         return 1.0 if ours is None or theirs is None else ours / theirs
 
     def all_settings(self) -> list[Setting]:
@@ -149,3 +152,8 @@ def _reach(record: Record, control: Record) -> float | None:
 def baseline_of(study: Study, settings: list[Setting]) -> float:
     """Mean last test PSNR of the baseline, dB."""
     return fmean(r.final for s in settings for r in study.runs(s, BASELINE).values())
+
+
+def falls(values: np.ndarray) -> np.ndarray:
+    """How far each value is below the best so far, of those of a training in their order."""
+    return np.maximum.accumulate(values) - values

@@ -445,6 +445,6 @@ def find_study_arm(name: str) -> StudyArm:
 
 def label(arm: str) -> str:
     """An arm's name in tables and plots, where the one in the records is long or out of date."""
-    if arm == DEFAULTS or arm.startswith((f"{DEFAULTS}-", f"{DEFAULTS}+")):
+    if arm.startswith(DEFAULTS):
         return "defaults" + arm.removeprefix(DEFAULTS)
     return re.sub("^defaults", SHORT_LABEL, arm.replace(ANNEALED, SHORT_LABEL))

@@ -7,9 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean, stdev
 
-import numpy as np
-
-from studies.scenes.analysis import Study
+from studies.scenes.analysis import Study, falls
 from studies.scenes.arms import BASELINE, DEFAULTS, STUDY_ARMS, label
 from studies.scenes.records import Record, Setting
 
@@ -201,16 +199,12 @@ def falls_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) 
         f"|---|{'---:|' * len(arms)}",
     ]
     for setting in settings:
-        found = [[_fall(r) for r in study.runs(setting, arm).values()] for arm in arms]
+        runs = [study.runs(setting, arm).values() for arm in arms]
+        found = [[falls(run.curve["train_psnr"]).max() for run in of] for of in runs]
         if any(found[1:]):
-            cells = [f"{max(falls):.2f}" if falls else "-" for falls in found]
+            cells = [f"{max(largest):.2f}" if largest else "-" for largest in found]
             lines.append(f"| {setting.scene} | {' | '.join(cells)} |")
     return "\n".join(lines)
-
-
-def _fall(record: Record) -> float:
-    psnr = record.curve["train_psnr"]
-    return float((np.maximum.accumulate(psnr) - psnr).max())
 
 
 def reach_table(study: Study, long: Sequence[Setting], arms: Sequence[str], short: int) -> str:

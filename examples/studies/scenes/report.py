@@ -90,6 +90,7 @@ CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4
 ROTATED = "rotated.json"  # records whose held-out views rotate with the seed
 LONG, BRIEF = 30_000, 7_500
 ASIDE = ("explorations", "unseen", "adaptive")  # groups with a table of their own
+NU_ARMS = (BASELINE, STABLE, f"{STABLE}-constant", "paper", "paper-constant")
 OFTEN_ARMS = (BASELINE, SHARE_KEPT, SELDOM_FADED, *UNFADED.values(), DEFAULTS)
 REACH_ARMS = (FADED, DEFAULTS)
 MARKER = re.compile(r"(<!-- study:([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -146,9 +147,8 @@ def rotated_tables(study: Study) -> dict[str, str]:
     for count, settings in ((LONG, long), (BRIEF, brief)):
         made[f"rotated-{count}"] = metrics_table(study, settings, shown)
         made[f"rotated-{count}-gains"] = differences_table(study, settings, shown)
-    nus = (BASELINE, STABLE, f"{STABLE}-constant", "paper", "paper-constant")
     made["collapse"] = (FOLDER.parent / "histogram" / "collapse.md").read_text("utf-8").strip()
-    made["falls"] = falls_table(study, quarter, nus)
+    made["falls"] = falls_table(study, quarter, NU_ARMS)
     often = [s for s in study.all_settings() if s.rotated and not s.tiled and not s.views]
     made["often"] = sizes_table(study, often, OFTEN_ARMS)
     made["explorations"] = differences_table(study, brief, (STABLE, *names("explorations")))
@@ -194,10 +194,8 @@ def paper_table(study: Study, settings: Sequence[Setting], *, brief: bool = Fals
         brief: the PSNR alone, without the scenes' names, for the README.
     """
     heads = ("PSNR, dB",) if brief else ("scenes", "PSNR, dB", "SSIM", "LPIPS")
-    lines = [
-        f"| part | {' | '.join(heads)} |",
-        "|---|" + ("" if brief else "---|---:|---:|") + "---:|",
-    ]
+    rule = "|---|---:|" if brief else "|---|---|---:|---:|---:|"
+    lines = [f"| part | {' | '.join(heads)} |", rule]
     for what, arm, control in PAPER:
         found = difference(study, settings, arm, control)
         if found.count:

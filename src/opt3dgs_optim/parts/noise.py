@@ -52,10 +52,8 @@ class PositionNoise(Part):
         self.scale = check_number("PositionNoise", "scale", scale, 0.0)
         self.during = during  # pyright: ignore[reportAttributeAccessIssue]
         self.generator = generator
-        self._left = (
-            None,
-            None,
-        )  # where the positions lay after the last step, and how often written
+        # Where the positions lay after the last step, and how often they had been written.
+        self._left = (None, None)
         self._moved = 0
 
     def __repr__(self) -> str:
@@ -103,7 +101,7 @@ class PositionNoise(Part):
         means += noise * (lr * self.scale)
 
 
-@dataclass(frozen=True, repr=False, eq=False)
+@dataclass(repr=False, eq=False)
 class IsotropicNoise(Part):
     """Langevin noise of a landscape: `sqrt(2 lr temperature)`, or a fixed deviation, times eta.
 
