@@ -1,8 +1,8 @@
 """What a step lends to torch's Adam, and takes back whatever happens."""
 
+import cmath
 import functools
 import inspect
-import math
 import operator
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -98,7 +98,7 @@ def guard(grad: Tensor, course: Course, told: bool) -> bool:
     """
     on_host = grad.is_cpu
     # The sum is finite unless a summand is not, or it overflows.
-    if on_host and math.isfinite(abs(grad.sum().item())):
+    if on_host and cmath.isfinite(grad.sum().item()):
         return False
     grad.nan_to_num_(0.0, 0.0, 0.0)
     if on_host and not told:

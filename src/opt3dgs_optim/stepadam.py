@@ -32,6 +32,7 @@ class StepAdam(Adam):
     base: type[Adam] = Adam  # whose step it is that the parts surround
     _ledger: Ledger
     _told = False  # of a gradient that is not finite
+    _split: tuple[Any, dict[str | None, list[list[Part]]]] = (None, {})  # hooks, by groups' slots
 
     def follow(self, course: Course, base: type[Adam] = Adam) -> None:
         """Have the parts of `course` from now on, around the step of `base`.
@@ -50,7 +51,7 @@ class StepAdam(Adam):
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """As torch's; notes which Gaussian parameter the group's name says that it holds."""
         super().add_param_group(param_group)
-        group = self.param_groups[-1]
+        group, self._split = self.param_groups[-1], (None, {})
         group.setdefault(SLOT, canonical_name(group.get("name")))
 
     def acts_on(self, part: Part, group: Group) -> bool:
@@ -115,16 +116,15 @@ class StepAdam(Adam):
 
     def _step(self, mask: Tensor | None, acting: bool) -> None:
         """Lend the base's step what the parts say, if they act, and take it back."""
-        course, moved, of = self.course, [], self.course.hooks
-        hooks = [of[name] if acting else [] for name in ("before", "factor", "after")]
+        course, moved = self.course, []
         if mask is not None:
             self._check_mask(mask)
-        back = self._puts_back(mask)
+        unknown = isinstance(course.valid, Tensor)  # only the device knows whether the step counts
+        fused = unknown and self.base is Adam and all(g["fused"] for g in self.param_groups)
+        back = unknown and not fused and (self.base is Adam or mask is None)
         with Lent() as lent:
             for group in self.param_groups:
-                befores, factors, afters = (
-                    [part for part in parts if self.acts_on(part, group)] for parts in hooks
-                )
+                befores, factors, afters = self._parts_of(group) if acting else ([], [], [])
                 masked = mask is not None and self._takes_mask(group, mask.numel())
                 # Another base's own step knows its mask; the parts' doing it does not.
                 own = mask if masked and (self.base is Adam or befores or afters) else None
@@ -137,8 +137,7 @@ class StepAdam(Adam):
                     moved.append((group, param, afters))
                 said = [part.factor(group, course) for part in factors]
                 lent.rate(group, [factor for factor in said if factor is not None], course.valid)
-            if isinstance(course.valid, Tensor) and self._drops_on_device():
-                # As a GradScaler tells torch's step on the device not to be made.
+            if fused:  # as a GradScaler tells torch's step not to be made
                 lent.attribute(self, "found_inf", (~course.valid).to(torch.float32))
             self._step_base(mask)
         for group, param, parts in moved:
@@ -148,6 +147,17 @@ class StepAdam(Adam):
                 self._ledger.remember(param, self.state[param], course.keys)
         for rows in reversed(lent.frozen):
             rows.put_back()
+
+    def _parts_of(self, group: Group) -> list[list[Part]]:
+        """The parts that act on a group before, in and after its step; sought when they change."""
+        hooks, slot = self.course.hooks, group.get(SLOT)
+        if self._split[0] is not hooks:
+            self._split = hooks, {}
+        found = self._split[1]
+        if slot not in found:
+            acting = [hooks[name] for name in ("before", "factor", "after")]
+            found[slot] = [[part for part in each if self.acts_on(part, group)] for each in acting]
+        return found[slot]
 
     def _step_base(self, mask: Tensor | None) -> None:
         if self.base is Adam:
@@ -189,15 +199,6 @@ class StepAdam(Adam):
             lent.frozen.append(Frozen(cast(Tensor, self.course.valid), param, state))
         if fed is not param.grad:
             lent.attribute(param, "grad", fed)
-
-    def _puts_back(self, mask: Tensor | None) -> bool:
-        """Whether only the device knows if the step counts, and the step cannot ask it."""
-        own_mask = self.base is not Adam and mask is not None
-        return isinstance(self.course.valid, Tensor) and not (own_mask or self._drops_on_device())
-
-    def _drops_on_device(self) -> bool:
-        """Whether torch's own step can be told on the device not to be made."""
-        return self.base is Adam and all(group["fused"] for group in self.param_groups)
 
     def _takes_mask(self, group: Group, rows: int) -> bool:
         """Whether a mask of so many rows is about this group."""
