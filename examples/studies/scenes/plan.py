@@ -109,6 +109,18 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
             *cross(("bonsai",), CROWDED_ARMS, 1, 7_500, 4, rotated=True),
             *cross(("plush",), CROWDED_ARMS, 1, 7_500, 10, rotated=True),
         ],
+        "sizes": [  # fewer Gaussians, views and iterations
+            *cross(("bonsai",), ("mcmc", DEFAULTS), 1, 7_500, 0.1, rotated=True),
+            *cross(("bonsai",), ("mcmc", DEFAULTS), 1, 7_500, 0.4, rotated=True),
+            *cross(("bonsai",), ("mcmc", DEFAULTS), 1, 3_000, rotated=True),
+            *(
+                spec
+                for views in (14, 28, 55, 110)
+                for spec in cross(
+                    ("bonsai",), ("mcmc", DEFAULTS), 1, 7_500, rotated=True, views=views
+                )
+            ),
+        ],
         "explorations": [
             *cross(("plush",), [STABLE, *arms["explorations"]], 1, 7_500, rotated=True),
             *cross(("plush", "embedded"), arms["explorations"], 1, 30_000, rotated=True),

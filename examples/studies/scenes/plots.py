@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib as mpl
@@ -14,6 +15,8 @@ import matplotlib.pyplot as plt
 
 from studies.scenes.analysis import Gain, Study
 from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, FADED, POOLED, label
+from studies.scenes.decisions import points_of
+from studies.scenes.long_tables import difference
 from studies.scenes.records import Record, Setting
 
 # Okabe and Ito's colours: told apart with any kind of colour vision.
@@ -30,6 +33,14 @@ COLOURS = {
 }
 SHOWN_FROM = 0.25  # of an arm's seconds: what it falls to before may be out of the picture
 VERDICT_COLOURS = {"pays": "#009e73", "does not pay": "#999999", "undecided": "#e69f00"}
+VIEWS = {"bonsai": 220, "lego": 87, "plush": 84}  # to train on, of the scenes with many
+SCENE_COLOURS = {"bonsai": "#0072b2", "lego": "#d55e00", "plush": "#009e73"}
+SIZE_AXES = {  # of `plot_sizes`, and what else is to know of the trainings there
+    "Gaussians": "(quarter size, 7,500 iterations)",
+    "training views": "(quarter size, 7,500 iterations)",
+    "iterations": "(quarter size)",
+    "share of the full width": "(30,000; half has 50,000 Gaussians)",
+}
 DPI = 150
 
 
@@ -102,6 +113,65 @@ def plot_metrics(
     figure.legend(handles, labels, loc="outside lower center", ncols=len(arms), frameon=False)
     figure.savefig(path, dpi=DPI)
     plt.close(figure)
+
+
+def plot_sizes(study: Study, path: Path) -> None:
+    """What the defaults gain over stock after the last iteration, over four sizes of a training.
+
+    A column per size, the other three the scene's own; scenes with two of it, means over the seeds.
+    """
+    lines: dict[str, dict[str, dict[float, Sequence[float]]]] = {name: {} for name in SIZE_AXES}
+    for setting in study.all_settings():
+        found = difference(study, [setting], DEFAULTS, BASELINE)
+        for axis, place in _places(setting).items() if found.count else ():
+            pairs = found.pairs[setting.scene]
+            gains = [
+                float(np.mean([a.curve[metric][-1] - b.curve[metric][-1] for a, b, _ in pairs]))
+                for metric in ("psnr", "lpips")
+            ]
+            lines[axis].setdefault(setting.scene, {})[place] = gains
+    figure, axes = plt.subplots(
+        2, len(lines), figsize=(3.2 * len(lines), 5.0), layout="constrained", sharey="row"
+    )
+    for column, (axis, every) in zip(axes.T, lines.items(), strict=True):
+        scenes = {scene: gains for scene, gains in every.items() if len(gains) > 1}
+        for scene, gains in scenes.items():
+            places = sorted(gains)
+            for row, panel in enumerate(column):
+                values = [gains[place][row] for place in places]
+                panel.plot(places, values, "o-", color=SCENE_COLOURS[scene], label=scene)
+        ticks = sorted({place for gains in scenes.values() for place in gains})
+        for panel in column:
+            panel.set_xscale("log")
+            panel.set_xticks(ticks, [f"{tick:,g}" for tick in ticks], fontsize=8)
+            panel.minorticks_off()
+            panel.axhline(0.0, color="black", linewidth=0.8)
+            panel.grid(alpha=0.3)
+        column[1].set_xlabel(f"{axis}\n{SIZE_AXES[axis]}")
+    axes[0, 0].set_ylabel("gain in test PSNR (dB)")
+    axes[1, 0].set_ylabel("change of test LPIPS")
+    handles, labels = axes[0, 2].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+    figure.savefig(path, dpi=DPI)
+    plt.close(figure)
+
+
+def _places(setting: Setting) -> dict[str, float]:
+    """Where trainings stand on the axes of `plot_sizes`, on those on which they alone differ."""
+    scene, places = setting.scene, {}
+    if scene not in VIEWS:
+        return {}
+    own = Setting(scene, points_of(scene), 7_500, "sfm", rotated=True)
+    half = replace(own, iterations=30_000, size="images_2", points=50_000)
+    if setting == replace(own, points=setting.points):
+        places["Gaussians"] = setting.points
+    if setting == replace(own, views=setting.views):
+        places["training views"] = setting.views or VIEWS[scene]
+    if setting == replace(own, iterations=setting.iterations):
+        places["iterations"] = setting.iterations
+    if setting in (replace(own, iterations=30_000), half):
+        places["share of the full width"] = 0.5 if setting == half else 0.25
+    return places
 
 
 def _curves(records: Sequence[Record]) -> tuple[np.ndarray, np.ndarray]:

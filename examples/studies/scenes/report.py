@@ -47,7 +47,7 @@ from studies.scenes.long_tables import (
     scenes_gain_table,
     sizes_table,
 )
-from studies.scenes.plots import plot_curves, plot_gains, plot_metrics
+from studies.scenes.plots import plot_curves, plot_gains, plot_metrics, plot_sizes
 from studies.scenes.records import COSTS, FOLDER, Setting, gather, merge, read, read_costs, write
 from studies.scenes.tables import (
     front_table,
@@ -279,7 +279,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if many := settings_of(rotating, LONG):
             arms = (BASELINE, FADED, DEFAULTS)
             plot_metrics(rotating, many, arms, FOLDER / "rotated.png")
-            drawn.append(FOLDER / "rotated.png")
+            plot_sizes(rotating, FOLDER / "sizes.png")
+            drawn += [FOLDER / "rotated.png", FOLDER / "sizes.png"]
     except (OSError, ValueError) as error:
         print(f"report: {error}", file=sys.stderr)
         return 2
