@@ -49,6 +49,7 @@ V_ONLY = f"{ANNEALED}-v-only"
 # Where points are many, fading kills a great part of them again and again: what may spare them.
 UNFADED = {name: f"{MEANS_LEFT}-{name}-unfaded" for name in ("means", "opacities")}
 SHARE_KEPT = f"{MEANS_LEFT}-share-kept"  # the defaults before Fading counted the points
+OWN_STEP = "own-step+faded"
 SELDOM_FADED = f"{MEANS_LEFT}-100-events"
 EVENT_STEPS = 10  # iterations for one event of fading in a run of 3,000, where it was chosen
 
@@ -274,6 +275,12 @@ def long_runs() -> list[StudyArm]:
             "root mean square of the steps on a schedule, whatever the learning rates",
             lambda _iterations, _nu: [OwnStep()],
             control=ANNEALED,
+        ),
+        StudyArm(
+            OWN_STEP,
+            "the same, faded: what needs no peak in the place of annealing",
+            lambda _iterations, _nu: [OwnStep(), FADING],
+            control=DEFAULTS,
         ),
         StudyArm(
             EARLY[0],

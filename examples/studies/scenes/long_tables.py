@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean, stdev
 
@@ -122,15 +122,21 @@ def cells_of(found: Difference) -> list[str]:
 
 
 def metrics_table(
-    study: Study, settings: Sequence[Setting], arms: Iterable[str], *, gaussians: bool = False
+    study: Study,
+    settings: Sequence[Setting],
+    arms: Iterable[str],
+    *,
+    head: Callable[[Setting], str] = lambda setting: setting.scene,
+    gaussians: bool = False,
 ) -> str:
-    """PSNR / SSIM / LPIPS of every arm on every scene, means over the seeds.
+    """PSNR / SSIM / LPIPS of every arm in every setting, means over the seeds.
 
     Args:
+        head: what stands above a setting's column.
         gaussians: whether their last number stands beside, for arms that grow it.
     """
     lines = [
-        f"| arm | {' | '.join(setting.scene for setting in settings)} |",
+        f"| arm | {' | '.join(map(head, settings))} |",
         f"|---|{'---|' * len(settings)}",
     ]
     for arm in arms:

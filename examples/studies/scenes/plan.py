@@ -15,6 +15,7 @@ from studies.scenes.arms import (
     EARLY,
     FADED,
     GROUPS,
+    OWN_STEP,
     POOLED,
     SELDOM_FADED,
     SHARE_KEPT,
@@ -45,6 +46,7 @@ HALF_ARMS = (  # with 50,000 Gaussians
     *("paper", "paper-constant"),
 )
 CROWDED_ARMS = ("mcmc", DEFAULTS, SHARE_KEPT, UNFADED["means"])
+RATES_ARMS = ("mcmc", OWN_STEP, DEFAULTS)
 LONG_ARMS = tuple(arm.name for arm in long_runs())
 FULL_PARTS_SCENES = ("brighton_beach", "lund_door")  # where the defaults lose
 CONFIRMED = ("faded-v-only", V_ONLY)  # what gained most among the other leads
@@ -120,6 +122,11 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
                     ("bonsai",), ("mcmc", DEFAULTS), 1, 7_500, rotated=True, views=views
                 )
             ),
+        ],
+        "rates": [  # the trainer's own, all of them times a factor
+            spec
+            for rates in (0.1, 0.3, 1.0, 3.0, 10.0)
+            for spec in cross(("plush",), RATES_ARMS, 1, 7_500, rotated=True, rates=rates)
         ],
         "explorations": [
             *cross(("plush",), [STABLE, *arms["explorations"]], 1, 7_500, rotated=True),

@@ -13,6 +13,7 @@ import json
 import re
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
@@ -47,7 +48,8 @@ from studies.scenes.long_tables import (
     scenes_gain_table,
     sizes_table,
 )
-from studies.scenes.plots import plot_curves, plot_gains, plot_metrics, plot_sizes
+from studies.scenes.plan import RATES_ARMS
+from studies.scenes.plots import VIEWS, plot_curves, plot_gains, plot_metrics, plot_sizes
 from studies.scenes.records import COSTS, FOLDER, Setting, gather, merge, read, read_costs, write
 from studies.scenes.tables import (
     front_table,
@@ -153,9 +155,22 @@ def rotated_tables(study: Study) -> dict[str, str]:
     made["often"] = sizes_table(study, often, OFTEN_ARMS)
     made["explorations"] = differences_table(study, brief, (STABLE, *names("explorations")))
     made["adaptive"] = metrics_table(study, brief, names("adaptive"), gaussians=True)
+    rates = of_kind(study, Setting("plush", 4_000, BRIEF, "sfm", rotated=True), "rates")
+    made["rates"] = metrics_table(study, rates, RATES_ARMS, head=lambda s: f"x{s.rates:g}")
+    views = of_kind(study, Setting("bonsai", 10_000, BRIEF, "sfm", rotated=True), "views")
+    views.sort(key=lambda s: s.views or VIEWS[s.scene])
+    made["views"] = metrics_table(
+        study, views, (BASELINE, DEFAULTS), head=lambda s: str(s.views or VIEWS[s.scene])
+    )
     tiled = [s for s in study.all_settings() if s.tiled]
     made["unseen"] = metrics_table(study, tiled, STUDY_ARMS)
     return made
+
+
+def of_kind(study: Study, like: Setting, field: str) -> list[Setting]:
+    """The settings that differ from one in that field at most."""
+    every = study.all_settings()
+    return [s for s in every if s == replace(like, **{field: getattr(s, field)})]
 
 
 def names(kind: str) -> list[str]:
