@@ -377,8 +377,7 @@ def adaptive() -> list[StudyArm]:
     """Clone, split and reset instead of 3DGS-MCMC."""
     kinds: dict[str, tuple[str, MakeParts | None]] = {
         "adc": ("stock 3DGS with adaptive density control, torch's Adam", None),
-        "adc+faded": ("the same, faded", of(FADING)),
-        "adc+annealed+faded": ("the same, annealed and faded", of(*TRUNKS[ANNEALED])),
+        "adc+defaults": ("the same, with the defaults", of(ANNEALING_OF_REST, FADING)),
     }
     return [
         StudyArm(name, what, parts, mcmc=False, control="adc", adaptive=True)

@@ -194,7 +194,7 @@ def test_adaptive_density_control_grows_and_resumes(tmp_path: Path) -> None:
     from studies.scenes.adaptive import AdaptiveFit
 
     def make() -> Fit:
-        fit = fit_with("adc+faded", AdaptiveFit, 120)
+        fit = fit_with("adc+defaults", AdaptiveFit, 120)
         strategy: Any = vars(fit.density)["strategy"]
         strategy.refine_start_iter, strategy.refine_every = 20, 30
         return fit
