@@ -377,7 +377,9 @@ def adaptive() -> list[StudyArm]:
     """Clone, split and reset instead of 3DGS-MCMC."""
     kinds: dict[str, tuple[str, MakeParts | None]] = {
         "adc": ("stock 3DGS with adaptive density control, torch's Adam", None),
-        "adc+defaults": ("the same, with the defaults", of(ANNEALING_OF_REST, FADING)),
+        "adc+faded": ("the same, faded", of(FADING)),
+        "adc+annealed": ("the same, all but the positions annealed", of(ANNEALING_OF_REST)),
+        "adc+defaults": ("the same, with both", of(ANNEALING_OF_REST, FADING)),
     }
     return [
         StudyArm(name, what, parts, mcmc=False, control="adc", adaptive=True)
