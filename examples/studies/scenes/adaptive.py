@@ -13,18 +13,24 @@ from splatting.scenes import View
 from torch import Tensor
 from torch.nn import Parameter
 
+from studies.scenes.arms import StudyArm
+
 
 class DefaultDensityControl:
-    """gsplat's DefaultStrategy with its defaults, as `Fit` calls density control.
+    """gsplat's DefaultStrategy, as `Fit` calls density control.
+
+    Args:
+        extent: the scene's, in world units.
+        threshold: the gradient of the projected means above which it clones and splits.
 
     Attributes:
         state: the strategy's, part of a checkpoint.
         info: of the last rendering; the strategy reads the projected means' gradient from it.
     """
 
-    def __init__(self, extent: float) -> None:
+    def __init__(self, extent: float, threshold: float) -> None:
         gsplat_modules.install()
-        self.strategy = importlib.import_module("gsplat").DefaultStrategy()
+        self.strategy = importlib.import_module("gsplat").DefaultStrategy(grow_grad2d=threshold)
         self.state: dict[str, Any] = self.strategy.initialize_state(scene_scale=extent)
         self.info: dict[str, Any] = {}
 
@@ -44,7 +50,8 @@ class AdaptiveFit(Fit):
     """`Fit` with adaptive density control; it starts from `points` points and has no cap."""
 
     def _density_control(self) -> DefaultDensityControl:
-        return DefaultDensityControl(self.scene.extent)
+        assert isinstance(self.arm, StudyArm)
+        return DefaultDensityControl(self.scene.extent, self.arm.adaptive)
 
     def _train_image(self, view: View) -> Tensor:
         gaussians, camera, density = self.gaussians, view.camera, self.density

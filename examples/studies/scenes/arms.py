@@ -51,6 +51,7 @@ UNFADED = {name: f"{MEANS_LEFT}-{name}-unfaded" for name in ("means", "opacities
 SHARE_KEPT = f"{MEANS_LEFT}-share-kept"  # the defaults before Fading counted the points
 OWN_STEP = "own-step+faded"
 SELDOM_FADED = f"{MEANS_LEFT}-100-events"
+GROW_GRAD = 2e-4  # gsplat's own threshold
 EVENT_STEPS = 10  # iterations for one event of fading in a run of 3,000, where it was chosen
 
 
@@ -88,7 +89,9 @@ class StudyArm(Arm):
     control: str = BASELINE
     switch: float = 1.0  # where exploitation starts
     trunk: str | None = None  # branch off this arm's run at the switch
-    adaptive: bool = False  # gsplat's DefaultStrategy in the place of 3DGS-MCMC's
+    # The gradient above which gsplat's DefaultStrategy, in the place of 3DGS-MCMC's, clones and
+    # splits; 0: it is not in its place.
+    adaptive: float = 0.0
     retired: bool = False  # its code is gone, its records are kept
 
     def make(
@@ -374,16 +377,21 @@ def unseen() -> list[StudyArm]:
 
 
 def adaptive() -> list[StudyArm]:
-    """Clone, split and reset instead of 3DGS-MCMC."""
+    """Clone, split and reset instead of 3DGS-MCMC.
+
+    gsplat's threshold is that of a gradient over the image's width, whatever its pixels: at a
+    quarter of the width four times of it leaves as many Gaussians per pixel as at full size.
+    """
     kinds: dict[str, tuple[str, MakeParts | None]] = {
-        "adc": ("stock 3DGS with adaptive density control, torch's Adam", None),
-        "adc+faded": ("the same, faded", of(FADING)),
-        "adc+annealed": ("the same, all but the positions annealed", of(ANNEALING_OF_REST)),
-        "adc+defaults": ("the same, with both", of(ANNEALING_OF_REST, FADING)),
+        "": ("stock 3DGS with adaptive density control, torch's Adam", None),
+        "+faded": ("the same, faded", of(FADING)),
+        "+annealed": ("the same, all but the positions annealed", of(ANNEALING_OF_REST)),
+        "+defaults": ("the same, with both", of(ANNEALING_OF_REST, FADING)),
     }
     return [
-        StudyArm(name, what, parts, mcmc=False, control="adc", adaptive=True)
-        for name, (what, parts) in kinds.items()
+        StudyArm(f"{name}{kind}", what, parts, mcmc=False, control=name, adaptive=threshold)
+        for name, threshold in (("adc", 4 * GROW_GRAD), ("adc-dense", GROW_GRAD))
+        for kind, (what, parts) in kinds.items()
     ]
 
 
