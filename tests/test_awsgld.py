@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import re
 import warnings
 
 import numpy as np
@@ -309,31 +308,6 @@ def test_deepcopy_goes_on_alike() -> None:
         each.histogram.observe(0.55)
         each.step()
     assert all(torch.equal(p, q) for p, q in zip(params, twins, strict=True))
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: AWSGLD(parameters(), preconditioner="rmsprop"), "preconditioner='rmsprop'"),  # pyright: ignore
-        (lambda: AWSGLD(parameters(), lr=-1.0), "learning rate"),
-        (IsotropicNoise, "exactly one"),
-        (lambda: IsotropicNoise(temperature=-1.0), "temperature=-1.0"),
-        (lambda: IsotropicNoise(temperature=1.0, std=1.0), "exactly one"),
-        (lambda: PositionNoise({}, scale=-1.0), "scale=-1.0"),
-        (lambda: AWSGLD(parameters(), histogram=0.75), "histogram=0.75, but EnergyHistogram"),  # pyright: ignore
-        (lambda: AWSGLD(parameters(), noise=0.1), "noise=0.1, but IsotropicNoise or Pos"),  # pyright: ignore
-    ],
-)
-def test_bad_options(make, message: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(message)):
-        make()
-
-
-def test_a_bare_tensor_is_torchs_type_error() -> None:
-    with pytest.raises(TypeError, match="params argument given to the optimizer should be"):
-        AWSGLD(torch.ones(3))
-    with pytest.raises(TypeError, match="histroy"):
-        AWSGLD(parameters(), histroy=3)  # pyright: ignore[reportCallIssue]
 
 
 def test_decoupled_decay_is_not_multiplied() -> None:

@@ -9,7 +9,7 @@ import re
 import pytest
 import torch
 
-from opt3dgs_optim import Curvature, LQNAdam, backend_info, cuda
+from opt3dgs_optim import LQNAdam, backend_info, cuda
 from opt3dgs_optim.backend import obstacle
 
 
@@ -90,20 +90,6 @@ def test_torch_can_be_insisted_on(machine) -> None:
     machine()
     assert backend_info("cuda", backend="torch").reason == "backend='torch' was asked for"
     assert obstacle("torch", torch.device("cuda"), torch.float32)
-
-
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda: backend_info("cpu", backend="triton"),  # pyright: ignore
-        lambda: Curvature(backend="triton"),  # pyright: ignore
-        lambda: LQNAdam([torch.zeros(1, 3)], backend="triton"),  # pyright: ignore
-    ],
-    ids=["backend_info", "Curvature", "LQNAdam"],
-)
-def test_unknown_backend_is_a_value_error(call) -> None:
-    with pytest.raises(ValueError, match="backend='triton', but one of 'auto', 'cuda', 'torch'"):
-        call()
 
 
 def test_cuda_on_a_cpu_is_one_clear_error() -> None:

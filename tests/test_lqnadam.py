@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import io
-import re
 
 import numpy as np
 import pytest
@@ -264,30 +263,6 @@ def test_bfloat16_points_keep_float32_history() -> None:
         optimizer.step()
     assert optimizer.state[x]["history"].dtype == torch.float32
     assert x.dtype == torch.bfloat16
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"history_size": 0}, "Curvature: history_size=0"),
-        ({"history_size": 17}, "1..16"),
-        ({"min_cosine": -0.1}, "min_cosine=-0.1"),
-        ({"graft": None}, "graft=None"),
-        ({"backend": "metal"}, "backend='metal'"),
-        ({"differentiable": True}, "LQNAdam: differentiable=True, but curvature pairs"),
-        ({"lr": -1.0}, "learning rate"),
-    ],
-)
-def test_bad_options(options: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(message)):
-        LQNAdam([points()], **options)
-
-
-def test_a_bare_tensor_is_torchs_type_error() -> None:
-    with pytest.raises(TypeError, match="params argument given to the optimizer should be"):
-        LQNAdam(points())
-    with pytest.raises(TypeError, match="histroy"):
-        LQNAdam([points()], histroy=3)  # pyright: ignore[reportCallIssue]
 
 
 def test_decoupled_weight_decay_is_adamws() -> None:

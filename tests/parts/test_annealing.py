@@ -132,18 +132,3 @@ def test_the_log_gets_the_factor() -> None:
     phases = only(TOTAL, Annealing(4.0, 1.0))
     phases.observe(0.1, iteration=TOTAL // 2)
     assert phases.numbers() == {"annealing": pytest.approx(2.0)}
-
-
-@pytest.mark.parametrize(
-    ("call", "said"),
-    [
-        (lambda: Annealing(0.0), r"Annealing: peak=0.0, but a finite number in \(0"),
-        (lambda: Annealing(8.0, -1.0), r"Annealing: final=-1.0"),
-        (lambda: Annealing(float("nan")), r"Annealing: peak=nan"),
-        (lambda: Annealing(names=("pose",)), r"Annealing: names=\('pose',\), but a tuple"),
-        (lambda: Annealing(names=()), r"Annealing: names=\(\), but a tuple"),
-    ],
-)
-def test_bad_options_are_named(call: Any, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
-        call()

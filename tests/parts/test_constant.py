@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import pytest
 import torch
 from trainers import gsplat_optimizers, make_splats, only, train
 
@@ -33,16 +30,3 @@ def test_it_is_one_during_the_warm_up() -> None:
         phases.observe(0.1)
         seen.append((part.factor({}, phases), dict(part.numbers(phases))))
     assert seen == [(1.0, {}), (1.0, {}), (2.5, {"nu": 2.5}), (2.5, {"nu": 2.5})]
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"value": float("nan")}, "value=nan"),
-        ({"value": "two"}, "value='two'"),
-        ({"value": 1.0, "warmup": -1}, "warmup=-1"),
-    ],
-)
-def test_bad_options_are_named(options: dict[str, Any], said: str) -> None:
-    with pytest.raises(ValueError, match=f"ConstantMultiplier: {said}"):
-        ConstantMultiplier(**options)

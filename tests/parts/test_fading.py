@@ -205,21 +205,3 @@ def test_the_log_gets_the_share_of_this_iteration() -> None:
     assert phases.numbers()["faded"] == pytest.approx(0.0)
     phases.observe(0.1, iteration=9)
     assert phases.numbers()["faded"] == pytest.approx(0.25)
-
-
-@pytest.mark.parametrize(
-    ("call", "said"),
-    [
-        (lambda: Fading(share=0.0), r"Fading: share=0.0"),
-        (lambda: Fading(exp_avg=1.5), r"Fading: exp_avg=1.5"),
-        (lambda: Fading(exp_avg_sq=-0.1), r"Fading: exp_avg_sq=-0.1"),
-        (lambda: Fading(events=0), r"Fading: events=0"),
-        (lambda: Fading(start=0.6, stop=0.5), r"Fading: stop=0.5.*\(0.6, 1.0\]"),
-        (lambda: Fading(seed=-1), r"Fading: seed=-1"),
-        (lambda: Fading(names=("pose",)), r"Fading: names=\('pose',\).*means, scales"),
-        (lambda: Fading(names=()), r"Fading: names=\(\)"),
-    ],
-)
-def test_bad_options_are_named(call: Any, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
-        call()

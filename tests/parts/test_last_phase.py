@@ -16,7 +16,7 @@ from trainers import (
     upgraded,
 )
 
-from opt3dgs_optim import FreshMoments, PhaseScheduler, SquaredLoss
+from opt3dgs_optim import FreshMoments, SquaredLoss
 
 TOTAL, SWITCH = 60, 40
 
@@ -96,15 +96,3 @@ def test_nor_does_one_of_which_only_the_device_knows(
         ] * 3
     train(splats, optimizers, phases, SWITCH + 1, SWITCH + 2)
     assert {float(state_of(optimizers, p)["step"]) for p in splats.values()} == {1.0}
-
-
-@pytest.mark.parametrize("settling", [-1, 1.5, None, "many", True])
-def test_settling_is_a_number_of_iterations(settling) -> None:
-    with pytest.raises(ValueError, match="FreshMoments: settling="):
-        FreshMoments(settling)
-
-
-def test_the_paper_has_both() -> None:
-    phases = PhaseScheduler.paper(300)
-    assert phases.part(SquaredLoss) is not None
-    assert phases.part(FreshMoments) == FreshMoments()

@@ -239,13 +239,3 @@ def test_empty_and_odd_shapes() -> None:
         else:
             assert torch.equal(state["exp_avg_sq"], moment)
     pool({})
-
-
-@pytest.mark.parametrize("names", ["means", (), ("means", "camera"), (3,)])
-def test_bad_names_say_what_is_allowed(names: Any) -> None:
-    with pytest.raises(ValueError, match=r"^Pooling: names="):
-        Pooling(names)
-
-
-def test_repr_says_what_is_pooled() -> None:
-    assert "Pooling(names=('means',))" in repr(only(TOTAL, Pooling(("means",))))
