@@ -10,12 +10,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from trainers import (
-    everything,
-    gsplat_optimizers,
-    make_splats,
-    train,
-)
+from trainers import begun, everything, gsplat_optimizers, train
 
 from opt3dgs_optim import (
     AWSGLD,
@@ -201,9 +196,11 @@ def test_a_truncated_file_raises_before_it_reaches_us(cut: float) -> None:
 
 
 def scheduler_state(change: Callable[[Any], Any]) -> tuple[PhaseScheduler, Any, dict]:
-    splats = make_splats()
-    phases = everything(60, 40, Annealing(names=GAUSSIAN), Fading(), nu=EnergyHistogram(warmup=10))
-    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    splats, optimizers = begun(
+        phases := everything(
+            60, 40, Annealing(names=GAUSSIAN), Fading(), nu=EnergyHistogram(warmup=10)
+        )
+    )
     train(splats, optimizers, phases, 0, 45)
     saved = copy.deepcopy(optimizers["means"].state_dict())
     return phases, optimizers["means"], change(saved)
@@ -276,9 +273,7 @@ def test_a_foreign_checkpoint_of_ours() -> None:
 
 def test_a_checkpoint_of_ours_loads_into_the_stock_trainer() -> None:
     """What is ours is in it, and stands in nobody's way."""
-    splats = make_splats()
-    phases = everything(60, 40, Fading(), settling=0)
-    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    splats, optimizers = begun(phases := everything(60, 40, Fading(), settling=0))
     train(splats, optimizers, phases, 0, 45)
     stock = gsplat_optimizers(splats)
     for name, optimizer in stock.items():

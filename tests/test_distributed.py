@@ -9,7 +9,7 @@ import torch
 import torch.multiprocessing as mp
 from ranks import free_port
 from torch import distributed
-from trainers import everything, gsplat_optimizers, make_splats, view_loss
+from trainers import everything, gsplat_optimizers, make_splats, step_all, view_loss
 
 from opt3dgs_optim import EnergyHistogram
 from opt3dgs_optim.phases import RankMean
@@ -34,9 +34,7 @@ def rank_main(rank: int, port: int, folder: str) -> None:
         phases.observe(loss * float("nan") if bad else loss)
         nus.append(float(histogram.multiplier))
         before = splats["means"].detach().clone()
-        for optimizer in optimizers.values():
-            optimizer.step()
-            optimizer.zero_grad()
+        step_all(optimizers)
         stood_still.append(torch.equal(before, splats["means"]))
     torch.save(
         {"nus": nus, "theta": histogram.weights, "still": stood_still}, f"{folder}/{rank}.pt"

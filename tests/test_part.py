@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 from trainers import (
+    assert_same,
     edit_rows,
     gsplat_optimizers,
     inria_optimizer,
@@ -107,8 +108,7 @@ def test_its_rows_and_its_state_are_in_checkpoints(make: Any, at: int, tmp_path:
                 optimizer.load_state_dict(saved[name])
         pulled(splats, optimizers, phases, TOTAL - at)
         ends.append((splats, float(part.share), state_of(optimizers, splats["quats"])))
-    for name in ends[0][0]:
-        assert torch.equal(ends[0][0][name], ends[1][0][name]), name
+    assert_same(ends[0][0], ends[1][0])
     assert ends[0][1] == ends[1][1] > 0
     assert torch.equal(ends[0][2]["disagreed"], ends[1][2]["disagreed"])
 
@@ -126,9 +126,7 @@ def test_masks_leave_its_other_rows_alone() -> None:
 
 
 def test_its_rows_follow_the_trainers_edits() -> None:
-    splats = make_splats()
-    phases = only(TOTAL, SignAgreement(), switch=0)
-    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    splats, phases, optimizers = upgraded(TOTAL, SignAgreement(), switch=0)
     pulled(splats, optimizers, phases, 5)
     assert bool((state_of(optimizers, splats["scales"])["disagreed"] > 1).any())
     edit_rows(splats, optimizers, torch.arange(1, 12), 2)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import Parameter
-from trainers import edit_rows, gsplat_optimizers, make_splats, train
+from trainers import begun, edit_rows, train
 
 from opt3dgs_optim import LQNAdam, Part, PhaseScheduler
 from opt3dgs_optim.lbfgs.history import header
@@ -182,9 +182,7 @@ class Age(Part):
 
 
 def aged(steps: int = 5) -> tuple[dict[str, Parameter], Any, Any, Any]:
-    splats = make_splats()
-    phases = PhaseScheduler(60, parts=[Age()])
-    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    splats, optimizers = begun(phases := PhaseScheduler(60, parts=[Age()]))
     train(splats, optimizers, phases, 0, steps)
     return splats, optimizers, phases, optimizers["means"]
 
