@@ -13,13 +13,11 @@ from torch import Tensor
 from torch.nn import Parameter
 from trainers import (
     assert_same,
-    edit_rows,
     gsplat_optimizers,
     inria_optimizer,
     make_splats,
     only,
     state_of,
-    train,
     upgraded,
 )
 
@@ -123,17 +121,6 @@ def test_masks_leave_its_other_rows_alone() -> None:
         means.step(visible=torch.arange(12) < (12 if step < 3 else 4))
     # against in each second step, for the others in the first three only
     assert means.state[splats["means"]]["disagreed"].tolist() == [3.0] * 4 + [1.0] * 8
-
-
-def test_its_rows_follow_the_trainers_edits() -> None:
-    splats, phases, optimizers = upgraded(TOTAL, SignAgreement(), switch=0)
-    pulled(splats, optimizers, phases, 5)
-    assert bool((state_of(optimizers, splats["scales"])["disagreed"] > 1).any())
-    edit_rows(splats, optimizers, torch.arange(1, 12), 2)
-    pulled(splats, optimizers, phases, 1)
-    counts = state_of(optimizers, splats["scales"])["disagreed"]
-    assert len(counts) == 13
-    assert not bool((counts > 1).any())
 
 
 def test_it_is_in_the_repr_and_in_the_upgrades_line(caplog: pytest.LogCaptureFixture) -> None:
@@ -259,11 +246,3 @@ def test_the_core_knows_no_part() -> None:
     for name in ("part", "course", "stepadam", "lending", "rows", "upgrading", "names", "checks"):
         text = (SOURCE / f"{name}.py").read_text()
         assert "opt3dgs_optim.parts" not in text, name
-
-
-def test_train_is_the_trainers() -> None:
-    """The helper of these tests calls what a trainer calls, and nothing else."""
-    splats = make_splats()
-    phases = only(TOTAL, SignAgreement())
-    train(splats, phases.upgrade(gsplat_optimizers(splats)), phases, 0, 2)
-    assert phases.iteration == 2
