@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from trainers import (
     assert_same,
+    edit_rows,
     gsplat_optimizers,
     inria_optimizer,
     make_splats,
@@ -121,6 +122,23 @@ def test_masks_leave_its_other_rows_alone() -> None:
         means.step(visible=torch.arange(12) < (12 if step < 3 else 4))
     # against in each second step, for the others in the first three only
     assert means.state[splats["means"]]["disagreed"].tolist() == [3.0] * 4 + [1.0] * 8
+
+
+EDITS = [(torch.arange(6), 2), (torch.arange(11), 1), (torch.arange(12).flip(0), 0)]
+
+
+@pytest.mark.parametrize(("keep", "new"), EDITS, ids=["fewer", "as many", "in another order"])
+def test_its_rows_begin_anew_after_the_trainers_edits(keep: Tensor, new: int) -> None:
+    """Also where the number of rows is what it was: other rows, for all that is known."""
+    splats, phases, optimizers = upgraded(TOTAL, SignAgreement(), switch=0)
+    pulled(splats, optimizers, phases, 5)
+    assert bool((state_of(optimizers, splats["scales"])["disagreed"] > 1).any())
+    edit_rows(splats, optimizers, keep, new)
+    assert "disagreed" not in optimizers["means"].state_dict()["state"][0]
+    pulled(splats, optimizers, phases, 1)
+    counts = state_of(optimizers, splats["scales"])["disagreed"]
+    assert len(counts) == len(keep) + new
+    assert not bool((counts > 1).any())
 
 
 def test_it_is_in_the_repr_and_in_the_upgrades_line(caplog: pytest.LogCaptureFixture) -> None:
