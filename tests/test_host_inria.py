@@ -11,11 +11,7 @@ from inria_host import ATTRIBUTES, OPTIONS, SimulatedModel, fill, real_model
 from torch import Tensor
 from trainers import everything, make_splats
 
-from opt3dgs_optim import (
-    EnergyHistogram,
-    Part,
-    PhaseScheduler,
-)
+from opt3dgs_optim import EnergyHistogram, Part, PhaseScheduler
 
 TOTAL, SWITCH, POINTS = 60, 30, 40
 MODELS = ["simulated", "3dgs-mcmc"]

@@ -261,8 +261,7 @@ def pulled(splats: dict[str, Parameter], *left_out: str) -> None:
 @MAKERS
 def test_a_stale_mask_with_nothing_to_step_is_nothing(make: Any) -> None:
     """INRIA after an edit: the mask has the old rows, the new Parameters no gradient yet."""
-    parts = Annealing(names=GAUSSIAN), Pooling()
-    splats, phases, optimizer = upgraded(40, *parts, make=make)
+    splats, phases, optimizer = upgraded(40, Annealing(names=GAUSSIAN), Pooling(), make=make)
     pulled(splats)
     phases.observe(0.1)
     optimizer.step(EVERY, 12)
@@ -292,17 +291,17 @@ def test_other_groups_ride_along_without_the_mask() -> None:
     optimizer = inria_optimizer(splats)
     optimizer.add_param_group({"params": [exposure], "lr": 0.1, "name": "exposure"})
     phases = only(10, Annealing(names=GAUSSIAN), Pooling())
-    upgraded: Any = phases.upgrade(optimizer)
+    whole: Any = phases.upgrade(optimizer)
     twin = Parameter(torch.ones(3, 4))
     plain = Adam([twin], lr=0.1, eps=1e-15)
     for p in (*splats.values(), exposure, twin):
         p.grad = torch.ones_like(p)
     phases.observe(0.1)
-    upgraded.step(torch.arange(12) % 2, 12)
+    whole.step(torch.arange(12) % 2, 12)
     plain.step()
     assert torch.equal(exposure, twin)
     with pytest.raises(ValueError, match="the mask has 3 rows"):
-        upgraded.step(torch.ones(3))
+        whole.step(torch.ones(3))
 
 
 @pytest.mark.parametrize(

@@ -8,14 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from trainers import (
-    gsplat_optimizers,
-    inria_optimizer,
-    make_splats,
-    only,
-    state_of,
-    train,
-)
+from trainers import gsplat_optimizers, inria_optimizer, make_splats, only, state_of, train
 
 from opt3dgs_optim import Fading, PhaseScheduler
 
