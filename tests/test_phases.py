@@ -198,6 +198,8 @@ def test_density_control_between_steps_is_survived_in_both_phases() -> None:
     state = state_of(optimizers, splats["means"])
     assert state["history"].shape[0] == len(splats["means"])
     assert bool((state["exp_avg_sq"] == state["exp_avg_sq"][:, :1]).all())  # pooled
+    holders = {name for name, p in splats.items() if "history" in state_of(optimizers, p)}
+    assert holders == {"means"}
 
 
 def test_presets() -> None:
