@@ -47,19 +47,19 @@ def test_a_second_optimizer_of_gaussians() -> None:
                 optimizer.step()
                 optimizer.zero_grad(set_to_none=True)
 
-    whole, *rest = begin()
-    run(whole, *rest, 1, 32)
-    plain, *rest = begin([])
-    run(plain, *rest, 1, 32)
+    whole, phases, optimizers = begin()
+    run(whole, phases, optimizers, 1, 32)
+    plain, phases, optimizers = begin([])
+    run(plain, phases, optimizers, 1, 32)
     assert not torch.equal(whole["shN"], plain["shN"])  # annealed: not plain Adam's
     assert not torch.equal(whole["shN"], make_splats(POINTS)["shN"])
 
-    half, *rest = begin()
-    run(half, *rest, 1, 16)
+    half, phases, before = begin()
+    run(half, phases, before, 1, 16)
     again, resumed, optimizers = begin()
     for name, value in half.items():
         again[name].data.copy_(value.data)
-    for optimizer, old in zip(optimizers, rest[1], strict=True):
+    for optimizer, old in zip(optimizers, before, strict=True):
         optimizer.load_state_dict(old.state_dict())
     assert resumed.iteration == 16
     run(again, resumed, optimizers, 17, 32)
