@@ -14,6 +14,7 @@ import torch.multiprocessing as mp
 from adaptive_scene import CHECK, SWITCH, TOTAL, Scene, Training, shorten
 from ranks import free_port
 from torch import Tensor, distributed
+from trainers import assert_same
 
 from opt3dgs_optim import Course, Part, PhaseScheduler
 
@@ -32,8 +33,7 @@ def test_where_every_part_is_of_use_all_stay_on(layout: str) -> None:
     assert watched.phases.switched_off == {}
     assert HISTORY in watched.positions_state
     plain = Training(Scene(), layout, adaptive=False).run(TOTAL)
-    for name, param in plain.splats.items():
-        assert torch.equal(param, watched.splats[name])  # watching changes nothing
+    assert_same(plain.splats, watched.splats)
 
 
 @pytest.mark.parametrize("layout", ["dict", "single"])
@@ -55,8 +55,7 @@ def test_all_at_once_is_then_plain_adam() -> None:
     expected = Training(bare, adaptive=False).load(training.save())
     training.run(TOTAL + 1)
     expected.step()
-    for name, param in expected.splats.items():
-        assert torch.equal(param, training.splats[name])
+    assert_same(expected.splats, training.splats)
 
 
 # -- the evidence of the parts -------------------------------------------------------------------
@@ -195,8 +194,7 @@ def test_a_resumed_run_is_the_same_bit_for_bit(part: str, cut: int, layout: str)
         torch.manual_seed(1)
         each.run(TOTAL)
     assert dict(again.phases.switched_off) == dict(whole.phases.switched_off)
-    for name, param in whole.splats.items():
-        assert torch.equal(param, again.splats[name]), name
+    assert_same(whole.splats, again.splats)
 
 
 def test_rewinding_brings_parts_back() -> None:
@@ -209,8 +207,7 @@ def test_rewinding_brings_parts_back() -> None:
     training.load(early)
     assert training.phases.switched_off == {}
     training.run(TOTAL)
-    for name, param in expected.splats.items():
-        assert torch.equal(param, training.splats[name])
+    assert_same(expected.splats, training.splats)
 
 
 def test_copies_go_on_alike() -> None:

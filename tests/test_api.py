@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 
 import opt3dgs_optim
 
@@ -23,31 +24,15 @@ def test_what_a_page_imports_from_the_top_is_there(page: Path) -> None:
 
 
 def test_the_names_that_must_stay() -> None:
-    needed = [
-        "AWSGLD",
-        "LQNAdam",
-        "PhaseScheduler",
-        "Phase",
-        "Part",
-        "Course",
-        "EnergyHistogram",
-        "two_loop",
-        "Annealing",
-        "Fading",
-        "Pooling",
-        "Curvature",
-        "ConstantMultiplier",
-        "FreshMoments",
-        "SquaredLoss",
-        "IsotropicNoise",
-        "PositionNoise",
-        "DEFAULTS",
-        "backend_info",
-        "__version__",
-    ]
+    steps = "AWSGLD LQNAdam PhaseScheduler Phase Part Course two_loop backend_info DEFAULTS"
+    parts = "EnergyHistogram Annealing Fading Pooling Curvature ConstantMultiplier FreshMoments"
+    parts += " SquaredLoss IsotropicNoise PositionNoise"
+    needed = [*steps.split(), *parts.split(), "__version__"]
     assert set(needed) <= set(opt3dgs_optim.__all__)
     assert sorted(opt3dgs_optim.__all__) == sorted(set(opt3dgs_optim.__all__))
     assert all(hasattr(opt3dgs_optim, name) for name in opt3dgs_optim.__all__)
+    for optimizer in (opt3dgs_optim.AWSGLD, opt3dgs_optim.LQNAdam):
+        assert issubclass(optimizer, torch.optim.Adam)
     scheduler = opt3dgs_optim.PhaseScheduler
     for name in ("upgrade", "observe", "pixel_loss", "phase", "paper"):
         assert hasattr(scheduler, name)

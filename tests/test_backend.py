@@ -9,7 +9,7 @@ import re
 import pytest
 import torch
 
-from opt3dgs_optim import Curvature, LQNAdam, backend_info, cuda
+from opt3dgs_optim import LQNAdam, backend_info, cuda
 from opt3dgs_optim.backend import obstacle
 
 
@@ -92,29 +92,8 @@ def test_torch_can_be_insisted_on(machine) -> None:
     assert obstacle("torch", torch.device("cuda"), torch.float32)
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda: backend_info("cpu", backend="triton"),  # pyright: ignore
-        lambda: Curvature(backend="triton"),  # pyright: ignore
-        lambda: LQNAdam([torch.zeros(1, 3)], backend="triton"),  # pyright: ignore
-    ],
-    ids=["backend_info", "Curvature", "LQNAdam"],
-)
-def test_unknown_backend_is_a_value_error(call) -> None:
-    with pytest.raises(ValueError, match="backend='triton', but one of 'auto', 'cuda', 'torch'"):
-        call()
-
-
 def test_cuda_on_a_cpu_is_one_clear_error() -> None:
     x = torch.nn.Parameter(torch.ones(4, 3))
     x.grad = torch.ones_like(x)
     with pytest.raises(RuntimeError, match="backend='cuda' was asked for on cpu"):
-        LQNAdam([x], backend="cuda").step()
-
-
-def test_cuda_is_refused_where_there_is_no_kernel() -> None:
-    x = torch.nn.Parameter(torch.ones(4, 2))
-    x.grad = torch.ones_like(x)
-    with pytest.raises(RuntimeError, match="points of 2 coordinates"):
         LQNAdam([x], backend="cuda").step()

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import io
-import pickle
 from typing import Any
 
 import pytest
@@ -45,30 +42,6 @@ def test_a_parameter_without_gradient_is_left_alone(cls: Any) -> None:
     optimizer.step()
     assert torch.equal(y, torch.ones(2, 3))
     assert not optimizer.state[y] if y in optimizer.state else True
-
-
-@pytest.mark.parametrize("cls", [AWSGLD, LQNAdam])
-@pytest.mark.parametrize("how", ["deepcopy", "pickle", "torch.save"])
-def test_copies_go_on_alike(cls: Any, how: str) -> None:
-    x = point()
-    optimizer = cls([x], lr=0.01)
-    for k in range(4):
-        x.grad = x.detach() * torch.tensor([1.0, 4.0, 9.0]) + k
-        x.grad[1] = float("nan") if k == 1 else 1.0
-        optimizer.step()
-    if how == "deepcopy":
-        twin = copy.deepcopy(optimizer)
-    elif how == "pickle":
-        twin = pickle.loads(pickle.dumps(optimizer))
-    else:
-        torch.save(optimizer, buffer := io.BytesIO())
-        buffer.seek(0)
-        twin = torch.load(buffer, weights_only=False)
-    y = twin.param_groups[0]["params"][0]
-    for param, each in ((x, optimizer), (y, twin)):
-        param.grad = param.detach() * 2
-        each.step()
-    assert torch.equal(x, y)
 
 
 def test_an_interval_of_no_numbers() -> None:

@@ -9,9 +9,9 @@ import torch
 import torch.multiprocessing as mp
 from ranks import free_port
 from torch import distributed
-from trainers import everything, gsplat_optimizers, make_splats, view_loss
+from trainers import everything, gsplat_optimizers, make_splats, step_all, view_loss
 
-from opt3dgs_optim import EnergyHistogram, PhaseScheduler
+from opt3dgs_optim import EnergyHistogram
 from opt3dgs_optim.phases import RankMean
 
 WORLD, TOTAL, BAD = 2, 40, 25
@@ -34,9 +34,7 @@ def rank_main(rank: int, port: int, folder: str) -> None:
         phases.observe(loss * float("nan") if bad else loss)
         nus.append(float(histogram.multiplier))
         before = splats["means"].detach().clone()
-        for optimizer in optimizers.values():
-            optimizer.step()
-            optimizer.zero_grad()
+        step_all(optimizers)
         stood_still.append(torch.equal(before, splats["means"]))
     torch.save(
         {"nus": nus, "theta": histogram.weights, "still": stood_still}, f"{folder}/{rank}.pt"
@@ -53,12 +51,6 @@ def test_two_ranks_have_one_nu_and_one_theta(tmp_path: Path) -> None:
     assert len(set(a["nus"])) > 3
     assert torch.equal(a["theta"], b["theta"])
     assert a["still"] == b["still"] == [iteration == BAD for iteration in range(TOTAL)]
-
-
-def test_a_group_without_torch_distributed() -> None:
-    with pytest.raises(ValueError, match=r"init_process_group first") as error:
-        PhaseScheduler(10, process_group="world")
-    assert "PhaseScheduler" in str(error.value)
 
 
 def test_a_process_that_is_not_in_the_group(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,6 +47,7 @@ def test_moments_have_the_parameters_dtype_and_the_history_float32(
     state = optimizer.state[x]
     assert {state[key].dtype for key in ("exp_avg", "exp_avg_sq")} == {dtype}
     assert state["step"].dtype == torch.float32
+    assert all(value.shape[0] == 8 for key, value in state.items() if key != "step")
     if cls is LQNAdam:
         wide = torch.float64 if dtype == torch.float64 else torch.float32
         assert state["history"].dtype == wide
@@ -226,13 +227,16 @@ def test_all_rows_unseen_for_long(steps: int) -> None:
     assert bool(torch.isfinite(back).all())
 
 
-@pytest.mark.parametrize("rows", [0, 1])
-def test_no_point_and_one_point(rows: int) -> None:
-    for cls in BOTH:
-        x = points(rows)
-        run(cls([x], lr=0.01), x, rows_of_noise(10, rows))
-        assert x.shape == (rows, 3)
-        assert bool(torch.isfinite(x).all())
+@pytest.mark.parametrize("shape", [(0, 3), (1, 3), (4,), (), (3, 2, 2)], ids=str)
+@pytest.mark.parametrize("cls", BOTH)
+def test_any_shape_whose_first_dimension_is_points(cls: Any, shape: tuple[int, ...]) -> None:
+    x = torch.nn.Parameter(torch.ones(shape))
+    optimizer = cls([x], lr=0.01)
+    for _ in range(3):
+        x.grad = 2 * x.detach()
+        optimizer.step()
+    assert x.shape == shape
+    assert bool((x < 1).all())
 
 
 # -- everything at once ----------------------------------------------------------------------------

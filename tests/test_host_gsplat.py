@@ -9,12 +9,7 @@ import pytest
 import torch
 from gsplat_host import ORDERS, VERSIONS, Trainer, scene_of_main, strategies
 from torch.nn import Parameter, ParameterDict
-from trainers import (
-    RATES,
-    everything,
-    gsplat_optimizers,
-    make_splats,
-)
+from trainers import RATES, everything, gsplat_optimizers, make_splats
 
 from opt3dgs_optim import EnergyHistogram, PhaseScheduler
 

@@ -9,19 +9,9 @@ import pytest
 import torch
 from inria_host import ATTRIBUTES, OPTIONS, SimulatedModel, fill, real_model
 from torch import Tensor
-from torch.nn import Parameter
-from trainers import (
-    everything,
-    make_splats,
-)
+from trainers import everything, make_splats
 
-from opt3dgs_optim import (
-    ConstantMultiplier,
-    Curvature,
-    EnergyHistogram,
-    Part,
-    PhaseScheduler,
-)
+from opt3dgs_optim import EnergyHistogram, Part, PhaseScheduler
 
 TOTAL, SWITCH, POINTS = 60, 30, 40
 MODELS = ["simulated", "3dgs-mcmc"]
@@ -182,27 +172,6 @@ def test_opacity_reset_of_inria() -> None:
     assert not bool(model.optimizer.state[model._opacity]["exp_avg"].any())
     run(model, phases, SWITCH + 4, SWITCH + 5, edits=False)
     assert model.optimizer.state[model._xyz]["history"].shape == pairs.shape
-
-
-@pytest.mark.parametrize("when", ["before", "after"])
-def test_exposures_and_poses_ride_along(when: str) -> None:
-    """13: groups that are not Gaussians are plain Adam's, added before or after the upgrade."""
-    model, plain = make_model("simulated"), []
-    extra = {"exposure": Parameter(torch.eye(3, 4)[None]), "pose": Parameter(torch.ones(5))}
-    twins = {name: Parameter(p.detach().clone()) for name, p in extra.items()}
-    phases = upgrade(model, [ConstantMultiplier(3.0), Curvature()]) if when == "after" else None
-    for name, p in extra.items():
-        model.optimizer.add_param_group({"params": [p], "lr": 0.01, "name": name})
-        plain.append(torch.optim.Adam([twins[name]], lr=0.01, eps=1e-15))
-    phases = phases or upgrade(model, [ConstantMultiplier(3.0), Curvature()])
-    for iteration in range(TOTAL):
-        for p in (*extra.values(), *twins.values()):
-            p.grad = torch.full_like(p, 0.1 * iteration)
-        run(model, phases, iteration, iteration + 1)
-        for optimizer in plain:
-            optimizer.step()
-    for name, p in extra.items():
-        assert torch.equal(p, twins[name])
 
 
 def test_sparse_adam_style_steps_through_edits() -> None:

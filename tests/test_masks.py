@@ -13,13 +13,16 @@ from torch.nn import Parameter
 from torch.optim import Adam
 from torch.optim.lr_scheduler import ExponentialLR
 from trainers import (
+    assert_same,
     every_one,
     everything,
     gsplat_optimizers,
     inria_optimizer,
     make_splats,
     only,
+    state_of,
     train,
+    upgraded,
     values_of,
 )
 
@@ -188,6 +191,8 @@ def test_invisible_rows_stand_still_in_both_phases(kind: Any, exploiting: bool, 
         for key in set(old) - {"step"}:
             assert torch.equal(old[key][~mask], new[key][~mask]), key
     assert any("history" in state for state in after) == exploiting
+    pooled = state_of(optimizers, splats["means"])["exp_avg_sq"][mask]
+    assert bool((pooled == pooled[:, :1]).all())
 
 
 def test_a_mask_before_the_first_energy() -> None:
@@ -238,31 +243,46 @@ def test_plain_drift_with_a_mask() -> None:
 # -- masks as hosts make them ----------------------------------------------------------------------
 
 
-def test_a_stale_mask_with_nothing_to_step_is_nothing() -> None:
+def sparse_optimizer(splats: dict[str, Parameter]) -> Adam:
+    """INRIA's other optimizer, with steps of its own."""
+    groups = inria_optimizer(splats).param_groups
+    return SparseGaussianAdam([{k: g[k] for k in ("params", "lr", "name")} for g in groups])
+
+
+EVERY = torch.ones(12, dtype=torch.bool)
+MAKERS = pytest.mark.parametrize("make", [inria_optimizer, sparse_optimizer])
+
+
+def pulled(splats: dict[str, Parameter], *left_out: str) -> None:
+    for name, param in splats.items():
+        param.grad = None if name in left_out else torch.ones_like(param)
+
+
+@MAKERS
+def test_a_stale_mask_with_nothing_to_step_is_nothing(make: Any) -> None:
     """INRIA after an edit: the mask has the old rows, the new Parameters no gradient yet."""
-    splats = make_splats()
-    phases = only(40, Annealing(names=GAUSSIAN), Pooling())
-    optimizer: Any = phases.upgrade(inria_optimizer(splats))
-    train(splats, optimizer, phases, 0, 3)
+    splats, phases, optimizer = upgraded(40, Annealing(names=GAUSSIAN), Pooling(), make=make)
+    pulled(splats)
+    phases.observe(0.1)
+    optimizer.step(EVERY, 12)
     before = values_of(splats)
+    pulled(splats, *splats)
     phases.observe(0.1)
     optimizer.step(torch.ones(19, dtype=torch.bool), 19)
-    assert all(torch.equal(before[name], splats[name]) for name in splats)
+    assert_same(before, splats)
 
 
-def test_only_the_opacities_have_no_gradient() -> None:
+@MAKERS
+def test_only_the_opacities_have_no_gradient(make: Any) -> None:
     """INRIA's reset of the opacities: their new Parameter has none, the others go on."""
-    splats = make_splats()
-    phases = only(40, Annealing(names=GAUSSIAN))
-    optimizer: Any = phases.upgrade(inria_optimizer(splats))
-    train(splats, optimizer, phases, 0, 3)
-    before = values_of(splats)
-    for name, param in splats.items():
-        param.grad = None if name == "opacities" else torch.ones_like(param)
-    phases.observe(0.1)
-    optimizer.step(torch.ones(12, dtype=torch.bool), 12)
-    moved = {name for name in splats if not torch.equal(before[name], splats[name])}
-    assert moved == set(splats) - {"opacities"}
+    splats, phases, optimizer = upgraded(40, Annealing(names=GAUSSIAN), make=make)
+    for left_out in ((), ("opacities",)):
+        before = values_of(splats)
+        pulled(splats, *left_out)
+        phases.observe(0.1)
+        optimizer.step(EVERY, 12)
+        moved = {name for name in splats if not torch.equal(before[name], splats[name])}
+        assert moved == set(splats) - set(left_out)
 
 
 def test_other_groups_ride_along_without_the_mask() -> None:
@@ -271,17 +291,17 @@ def test_other_groups_ride_along_without_the_mask() -> None:
     optimizer = inria_optimizer(splats)
     optimizer.add_param_group({"params": [exposure], "lr": 0.1, "name": "exposure"})
     phases = only(10, Annealing(names=GAUSSIAN), Pooling())
-    upgraded: Any = phases.upgrade(optimizer)
+    whole: Any = phases.upgrade(optimizer)
     twin = Parameter(torch.ones(3, 4))
     plain = Adam([twin], lr=0.1, eps=1e-15)
     for p in (*splats.values(), exposure, twin):
         p.grad = torch.ones_like(p)
     phases.observe(0.1)
-    upgraded.step(torch.arange(12) % 2, 12)
+    whole.step(torch.arange(12) % 2, 12)
     plain.step()
     assert torch.equal(exposure, twin)
     with pytest.raises(ValueError, match="the mask has 3 rows"):
-        upgraded.step(torch.ones(3))
+        whole.step(torch.ones(3))
 
 
 @pytest.mark.parametrize(

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 from trainers import (
+    assert_same,
     edit_rows,
     gsplat_optimizers,
     inria_optimizer,
     make_splats,
     only,
     state_of,
-    train,
     upgraded,
 )
 
@@ -107,8 +107,7 @@ def test_its_rows_and_its_state_are_in_checkpoints(make: Any, at: int, tmp_path:
                 optimizer.load_state_dict(saved[name])
         pulled(splats, optimizers, phases, TOTAL - at)
         ends.append((splats, float(part.share), state_of(optimizers, splats["quats"])))
-    for name in ends[0][0]:
-        assert torch.equal(ends[0][0][name], ends[1][0][name]), name
+    assert_same(ends[0][0], ends[1][0])
     assert ends[0][1] == ends[1][1] > 0
     assert torch.equal(ends[0][2]["disagreed"], ends[1][2]["disagreed"])
 
@@ -125,16 +124,20 @@ def test_masks_leave_its_other_rows_alone() -> None:
     assert means.state[splats["means"]]["disagreed"].tolist() == [3.0] * 4 + [1.0] * 8
 
 
-def test_its_rows_follow_the_trainers_edits() -> None:
-    splats = make_splats()
-    phases = only(TOTAL, SignAgreement(), switch=0)
-    optimizers = phases.upgrade(gsplat_optimizers(splats))
+EDITS = [(torch.arange(6), 2), (torch.arange(11), 1), (torch.arange(12).flip(0), 0)]
+
+
+@pytest.mark.parametrize(("keep", "new"), EDITS, ids=["fewer", "as many", "in another order"])
+def test_its_rows_begin_anew_after_the_trainers_edits(keep: Tensor, new: int) -> None:
+    """Also where the number of rows is what it was: other rows, for all that is known."""
+    splats, phases, optimizers = upgraded(TOTAL, SignAgreement(), switch=0)
     pulled(splats, optimizers, phases, 5)
     assert bool((state_of(optimizers, splats["scales"])["disagreed"] > 1).any())
-    edit_rows(splats, optimizers, torch.arange(1, 12), 2)
+    edit_rows(splats, optimizers, keep, new)
+    assert "disagreed" not in optimizers["means"].state_dict()["state"][0]
     pulled(splats, optimizers, phases, 1)
     counts = state_of(optimizers, splats["scales"])["disagreed"]
-    assert len(counts) == 13
+    assert len(counts) == len(keep) + new
     assert not bool((counts > 1).any())
 
 
@@ -261,11 +264,3 @@ def test_the_core_knows_no_part() -> None:
     for name in ("part", "course", "stepadam", "lending", "rows", "upgrading", "names", "checks"):
         text = (SOURCE / f"{name}.py").read_text()
         assert "opt3dgs_optim.parts" not in text, name
-
-
-def test_train_is_the_trainers() -> None:
-    """The helper of these tests calls what a trainer calls, and nothing else."""
-    splats = make_splats()
-    phases = only(TOTAL, SignAgreement())
-    train(splats, phases.upgrade(gsplat_optimizers(splats)), phases, 0, 2)
-    assert phases.iteration == 2

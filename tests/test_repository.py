@@ -91,20 +91,6 @@ def test_the_install_line_has_the_address_of_the_project() -> None:
     assert f"\npip install git+{address}\n" in README
 
 
-def test_public_names() -> None:
-    for name in (
-        "AWSGLD",
-        "LQNAdam",
-        "PhaseScheduler",
-        "Phase",
-        "EnergyHistogram",
-        "two_loop",
-        "__version__",
-    ):
-        assert name in opt3dgs_optim.__all__
-        assert hasattr(opt3dgs_optim, name)
-
-
 def test_readme_has_the_two_commands() -> None:
     setup = "python3 -m venv .venv && .venv/bin/pip install -c constraints.txt -e "
     assert f'{setup}".[examples]" && .venv/bin/python examples/error_vs_time.py\n' in README

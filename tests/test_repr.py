@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 from torch.nn import Parameter
-from trainers import everything, gsplat_optimizers, make_splats, only, train
+from trainers import begun, everything, gsplat_optimizers, make_splats, only, train
 
 from opt3dgs_optim import (
     AWSGLD,
@@ -96,8 +96,7 @@ def test_a_part_says_its_options() -> None:
 
 @pytest.mark.parametrize("steps", [0, 3, 11])
 def test_copies_say_the_same(steps: int) -> None:
-    splats, phases = make_splats(), everything(12, 8)
-    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    splats, optimizers = begun(phases := everything(12, 8))
     train(splats, optimizers, phases, 0, steps)
     for item in (phases, *optimizers.values()):
         assert repr(item).splitlines()[0] == f"{type(item).__name__}("
@@ -108,8 +107,7 @@ def test_copies_say_the_same(steps: int) -> None:
 def test_the_repr_changes_nothing() -> None:
     ends = []
     for look in (False, True):
-        splats, phases = make_splats(), everything(12, 8)
-        optimizers = phases.upgrade(gsplat_optimizers(splats))
+        splats, optimizers = begun(phases := everything(12, 8))
         for iteration in range(11):
             train(splats, optimizers, phases, iteration, iteration + 1)
             if look:

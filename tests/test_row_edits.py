@@ -99,6 +99,10 @@ class RowEdits(RuleBasedStateMachine):
         self.trainer.replace(everything, {}, zeroed=self.rows(chosen))
         self.edited()
 
+    @rule(row=st.integers(0, ROWS - 1))
+    def relocate_in_place(self, row: int) -> None:
+        self.trainer.zero_row(row % len(self.trainer))
+
     @rule()
     def reset_opacities(self) -> None:
         everything = list(range(len(self.trainer)))
@@ -160,3 +164,23 @@ def test_the_twins_notice_foreign_moments(kind: str) -> None:
     moment.copy_(moment.flip(0).clone())
     trainer.step([1.0] * 3, masked=False)
     assert trainer.difference() > 1e-4
+
+
+@pytest.mark.parametrize("zeroed", [True, False])
+def test_a_point_moved_in_place_begins_anew_where_its_row_is_zeroed(zeroed: bool) -> None:
+    """Otherwise it keeps its pairs, and gets one taken over the jump."""
+    trainer = HostileTrainer("gsplat", 3)
+    trainer.iteration = SWITCH
+    for _ in range(6):
+        trainer.step([1.0] * 3, masked=False)
+    kept = trainer.ours.state("means")["history"][2].clone()
+    trainer.zero_row(2)
+    if not zeroed:
+        trainer.ours.state("means")["history"][2] = kept
+    with torch.no_grad():
+        for params, row in ((trainer.ours.params, 2), (trainer.twins[2].params, 0)):
+            params["means"][row] = torch.tensor([0.4, -0.3, 0.2])
+    for _ in range(4):
+        trainer.step([1.0] * 3, masked=False)
+    assert trainer.difference(slice(2)) < TOLERANCE
+    assert (trainer.difference() < TOLERANCE) == zeroed

@@ -12,14 +12,17 @@ from devices import on_a_device
 from torch import Tensor
 from torch.nn import Parameter
 from trainers import (
-    every_one,
+    assert_same,
+    begun,
     everything,
     gsplat_optimizers,
     inria_optimizer,
     make_splats,
     only,
     state_of,
+    step_all,
     train,
+    upgraded,
     values_of,
     view_loss,
 )
@@ -33,7 +36,6 @@ from opt3dgs_optim import (
     FreshMoments,
     LQNAdam,
     Part,
-    PhaseScheduler,
     Pooling,
     PositionNoise,
 )
@@ -55,12 +57,6 @@ BAD = [math.nan, math.inf, -math.inf]
 TOTAL = 40
 
 
-def upgraded(splats: dict[str, Parameter], *parts: Part, **options: Any) -> tuple[Any, Any]:
-    """A scheduler of these parts, and the optimizers that have them."""
-    phases = only(TOTAL, *parts, switch=20)
-    return phases, phases.upgrade(gsplat_optimizers(splats, **options))
-
-
 class Nothing(Part):
     """A part that has every hook and changes nothing."""
 
@@ -80,15 +76,14 @@ class Nothing(Part):
 @pytest.mark.parametrize("path", PATHS, ids=str)
 @pytest.mark.parametrize("parts", [[], [Nothing()]], ids=["no parts", "a part that does nothing"])
 def test_it_is_torchs_adam_bit_for_bit(parts: list[Part], path: dict[str, Any]) -> None:
-    ours, theirs = make_splats(), make_splats()
-    phases, optimizers = upgraded(ours, *parts, **path)
+    ours, phases, optimizers = upgraded(TOTAL, *parts, **path)
+    theirs = make_splats()
     stock = gsplat_optimizers(theirs, **path)
     train(ours, optimizers, phases, 0, TOTAL)
     train(theirs, stock, None, 0, TOTAL)
+    assert_same(ours, theirs)
     for name in ours:
-        assert torch.equal(ours[name], theirs[name]), name
-        for key, value in state_of(stock, theirs[name]).items():
-            assert torch.equal(value, state_of(optimizers, ours[name])[key]), key
+        assert_same(state_of(stock, theirs[name]), state_of(optimizers, ours[name]))
 
 
 @pytest.mark.parametrize("path", [{}, {"foreach": True}, {"fused": True}], ids=str)
@@ -111,8 +106,8 @@ def test_a_factor_is_a_learning_rate(path: dict[str, Any], lr: Any) -> None:
 
 
 def test_step_hooks_of_torch_run_once() -> None:
-    splats, calls = make_splats(), []
-    phases, optimizers = upgraded(splats, Annealing(names=GAUSSIAN))
+    calls = []
+    splats, phases, optimizers = upgraded(TOTAL, Annealing(names=GAUSSIAN))
     means = optimizers["means"]
     torch.optim.Adam([Parameter(torch.ones(1))])  # torch wraps Adam.step when one is made
     means.register_step_pre_hook(lambda *_: calls.append("pre"))
@@ -158,9 +153,9 @@ def test_what_is_lent_is_taken_back_after_an_exception(
 ) -> None:
     from opt3dgs_optim import stepadam
 
-    splats = make_splats()
-    phases = only(TOTAL, Annealing(names=GAUSSIAN), Fails(hook))
-    optimizer = phases.upgrade(inria_optimizer(splats))
+    splats, phases, optimizer = upgraded(
+        TOTAL, Annealing(names=GAUSSIAN), Fails(hook), make=inria_optimizer
+    )
     phases.observe(0.1)
     for param in splats.values():
         param.grad = torch.ones_like(param)
@@ -180,8 +175,7 @@ def test_what_is_lent_is_taken_back_after_an_exception(
 
 
 def test_a_parameter_without_gradient_is_left_alone() -> None:
-    splats = make_splats()
-    phases, optimizers = upgraded(splats, Annealing(names=GAUSSIAN), Fading(), Pooling())
+    splats, phases, optimizers = upgraded(TOTAL, Annealing(names=GAUSSIAN), Fading(), Pooling())
     before = splats["means"].detach().clone()
     for _ in range(3):
         phases.observe(0.1)
@@ -239,8 +233,7 @@ def test_numbers_that_are_not_finite_are_zero_and_nobody_else_notices(
         clean.step()
     assert bool(torch.isfinite(x).all())
     assert torch.equal(x, y)
-    for key, value in clean.state[y].items():
-        assert torch.equal(hostile.state[x][key], value), key
+    assert_same(clean.state[y], hostile.state[x])
 
 
 @pytest.mark.parametrize("cls", [AWSGLD, LQNAdam])
@@ -288,27 +281,23 @@ def test_a_broken_loss_skips_the_step(make: Any, bad: float) -> None:
     """A run with broken losses thrown in is the run without them, in both phases."""
     ends, histograms = [], []
     for hostile in (False, True):
-        splats, histogram = make_splats(), EnergyHistogram(warmup=10)
-        phases = everything(60, 40, Annealing(names=GAUSSIAN), Fading(), nu=histogram, settling=0)
-        optimizers: Any = phases.upgrade(make(splats))
+        histogram = EnergyHistogram(warmup=10)
+        others = Annealing(names=GAUSSIAN), Fading(), Pooling()
+        phases = everything(60, 40, *others, nu=histogram, settling=0)
+        splats, optimizers = begun(phases, make)
         for iteration in range(60):
             if hostile and iteration in (0, 5, 22, 38, 40, 55):
                 (view_loss(splats, 1, phases) * bad).backward()
                 phases.observe(bad, iteration=iteration)
-                for optimizer in every_one(optimizers):
-                    optimizer.step()
-                    optimizer.zero_grad()
+                step_all(optimizers)
             loss = view_loss(splats, iteration % 5, phases)
             loss.backward()
             phases.observe(loss, iteration=iteration)
-            for optimizer in every_one(optimizers):
-                optimizer.step()
-                optimizer.zero_grad()
+            step_all(optimizers)
         ends.append(splats)
         histograms.append({**histogram.state_dict(), "num_observed": 0})
     assert histograms[0] == histograms[1]
-    for name in ends[0]:
-        assert torch.equal(ends[0][name], ends[1][name]), name
+    assert_same(ends[0], ends[1])
 
 
 @pytest.mark.parametrize("path", [{}, {"foreach": True}, {"foreach": False}, {"fused": True}])
@@ -336,13 +325,10 @@ def test_a_broken_loss_is_dropped_on_a_device_too(
         }
         (view_loss(splats, 0, phases) * math.nan).backward()
         phases.observe(torch.tensor(math.nan))
-        for optimizer in optimizers.values():
-            optimizer.step()
-            optimizer.zero_grad()
+        step_all(optimizers)
+        assert_same(before, splats)
         for name, param in splats.items():
-            assert torch.equal(before[name], param), name
-            for key, value in states[name].items():
-                assert torch.equal(value, state_of(optimizers, param)[key]), (name, key)
+            assert_same(states[name], state_of(optimizers, param))
     train(splats, optimizers, phases, phases.iteration, TOTAL)
     assert all(bool(torch.isfinite(p).all()) for p in splats.values())
 
@@ -355,15 +341,12 @@ def test_a_finite_loss_on_a_device_is_the_step_on_a_host(
     for device in (False, True):
         if device:
             on_a_device(monkeypatch)
-        splats = make_splats()
-        phases = everything(
-            TOTAL, 20, Annealing(names=GAUSSIAN), Fading(), Pooling(), nu=ConstantMultiplier(2.0)
-        )
-        optimizers = phases.upgrade(gsplat_optimizers(splats, **path))
+        others = Annealing(names=GAUSSIAN), Fading(), Pooling()
+        phases = everything(TOTAL, 20, *others, nu=ConstantMultiplier(2.0))
+        splats, optimizers = begun(phases, **path)
         train(splats, optimizers, phases, 0, TOTAL)
         ends.append(splats)
-    for name in ends[0]:
-        assert torch.equal(ends[0][name], ends[1][name]), name
+    assert_same(ends[0], ends[1])
 
 
 @pytest.mark.parametrize("path", [{}, {"fused": True}], ids=str)
@@ -371,8 +354,7 @@ def test_a_masked_step_with_a_broken_loss_on_a_device(
     path: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     on_a_device(monkeypatch)
-    splats = make_splats()
-    phases, optimizers = upgraded(splats, Annealing(names=GAUSSIAN), Pooling(), **path)
+    splats, phases, optimizers = upgraded(TOTAL, Annealing(names=GAUSSIAN), Pooling(), **path)
     train(splats, optimizers, phases, 0, 5)
     before = splats["means"].detach().clone()
     phases.observe(torch.tensor(math.inf))
@@ -399,9 +381,8 @@ def test_a_closure_with_a_broken_loss() -> None:
 
 def test_a_capture_is_refused_where_parts_act(monkeypatch: pytest.MonkeyPatch) -> None:
     """A replay would repeat one iteration's annealing factor, phase and fading for ever."""
-    splats = make_splats()
-    phases, optimizers = upgraded(splats, Annealing(names=GAUSSIAN))
-    plain, bare = upgraded(make_splats())
+    splats, phases, optimizers = upgraded(TOTAL, Annealing(names=GAUSSIAN))
+    _, plain, bare = upgraded(TOTAL)
     view_loss(splats, 0, phases).backward()
     phases.observe(0.1)
     plain.observe(0.1)
@@ -418,10 +399,9 @@ def test_a_capture_is_refused_where_parts_act(monkeypatch: pytest.MonkeyPatch) -
 
 
 def scaled(fused: bool | None) -> tuple[Any, dict[str, Parameter], Any, Any, EnergyHistogram]:
-    splats, histogram = make_splats(), EnergyHistogram(warmup=4)
     others = (Annealing(names=GAUSSIAN), Fading(share=1.0, events=100, start=0.0, stop=1.0))
-    phases = everything(100, 50, *others, nu=histogram)
-    optimizers = phases.upgrade(gsplat_optimizers(splats, fused=fused))
+    phases = everything(100, 50, *others, nu=(histogram := EnergyHistogram(warmup=4)))
+    splats, optimizers = begun(phases, fused=fused)
     # like nerfstudio's Trainer; a first scale at which nothing overflows
     scaler = torch.amp.GradScaler("cpu", init_scale=8.0)  # pyright: ignore
     return scaler, splats, optimizers, phases, histogram
@@ -448,7 +428,7 @@ def test_grad_scaler_skips_non_finite_steps(fused: bool | None, exploiting: bool
     before = values_of(splats)
     theta, seen = histogram.weights, histogram.num_observed
     scaled_step(scaler, splats, optimizers, phases, factor=float("inf"))
-    assert all(torch.equal(before[name], p) for name, p in splats.items())
+    assert_same(before, splats)
     assert torch.equal(histogram.weights, theta)
     assert histogram.num_observed == seen + (not exploiting)
     scaled_step(scaler, splats, optimizers, phases)
@@ -470,9 +450,8 @@ def test_a_gradient_that_overflows_at_a_finite_loss_is_skipped(
     moments = {n: state_of(optimizers, p)["exp_avg"].clone() for n, p in splats.items()}
     scaler.update(new_scale=3e38)  # the loss is finite, its scaled gradient is not
     scaled_step(scaler, splats, optimizers, phases, factor=1e3)
-    assert all(torch.equal(before[name], p) for name, p in splats.items())
-    for name, p in splats.items():
-        assert torch.equal(state_of(optimizers, p)["exp_avg"], moments[name]), name
+    assert_same(before, splats)
+    assert_same(moments, {n: state_of(optimizers, p)["exp_avg"] for n, p in splats.items()})
 
 
 @pytest.mark.parametrize("fused", [None, True])
@@ -485,9 +464,7 @@ def test_grad_scaler_gives_the_unscaled_steps(fused: bool | None) -> None:
         loss = view_loss(plain, 0, other)
         loss.backward()
         other.observe(loss)
-        for optimizer in own.values():
-            optimizer.step()
-            optimizer.zero_grad()
+        step_all(own)
     for name, p in splats.items():
         torch.testing.assert_close(p, plain[name], rtol=1e-6, atol=1e-7)
 
@@ -499,9 +476,8 @@ def test_gradient_accumulation_observes_the_mean_once() -> None:
     """Four views per step: the means of losses and gradients, as of one batch."""
     results = []
     for together in (True, False):
-        splats, histogram = make_splats(), EnergyHistogram(warmup=4)
-        phases = everything(20, 12, nu=histogram, settling=0)
-        optimizers = phases.upgrade(gsplat_optimizers(splats))
+        histogram = EnergyHistogram(warmup=4)
+        splats, optimizers = begun(phases := everything(20, 12, nu=histogram, settling=0))
         for _ in range(20):
             if together:
                 energy = torch.stack([view_loss(splats, v, phases) for v in range(4)]).mean()
@@ -514,9 +490,7 @@ def test_gradient_accumulation_observes_the_mean_once() -> None:
                     loss.backward()
                     energy = energy + loss.detach()
             phases.observe(energy)
-            for optimizer in optimizers.values():
-                optimizer.step()
-                optimizer.zero_grad()
+            step_all(optimizers)
         assert phases.iteration == 20
         results.append((splats, float(histogram.multiplier)))
     (a, nu_a), (b, nu_b) = results
@@ -530,9 +504,9 @@ def test_a_compiled_step_is_the_step_in_both_phases() -> None:
     """torch.compile runs it as it is: the same digits."""
     results = []
     for compiled in (False, True):
-        splats = make_splats()
-        phases = everything(12, 6, Annealing(names=GAUSSIAN), settling=0)
-        optimizers: Any = phases.upgrade(gsplat_optimizers(splats))
+        splats, optimizers = begun(
+            phases := everything(12, 6, Annealing(names=GAUSSIAN), settling=0)
+        )
         if compiled:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -549,9 +523,7 @@ def test_a_compiled_step_is_the_step_in_both_phases() -> None:
 
 
 def test_parts_that_do_not_act_store_nothing() -> None:
-    splats = make_splats()
-    phases = everything(TOTAL, 20)
-    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    splats, optimizers = begun(phases := everything(TOTAL, 20))
     train(splats, optimizers, phases, 0, 5)
     for name, param in splats.items():
         assert set(state_of(optimizers, param)) == {"step", "exp_avg", "exp_avg_sq"}, name
@@ -559,27 +531,22 @@ def test_parts_that_do_not_act_store_nothing() -> None:
 
 def test_both_phases_with_a_constant_image() -> None:
     """Loss 0 and gradient 0 from the first step to the last: nothing moves, nothing is NaN."""
-    splats = make_splats()
+    others = Annealing(names=GAUSSIAN), Fading()
+    phases = everything(50, 20, *others, nu=ConstantMultiplier(2.0), settling=0)
+    splats, optimizers = begun(phases)
     before = values_of(splats)
-    phases = everything(
-        50, 20, Annealing(names=GAUSSIAN), Fading(), nu=ConstantMultiplier(2.0), settling=0
-    )
-    optimizers = phases.upgrade(gsplat_optimizers(splats))
     for _ in range(40):
         for param in splats.values():
             param.grad = torch.zeros_like(param)
         phases.observe(0.0)
-        for optimizer in optimizers.values():
-            optimizer.step()
-    assert all(torch.equal(before[k], splats[k]) for k in splats)
+        step_all(optimizers)
+    assert_same(before, splats)
     train(splats, optimizers, phases, 40, 45)
     assert all(bool(torch.isfinite(p).all()) for p in splats.values())
 
 
 def test_the_object_is_one_for_the_whole_run() -> None:
-    splats = make_splats()
-    phases = PhaseScheduler(TOTAL, 20, [FreshMoments()])
-    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    splats, phases, optimizers = upgraded(TOTAL, FreshMoments(), switch=20)
     ids = {name: (id(opt), id(opt.step.__func__)) for name, opt in optimizers.items()}  # pyright: ignore
     train(splats, optimizers, phases, 0, TOTAL)
     assert ids == {n: (id(o), id(o.step.__func__)) for n, o in optimizers.items()}  # pyright: ignore

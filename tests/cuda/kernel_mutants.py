@@ -15,14 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from kernel_host import (
-    SOURCES,
-    HostKernels,
-    compare_energies,
-    compare_runs,
-    compile_host,
-    energies,
-)
+from kernel_host import SOURCES, HostKernels, compare_energies, compare_runs, compile_host, energies
 
 SIZE = 5
 ROWS = 257  # not a multiple of a block: the tail guard has something to do

@@ -120,13 +120,15 @@ def test_a_step_is_record_and_direction(graft: bool) -> None:
 
 
 def test_no_pair_leaves_every_bit_of_the_gradient() -> None:
-    """Scaling there and back would round; one visible step is no pair yet."""
+    """Scaling there and back would round; no visible step, or one, is no pair yet."""
     x, g, _ = walk(500, 3, 2, seed=1)
     x, g = x.float(), g.float() / 3
     history = new_history(x[0], 5)
-    record(history, 5, x[0], g[0], torch.ones(500, dtype=torch.bool), min_cosine=0.0)
-    for graft in (True, False):
-        assert torch.equal(direction(g[1], history, 5, graft=graft), g[1])
+    for visible in (torch.zeros(500, dtype=torch.bool), torch.ones(500, dtype=torch.bool)):
+        record(history, 5, x[0], g[0], visible, min_cosine=0.0)
+        for graft in (True, False):
+            assert torch.equal(direction(g[1], history, 5, graft=graft), g[1])
+        torch.testing.assert_close(two_loop(g[1], history, 5), g[1], rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("small", [1e-35, 0.0])
@@ -203,8 +205,8 @@ def test_the_header_gets_a_slot_where_the_spare_lanes_are_few(
     assert history_shape(torch.zeros(7, dim), size) == (7, slots, 2 * (dim + 1))
 
 
-@pytest.mark.parametrize("size", [1, 3, 4, 6])
-@pytest.mark.parametrize("dim", [1, 2, 3, 5])
+@pytest.mark.parametrize("size", [1, 3, 4, 5, 16])
+@pytest.mark.parametrize("dim", [1, 2, 3, 4, 7])
 def test_pairs_and_header_lie_where_the_docstring_says(size: int, dim: int) -> None:
     """The CUDA kernel reads them there."""
     g = torch.Generator().manual_seed(size)
@@ -249,6 +251,9 @@ def test_what_does_not_fit_is_named() -> None:
         lqn_direction(g[:3], g[:3], history, 5, min_cosine=0.0, graft=True)
     with pytest.raises(ValueError, match=r"two_loop: history has shape \(4, 5, 8\)"):
         two_loop(g, history, 7)
+    for other in (g[:3], g[:, :2]):
+        with pytest.raises(ValueError, match=r"two_loop: history has shape \(4, 5, 8\)"):
+            two_loop(other, history, 5)
     two_loop(wide, new_history(wide, 5), 5)
     assert new_history(wide, 5).dtype == F64
     assert new_history(g.half(), 5).dtype == torch.float32

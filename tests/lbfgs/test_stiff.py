@@ -1,15 +1,22 @@
-"""Stiff problems: all scales, axes and conditions at once, and the whole range of float32."""
+"""Stiff problems: all scales, axes and conditions at once, and the whole range of float32.
+
+Through one step of the curvature, by pure torch and by the CUDA kernel's source, which g++ compiles
+for the host.
+"""
 
 from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
+from kernel_host import compiler, host_kernels
 from line_search import minimise
 from oracles import dense_bfgs
-from points_first import direction, newest_gamma, record
+from points_first import newest_gamma
 from problems import (
     MUELLER_BROWN_OTHERS,
     MULTIMODAL,
@@ -18,63 +25,78 @@ from problems import (
     hessians,
     log_uniform,
     placed,
+    quadratic,
     rotations,
     to_world,
 )
 from torch import Tensor
 
-from opt3dgs_optim.lbfgs import history_from_pairs, new_history, two_loop
+from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history
 from opt3dgs_optim.lbfgs.history import header
 
 ROWS, SIZE = 10_000, 5
 CONDITIONS = (1.0, 1e3, 1e6, 1e12)
+OPTIONS = {"min_cosine": 1e-14}
+Step = Callable[..., tuple[Tensor, Tensor, Tensor]]  # as `lqn_direction`
+COMPILED = [
+    pytest.mark.compiles,
+    pytest.mark.skipif(compiler() is None, reason="g++ is not installed"),
+]
 
 
-def recorded(
-    hessian: Tensor,
-    positions: Tensor,  # [steps, N, 3]
-    gradient_scale: Tensor | float = 1.0,
-    dtype: torch.dtype = torch.float64,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """A history of the quadratic's pairs along `positions`, the last gradient, and acceptances."""
-    history = new_history(positions[0].to(dtype), SIZE)
-    g = torch.zeros_like(positions[0], dtype=dtype)
-    accepted = torch.zeros(len(g), dtype=torch.bool)
-    for x in positions:
-        g = (torch.einsum("nij,nj->ni", hessian, x) * gradient_scale).to(dtype)
-        visible = torch.isfinite(g).all(1) & (g != 0).any(1)
-        accepted, _ = record(history, SIZE, x.to(dtype), g, visible, min_cosine=1e-14)
-    return history, g, accepted
+def on_the_host(x: Tensor, g: Tensor, history: Tensor, size: int, **options: Any) -> Any:
+    """`lqn_direction` by the compiled source, for a history in either layout."""
+    cells = history.contiguous()
+    found = host_kernels(size, g.dtype).lqn(x, g, cells, **options)
+    history.copy_(cells)
+    return found
 
 
-def walk(rows: int, steps: int = 6, seed: int = 0) -> Tensor:
+@pytest.fixture(params=["torch", pytest.param("kernel", marks=COMPILED, id="kernel on the host")])
+def lqn(request: pytest.FixtureRequest) -> Step:
+    """`lqn_direction` by either backend."""
+    return lqn_direction if request.param == "torch" else on_the_host
+
+
+def walk(rows: int, steps: int = 6) -> Tensor:
     """[steps, rows, 3] random positions: differences that span the space."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     return torch.randn(steps, rows, 3, generator=generator, dtype=torch.float64)
 
 
+def fed(
+    lqn: Step, hessian: Tensor, positions: Tensor, slope: Any = 1.0, **options: Any
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Walk over a quadratic: the last direction, its gradient, the acceptances, the history."""
+    dtype = options.pop("dtype", torch.float64)
+    history = new_history(positions[0].to(dtype), SIZE)
+    found = g = accepted = torch.zeros(0)
+    for x in positions:
+        g = (torch.einsum("nij,nj->ni", hessian, x) * slope).to(dtype)
+        found, accepted, _ = lqn(x.to(dtype), g, history, SIZE, **OPTIONS, **options)
+    return found, g, accepted, history
+
+
+@pytest.mark.parametrize("graft", [True, False])
 @pytest.mark.parametrize("condition", CONDITIONS)
-def test_units_change_nothing_but_the_units(condition: float) -> None:
+def test_units_change_nothing_but_the_units(lqn: Step, condition: float, graft: bool) -> None:
     """Positions in units 1e-8 .. 1e8 and losses times 1e-12 .. 1e12, each row its own.
 
     The units are powers of two, so that the inputs are the same digits: so must the outputs be.
     """
     length = log_uniform(ROWS, 1e-8, 1e8, seed=1).log2().round().exp2()[:, None]
     loss = log_uniform(ROWS, 1e-12, 1e12, seed=2).log2().round().exp2()[:, None]
-    hessian, x = hessians(ROWS, condition), walk(ROWS)
-    history, g, accepted = recorded(hessian, x)
-    plain = two_loop(g, history, SIZE)
-    slope = loss / length  # gradients are loss per length
-    there = recorded(hessian / length[:, :, None] * slope[:, :, None], x * length)
+    hessian, x, slope = hessians(ROWS, condition), walk(ROWS), loss / length
+    plain, _, accepted, _ = fed(lqn, hessian, x, graft=graft)
+    there = fed(lqn, hessian / length[:, :, None], x * length, slope, graft=graft)
     assert torch.equal(there[2], accepted)
-    assert torch.equal(two_loop(there[1], there[0], SIZE), plain * length)
-    grafted = direction(g, history, SIZE, graft=True)
-    assert torch.equal(direction(there[1], there[0], SIZE, graft=True), grafted * slope)
+    assert bool(accepted.any())
+    assert torch.equal(there[0], plain * (slope if graft else length))
 
 
 @pytest.mark.parametrize("condition", CONDITIONS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_axes_change_nothing_but_the_axes(condition: float, dtype: torch.dtype) -> None:
+def test_axes_change_nothing_but_the_axes(lqn: Step, condition: float, dtype: torch.dtype) -> None:
     """Rotate pairs and gradient: the pseudo-gradient turns along, to the rounding of the pairs."""
     hessian, x, turn = hessians(ROWS, condition), walk(ROWS), rotations(ROWS, 3, seed=3)
     s = x.diff(dim=0)
@@ -84,7 +106,10 @@ def test_axes_change_nothing_but_the_axes(condition: float, dtype: torch.dtype) 
     def pseudo(axes: Tensor) -> Tensor:
         turned = [torch.einsum("nij,...nj->...ni", axes, v).to(dtype) for v in (s, y, g)]
         history = history_from_pairs(turned[0], turned[1])
-        return two_loop(turned[2], history, SIZE).double()
+        head, at = header(history, SIZE), torch.zeros_like(turned[2])
+        head.position.copy_(at)  # where it is: no pair is added
+        head.gradient.copy_(turned[2])
+        return lqn(at, turned[2], history, SIZE, **OPTIONS, graft=False)[0].double()
 
     plain, turned = pseudo(torch.eye(3, dtype=torch.float64).expand(ROWS, 3, 3)), pseudo(turn)
     expected = torch.einsum("nij,nj->ni", turn, plain)
@@ -98,23 +123,21 @@ def test_axes_change_nothing_but_the_axes(condition: float, dtype: torch.dtype) 
 
 
 @pytest.mark.parametrize("condition", CONDITIONS)
-def test_equals_the_dense_recursion(condition: float) -> None:
+def test_equals_the_dense_recursion(lqn: Step, condition: float) -> None:
     rows = 40
     hessian, x = hessians(rows, condition), walk(rows)
-    history, g, _ = recorded(hessian, x)
-    found = two_loop(g, history, SIZE)
+    found, g, _, _ = fed(lqn, hessian, x, graft=False)
     s = x.diff(dim=0).numpy()
     y = torch.einsum("nij,knj->kni", hessian, x).diff(dim=0).numpy()
     for row in range(rows):
         matrix = torch.from_numpy(dense_bfgs(s[:, row], y[:, row]))
-        expected = matrix @ g[row]
         # Both are 2 K updates in float64, each of which can amplify rounding by |V|^2 ~ |y|^2/s.y
         worst = min(
             float(abs(a @ b) / math.sqrt((a @ a) * (b @ b)))
             for a, b in zip(s[:, row], y[:, row], strict=True)
         )
         slack = 1e-13 / worst**2 * float(matrix.abs().max() * g[row].abs().max())
-        assert float((found[row] - expected).abs().max()) <= slack
+        assert float((found[row] - matrix @ g[row]).abs().max()) <= slack
 
 
 # -- the whole range of float32 ------------------------------------------------------------------
@@ -124,31 +147,29 @@ STEPS = [1e-30, 1e-20, 1e-12, 1e-6, 1.0, 1e6, 1e20]
 
 
 @pytest.mark.parametrize(("size", "step"), list(itertools.product(GRADIENTS, STEPS)))
-def test_no_intermediate_leaves_float32(size: float, step: float) -> None:
+def test_no_intermediate_leaves_float32(lqn: Step, size: float, step: float) -> None:
     """Gradients from 1e-44 (denormal) to 3e37, whose squares are nowhere near float32.
 
     Where gradient and step can be told from zero, and the two units' ratio is a float32, the
     result is the float64 recursion's; where not, the gradient comes back. It is never non-finite,
     never zero.
     """
-    rows = 500
+    rows, slope = 500, size / 100  # |H x| is up to 100
     hessian, x = hessians(rows, 30.0), walk(rows)
-    slope = size / 100  # |H x| is up to 100
-    history, g, accepted = recorded(hessian, x * step, slope / step, torch.float32)
-    found = direction(g, history, SIZE, graft=True)
+    single = (hessian, x * step, slope / step)
+    found, g, accepted, history = fed(lqn, *single, graft=True, dtype=torch.float32)
+    raw = fed(lqn, *single, graft=False, dtype=torch.float32)[0]
     assert bool(torch.isfinite(found).all())
+    assert bool(torch.isfinite(raw).all())
     assert bool((found != 0).any(1)[(g != 0).any(1)].all())
     assert bool(torch.isfinite(header(history, SIZE).counter).all())
-    raw = direction(g, history, SIZE, graft=False)
-    assert bool(torch.isfinite(raw).all())
     # Per unit of gradient: s / |y|, which is what is stored. Outside of 1e-30 .. 1e30 float32 has
     # no room for it and its square.
     if slope >= 1e-36 and 1e-30 <= step / slope <= 1e30:
         assert bool(accepted.all())
         gamma = newest_gamma(history, SIZE)
         assert bool(((gamma > 0) & torch.isfinite(gamma)).all())
-        reference, g64, _ = recorded(hessian, x, 1.0)
-        expected = direction(g64, reference, SIZE, graft=True)
+        expected = fed(lqn, hessian, x, graft=True)[0]
         expected = expected / expected.norm(dim=1, keepdim=True)
         unit = found.double() / found.double().norm(dim=1, keepdim=True)
         # rounding of positions and gradients, over pairs with cosines of 0.3 and more
@@ -156,6 +177,28 @@ def test_no_intermediate_leaves_float32(size: float, step: float) -> None:
 
 
 # -- convergence ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("condition", "left"), [(1.0, 1e-12), (1e3, 1e-10), (1e6, 1e-6), (1e12, 1.0)]
+)
+def test_line_search_on_quadratics(lqn: Step, condition: float, left: float) -> None:
+    hessian = hessians(500, condition)
+    start = torch.ones(500, 3, dtype=torch.float64)
+    end = minimise(quadratic(hessian), start, 60, step=lqn)[-1]
+    assert float(end.norm(dim=1).median()) < left
+    # rounding of H x (1e-16 times the condition) is the gradient that is left along the flat axis
+    assert float(quadratic(hessian)(end).max()) < 1e-11 * condition
+
+
+def test_line_search_in_the_helical_valley(lqn: Step) -> None:
+    """The problem of three coordinates, every row in units of 1e-8 to 1e8 and axes of its own."""
+    (problem,) = (p for p in SMOOTH if p.dim == 3)
+    scale, turn = log_uniform(50, 1e-8, 1e8), rotations(50, 3)
+    value = placed(problem, scale, turn)
+    end = minimise(value, to_world(problem.starts(50), scale, turn), 150, step=lqn)[-1]
+    assert float(value(end).max()) < 1e-25 * problem.start_value
+
 
 REACHED = {  # relative to the start's value: what is left after the line searches below
     "Brown badly scaled": 1e-18,  # f = 1e12 at the start: 1e-18 of it is 1e-6

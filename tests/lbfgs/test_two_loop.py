@@ -159,35 +159,6 @@ def feed(history: Tensor, size: int, s: Tensor, y: Tensor) -> None:
         record(history, size, x, g, visible, min_cosine=0.0)
 
 
-def test_empty_history_returns_the_gradient_bit_for_bit() -> None:
-    g = torch.randn(5, 3)
-    history = new_history(g, 5)
-    assert torch.equal(direction(g, history, 5, graft=True), g)
-    assert torch.equal(direction(g, history, 5, graft=False), g)
-    torch.testing.assert_close(two_loop(g, history, 5), g, rtol=1e-6, atol=0)
-
-
-def test_160_bytes_per_point_for_five_pairs() -> None:
-    history = new_history(torch.zeros(10, 3), 5)
-    assert history.shape == (10, 5, 8)
-    assert history.element_size() * history[0].numel() == 160
-
-
-@pytest.mark.parametrize("size", [1, 3, 4, 5, 16])
-@pytest.mark.parametrize("dim", [1, 2, 3, 4, 7])
-def test_header_and_pairs_do_not_overlap(size: int, dim: int) -> None:
-    history = new_history(torch.zeros(2, dim, dtype=torch.float64), size)
-    head = header(history, size)
-    head.position.fill_(1)
-    head.gradient.fill_(2)
-    head.counter.fill_(3)
-    assert float(history.sum()) == 2 * (dim * 1 + dim * 2 + 3)
-    if size > dim:
-        assert history.shape[1] == size
-    assert float(history[:, :size, :dim].sum()) == 0
-    assert float(history[:, :size, dim + 1 : 2 * dim + 1].sum()) == 0
-
-
 def test_grafting_keeps_the_gradients_length() -> None:
     s, y, _ = convex_pairs(4, 3, 20, 3)
     g = gradients(20, 3, 3) * 10.0 ** torch.arange(-10, 10, dtype=torch.float64).unsqueeze(1)
@@ -267,15 +238,6 @@ def test_poisoned_history_falls_back_to_the_gradient(poison: float) -> None:
     result = direction(g, history, 5, graft=True)
     assert torch.equal(result[1], g[1])
     assert bool(torch.isfinite(result).all())
-
-
-def test_wrong_shapes_are_named() -> None:
-    with pytest.raises(ValueError, match=r"two_loop: history has shape \(4, 5, 8\)"):
-        two_loop(torch.zeros(4, 2), new_history(torch.zeros(4, 3), 5), 5)
-    with pytest.raises(ValueError, match="two_loop"):
-        two_loop(torch.zeros(3, 3), new_history(torch.zeros(4, 3), 5), 5)
-    with pytest.raises(ValueError, match="two_loop"):
-        two_loop(torch.zeros(4, 3), new_history(torch.zeros(4, 3), 5), 7)
 
 
 @pytest.mark.parametrize("n", [0, 1])

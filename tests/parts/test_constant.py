@@ -2,26 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import pytest
-import torch
-from trainers import gsplat_optimizers, make_splats, only, train
+from trainers import only
 
 from opt3dgs_optim import ConstantMultiplier
-
-
-def test_it_is_a_larger_learning_rate_while_exploring() -> None:
-    ours, theirs = make_splats(), make_splats()
-    phases = only(30, ConstantMultiplier(2.0), switch=20)
-    optimizers, plain = phases.upgrade(gsplat_optimizers(ours)), gsplat_optimizers(theirs)
-    for iteration in range(30):
-        for name, optimizer in plain.items():
-            rate = optimizers[name].param_groups[0]["lr"]
-            optimizer.param_groups[0]["lr"] = rate * (2.0 if iteration < 20 else 1.0)
-        train(ours, optimizers, phases, iteration, iteration + 1)
-        train(theirs, plain, None, iteration, iteration + 1)
-    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
 
 
 def test_it_is_one_during_the_warm_up() -> None:
@@ -33,16 +16,3 @@ def test_it_is_one_during_the_warm_up() -> None:
         phases.observe(0.1)
         seen.append((part.factor({}, phases), dict(part.numbers(phases))))
     assert seen == [(1.0, {}), (1.0, {}), (2.5, {"nu": 2.5}), (2.5, {"nu": 2.5})]
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"value": float("nan")}, "value=nan"),
-        ({"value": "two"}, "value='two'"),
-        ({"value": 1.0, "warmup": -1}, "warmup=-1"),
-    ],
-)
-def test_bad_options_are_named(options: dict[str, Any], said: str) -> None:
-    with pytest.raises(ValueError, match=f"ConstantMultiplier: {said}"):
-        ConstantMultiplier(**options)

@@ -8,16 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from trainers import (
-    edit_rows,
-    gsplat_optimizers,
-    inria_optimizer,
-    make_splats,
-    only,
-    state_of,
-    train,
-    upgraded,
-)
+from trainers import gsplat_optimizers, inria_optimizer, make_splats, only, state_of, train
 
 from opt3dgs_optim import Fading, PhaseScheduler
 
@@ -115,14 +106,6 @@ def test_a_step_after_fading_is_no_longer_than_before() -> None:
     torch.testing.assert_close(faded, length)
 
 
-def test_fading_survives_density_control() -> None:
-    splats, phases, optimizers = upgraded(TOTAL, Fading(share=1.0, events=60, start=0.0, stop=1.0))
-    for i in range(0, TOTAL, 10):
-        train(splats, optimizers, phases, i, i + 10)
-        edit_rows(splats, optimizers, torch.arange(len(splats["means"])) % 4 != 1, 2)  # pyright: ignore[reportArgumentType]
-    assert all(bool(p.isfinite().all()) for p in splats.values())
-
-
 # -- each event once, whatever the iterations do --------------------------------------------------
 
 
@@ -205,21 +188,3 @@ def test_the_log_gets_the_share_of_this_iteration() -> None:
     assert phases.numbers()["faded"] == pytest.approx(0.0)
     phases.observe(0.1, iteration=9)
     assert phases.numbers()["faded"] == pytest.approx(0.25)
-
-
-@pytest.mark.parametrize(
-    ("call", "said"),
-    [
-        (lambda: Fading(share=0.0), r"Fading: share=0.0"),
-        (lambda: Fading(exp_avg=1.5), r"Fading: exp_avg=1.5"),
-        (lambda: Fading(exp_avg_sq=-0.1), r"Fading: exp_avg_sq=-0.1"),
-        (lambda: Fading(events=0), r"Fading: events=0"),
-        (lambda: Fading(start=0.6, stop=0.5), r"Fading: stop=0.5.*\(0.6, 1.0\]"),
-        (lambda: Fading(seed=-1), r"Fading: seed=-1"),
-        (lambda: Fading(names=("pose",)), r"Fading: names=\('pose',\).*means, scales"),
-        (lambda: Fading(names=()), r"Fading: names=\(\)"),
-    ],
-)
-def test_bad_options_are_named(call: Any, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
-        call()

@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 import torch
 from oracles import covariance
-from trainers import edit_rows, gaussians, gsplat_optimizers, make_splats, only, train, values_of
+from trainers import (
+    edit_rows,
+    gaussians,
+    gsplat_optimizers,
+    make_splats,
+    only,
+    train,
+    upgraded,
+    values_of,
+)
 
 from opt3dgs_optim import Annealing, Course, IsotropicNoise, Phase, PositionNoise
 from opt3dgs_optim.names import GAUSSIAN
@@ -227,9 +236,8 @@ def test_a_step_that_only_the_device_may_drop() -> None:
 
 
 def test_a_trainers_noise_is_fine_where_ours_is_off() -> None:
-    splats, phases = make_splats(), only(60, Annealing(names=GAUSSIAN))
-    upgraded = phases.upgrade(gsplat_optimizers(splats))
+    splats, phases, optimizers = upgraded(60, Annealing(names=GAUSSIAN))
     for iteration in range(10):
-        train(splats, upgraded, phases, iteration, iteration + 1)
+        train(splats, optimizers, phases, iteration, iteration + 1)
         with torch.no_grad():
             splats["means"].add_(0.01)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import numpy as np
@@ -10,8 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 from trainers import (
-    check_resume,
-    edit_rows,
     gsplat_optimizers,
     inria_optimizer,
     make_splats,
@@ -21,7 +18,7 @@ from trainers import (
     upgraded,
 )
 
-from opt3dgs_optim import Course, Fading, PhaseScheduler, Pooling
+from opt3dgs_optim import Course, Pooling
 
 TOTAL = 60
 GEOMETRY = ("means", "scales", "quats")
@@ -83,9 +80,7 @@ def test_a_step_has_the_direction_of_the_mean_gradient() -> None:
     for kind, pooling in (("adam", []), ("pooled", [Pooling()])):
         param = torch.nn.Parameter(torch.zeros(50, 3, dtype=torch.float64))
         phases = only(TOTAL, *pooling)
-        (optimizer,) = phases.upgrade(
-            {"means": torch.optim.Adam([{"params": param, "lr": 1e-3, "name": "means"}], eps=EPS)}
-        ).values()
+        optimizer = phases.upgrade({"means": torch.optim.Adam([param], lr=1e-3, eps=EPS)})["means"]
         draws = torch.Generator().manual_seed(1)
         before = param.detach().clone()
         for _ in range(60):
@@ -106,9 +101,7 @@ def test_an_axis_without_evidence_does_not_make_full_steps() -> None:
     for kind, pooling in (("adam", []), ("pooled", [Pooling()])):
         param = torch.nn.Parameter(torch.zeros(20, 3))
         phases = only(TOTAL, *pooling)
-        (optimizer,) = phases.upgrade(
-            {"means": torch.optim.Adam([{"params": param, "lr": 1e-3, "name": "means"}], eps=EPS)}
-        ).values()
+        optimizer = phases.upgrade({"means": torch.optim.Adam([param], lr=1e-3, eps=EPS)})["means"]
         draws = torch.Generator().manual_seed(1)
         for _ in range(TOTAL):
             phases.observe(0.1)
@@ -122,22 +115,14 @@ def test_an_axis_without_evidence_does_not_make_full_steps() -> None:
 
 @pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
 def test_every_trainers_names_are_pooled(make: Any) -> None:
-    splats = make_splats()
     pooling = Pooling(("xyz", "scales"))
     assert pooling.names == ("means", "scales")
-    phases = only(TOTAL, pooling)
-    optimizers = phases.upgrade(make(splats))
+    splats, phases, optimizers = upgraded(TOTAL, pooling, make=make)
     train(splats, optimizers, phases, 0, 5)
     for name, param in splats.items():
         moment = state_of(optimizers, param)["exp_avg_sq"].reshape(len(param), -1)
         equal = bool((moment == moment[:, :1]).all())
         assert equal == (name in ("means", "scales", "opacities")), name
-
-
-@pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
-def test_resume_is_bit_exact(make: Any) -> None:
-    parts = [Fading(share=0.5, events=20), Pooling()]
-    check_resume(make, lambda: only(TOTAL, *parts), TOTAL, 23)
 
 
 def test_a_training_that_began_without_it_is_pooled_from_the_next_step() -> None:
@@ -153,57 +138,6 @@ def test_a_training_that_began_without_it_is_pooled_from_the_next_step() -> None
     assert (pooled[:, 0] >= 0.99 * mean).all()
 
 
-def test_density_control_may_edit_the_rows() -> None:
-    splats = make_splats(12)
-    phases = only(TOTAL, Pooling())
-    optimizers = phases.upgrade(gsplat_optimizers(splats))
-    train(splats, optimizers, phases, 0, 10)
-    kept = torch.tensor([0, 3, 5, 11])
-    old = optimizers["means"].state[splats["means"]]["exp_avg_sq"].clone()
-    edit_rows(splats, optimizers, kept, 6)
-    moment = optimizers["means"].state[splats["means"]]["exp_avg_sq"]
-    assert torch.equal(moment[:4], old[kept])
-    train(splats, optimizers, phases, 10, 20)
-    moment = optimizers["means"].state[splats["means"]]["exp_avg_sq"]
-    assert moment.shape == (10, 3)
-    assert (moment == moment[:, :1]).all()
-
-
-def test_rows_that_do_not_step_keep_their_moments() -> None:
-    """Invisible ones; a number that is not finite is taken as zero, and the row goes on."""
-    splats = make_splats(6)
-    stock = gsplat_optimizers(splats)
-    train(splats, stock, None, 0, 5)
-    state = copy.deepcopy(stock["means"].state[splats["means"]])
-    phases = only(TOTAL, Pooling())
-    optimizer: Any = phases.upgrade(stock)["means"]
-    mask = torch.tensor([True, False, True, True, False, True])
-    phases.observe(0.1)
-    splats["means"].grad = torch.ones(6, 3)
-    splats["means"].grad[2, 1] = torch.nan
-    optimizer.step(visible=mask)
-    moment = optimizer.state[splats["means"]]["exp_avg_sq"]
-    still = torch.tensor([1, 4])
-    assert torch.equal(moment[still], state["exp_avg_sq"][still])
-    moving = moment[[0, 2, 3, 5]]
-    assert torch.isfinite(moving).all()
-    assert (moving == moving[:, :1]).all()
-
-
-def test_a_step_that_is_dropped_leaves_everything() -> None:
-    splats, phases, optimizers = upgraded(TOTAL, Pooling())
-    train(splats, optimizers, phases, 0, 5)
-    before = [
-        splats["scales"].detach().clone(),
-        optimizers["scales"].state[splats["scales"]]["exp_avg_sq"].clone(),
-    ]
-    phases.observe(float("nan"))
-    splats["scales"].grad = torch.ones_like(splats["scales"])
-    optimizers["scales"].step()
-    assert torch.equal(before[0], splats["scales"])
-    assert torch.equal(before[1], optimizers["scales"].state[splats["scales"]]["exp_avg_sq"])
-
-
 def test_amsgrads_maxima_are_pooled_too() -> None:
     splats, phases, optimizers = upgraded(TOTAL, Pooling(), amsgrad=True)
     train(splats, optimizers, phases, 0, 5)
@@ -212,40 +146,15 @@ def test_amsgrads_maxima_are_pooled_too() -> None:
         assert (state[key] == state[key][:, :1]).all(), key
 
 
-def test_without_it_nothing_is_pooled_and_the_paper_has_none() -> None:
-    assert PhaseScheduler.paper(100).part(Pooling) is None
-    splats, plain = make_splats(), make_splats()
-    phases = only(TOTAL)
-    optimizers, adam = phases.upgrade(gsplat_optimizers(splats)), gsplat_optimizers(plain)
-    train(splats, optimizers, phases, 0, 20)
-    train(plain, adam, None, 0, 20)
-    assert all(torch.equal(splats[name], plain[name]) for name in splats)
-
-
-def pool(state: dict[str, Any]) -> None:
+@pytest.mark.parametrize("shape", [(0, 3), (4,), (3, 1), (2, 15, 3), ()], ids=str)
+def test_empty_and_odd_shapes(shape: tuple[int, ...]) -> None:
+    moment = torch.rand(shape)
+    state = {"exp_avg_sq": moment.clone()}
     Pooling().after({}, torch.zeros(()), state, Course())
-
-
-def test_empty_and_odd_shapes() -> None:
-    shapes: list[tuple[int, ...]] = [(0, 3), (4,), (3, 1), (2, 15, 3), ()]
-    for shape in shapes:
-        moment = torch.rand(shape)
-        state = {"exp_avg_sq": moment.clone()}
-        pool(state)
-        assert state["exp_avg_sq"].shape == shape
-        if moment.dim() > 1 and moment.numel():
-            mean = moment.reshape(shape[0], -1).mean(1)
-            torch.testing.assert_close(state["exp_avg_sq"].reshape(shape[0], -1)[:, -1], mean)
-        else:
-            assert torch.equal(state["exp_avg_sq"], moment)
-    pool({})
-
-
-@pytest.mark.parametrize("names", ["means", (), ("means", "camera"), (3,)])
-def test_bad_names_say_what_is_allowed(names: Any) -> None:
-    with pytest.raises(ValueError, match=r"^Pooling: names="):
-        Pooling(names)
-
-
-def test_repr_says_what_is_pooled() -> None:
-    assert "Pooling(names=('means',))" in repr(only(TOTAL, Pooling(("means",))))
+    assert state["exp_avg_sq"].shape == shape
+    if moment.dim() > 1 and moment.numel():
+        mean = moment.reshape(shape[0], -1).mean(1)
+        torch.testing.assert_close(state["exp_avg_sq"].reshape(shape[0], -1)[:, -1], mean)
+    else:
+        assert torch.equal(state["exp_avg_sq"], moment)
+    Pooling().after({}, torch.zeros(()), {}, Course())

@@ -195,6 +195,16 @@ class HostileTrainer:
                 state[key].zero_()
         state.pop(PAIRS, None)
 
+    def zero_row(self, row: int) -> None:
+        """Relocation in place: all that is kept of a row is zeroed, and the Parameters stay."""
+        for name, param in self.ours.params.items():
+            twin = self.twins[row]
+            alone = twin.optimizer(name).state.get(twin.params[name], {})
+            alone.pop(PAIRS, None)
+            for state, at in ((self.ours.optimizer(name).state.get(param, {}), row), (alone, 0)):
+                for key in set(state) - {"step"}:
+                    state[key][at] = 0
+
     # -- checkpoints -----------------------------------------------------------------------------
 
     def resume(self, *, load_first: bool) -> None:
@@ -222,12 +232,12 @@ class HostileTrainer:
 
     # -- what must hold --------------------------------------------------------------------------
 
-    def difference(self) -> float:
-        """The largest distance of any row from its twin, relative to 1 or its size."""
+    def difference(self, rows: slice = slice(None)) -> float:
+        """The largest distance of any of the rows from its twin, relative to 1 or its size."""
         worst = 0.0
         for name, param in self.ours.params.items():
             alone = torch.cat([twin.params[name].detach() for twin in self.twins])
             error = (param.detach() - alone).abs() / alone.abs().clamp(min=1)
-            worst = max(worst, float(error.max()))
+            worst = max(worst, float(error[rows].max()))
             assert bool(torch.isfinite(param).all())
         return worst

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -150,6 +150,13 @@ def values_of(splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name: param.detach().clone() for name, param in splats.items()}
 
 
+def step_all(optimizers: Any) -> None:
+    """Step and zero_grad of every optimizer."""
+    for optimizer in every_one(optimizers):
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+
+
 def train(
     splats: dict[str, Parameter],
     optimizers: Mapping[str, torch.optim.Optimizer] | torch.optim.Optimizer,
@@ -158,38 +165,26 @@ def train(
     last: int,
 ) -> None:
     """Iterations first .. last - 1 in gsplat's order: backward, (observe), step, zero_grad."""
-    every = every_one(optimizers)
     for iteration in range(first, last):
         loss = view_loss(splats, iteration % 5, phases)
         loss.backward()
         if phases is not None:
             phases.observe(loss)
-        for optimizer in every:
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
+        step_all(optimizers)
 
 
-def check_resume(make: Any, phases: Callable[[], PhaseScheduler], total: int, at: int) -> None:
-    """A run that is saved after `at` iterations and goes on ends with the bits of a whole one.
+def trained_by_adam(last: int, **options: Any) -> dict[str, Parameter]:
+    """The Gaussians after so many iterations of the trainer's own Adam."""
+    splats = make_splats()
+    train(splats, gsplat_optimizers(splats, **options), None, 0, last)
+    return splats
 
-    Args:
-        make: `gsplat_optimizers` or `inria_optimizer`.
-        phases: a new scheduler with each call.
-    """
-    ours, theirs = make_splats(), make_splats()
-    a, b, c = phases(), phases(), phases()
-    whole, first = a.upgrade(make(ours)), b.upgrade(make(theirs))
-    train(ours, whole, a, 0, total)
-    train(theirs, first, b, 0, at)
-    second: Any = c.upgrade(make(theirs))
-    if isinstance(first, dict):
-        for name, optimizer in first.items():
-            second[name].load_state_dict(optimizer.state_dict())
-    else:
-        second.load_state_dict(first.state_dict())
-    train(theirs, second, c, at, total)
-    for name in ours:
-        assert torch.equal(ours[name], theirs[name]), name
+
+def assert_same(ours: Mapping[str, Tensor], theirs: Mapping[str, Tensor]) -> None:
+    """Bit for bit, whatever their names are in."""
+    assert set(ours) == set(theirs)
+    for name, value in ours.items():
+        assert torch.equal(value, theirs[name]), name
 
 
 def edit_rows(
@@ -214,6 +209,14 @@ def edit_rows(
             splats[name] = fresh
 
 
+def begun(
+    phases: PhaseScheduler, make: Any = gsplat_optimizers, **options: Any
+) -> tuple[dict[str, Parameter], Any]:
+    """Gaussians, and their optimizers, which `make` has made and `phases` upgraded."""
+    splats = make_splats()
+    return splats, phases.upgrade(make(splats, **options))
+
+
 def upgraded(
     total_steps: int,
     *parts: Part,
@@ -221,6 +224,7 @@ def upgraded(
     switch: float | int = PAPER_SWITCH,
     **options: Any,
 ) -> tuple[dict[str, Parameter], PhaseScheduler, Any]:
-    """Gaussians, a scheduler with these parts alone, and the optimizers that `make` makes."""
-    splats, phases = make_splats(), only(total_steps, *parts, switch=switch)
-    return splats, phases, phases.upgrade(make(splats, **options))
+    """Gaussians, a scheduler with these parts alone, and the upgraded optimizers."""
+    phases = only(total_steps, *parts, switch=switch)
+    splats, optimizers = begun(phases, make, **options)
+    return splats, phases, optimizers
