@@ -37,7 +37,7 @@ class Arm:
     """One way of training."""
 
     name: str
-    what: str
+    what: str = ""
     parts: MakeParts | None = None  # None: torch's own Adam in the trainer
     mcmc: bool = True  # relocation, growth, noise and regularisers of 3DGS-MCMC
     needs: str | None = None  # the arm whose mean nu it takes, seed by seed

@@ -149,11 +149,6 @@ def _reach(record: Record, control: Record) -> float | None:
     return None if seconds is None else seconds / control.seconds
 
 
-def baseline_of(study: Study, settings: list[Setting]) -> float:
-    """Mean last test PSNR of the baseline, dB."""
-    return fmean(r.final for s in settings for r in study.runs(s, BASELINE).values())
-
-
 def falls(values: np.ndarray) -> np.ndarray:
     """How far each value is below the best so far, of those of a training in their order."""
     return np.maximum.accumulate(values) - values

@@ -13,7 +13,7 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 
 from studies.scenes.analysis import Gain, Study
-from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, FADED, POOLED, label
+from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, FADED, label
 from studies.scenes.records import Record, Setting
 
 # Okabe and Ito's colours: told apart with any kind of colour vision.
@@ -26,7 +26,7 @@ COLOURS = {
     ANNEALED: "#56b4e9",
     DEFAULTS: "#0072b2",
     FADED: "#cc79a7",
-    POOLED: "#009e73",
+    f"{ANNEALED}+pooled": "#009e73",
 }
 SHOWN_FROM = 0.25  # of an arm's seconds: what it falls to before may be out of the picture
 VERDICT_COLOURS = {"pays": "#009e73", "does not pay": "#999999", "undecided": "#e69f00"}
