@@ -22,14 +22,13 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from hosts.cpu_host import gsplat_modules
 from splatting.density import regularisers
 from splatting.embedded import embedded_scene
 from splatting.gaussians import gaussians_from_points, stock_learning_rates
-from splatting.metrics import psnr, ssim
+from splatting.metrics import photometric_loss, psnr
 from splatting.rasterizer import render
-from splatting.relocation import relocated_values
 from splatting.scenes import View
-from torch import Tensor
 
 from opt3dgs_optim import PhaseScheduler
 
@@ -55,19 +54,9 @@ ARMS = {"adam": None, "opt3dgs": install}
 
 
 def gsplat_on_a_cpu() -> Any:
-    """gsplat.strategy with its two CUDA functions replaced by torch ones."""
-    import torch.utils.cpp_extension as extension
-
-    extension._find_cuda_home = lambda: None  # no build of the kernels
-    package: Any = importlib.import_module("gsplat.strategy")
-    torch_impl = importlib.import_module("gsplat.cuda._torch_impl")
-    package.ops.compute_relocation = _relocation
-    package.ops.quat_scale_to_covar_preci = torch_impl._quat_scale_to_covar_preci
-    return package
-
-
-def _relocation(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor) -> Any:
-    return relocated_values(opacities, scales, ratios)
+    """gsplat.strategy with its CUDA functions replaced by torch ones."""
+    gsplat_modules.install()
+    return importlib.import_module("gsplat.strategy")
 
 
 def crop(view: View) -> View:
@@ -78,11 +67,6 @@ def crop(view: View) -> View:
         camera, cx=camera.cx - x, cy=camera.cy - y, width=SIDE, height=SIDE
     )
     return View(view.name, middle, image[y : y + SIDE, x : x + SIDE].contiguous())
-
-
-def stock_loss(image: Tensor, target: Tensor) -> Tensor:
-    """simple_trainer's photometric loss."""
-    return 0.8 * (image - target).abs().mean() + 0.2 * (1 - ssim(image, target))
 
 
 def train(package: Any, seed: int, make: Any = None, iterations: int = ITERATIONS) -> Result:
@@ -111,10 +95,8 @@ def train(package: Any, seed: int, make: Any = None, iterations: int = ITERATION
     for step in range(iterations):
         view = views[int(torch.randint(len(views), ()))]
         image = render(splats, view.camera).image
-        pixel = (image - view.image).abs().mean()
-        if phases is not None:
-            pixel = phases.pixel_loss(image, view.image)
-        loss = 0.8 * pixel + 0.2 * (1 - ssim(image, view.image)) + regularisers(splats)
+        pixel_loss = None if phases is None else phases.pixel_loss
+        loss = photometric_loss(image, view.image, pixel_loss) + regularisers(splats)
         loss.backward()
         if phases is not None:
             phases.observe(loss)
@@ -129,15 +111,13 @@ def train(package: Any, seed: int, make: Any = None, iterations: int = ITERATION
 @torch.no_grad()
 def evaluate(splats: Any, train_views: list[View], test_views: list[View]) -> Result:
     """The stock loss and PSNR of all views."""
-    losses, quality = [], []
-    for view in train_views:
-        image = render(splats, view.camera).image
-        losses.append(float(stock_loss(image, view.image)))
-        quality.append(float(psnr(image, view.image)))
+    pairs = [(render(splats, view.camera).image, view.image) for view in train_views]
     test = [float(psnr(render(splats, v.camera).image, v.image)) for v in test_views]
-    count = len(train_views)
     return Result(
-        sum(losses) / count, sum(quality) / count, sum(test) / len(test), len(splats["means"])
+        statistics.fmean(float(photometric_loss(*pair)) for pair in pairs),
+        statistics.fmean(float(psnr(*pair)) for pair in pairs),
+        statistics.fmean(test),
+        len(splats["means"]),
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from plyfile import PlyData, PlyParseError
 
-from splatting.colmap import PosedImage, SparseModel
+from splatting.colmap import UNDISTORT, PosedImage, SparseModel
 
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -57,23 +57,15 @@ def _posed_image(path: Path, index: int, table: dict[str, Any], frame: Any) -> P
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
         raise ValueError(f"{where}: expected an object with a 'file_path'")
     merged = {**table, **frame}
-    numbers = {
-        key: _number(where, key, merged[key])
-        for key in (*_INTRINSICS, *_DISTORTION)
-        if key in merged
-    }
+    given = [key for key in (*_INTRINSICS, *_DISTORTION) if key in merged]
+    numbers = {key: _number(where, key, merged[key]) for key in given}
     missing = [key for key in _INTRINSICS if key not in numbers]
     if missing:
         raise ValueError(f"{where}: missing {', '.join(missing)}")
     distortion = {key: numbers[key] for key in _DISTORTION if numbers.get(key)}
     if distortion:
-        raise ValueError(
-            f"{where}: lens distortion {distortion}; only pinhole cameras can be rasterized. "
-            "Undistort the photos first: colmap image_undistorter"
-        )
+        raise ValueError(f"{where}: lens distortion {distortion}; {UNDISTORT}")
     fx, fy, cx, cy, width, height = (numbers[key] for key in _INTRINSICS)
-    if min(fx, fy, width, height) <= 0:
-        raise ValueError(f"{where}: impossible camera {width}x{height}, focal lengths {fx}, {fy}")
     name = frame["file_path"].removeprefix("./").removeprefix("images/")
     viewmat = _viewmat(where, frame.get("transform_matrix"))
     return PosedImage(name, viewmat, fx, fy, cx, cy, int(width), int(height))

@@ -12,7 +12,6 @@ import numpy as np
 from studies.landscapes.kernel import ADAM, DOUBLE_WELL, NINE_MODES, PLAIN, advance
 
 BLOCK = 1000
-CALL = "Chains"
 
 
 @dataclass(frozen=True)
@@ -117,7 +116,7 @@ class Chains:
             FloatingPointError: a position is not finite.
         """
         if every < 1 or BLOCK % every:
-            raise ValueError(f"{CALL}.run: every={every}, but a divisor of {BLOCK} is needed")
+            raise ValueError(f"Chains.run: every={every}, but a divisor of {BLOCK} is needed")
         last = self.step + steps
         while self.step < last:
             count = min(BLOCK, last - self.step)
@@ -127,7 +126,7 @@ class Chains:
             if watch is not None:
                 watch(samples)
             if not np.isfinite(self.x).all():
-                raise FloatingPointError(f"{CALL}.run: a position of step {at[-1]} is not finite")
+                raise FloatingPointError(f"Chains.run: a position of step {at[-1]} is not finite")
             if progress is not None:
                 progress(count)
 

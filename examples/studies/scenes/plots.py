@@ -5,12 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib as mpl
-import numpy as np
-
-mpl.use("Agg")
-
 import matplotlib.pyplot as plt
+import numpy as np
 
 from studies.scenes.analysis import Gain, Study
 from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, FADED, label

@@ -408,7 +408,7 @@ def _own_step_lengths(times: float) -> dict[str, list[float]]:
         fit.step()
         # The Gaussians begin round: nothing turns them in the first step.
         for name, rows in lengths.rows.items() if iteration > 2 else []:
-            length = rows[-1][1] * rates[name]
+            length = rows[-1] * rates[name]
             # Points that no view has seen yet stand still, and do not count as steps.
             assert 0.3 < length / own.wanted(name, iteration / 40) < 1.5, (name, iteration)
             found[name].append(length)
