@@ -15,7 +15,7 @@ from torch.nn import Parameter
 from opt3dgs_optim import Phase, PhaseScheduler, PositionNoise
 from opt3dgs_optim.runs import RunLog
 from splatting.arms import NOISE_LR, Arm
-from splatting.density import DensityReport, MCMCDensityControl, Optimizers, regularisers
+from splatting.density import MCMCDensityControl, Optimizers, regularisers
 from splatting.gaussians import (
     DEFAULT_PRESET,
     MCMC_PRESET,
@@ -66,8 +66,8 @@ class DensityControl(Protocol):
 
     def step(
         self, iteration: int, gaussians: dict[str, Parameter], optimizers: Optimizers, /
-    ) -> DensityReport:
-        """Called after the optimizers' step, with the iteration from 0."""
+    ) -> int:
+        """Called after the optimizers' step, with the iteration from 0; how many were relocated."""
         ...
 
 
@@ -147,37 +147,26 @@ class Fit:
         pixel_loss = None if self.phases is None else self.phases.pixel_loss
         loss = photometric_loss(image, view.image, pixel_loss)
         if self.arm.mcmc:
-            loss = loss + self._regularisers()
+            loss = loss + regularisers(self.gaussians)
         loss.backward()
         if self.phases is not None:
             for part in self.phases.parts:
                 if hasattr(part, "view"):  # a study's own
                     part.view = index  # pyright: ignore[reportAttributeAccessIssue]
             self.phases.observe(loss, iteration=self.iteration)
-        self._step_optimizers()
-        self._inject_noise()
+        for optimizer in self.optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        if self.noise is not None:
+            with torch.no_grad():
+                lr = self.optimizers["means"].param_groups[0]["lr"]
+                self.noise.add_to(self.gaussians["means"], lr)
         if self.density is not None:
-            report = self.density.step(self.iteration, self.gaussians, self.optimizers)
-            self.relocated += report.relocated
+            self.relocated += self.density.step(self.iteration, self.gaussians, self.optimizers)
         self.iteration += 1
         decay = LR_DECAY ** (self.iteration / self.options.iterations)
         self.optimizers["means"].param_groups[0]["lr"] = self.rates["means"] * decay
         return loss.detach()
-
-    def _regularisers(self) -> Tensor:
-        return regularisers(self.gaussians)
-
-    def _step_optimizers(self) -> None:
-        for optimizer in self.optimizers.values():
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
-
-    @torch.no_grad()
-    def _inject_noise(self) -> None:
-        """What an MCMC trainer does itself; with a scheduler, the optimizer of the means does."""
-        if self.noise is not None:
-            lr = self.optimizers["means"].param_groups[0]["lr"]
-            self.noise.add_to(self.gaussians["means"], lr)
 
     def _next_view(self) -> int:
         if not self.views:

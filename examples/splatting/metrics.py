@@ -57,16 +57,6 @@ def _blur(maps: Tensor) -> Tensor:
     return _Blur.apply(maps.contiguous())  # pyright: ignore[reportReturnType]
 
 
-def _check(call: str, render: Tensor, target: Tensor) -> None:
-    if render.shape != target.shape or render.dim() < 3:
-        raise ValueError(
-            f"{call}: render and target must be images [..., H, W, C] of one shape, "
-            f"got {tuple(render.shape)} and {tuple(target.shape)}"
-        )
-    if render.numel() == 0:
-        raise ValueError(f"{call}: empty image, shape {tuple(render.shape)}")
-
-
 def psnr(render: Tensor, target: Tensor) -> Tensor:
     """Peak signal to noise ratio of each image in dB, 10 log10(1 / mse); inf where equal.
 
@@ -77,7 +67,6 @@ def psnr(render: Tensor, target: Tensor) -> Tensor:
     Returns:
         `[...]`, one number an image: papers average these, not the errors.
     """
-    _check("psnr", render, target)
     return -10.0 * torch.log10((render - target).square().mean(dim=(-3, -2, -1)))
 
 
@@ -95,7 +84,6 @@ def ssim_map(render: Tensor, target: Tensor) -> Tensor:
     Returns:
         `[..., H, W, C]`, at most 1.
     """
-    _check("ssim", render, target)
     # Two calls, so that the backward pass does not blur the target's moments when it is constant.
     mu_r, rr, rt = _blur(torch.stack((render, render * render, render * target)))
     mu_t, tt = _blur(torch.stack((target, target * target)))
@@ -128,15 +116,10 @@ def photometric_loss(
     Returns:
         a scalar.
     """
-    _check("photometric_loss", render, target)
     if pixel_loss_fn is None:
         pixel = (render - target).abs().mean()
     else:
         pixel = pixel_loss_fn(render, target)
-        if pixel.dim() != 0:
-            raise ValueError(
-                f"photometric_loss: pixel_loss_fn must return a scalar, got {tuple(pixel.shape)}"
-            )
     return 0.8 * pixel + 0.2 * (1.0 - _mean_ssim(render, target))
 
 

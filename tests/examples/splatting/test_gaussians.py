@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -112,14 +111,12 @@ def test_float64_points_give_float64_parameters():
 def test_random_gaussians_fill_their_cube():
     center = torch.tensor([10.0, 0.0, -4.0])
     gaussians = random_gaussians(
-        2.0, 3000, center=center, generator=torch.Generator().manual_seed(0)
+        2.0, 3000, center=center, spread=3.0, generator=torch.Generator().manual_seed(0)
     )
     offsets = gaussians["means"].detach() - center
     assert offsets.abs().max() <= 6.0
     assert offsets.abs().max() > 5.9  # 3000 uniform draws come closer than 0.1 to the wall
     assert offsets.mean(dim=0).abs().max() < 0.32  # 5 deviations: 5 * 12 / sqrt(12 * 3000)
-    again = random_gaussians(2.0, 3000, center=center, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(gaussians["sh0"], again["sh0"])
 
 
 def test_stock_learning_rates():
@@ -161,27 +158,7 @@ def test_ply_columns_are_inrias(tmp_path):
     np.testing.assert_array_equal(vertices["f_rest_4"], rest[:, 1, 1].numpy())
 
 
-def test_bad_input_is_named(tmp_path):
-    points, colors = _cloud(4)
-    bad: list[tuple[dict[str, Any], str]] = [
-        ({"sh_degree": 4}, "sh_degree=4"),
-        ({"init_opacity": 1.0}, r"init_opacity=1.0, must be inside"),
-        ({"init_scale": 0.0}, "init_scale=0.0"),
-        ({"num_points": 0}, "num_points=0"),
-    ]
-    for options, message in bad:
-        with pytest.raises(ValueError, match=message):
-            gaussians_from_points(points, colors, **options)
-    with pytest.raises(ValueError, match=r"both be \[P, 3\]"):
-        gaussians_from_points(points, colors[:2])
-    with pytest.raises(ValueError, match="at least 1 point"):
-        gaussians_from_points(points[:0], colors[:0])
-    with pytest.raises(ValueError, match="finite"):
-        gaussians_from_points(points * math.nan, colors)
-    with pytest.raises(ValueError, match="extent=0"):
-        random_gaussians(0.0, 10)
-    with pytest.raises(ValueError, match="extent=0"):
-        stock_learning_rates(0.0)
+def test_bad_files_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"none\.ply"):
         load_ply(tmp_path / "none.ply")
     (tmp_path / "text.ply").write_text("hello")
