@@ -145,7 +145,7 @@ def _gain_at_seconds(record: Record, control: Record) -> float:
 
 
 def _reach(record: Record, control: Record) -> float | None:
-    seconds = record.seconds_to(control.final)
+    seconds = record.reached(control.final, "seconds")
     return None if seconds is None else seconds / control.seconds
 
 

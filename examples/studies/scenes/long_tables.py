@@ -225,7 +225,7 @@ def reach_table(study: Study, long: Sequence[Setting], arms: Sequence[str], shor
         for arm in arms:
             found = difference(study, [setting], arm, BASELINE)
             reached = [
-                ours.iteration_of(theirs.final)
+                ours.reached(theirs.final)
                 for pairs in found.pairs.values()
                 for ours, theirs, _ in pairs
             ]
