@@ -10,7 +10,6 @@ the package from this folder. Writes `docs/torch_versions.json` and a table besi
 from __future__ import annotations
 
 import argparse
-import ast
 import json
 import os
 import platform
@@ -27,16 +26,18 @@ from typing import Any
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parent.parent
-TESTS = ROOT / "tests"
-FOLDERS = (ROOT / "examples", TESTS, *(TESTS / name for name in ("support", "lbfgs", "cuda")))
-PRESENT = {"torch", "numpy", "pytest", "hypothesis", "opt3dgs_optim"}
+# Tests that need more than torch, numpy, pytest and hypothesis.
+LEFT_OUT = (
+    *("examples", "test_docs.py", "test_mutants.py", "cuda/test_kernel_compile.py"),
+    *("hosts/test_survey.py", "hosts/test_trainers.py"),
+)
 OLDEST, NEWEST = "2.4.1", "2.15.0"
 # In place of the project's own options: no workers, which would be one more package.
 PYTEST = ("-m", "pytest", "-q", "-o", "addopts=--import-mode=importlib", "-p", "no:cacheprovider")
 MARKS = "not slow and not hosts and not compiles and not processes"
 # In a process of its own: what torch 2.4 compiles makes the whole process flush denormal numbers
 # to zero, and hypothesis refuses to draw numbers then.
-ALONE = "test_log.py"
+ALONE = "tests/runs/test_log.py"
 # (first torch that has it, test, what it needs)
 NEWER = (
     (
@@ -52,51 +53,6 @@ NEWER = (
 )
 
 
-def needs_only_torch(test: Path) -> bool:
-    """Whether a test file, with all of ours that it imports, needs no other package."""
-    seen: set[Path] = set()
-    waiting = [test]
-    while waiting:
-        path = waiting.pop()
-        if path in seen:
-            continue
-        seen.add(path)
-        for name in imported(path):
-            ours = local_files(name)
-            waiting += ours
-            top = name.split(".")[0]
-            if not ours and top not in PRESENT and top not in sys.stdlib_module_names:
-                return False
-    return True
-
-
-def imported(path: Path) -> set[str]:
-    """Names of the modules that a file imports, at its top or inside a function."""
-    names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            names.add(node.module)
-    return names
-
-
-def local_files(name: str) -> list[Path]:
-    """The files of a module of the tests or the examples; none for any other module."""
-    stem = name.replace(".", "/")
-    found = [folder / f"{stem}{end}" for folder in FOLDERS for end in (".py", "/__init__.py")]
-    return [path for path in found if path.exists()]
-
-
-def suitable_tests() -> list[Path]:
-    """The test files that need torch, numpy, pytest and hypothesis alone.
-
-    That of the documentation starts the examples' commands, which need the extras.
-    """
-    found = sorted(TESTS.rglob("test_*.py"))
-    return [path for path in found if path.name != "test_docs.py" and needs_only_torch(path)]
-
-
 def environment(version: str, folder: Path) -> Path:
     """Python of a virtual environment with that torch and this package; made if it is missing."""
     python = folder / version / "bin" / "python"
@@ -110,19 +66,19 @@ def environment(version: str, folder: Path) -> Path:
     return python
 
 
-def check(version: str, python: Path, tests: Sequence[Path]) -> dict[str, Any]:
-    """What pytest says of `tests` in that environment."""
+def check(version: str, python: Path) -> dict[str, Any]:
+    """What pytest says in that environment."""
     ask = "import torch, numpy as n, platform as p; "
     ask += "print(torch.__version__, n.__version__, p.python_version())"
     command = [str(python), "-c", ask]
     answer = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
     number = tuple(map(int, version.split(".")[:2]))
     missing = [(test, what) for since, test, what in NEWER if number < since]
-    left_out = [argument for test, _ in missing for argument in ("--deselect", test)]
+    left_out = [f"--deselect={test}" for test, _ in missing]
+    others = [f"--ignore=tests/{name}" for name in LEFT_OUT]
     counts, bad = Counter[str](), []
-    for alone in (False, True):
-        names = [str(p.relative_to(ROOT)) for p in tests if (p.name == ALONE) is alone]
-        for case in cases(python, ["-m", MARKS, *left_out, *names]):
+    for tests in (["tests", f"--ignore={ALONE}", *others], [ALONE]):
+        for case in cases(python, ["-m", MARKS, *left_out, *tests]):
             kinds = ("failure", "error", "skipped")
             outcome = next((kind for kind in kinds if case.find(kind) is not None), "passed")
             counts[outcome] += 1
@@ -186,15 +142,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--out", type=Path, default=ROOT / "docs", metavar="DIR")
     options = parser.parse_args(arguments)
-    tests = suitable_tests()
     kept = nullcontext(options.keep) if options.keep else tempfile.TemporaryDirectory()
     with kept as folder:
-        results = [check(v, environment(v, Path(folder)), tests) for v in options.torch]
+        results = [check(v, environment(v, Path(folder))) for v in options.torch]
     record = {
         "command": f"python examples/check_torch_versions.py --torch {' '.join(options.torch)}",
         "date": date.today().isoformat(),
         "platform": platform.platform(),
-        "test_files": [path.name for path in tests],
+        "left_out": LEFT_OUT,
         "results": results,
     }
     text = table(record)

@@ -110,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _train_all(trainings, args, recorded_command("error_vs_time.py", parser, args))
     runs = [run for training in trainings if (run := training.finished())]
     written = write_report(runs, out)
-    fitted = {t.arm.name: t.folder / "gaussians.ply" for t in trainings if t.seed == 0}
+    fitted = {t.arm.name: t.folder / "view.npy" for t in trainings if t.seed == 0}
     draw_gallery(scene.test[0], fitted, out / "renders.png")
     print((out / "report.md").read_text(encoding="utf-8"))
     print(*written, out / "renders.png", sep="\n")

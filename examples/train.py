@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
 import torch
 from splatting.arms import ARMS, DEFAULT_ARM, find_arm
 from splatting.fit import Fit, FitOptions, run
@@ -100,6 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     about = {"size": args.size, "background": args.background, "command": said}
     metrics = run(fit, args.out, about, quiet=args.quiet)
     save_ply(args.out / "gaussians.ply", fit.gaussians)
+    np.save(args.out / "view.npy", fit.image(scene.test[0]).numpy())  # for a gallery
     if not args.quiet:
         print(f"{args.arm}: test PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.4f}")
     return 0

@@ -109,7 +109,9 @@ class MCMCDensityControl:
         for name, parameter in list(gaussians.items()):
             parameter[dead] = parameter[sources]
             # Upstream keeps the moved rows' moments and zeroes those of their sources.
-            _replace(name, parameter.data, gaussians, optimizers, _zero_rows(sources))
+            _replace(
+                name, parameter.data, gaussians, optimizers, lambda v: v.index_fill_(0, sources, 0)
+            )
         return len(dead)
 
     def _grow(self, gaussians: dict[str, Parameter], optimizers: Optimizers) -> None:
@@ -120,9 +122,14 @@ class MCMCDensityControl:
             return
         sources = self._sample(opacities, added)
         self._shrink(gaussians, opacities, sources)
+
+        def with_zero_rows(value: Tensor) -> Tensor:
+            # float32 whatever the state's dtype is, as upstream: optimizers must survive that
+            return torch.cat((value, torch.zeros(added, *value.shape[1:], device=value.device)))
+
         for name, parameter in list(gaussians.items()):
             grown = torch.cat((parameter.data, parameter.data[sources]))
-            _replace(name, grown, gaussians, optimizers, _append_zero_rows(added))
+            _replace(name, grown, gaussians, optimizers, with_zero_rows)
 
     def _sample(self, weights: Tensor, count: int) -> Tensor:
         return torch.multinomial(weights, count, replacement=True, generator=self.generator)
@@ -141,22 +148,6 @@ def regularisers(gaussians: dict[str, Parameter]) -> Tensor:
     """0.01 * mean(opacity) + 0.01 * mean(scale), both after activation."""
     opacities, scales = gaussians["opacities"], gaussians["scales"]
     return 0.01 * torch.sigmoid(opacities).mean() + 0.01 * torch.exp(scales).mean()
-
-
-def _zero_rows(rows: Tensor) -> Callable[[Tensor], Tensor]:
-    def edit(value: Tensor) -> Tensor:
-        value[rows] = 0
-        return value
-
-    return edit
-
-
-def _append_zero_rows(count: int) -> Callable[[Tensor], Tensor]:
-    def edit(value: Tensor) -> Tensor:
-        # float32 whatever the state's dtype is, as upstream: that is what optimizers must survive
-        return torch.cat((value, torch.zeros(count, *value.shape[1:], device=value.device)))
-
-    return edit
 
 
 def _replace(

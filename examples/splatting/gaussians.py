@@ -13,11 +13,11 @@ from typing import Any, TypedDict
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement
 from torch import Tensor
 from torch.nn import Parameter
 
-from splatting.spherical_harmonics import MAX_DEGREE, SH_0
+from splatting.spherical_harmonics import SH_0
 
 Gaussians = dict[str, Parameter]
 
@@ -173,31 +173,3 @@ def save_ply(path: str | Path, gaussians: Gaussians) -> None:
     for index, name in enumerate(names):
         vertices[name] = table[:, index]
     PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
-
-
-def load_ply(path: str | Path) -> Gaussians:
-    """Read what `save_ply`, gsplat's exporter or INRIA's trainer wrote, as float32 parameters."""
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"load_ply: {path} is missing")
-    try:
-        vertices = PlyData.read(str(path))["vertex"]
-        names = [prop.name for prop in vertices.properties]
-        tables = {
-            key: np.stack([np.asarray(vertices[name], np.float32) for name in columns], axis=1)
-            for key, columns in _COLUMNS.items()
-            if key != "normals"
-        }
-    except (PlyParseError, KeyError, ValueError, EOFError) as error:
-        raise ValueError(f"load_ply: {path} is no .ply file of Gaussians: {error}") from None
-    rest = sum(name.startswith("f_rest_") for name in names)
-    if rest not in {3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_DEGREE + 1)}:
-        raise ValueError(f"load_ply: {path} has {rest} f_rest columns, expected 0, 9, 24 or 45")
-    tensors = {key: torch.from_numpy(table) for key, table in tables.items()}
-    tensors["opacities"] = tensors["opacities"][:, 0]
-    tensors["sh0"] = tensors["sh0"][:, None]
-    if rest:
-        columns = [np.asarray(vertices[f"f_rest_{i}"], np.float32) for i in range(rest)]
-        by_channel = torch.from_numpy(np.stack(columns, axis=1)).reshape(-1, 3, rest // 3)
-        tensors["shN"] = by_channel.transpose(1, 2).contiguous()
-    order = ("means", "scales", "quats", "opacities", "sh0", "shN")
-    return {key: Parameter(tensors[key]) for key in order if key in tensors}

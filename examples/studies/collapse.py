@@ -31,6 +31,7 @@ from splatting.fit import Fit, FitOptions
 from splatting.scenes import load_scene
 
 from opt3dgs_optim import EnergyHistogram, Part
+from studies import pages
 from studies.scenes.analysis import falls
 from studies.scenes.training import BACKGROUNDS
 
@@ -123,17 +124,14 @@ def train(folder: str, arm: str, seed: int, iterations: int, points: int) -> dic
 
 def table(records: list[dict[str, Any]]) -> str:
     """Markdown: a row per scene and length, the worst of an arm's seeds in its cell."""
-    lines = [
-        f"| scene, iterations | {' | '.join(LABELS[arm] for arm in ARMS)} | test PSNR, seed 0 |",
-        f"|---|{'---|' * len(ARMS)}---|",
-    ]
+    rows = []
     for scene, length in sorted({(r["scene"], r["iterations"]) for r in records}):
         here = [r for r in records if (r["scene"], r["iterations"]) == (scene, length)]
         by_arm = [[r for r in here if r["arm"] == arm] for arm in ARMS]
         psnr = [next((f"{r['psnr']:.2f}" for r in own if r["seed"] == 0), "-") for own in by_arm]
-        cells = " | ".join(map(_cell, by_arm))
-        lines.append(f"| {scene}, {length:,} | {cells} | {' / '.join(psnr)} |")
-    return "\n".join(lines) + "\n"
+        rows.append((f"{scene}, {length:,}", *map(_cell, by_arm), " / ".join(psnr)))
+    heads = ("scene, iterations", *(LABELS[arm] for arm in ARMS), "test PSNR, seed 0")
+    return pages.table(heads, "l", rows) + "\n"
 
 
 def _cell(records: list[dict[str, Any]]) -> str:

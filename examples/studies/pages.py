@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 
 def filled(page: str, texts: Mapping[str, str], mark: str, *, every: bool = True) -> str:
@@ -32,3 +32,15 @@ def filled(page: str, texts: Mapping[str, str], mark: str, *, every: bool = True
             places = found.count(name)
             raise ValueError(f"the page has {places} places for {name!r}, but 1 is needed")
     return made
+
+
+def table(heads: Iterable[str], align: str, rows: Iterable[Iterable[object]]) -> str:
+    """A Markdown table.
+
+    Args:
+        align: an l or an r for each column; the last one counts for the rest.
+    """
+    heads = list(heads)
+    first, *others = [f"| {' | '.join(map(str, line))} |" for line in (heads, *rows)]
+    marks = ["---:" if side == "r" else "---" for side in align.ljust(len(heads), align[-1])]
+    return "\n".join([first, f"|{'|'.join(marks)}|", *others])

@@ -6,6 +6,8 @@ import statistics
 from collections.abc import Sequence
 from typing import Any
 
+from studies.pages import table
+
 Results = dict[str, Any]
 
 
@@ -13,12 +15,6 @@ def spread(values: Sequence[float], digits: int) -> str:
     """Mean and standard deviation over seeds."""
     deviation = statistics.stdev(values) if len(values) > 1 else 0.0
     return f"{statistics.fmean(values):.{digits}f} ± {deviation:.{digits}f}"
-
-
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table; the first column is text, the others numbers."""
-    lines = ["| " + " | ".join(header) + " |", "|---" + "|---:" * (len(header) - 1) + "|"]
-    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
 
 
 def column(seeds: list[Results], name: str, digits: int, unit: float = 1.0) -> str:
@@ -50,7 +46,7 @@ def nine(results: Results) -> str:
                 f"{result['mean_nu']:.2f}",
             ]
         )
-    return table(header, rows)
+    return table(header, "lr", rows)
 
 
 def gaussian(results: Results) -> str:
@@ -69,7 +65,7 @@ def gaussian(results: Results) -> str:
             figures = [f"{row['lr']:g}", spread(row["variance"], 4), f"{row['expected']:.4f}"]
             rows.append([title, *figures, f"{100 * error:+.1f} %"])
     header = ["drift", "lr", "variance", "theory", "off theory"]
-    return table(header, rows)
+    return table(header, "lr", rows)
 
 
 def well(results: Results) -> str:
@@ -91,7 +87,7 @@ def well(results: Results) -> str:
         )
     rows.sort(key=lambda row: float(row[0]))
     header = ["h / T", "arm", "KL of the visits", "KL, re-weighted", "left well (%; exact 50)"]
-    return table(header, rows)
+    return table(header, "lr", rows)
 
 
 def escape(results: Results) -> str:
@@ -114,7 +110,7 @@ def escape(results: Results) -> str:
         )
     header = ["h / T", "exact", "SGLD", "AWSGLD", "AWSGLD / exact"]
     header += ["mean nu", "constant nu of that mean, exact"]
-    return table(header, rows)
+    return table(header, "lr", rows)
 
 
 def about(results: Results) -> str:

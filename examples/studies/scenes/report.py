@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from splatting.stopping import command
 
-from studies.pages import filled
+from studies.pages import filled, table
 from studies.scenes.analysis import Study
 from studies.scenes.arms import (
     ANNEALED,
@@ -165,19 +165,26 @@ def names(kind: str) -> list[str]:
 
 def decisions_table(study: Study) -> str:
     """One line per part: what it was judged by, and whether it is on."""
-    lines = [
-        "| part | decided by | iterations | scenes, trainings | PSNR | SSIM | LPIPS | default |",
-        "|---|---|---:|---|---:|---:|---:|---|",
-    ]
+    rows = []
     for part, decision in decide(study).items():
         by = f"`{label(decision.arm)}` against `{label(decision.control)}`"
-        found, shown = decision.found, "- | - | - | - | -"
+        found, shown = decision.found, ["-"] * 5
         if found is not None:
             count = f"{len(found.pairs)}, {found.count}"
-            shown = f"{decision.iterations:,} | {count} | {' | '.join(cells_of(found))}"
+            shown = [f"{decision.iterations:,}", count, *cells_of(found)]
         on = "on" if decision.on else "off"
-        lines.append(f"| {part} | {by} | {shown} | {on} ({decision.verdict}) |")
-    return "\n".join(lines)
+        rows.append((part, by, *shown, f"{on} ({decision.verdict})"))
+    heads = (
+        "part",
+        "decided by",
+        "iterations",
+        "scenes, trainings",
+        "PSNR",
+        "SSIM",
+        "LPIPS",
+        "default",
+    )
+    return table(heads, "llrlrrrl", rows)
 
 
 def paper_table(study: Study, settings: Sequence[Setting], *, brief: bool = False) -> str:
@@ -186,15 +193,16 @@ def paper_table(study: Study, settings: Sequence[Setting], *, brief: bool = Fals
     Args:
         brief: the PSNR alone, without the scenes' names, for the README.
     """
-    heads = ("PSNR, dB",) if brief else ("scenes", "PSNR, dB", "SSIM", "LPIPS")
-    rule = "|---|---:|" if brief else "|---|---|---:|---:|---:|"
-    lines = [f"| part | {' | '.join(heads)} |", rule]
+    rows = []
     for what, arm, control in PAPER:
         found = difference(study, settings, arm, control)
         if found.count:
-            cells = cells_of(found)[:1] if brief else [", ".join(found.pairs), *cells_of(found)]
-            lines.append(f"| {what} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+            psnr, *others = cells_of(found)
+            names = ", ".join(found.pairs)
+            rows.append((what, psnr) if brief else (what, names, psnr, *others))
+    if brief:
+        return table(("part", "PSNR, dB"), "lr", rows)
+    return table(("part", "scenes", "PSNR, dB", "SSIM", "LPIPS"), "llr", rows)
 
 
 def plots(study: Study, rotating: Study) -> list[Path]:

@@ -209,37 +209,29 @@ def reached(course: Course) -> str:
     return digits(course[-1][2]) + (f" ({hits[0]})" if hits else "")
 
 
-def comparison(
-    title: str, results: dict[str, dict[str, Course]], cell: Callable[[Course], str]
-) -> str:
-    rows = [(name, *(cell(courses[arm]) for arm in ARMS)) for name, courses in results.items()]
-    return f"### {title}\n\n" + table(("problem", *ARMS), rows)
-
-
 def report(results: dict[str, Any]) -> str:
+    """The page's tables."""
     about = results["about"]
     decades = ", ".join(f"{arm} {count}" for arm, count in results["decades"].items())
-    parts = [
-        f"Made by `{about['command']}` on {about['date']}: {about['machine']}, {about['rows']} "
-        f"rows, {about['steps']} steps (line searches: up to 150).\n",
-        comparison(
-            "Digits reached (-log10 of f over its start), and iterations to six",
-            results["problems"],
-            reached,
-        ),
-        comparison(
-            "Several valleys: what is left of f above its lowest minimum, over that of the start",
-            results["valleys"],
-            lambda c: f"{c[-1][2]:.2f}",
-        ),
-        comparison(
-            "Quadratics: digits reached (-log10 of |x| over its start)",
-            results["quadratics"],
-            lambda c: digits(c[-1][2]),
-        ),
-        f"Decades of gradient size (of 82, 1e-44 to 1e37; float32) with the same steps: {decades}.",
-    ]
-    return "\n".join(parts) + "\n"
+
+    def comparison(kind: str, cell: Callable[[Course], str]) -> str:
+        rows = [(name, *(cell(c[arm]) for arm in ARMS)) for name, c in results[kind].items()]
+        return table(("problem", *ARMS), rows)
+
+    return f"""Made by `{about["command"]}` on {about["date"]}: {about["machine"]}, \
+{about["rows"]} rows, {about["steps"]} steps (line searches: up to 150).
+
+### Digits reached (-log10 of f over its start), and iterations to six
+
+{comparison("problems", reached)}
+### Several valleys: what is left of f above its lowest minimum, over that of the start
+
+{comparison("valleys", lambda c: f"{c[-1][2]:.2f}")}
+### Quadratics: digits reached (-log10 of |x| over its start)
+
+{comparison("quadratics", lambda c: digits(c[-1][2]))}
+Decades of gradient size (of 82, 1e-44 to 1e37; float32) with the same steps: {decades}.
+"""
 
 
 def plot(results: dict[str, dict[str, Course]], path: Path) -> None:
