@@ -49,14 +49,9 @@ class SparseModel:
 
 
 def read_colmap(folder: Path) -> SparseModel:
-    """Read `cameras.bin`, `images.bin` and `points3D.bin`.
+    """Read `cameras.bin`, `images.bin` and `points3D.bin`, usually of `<scene>/sparse/0`.
 
-    Args:
-        folder: the model folder, usually `<scene>/sparse/0`.
-
-    Raises:
-        FileNotFoundError: a file is missing.
-        ValueError: a file is truncated or malformed, or a camera is not a pinhole.
+    Raises FileNotFoundError, or ValueError where a file is malformed or a camera no pinhole.
     """
     paths = [folder / f"{stem}.bin" for stem in ("cameras", "images", "points3D")]
     for path in paths:

@@ -20,27 +20,17 @@ Optimizers = Mapping[str, torch.optim.Optimizer]
 
 
 class MCMCDensityControl:
-    """Relocation and growth on a schedule, with gsplat 1.5.3's edits of the optimizer state.
-
-    Args:
-        cap_max: at most so many Gaussians.
-        refine_start: refine after this iteration.
-        refine_stop: refine before this iteration.
-        refine_every: refine at the multiples of this.
-        min_opacity: at or below it (after the sigmoid) a Gaussian is dead.
-        growth: factor on the number of Gaussians at each refinement, rounded down.
-        generator: for the sampling; None is torch's global one.
-    """
+    """Relocation and growth on a schedule, with gsplat 1.5.3's edits of the optimizer state."""
 
     def __init__(
         self,
-        cap_max: int,
-        refine_start: int = 500,
+        cap_max: int,  # at most so many Gaussians
+        refine_start: int = 500,  # refine after this iteration, before the next number
         refine_stop: int = 25_000,
         refine_every: int = 100,
-        min_opacity: float = 0.005,
-        growth: float = 1.05,
-        generator: torch.Generator | None = None,
+        min_opacity: float = 0.005,  # at or below it (after the sigmoid) a Gaussian is dead
+        growth: float = 1.05,  # of their number at each refinement, rounded down
+        generator: torch.Generator | None = None,  # for the sampling; None: torch's global one
     ) -> None:
         self.cap_max, self.min_opacity, self.growth = cap_max, min_opacity, growth
         self.refine_start, self.refine_stop = refine_start, refine_stop

@@ -28,14 +28,9 @@ def _blur(maps: Tensor) -> Tensor:
 
 
 def psnr(render: Tensor, target: Tensor) -> Tensor:
-    """Peak signal to noise ratio of each image in dB, 10 log10(1 / mse); inf where equal.
+    """Peak signal to noise ratio in dB, 10 log10(1 / mse), of images [..., H, W, C] in 0..1.
 
-    Args:
-        render: `[..., H, W, C]`, 0..1.
-        target: the same shape.
-
-    Returns:
-        `[...]`, one number an image: papers average these, not the errors.
+    Returns [...], one number an image: papers average these, not the errors.
     """
     return -10.0 * torch.log10((render - target).square().mean(dim=(-3, -2, -1)))
 
@@ -45,14 +40,7 @@ def ssim_map(render: Tensor, target: Tensor) -> Tensor:
 
     Window 11x11, Gaussian with sigma 1.5, zero padding: what the 3DGS papers compute. At least
     5 pixels away from the border it equals scikit-image's `structural_similarity` with
-    `gaussian_weights=True, sigma=1.5, use_sample_covariance=False`.
-
-    Args:
-        render: `[..., H, W, C]`, 0..1.
-        target: the same shape.
-
-    Returns:
-        `[..., H, W, C]`, at most 1.
+    `gaussian_weights=True, sigma=1.5, use_sample_covariance=False`. All are [..., H, W, C].
     """
     moments = (render, target, render * render, target * target, render * target)
     mu_r, mu_t, rr, tt, rt = _blur(torch.stack(moments))
@@ -77,13 +65,8 @@ def photometric_loss(
     is a constant (a compiled SSIM, see `fast/similarity.py`), and otherwise as often as one likes.
 
     Args:
-        render: `[..., H, W, C]`, 0..1.
-        target: the same shape.
         pixel_loss_fn: replaces the mean absolute error, takes `(render, target)` and returns a
             scalar; `PhaseScheduler.pixel_loss` fits (L1 while exploring, L2 while exploiting).
-
-    Returns:
-        a scalar.
     """
     if pixel_loss_fn is None:
         pixel = (render - target).abs().mean()

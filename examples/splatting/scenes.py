@@ -63,9 +63,7 @@ def load_scene(
         held_out: the test views are those whose index among the sorted names is this modulo 8
             (7 in the embedded scene); by default those of `split.json`, or 0.
 
-    Raises:
-        FileNotFoundError: a file or folder of the scene is missing.
-        ValueError: a file is malformed, or an option is not one of those above.
+    Raises FileNotFoundError, or ValueError where a file is malformed or an option none of these.
     """
     options = ("size", size, Size), ("background", background, Background)
     for option, value, allowed in options:

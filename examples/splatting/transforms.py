@@ -22,12 +22,7 @@ def read_transforms(folder: Path) -> SparseModel:
     Intrinsics may stand at the top, or in a frame, which then wins. Image names lose a leading
     `images/`, so that they agree with COLMAP's.
 
-    Args:
-        folder: the scene folder.
-
-    Raises:
-        FileNotFoundError: a file is missing.
-        ValueError: a file is malformed, or a camera has lens distortion.
+    Raises FileNotFoundError, or ValueError where a file is malformed or a lens distorts.
     """
     path = folder / "transforms.json"
     table = read_json_object(path)
