@@ -8,20 +8,20 @@ import sys
 import time
 from collections.abc import Callable
 from signal import SIGINT
-from typing import Any, TypeVar
+from typing import BinaryIO, TypeVar
 
 POLL_SECONDS = 0.2
 Job = TypeVar("Job")
 
 
-def start(words: list[str], **options: Any) -> subprocess.Popen[bytes]:
+def start(words: list[str], stderr: BinaryIO | None = None) -> subprocess.Popen[bytes]:
     """A Python process with one thread: side by side they share the cores, and stay comparable.
 
     A session of its own: Ctrl-C reaches this process alone, which passes it on once.
     """
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     command = [sys.executable, *words]
-    return subprocess.Popen(command, env=environment, start_new_session=True, **options)
+    return subprocess.Popen(command, env=environment, stderr=stderr, start_new_session=True)
 
 
 def side_by_side(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Union
+from typing import ClassVar
 
 import numpy as np
 
@@ -103,7 +103,7 @@ class Ground:
         return normals, self.pattern(points, normals)
 
 
-Solid = Union[Sphere, Box, Ground]  # noqa: UP007
+Solid = Sphere | Box | Ground
 
 
 def trace(

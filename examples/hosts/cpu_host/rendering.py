@@ -67,7 +67,8 @@ def draw(
     }
     rendering = render(gaussians, camera, sh_degree=0, background=background)
     with torch.no_grad():
-        means2d, radii = _footprints(project(*list(gaussians.values())[:3], camera))
+        geometry = (inside, gaussians["quats"], gaussians["scales"])
+        means2d, radii = _footprints(project(*geometry, camera))
         radii = torch.where(rendering.visible, radii, torch.zeros_like(radii))
     return Drawn(rendering.image, rendering.alpha, rendering.visible, means2d, radii, depths)
 
