@@ -10,30 +10,34 @@ the package from this folder. Writes `docs/torch_versions.json` and a table besi
 from __future__ import annotations
 
 import argparse
-import ast
 import json
 import os
 import platform
-import re
-import shutil
 import subprocess
 import sys
 import tempfile
 import venv
+from collections import Counter
 from collections.abc import Sequence
+from contextlib import nullcontext
 from datetime import date
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parent.parent
-TESTS, EXAMPLES = ROOT / "tests", ROOT / "examples"
-PRESENT = {"torch", "numpy", "pytest", "hypothesis", "opt3dgs_optim"}
+# Tests that need more than torch, numpy, pytest and hypothesis.
+LEFT_OUT = (
+    *("examples", "test_docs.py", "test_mutants.py", "cuda/test_kernel_compile.py"),
+    *("hosts/test_survey.py", "hosts/test_trainers.py"),
+)
 OLDEST, NEWEST = "2.4.1", "2.15.0"
-PROGRESS = re.compile(r"\[\s*(\d+)%\]")
-COUNTS = re.compile(r"(\d+) (passed|failed|skipped|errors?)\b")
+# In place of the project's own options: no workers, which would be one more package.
+PYTEST = ("-m", "pytest", "-q", "-o", "addopts=--import-mode=importlib", "-p", "no:cacheprovider")
+MARKS = "not slow and not hosts and not compiles and not processes"
 # In a process of its own: what torch 2.4 compiles makes the whole process flush denormal numbers
 # to zero, and hypothesis refuses to draw numbers then.
-ALONE = "test_log.py"
+ALONE = "tests/runs/test_log.py"
 # (first torch that has it, test, what it needs)
 NEWER = (
     (
@@ -47,54 +51,6 @@ NEWER = (
         "AdamW as a kind of Adam, so `upgrade` refuses it",
     ),
 )
-# A time, which says something of the machine rather than of the version.
-NOT_ASKED = "tests/test_import_cost.py::test_import_costs_less_than_50_ms_beyond_torch"
-
-
-def needs_only_torch(test: Path) -> bool:
-    """Whether a test file, with all of ours that it imports, needs no other package."""
-    seen: set[Path] = set()
-    waiting = [test]
-    while waiting:
-        path = waiting.pop()
-        if path in seen:
-            continue
-        seen.add(path)
-        for name in imported(path):
-            ours = local_files(name)
-            waiting += ours
-            top = name.split(".")[0]
-            if not ours and top not in PRESENT and top not in sys.stdlib_module_names:
-                return False
-    return True
-
-
-def imported(path: Path) -> set[str]:
-    """Names of the modules that a file imports, at its top or inside a function."""
-    names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            names.add(node.module)
-    return names
-
-
-def local_files(name: str) -> list[Path]:
-    """The files of a module of the tests or the examples; none for any other module."""
-    stem = name.replace(".", "/")
-    found = [folder / f"{stem}.py" for folder in (TESTS, EXAMPLES)]
-    found += [folder / stem / "__init__.py" for folder in (TESTS, EXAMPLES)]
-    return [path for path in found if path.exists()]
-
-
-def suitable_tests() -> list[Path]:
-    """The test files that need torch, numpy, pytest and hypothesis alone.
-
-    That of the documentation starts the examples' commands, which need the extras.
-    """
-    found = sorted(TESTS.rglob("test_*.py"))
-    return [path for path in found if path.name != "test_docs.py" and needs_only_torch(path)]
 
 
 def environment(version: str, folder: Path) -> Path:
@@ -110,93 +66,71 @@ def environment(version: str, folder: Path) -> Path:
     return python
 
 
-def check(version: str, python: Path, tests: Sequence[Path]) -> dict[str, Any]:
-    """What pytest says of `tests` in that environment."""
+def check(version: str, python: Path) -> dict[str, Any]:
+    """What pytest says in that environment."""
     ask = "import torch, numpy as n, platform as p; "
     ask += "print(torch.__version__, n.__version__, p.python_version())"
     command = [str(python), "-c", ask]
     answer = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
-    missing = [(test, what) for since, test, what in NEWER if numbers(version) < since]
-    left_out = [argument for test, _ in missing for argument in ("--deselect", test)]
-    parts = [[p for p in tests if (p.name == ALONE) is alone] for alone in (False, True)]
-    lines: list[str] = []
-    for part in filter(None, parts):
-        names = [str(path.relative_to(ROOT)) for path in part]
-        options = ["-q", "-p", "no:cacheprovider", "--deselect", NOT_ASKED, *left_out]
-        lines += pytest(version, [str(python), "-m", "pytest", *options, *names])
-    counts = dict.fromkeys(("passed", "failed", "skipped", "error"), 0)
-    for line in lines:
-        if re.search(r" in [\d.]+s", line):  # pytest's last
-            for number, what in COUNTS.findall(line):
-                counts[what.removesuffix("s")] += int(number)
+    number = tuple(map(int, version.split(".")[:2]))
+    missing = [(test, what) for since, test, what in NEWER if number < since]
+    left_out = [f"--deselect={test}" for test, _ in missing]
+    others = [f"--ignore=tests/{name}" for name in LEFT_OUT]
+    counts, bad = Counter[str](), []
+    for tests in (["tests", f"--ignore={ALONE}", *others], [ALONE]):
+        for case in cases(python, ["-m", MARKS, *left_out, *tests]):
+            kinds = ("failure", "error", "skipped")
+            outcome = next((kind for kind in kinds if case.find(kind) is not None), "passed")
+            counts[outcome] += 1
+            if outcome in ("failure", "error"):
+                bad.append(f"{outcome}: {case.get('classname')}::{case.get('name')}")
     return {
         "torch": answer[0],
         "numpy": answer[1],
         "python": answer[2],
-        **counts,
-        "bad": [line for line in lines if line.startswith(("FAILED", "ERROR"))],
+        "passed": counts["passed"],
+        "failed": counts["failure"],
+        "skipped": counts["skipped"],
+        "error": counts["error"],
+        "bad": bad,
         "not_in_this_torch": [what for _, what in missing],
     }
 
 
-def numbers(version: str) -> tuple[int, int]:
-    """Major and minor version."""
-    major, minor = version.split(".")[:2]
-    return int(major), int(minor)
-
-
-def pytest(version: str, command: list[str]) -> list[str]:
-    """The lines that a test run prints, its progress shown on the way."""
-    environ = {**os.environ, "OMP_NUM_THREADS": "1"}
-    process = subprocess.Popen(
-        command, cwd=ROOT, env=environ, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
-    lines = []
-    for line in process.stdout or []:
-        lines.append(line.rstrip())
-        found = PROGRESS.search(line)
-        if found and sys.stderr.isatty():
-            print(f"\rtorch {version}: {found[1]:>3} % of the tests", end="", file=sys.stderr)
-    if process.wait() not in (0, 1):  # neither all passed nor some failed
-        raise RuntimeError(
-            f"torch {version}: pytest ended with {process.returncode}: {lines[-20:]}"
-        )
-    if sys.stderr.isatty():
-        print(file=sys.stderr)
-    return lines
+def cases(python: Path, arguments: list[str]) -> list[ElementTree.Element]:
+    """Every test of a run of pytest, which shows its own progress."""
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder) / "junit.xml"
+        command = [str(python), *PYTEST, f"--junitxml={report}", *arguments]
+        code = subprocess.run(
+            command, check=False, cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"}
+        ).returncode
+        if code not in (0, 1):  # neither all passed nor some failed
+            raise RuntimeError(f"{python}: pytest ended with {code}")
+        return [*ElementTree.parse(report).iter("testcase")]
 
 
 def table(record: dict[str, Any]) -> str:
     """The results as Markdown."""
+    results = record["results"]
     rows = [
         f"| {r['torch']} | {r['numpy']} | {r['python']} | {r['passed']:,} | {r['skipped']:,} "
-        f"| {r['failed'] + r['error']} |"
-        for r in record["results"]
+        f"| {r['failed'] + r['error']} |\n"
+        for r in results
     ]
-    notes = [
-        f"- torch {r['torch']} lacks {what}."
-        for r in record["results"]
-        for what in r["not_in_this_torch"]
-    ]
-    bad = [f"- torch {r['torch']}: `{line}`" for r in record["results"] for line in r["bad"]]
-    return "\n".join(
-        [
-            "# Supported torch versions",
-            "",
-            "The oldest that `pyproject.toml` declares and the newest, each with the tests that "
-            "need torch, numpy, pytest and hypothesis alone.",
-            "",
-            "| torch | numpy | python | passed | skipped | failed |",
-            "|---|---|---|---:|---:|---:|",
-            *rows,
-            "",
-            *notes,
-            *bad,
-            "",
-            f"By `{record['command']}` on {record['date']}, {record['platform']}; no GPU.",
-            "",
-        ]
-    )
+    lacks = [f"- torch {r['torch']} lacks {w}.\n" for r in results for w in r["not_in_this_torch"]]
+    bad = [f"- torch {r['torch']}: `{line}`\n" for r in results for line in r["bad"]]
+    return f"""# Supported torch versions
+
+The oldest that `pyproject.toml` declares and the newest, each with the tests that need torch, \
+numpy, pytest and hypothesis alone.
+
+| torch | numpy | python | passed | skipped | failed |
+|---|---|---|---:|---:|---:|
+{"".join(rows)}
+{"".join(lacks + bad)}
+By `{record["command"]}` on {record["date"]}, {record["platform"]}; no GPU.
+"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -208,18 +142,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--out", type=Path, default=ROOT / "docs", metavar="DIR")
     options = parser.parse_args(arguments)
-    folder = options.keep or Path(tempfile.mkdtemp(prefix="torch-versions-"))
-    tests = suitable_tests()
-    try:
-        results = [check(v, environment(v, folder), tests) for v in options.torch]
-    finally:
-        if options.keep is None:
-            shutil.rmtree(folder)
+    kept = nullcontext(options.keep) if options.keep else tempfile.TemporaryDirectory()
+    with kept as folder:
+        results = [check(v, environment(v, Path(folder))) for v in options.torch]
     record = {
         "command": f"python examples/check_torch_versions.py --torch {' '.join(options.torch)}",
         "date": date.today().isoformat(),
         "platform": platform.platform(),
-        "test_files": [path.name for path in tests],
+        "left_out": LEFT_OUT,
         "results": results,
     }
     text = table(record)

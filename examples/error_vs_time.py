@@ -12,19 +12,17 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import signal
 import subprocess
-import sys
-import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from splatting.arms import ARMS, Arm, in_order
 from splatting.gallery import draw_gallery
+from splatting.processes import side_by_side, start
 from splatting.scenes import load_scene
-from splatting.stopping import stop_at_once
+from splatting.stopping import command, stop_at_once
 from splatting.writable import check_folder
 from tqdm import tqdm
 from train import SHARED_OPTIONS, add_fit_options, fit_options, recorded_command
@@ -33,7 +31,6 @@ from opt3dgs_optim.runs import Run, read_run
 from opt3dgs_optim.runs.report import write_report
 
 DEFAULT_ARMS = "adam,mcmc,mcmc+awsgld,mcmc+constant-multiplier,mcmc+l2+reset,opt3dgs,defaults"
-POLL_SECONDS = 0.2
 
 
 @dataclass
@@ -43,7 +40,6 @@ class Training:
     arm: Arm
     seed: int
     folder: Path
-    process: subprocess.Popen[bytes] | None = field(default=None, repr=False)
 
     @property
     def log(self) -> Path:
@@ -85,47 +81,39 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+@command("error_vs_time")
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; 0, 2 after one line that says what is wrong, 130 when interrupted."""
+    """The command line."""
     parser = _parser()
     args = parser.parse_args(arguments)
-    try:
-        arms = in_order([name.strip() for name in args.arms.split(",") if name.strip()])
-        if not arms:
-            raise ValueError(f"--arms {args.arms!r}: names no arm; there are {', '.join(ARMS)}")
-        options = asdict(fit_options(args))
-        for name in ("seeds", "jobs"):
-            if getattr(args, name) < 1:
-                raise ValueError(f"--{name} {getattr(args, name)}: must be at least 1")
-        if args.out is not None:
-            check_folder(args.out)  # before the scene is read
-        scene = load_scene(args.scene, args.size, background=args.background)
-        out = args.out or Path("runs") / f"{scene.name}-{args.size}"
-        check_folder(out)
-        trainings = [
-            Training(arm, seed, out / arm.name / f"seed-{seed}")
-            for seed in range(args.seeds)
-            for arm in arms
-        ]
-        del options["seed"]
-        about = {"scene": scene.name, "size": args.size, "background": args.background}
-        _refuse_other_options(trainings, options | about)
-        command = recorded_command("error_vs_time.py", parser, args)
-        stop_at_once()
-        _train_all(trainings, args, command)
-    except (OSError, ValueError) as error:
-        print(f"error_vs_time: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted: the same command goes on from the checkpoints", file=sys.stderr)
-        return 130
+    arms = in_order([name.strip() for name in args.arms.split(",") if name.strip()])
+    if not arms:
+        raise ValueError(f"--arms {args.arms!r}: names no arm; there are {', '.join(ARMS)}")
+    options = asdict(fit_options(args))
+    for name in ("seeds", "jobs"):
+        if getattr(args, name) < 1:
+            raise ValueError(f"--{name} {getattr(args, name)}: must be at least 1")
+    if args.out is not None:
+        check_folder(args.out)  # before the scene is read
+    scene = load_scene(args.scene, args.size, background=args.background)
+    out = args.out or Path("runs") / f"{scene.name}-{args.size}"
+    check_folder(out)
+    trainings = [
+        Training(arm, seed, out / arm.name / f"seed-{seed}")
+        for seed in range(args.seeds)
+        for arm in arms
+    ]
+    del options["seed"]
+    about = {"scene": scene.name, "size": args.size, "background": args.background}
+    _refuse_other_options(trainings, options | about)
+    stop_at_once()
+    _train_all(trainings, args, recorded_command("error_vs_time.py", parser, args))
     runs = [run for training in trainings if (run := training.finished())]
     written = write_report(runs, out)
-    fitted = {t.arm.name: t.folder / "gaussians.ply" for t in trainings if t.seed == 0}
+    fitted = {t.arm.name: t.folder / "view.npy" for t in trainings if t.seed == 0}
     draw_gallery(scene.test[0], fitted, out / "renders.png")
     print((out / "report.md").read_text(encoding="utf-8"))
-    for path in [*written, out / "renders.png"]:
-        print(path)
+    print(*written, out / "renders.png", sep="\n")
     return 0
 
 
@@ -141,76 +129,41 @@ def _refuse_other_options(trainings: list[Training], asked: dict[str, Any]) -> N
             )
 
 
-def _train_all(trainings: list[Training], args: argparse.Namespace, command: str) -> None:
+def _train_all(trainings: list[Training], args: argparse.Namespace, said: str) -> None:
     waiting = [training for training in trainings if training.finished() is None]
-    running: list[Training] = []
     total = args.iterations * len(waiting)
-    bar = tqdm(total=total, unit="it", desc=f"{len(waiting)} trainings", smoothing=0.05)
-    try:
-        while waiting or running:
-            for training in list(waiting):
-                if len(running) < args.jobs and _may_start(training, trainings):
-                    waiting.remove(training)
-                    running.append(training)
-                    _start(training, trainings, args, command)
-            time.sleep(POLL_SECONDS)
-            _reap(running)
-            left = sum(args.iterations - training.iteration() for training in running)
-            bar.update(total - left - args.iterations * len(waiting) - bar.n)
-            bar.set_postfix_str(", ".join(f"{t.arm.name} #{t.seed}" for t in running))
-    except BaseException:
-        _stop(running)
-        raise
-    finally:
-        bar.close()
+    named = {(training.arm.name, training.seed): training for training in trainings}
 
+    def source(training: Training) -> Training:
+        """The run whose mean nu a control takes: same seed, the arm that it is the control of."""
+        return named[training.arm.needs or "", training.seed]
 
-def _may_start(training: Training, trainings: list[Training]) -> bool:
-    return training.arm.needs is None or _source(training, trainings).finished() is not None
+    def may_start(training: Training) -> bool:
+        return training.arm.needs is None or source(training).finished() is not None
 
+    def begin(training: Training) -> subprocess.Popen[bytes]:
+        words = [str(Path(__file__).with_name("train.py")), "--quiet"]
+        for name in SHARED_OPTIONS:
+            words += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
+        words += ["--arm", training.arm.name, "--seed", str(training.seed)]
+        words += ["-o", str(training.folder), "--command", said]
+        if training.arm.needs is not None:
+            words += ["--mean-nu", repr(source(training).mean_nu())]
+        return start(words)
 
-def _source(training: Training, trainings: list[Training]) -> Training:
-    """The run whose mean nu a control takes: same seed, the arm that it is the control of."""
-    return next(t for t in trainings if (t.arm.name, t.seed) == (training.arm.needs, training.seed))
-
-
-def _start(
-    training: Training, trainings: list[Training], args: argparse.Namespace, command: str
-) -> None:
-    words = [sys.executable, str(Path(__file__).with_name("train.py")), "--quiet"]
-    for name in SHARED_OPTIONS:
-        words += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
-    words += ["--arm", training.arm.name, "--seed", str(training.seed)]
-    words += ["-o", str(training.folder), "--command", command]
-    if training.arm.needs is not None:
-        words += ["--mean-nu", repr(_source(training, trainings).mean_nu())]
-    # One thread each: trainings side by side share the cores, and the figures stay comparable.
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-    # A session of its own: Ctrl-C reaches this process alone, which passes it on once.
-    training.process = subprocess.Popen(words, env=environment, start_new_session=True)
-
-
-def _reap(running: list[Training]) -> None:
-    for training in list(running):
-        assert training.process is not None
-        code = training.process.poll()
-        if code is None:
-            continue
-        running.remove(training)
+    def ended(training: Training, code: int) -> None:
         if code in (130, -2):
             raise KeyboardInterrupt
         if code != 0:
             raise ValueError(f"{training.folder}: the training ended with code {code}")
 
+    def look(running: list[Training]) -> None:
+        left = sum(args.iterations - training.iteration() for training in running)
+        bar.update(total - left - args.iterations * len(waiting) - bar.n)
+        bar.set_postfix_str(", ".join(f"{t.arm.name} #{t.seed}" for t in running))
 
-def _stop(running: list[Training]) -> None:
-    """Ask each for a checkpoint, and wait for it."""
-    for training in running:
-        if training.process is not None and training.process.poll() is None:
-            training.process.send_signal(signal.SIGINT)
-    for training in running:
-        if training.process is not None:
-            training.process.wait()
+    with tqdm(total=total, unit="it", desc=f"{len(waiting)} trainings", smoothing=0.05) as bar:
+        side_by_side(waiting, args.jobs, may_start, begin, ended, look)
 
 
 if __name__ == "__main__":

@@ -7,18 +7,18 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
 import torch
 from splatting.arms import ARMS, DEFAULT_ARM, find_arm
-from splatting.fit import Fit, FitOptions, Progress, run
+from splatting.fit import Fit, FitOptions, run
 from splatting.gaussians import save_ply
 from splatting.scenes import Background, Size, load_scene
+from splatting.stopping import command
 from splatting.writable import check_folder
-from tqdm import tqdm
 
 SHARED_OPTIONS = (
     *("scene", "size", "background", "points", "iterations"),
@@ -88,40 +88,20 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+@command("train")
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; 0, 2 after one line that says what is wrong, 130 when interrupted."""
+    """The command line."""
     args = _parser().parse_args(arguments)
     torch.set_num_threads(1)
-    try:
-        options = fit_options(args, args.seed)
-        check_folder(args.out)
-        scene = load_scene(args.scene, args.size, background=args.background)
-        fit = Fit(scene, find_arm(args.arm), options, args.mean_nu)
-    except (OSError, ValueError) as error:
-        print(f"train: {error}", file=sys.stderr)
-        return 2
-    command = args.command or recorded_command("train.py", _parser(), args)
-    about = {"size": args.size, "background": args.background, "command": command}
-    bar = tqdm(total=options.iterations, desc=args.arm, unit="it", disable=args.quiet)
-
-    def show(progress: Progress) -> None:
-        bar.update(progress.iteration - bar.n)
-        bar.set_postfix_str(
-            f"loss {progress.loss:.4f}, PSNR {progress.psnr:.2f} dB, {progress.phase}"
-        )
-
-    try:
-        metrics = run(fit, args.out, show, about)
-    except KeyboardInterrupt:
-        bar.close()
-        print(f"interrupted at iteration {fit.iteration}: start again to go on", file=sys.stderr)
-        return 130
-    except ValueError as error:
-        bar.close()
-        print(f"train: {error}", file=sys.stderr)
-        return 2
-    bar.close()
+    options = fit_options(args, args.seed)
+    check_folder(args.out)
+    scene = load_scene(args.scene, args.size, background=args.background)
+    fit = Fit(scene, find_arm(args.arm), options, args.mean_nu)
+    said = args.command or recorded_command("train.py", _parser(), args)
+    about = {"size": args.size, "background": args.background, "command": said}
+    metrics = run(fit, args.out, about, quiet=args.quiet)
     save_ply(args.out / "gaussians.ply", fit.gaussians)
+    np.save(args.out / "view.npy", fit.image(scene.test[0]).numpy())  # for a gallery
     if not args.quiet:
         print(f"{args.arm}: test PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.4f}")
     return 0

@@ -67,22 +67,6 @@ def write_binary(folder: Path, count: int, model: int = 1) -> None:
         (folder / f"{stem}.bin").write_bytes(data)
 
 
-def write_text(folder: Path, count: int) -> None:
-    """Write the same model as COLMAP .txt."""
-    numbers = " ".join(map(repr, PINHOLE))
-    images = "# two lines an image\n"
-    for index, (name, (quat, shift)) in enumerate(
-        zip(image_names(count), poses(count), strict=True)
-    ):
-        pose = " ".join(map(repr, (*quat, *shift)))
-        images += f"{index + 3} {pose} 7 {name}\n" + "1.0 2.0 -1 " * index + "\n"
-    rows = [f"{i} {' '.join(map(str, p))} 0.5 3 0" for i, p in enumerate(POINTS)]
-    folder.mkdir(parents=True)
-    (folder / "cameras.txt").write_text(f"# one line\n7 PINHOLE {WIDTH} {HEIGHT} {numbers}\n")
-    (folder / "images.txt").write_text(images)
-    (folder / "points3D.txt").write_text("# x\n" + "\n".join(rows) + "\n")
-
-
 def write_transforms(folder: Path, count: int) -> None:
     """Write the same cameras and points as transforms.json and points.ply."""
     frames = []
@@ -102,13 +86,11 @@ def write_transforms(folder: Path, count: int) -> None:
 
 
 def write_scene(folder: Path, layout: str, count: int = 10) -> Path:
-    """Write a whole scene in the layout "bin", "txt" or "json" and return its folder."""
+    """Write a whole scene in the layout "bin" or "json" and return its folder."""
     folder.mkdir(exist_ok=True)
     write_images(folder, count)
     if layout == "bin":
         write_binary(folder / "sparse" / "0", count)
-    elif layout == "txt":
-        write_text(folder / "sparse", count)
     else:
         write_transforms(folder, count)
     return folder

@@ -37,7 +37,37 @@ OTHERS = re.compile(
 MORE = ("sugar_trainers/*.py", "nerfstudio/engine/trainer.py", "internal/gaussian_splatting.py")
 GROUPS = re.compile(r" \(all: [^)]*\)")  # the names of an optimizer's groups: long
 STOPS = re.compile(r"(?<=stops: )(\w+):.*")  # what an exception says after its name
-NEVER = "the lines to add by hand are printed"
+PAGE_TEXT = """# Which trainers were tried
+
+`python examples/hosts/survey.py --trainers DIR --write` makes this page \
+(opt3dgs_optim {version}, {today}).
+
+{iterations} iterations of the real script on a CPU through `on_cpu.py`, \
+on {scene}, stock and with the lines; PSNR of the test views at the end. \
+So short a run shows that the lines work, not what they gain. \
+Parts of these runs: {parts}. {date}, torch {torch}, {machine}.
+
+| trainer and options | commit | lines of `diff` | stock | edited | resume | what is different |
+|---|---|---|---|---|---|---|
+{ran}
+{counts[0]} of the {counts[1]} trials in `examples/hosts/trials.py` have \
+been run for this table; {counts[2]} of them left a checkpoint. Resume: from the edited \
+trainer's own, and from the stock one's; gsplat's scripts evaluate a checkpoint and do \
+not go on from one.
+
+## `hosts diff` over public trainers
+
+{counts[3]} training scripts of {counts[4]} repositories: {counts[5]} are edited \
+(each result compiles and defines every name it uses), the others are refused; \
+for these the lines to add by hand are printed.
+
+<details markdown><summary>All scripts, with their commits</summary>
+
+| scripts | what `diff` says |
+|---|---|
+{diffs}
+</details>
+"""
 
 
 @dataclass(frozen=True)
@@ -129,55 +159,30 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
     edited = [row for row in rows if row.edited]
     names = {row.trainer for row in rows}
     lines = {(row.trainer, row.path): str(row.lines) for row in edited}
-    text = [
-        "# Which trainers were tried",
-        "",
-        "`python examples/hosts/survey.py --trainers DIR --write` makes this page"
-        f" (opt3dgs_optim {__version__}, {datetime.date.today().isoformat()}).",
-        "",
-        f"{trials['iterations']} iterations of the real script on a CPU through `on_cpu.py`, "
-        f"on {trials['scene']}, stock and with the lines; PSNR of the test views at the end. "
-        "So short a run shows that the lines work, not what they gain. "
-        f"Parts of these runs: {_span(trials, 'parts')}. {_span(trials, 'date')}, "
-        f"torch {_span(trials, 'torch')}, {trials['machine']}.",
-        "",
-        "| trainer and options | commit | lines of `diff` | stock | edited | resume "
-        "| what is different |",
-        "|---|---|---|---|---|---|---|",
-    ]
     trained = {row["name"]: row for row in trials["rows"]}
+    ran = []
     for trial in TRIALS:
         if row := trained.get(trial.name):
             none = "none needed" if isinstance(trial, Nerfstudio) else "-"
             count = lines.get((trial.trainer, trial.script), none)
             done = (STOPS.sub(r"\1", row[key]) for key in ("stock", "ours", "resume"))
-            text.append(_row(trial.name, row["commit"], count, *done, trial.different))
+            ran.append(_row(trial.name, row["commit"], count, *done, trial.different))
     saved = sum(row["checkpoint"] == "yes" for row in trials["rows"])
-    text += [
-        "",
-        f"{len(trials['rows'])} of the {len(TRIALS)} trials in `examples/hosts/trials.py` have "
-        f"been run for this table; {saved} of them left a checkpoint. Resume: from the edited "
-        "trainer's own, and from the stock one's; gsplat's scripts evaluate a checkpoint and do "
-        "not go on from one.",
-        "",
-        "## `hosts diff` over public trainers",
-        "",
-        f"{len(rows)} training scripts of {len(names)} repositories: {len(edited)} are edited "
-        "(each result compiles and defines every name it uses), the others are refused; "
-        f"for these {NEVER}.",
-        "",
-        "<details markdown><summary>All scripts, with their commits</summary>",
-        "",
-        "| scripts | what `diff` says |",
-        "|---|---|",
-    ]
     said: dict[str, list[str]] = {}
     for row in rows:
         what = row.said or "nothing" if row.edited else f"**refused**: {row.said}"
         script = f"`{row.trainer}/{row.path}@{row.commit.split()[0]}`"
         said.setdefault(GROUPS.sub("", what), []).append(script)
-    text += [_row(" ".join(scripts), what) for what, scripts in said.items()]
-    return "\n".join([*text, "", "</details>", ""])
+    diffs = [_row(" ".join(scripts), what) for what, scripts in said.items()]
+    return PAGE_TEXT.format(
+        version=__version__,
+        today=datetime.date.today().isoformat(),
+        **{key: trials[key] for key in ("iterations", "scene", "machine")},
+        **{key: _span(trials, key) for key in ("parts", "date", "torch")},
+        ran="".join(ran),
+        counts=(len(trials["rows"]), len(TRIALS), saved, len(rows), len(names), len(edited)),
+        diffs="".join(diffs),
+    )
 
 
 def _span(trials: dict[str, Any], key: str) -> str:
@@ -187,7 +192,7 @@ def _span(trials: dict[str, Any], key: str) -> str:
 
 
 def _row(*cells: str) -> str:
-    return "| " + " | ".join(_cell(cell) for cell in cells) + " |"
+    return "| " + " | ".join(_cell(cell) for cell in cells) + " |\n"
 
 
 def _cell(text: str) -> str:

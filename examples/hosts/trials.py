@@ -40,23 +40,14 @@ SHORTER = {*INRIA_OPTIONS, *SHORT_GSPLAT, *SHORT_SPLATFACTO, *NO_VIDEO}
 
 @dataclass(frozen=True)
 class Trial:
-    """One way to run one trainer.
+    """One way to run one trainer."""
 
-    Args:
-        trainer: the folder of its sources.
-        script: its path there.
-        options: beside scene, iterations and output, which `command` adds.
-        refused: what a refusal says, where the edited trainer must refuse to start.
-        stock_fails: what the stock trainer stops with, where it does not run itself.
-        different: from the stock run, for the table.
-    """
-
-    trainer: str
-    script: str
-    options: tuple[str, ...]
-    refused: str | None = None
-    stock_fails: str | None = None
-    different: str = ""
+    trainer: str  # the folder of its sources
+    script: str  # its path there
+    options: tuple[str, ...]  # beside scene, iterations and output, which `command` adds
+    refused: str | None = None  # what a refusal says, where the edited trainer must refuse
+    stock_fails: str | None = None  # what the stock trainer stops with, where it does not run
+    different: str = ""  # from the stock run, for the table
 
     @property
     def name(self) -> str:
@@ -92,16 +83,7 @@ class Trial:
     def start(
         self, trainers: Path, scene: Path, work: Path, out: str, *more: str, ours: bool
     ) -> Done:
-        """Train, stock or ours.
-
-        Args:
-            trainers: the folder of all trainers' sources.
-            scene: that of `copy_scene`.
-            work: where copies of the trainers go, and the results.
-            out: the run's folder there.
-            more: options beside the trial's.
-            ours: with our lines.
-        """
+        """Train, stock or with our lines, in `work / out`; copies of the trainers go to `work`."""
         script = trainers / self.trainer / self.script
         if ours:
             script = edited_copy(self, trainers, work / "edited" / self.trainer)
@@ -238,20 +220,13 @@ class Done:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one trial came to.
-
-    Args:
-        stock, ours: the whole runs.
-        checkpoint: the file that ours left behind, where it did.
-        own, theirs: ours, gone on from its own checkpoint and from the stock run's; None where
-            there is no checkpoint, or the trainer does not go on from one.
-    """
+    """What one trial came to."""
 
     stock: Done
     ours: Done
-    checkpoint: Path | None = None
-    own: Done | None = None
-    theirs: Done | None = None
+    checkpoint: Path | None = None  # that ours left behind, where it did
+    own: Done | None = None  # ours, gone on from it; None where the trainer does not go on
+    theirs: Done | None = None  # ours, gone on from the stock run's
 
 
 def try_out(trial: Trial, trainers: Path, scene: Path, work: Path) -> Outcome:
@@ -303,13 +278,9 @@ def edited_copy(trial: Trial, trainers: Path, target: Path) -> Path:
 
 
 def run(script: Path, arguments: list[str], folder: Path, *, trusted: bool = False) -> Done:
-    """Run a script on the CPU in `folder`.
+    """Run a script on the CPU in `folder`, which some trainers write to.
 
-    Args:
-        script: stock or edited.
-        arguments: its own.
-        folder: the working folder; some trainers write there.
-        trusted: whether its checkpoint may hold more than tensors, as INRIA's do.
+    `trusted`: its checkpoint may hold more than tensors, as INRIA's do.
     """
     environment = dict(os.environ)
     if trusted:

@@ -19,7 +19,6 @@ from opt3dgs_optim import (
     PhaseScheduler,
     PositionNoise,
     SquaredLoss,
-    paper_parts,
 )
 from opt3dgs_optim.presets import PAPER_WARMUP
 
@@ -37,7 +36,7 @@ class Arm:
     """One way of training."""
 
     name: str
-    what: str
+    what: str = ""
     parts: MakeParts | None = None  # None: torch's own Adam in the trainer
     mcmc: bool = True  # relocation, growth, noise and regularisers of 3DGS-MCMC
     needs: str | None = None  # the arm whose mean nu it takes, seed by seed
@@ -94,23 +93,12 @@ _ARMS = (
         constant,
         needs=HISTOGRAM_ARM,
     ),
-    Arm("mcmc+l2", "L2 in the last phase", fixed(SquaredLoss)),
     Arm(
         "mcmc+l2+reset",
         "L2 and fresh Adam moments in the last phase",
         fixed(FreshMoments, SquaredLoss),
     ),
-    Arm(
-        "mcmc+l2+reset+lqn",
-        "the same with L-BFGS directions for the positions",
-        fixed(FreshMoments, SquaredLoss, Curvature),
-    ),
     Arm("opt3dgs", "every part of the paper, settings measured on the run", opt3dgs),
-    Arm(
-        "opt3dgs-paper",
-        "every part of the paper, its settings",
-        lambda iterations, _nu: paper_parts(iterations),
-    ),
     Arm(
         DEFAULT_ARM,
         "the package's: all but the positions annealed, moments faded",

@@ -14,8 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-# What a camera model's parameters start with; the others of COLMAP's models have lens distortion.
-_PINHOLES = {0: "SIMPLE_PINHOLE", 1: "PINHOLE"}
+_PINHOLES = {0: 3, 1: 4}  # SIMPLE_PINHOLE, PINHOLE: parameters; other models have lens distortion
+UNDISTORT = (
+    "only pinhole cameras can be rasterized. Undistort the photos first: colmap image_undistorter"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +33,11 @@ class PosedImage:
     width: int
     height: int
 
+    def __post_init__(self) -> None:
+        sizes = (self.fx, self.fy, self.width, self.height)
+        if not all(0 < size < np.inf for size in sizes) or not np.isfinite(self.viewmat).all():
+            raise ValueError(f"image {self.name}: impossible camera {sizes} or pose {self.viewmat}")
+
 
 @dataclass(frozen=True, eq=False)
 class SparseModel:
@@ -41,76 +48,20 @@ class SparseModel:
     colors: np.ndarray  # [P, 3] float64, 0..1
 
 
-_Intrinsics = tuple[float, float, float, float, int, int]  # fx, fy, cx, cy, width, height
-
-
 def read_colmap(folder: Path) -> SparseModel:
-    """Read `cameras`, `images` and `points3D`, as .bin where present and else as .txt.
+    """Read `cameras.bin`, `images.bin` and `points3D.bin`, usually of `<scene>/sparse/0`.
 
-    Args:
-        folder: the model folder, usually `<scene>/sparse/0`.
-
-    Raises:
-        FileNotFoundError: a file is missing.
-        ValueError: a file is truncated or malformed, or a camera is not a pinhole.
+    Raises FileNotFoundError, or ValueError where a file is malformed or a camera no pinhole.
     """
-    for suffix, readers in (
-        (".bin", (_cameras_bin, _images_bin, _points_bin)),
-        (".txt", (_cameras_txt, _images_txt, _points_txt)),
-    ):
-        paths = [folder / f"{stem}{suffix}" for stem in ("cameras", "images", "points3D")]
-        present = [path for path in paths if path.is_file()]
-        if present:
-            missing = [path for path in paths if path not in present]
-            if missing:
-                raise FileNotFoundError(f"{missing[0]}: missing, but {present[0].name} is there")
-            cameras = readers[0](paths[0])
-            return SparseModel(readers[1](paths[1], cameras), *readers[2](paths[2]))
-    raise FileNotFoundError(
-        f"{folder}: expected cameras, images and points3D as .bin or .txt (a COLMAP model)"
-    )
-
-
-def _intrinsics(path: Path, model: str, width: int, height: int, params: list[float]):
-    if model == "SIMPLE_PINHOLE" and len(params) == 3:
-        fx, fy, cx, cy = params[0], *params
-    elif model == "PINHOLE" and len(params) == 4:
-        fx, fy, cx, cy = params
-    else:
-        raise ValueError(f"{path}: {model} camera with {len(params)} parameters")
-    if not (width > 0 and height > 0 and 0 < fx < np.inf and 0 < fy < np.inf):
-        raise ValueError(f"{path}: impossible camera {width}x{height}, focal lengths {fx}, {fy}")
-    return fx, fy, cx, cy, width, height
-
-
-def _refuse_distorted(path: Path, model: str) -> None:
-    if model not in _PINHOLES.values():
-        raise ValueError(
-            f"{path}: camera model {model}; only PINHOLE and SIMPLE_PINHOLE can be rasterized. "
-            "Undistort the photos first: colmap image_undistorter"
-        )
-
-
-def _world_to_camera(path: Path, quat: list[float], translation: list[float]) -> np.ndarray:
-    """Return the [4, 4] matrix of a wxyz quaternion and a translation."""
-    norm = float(np.linalg.norm(quat))
-    if not (0 < norm < np.inf and np.isfinite(translation).all()):
-        raise ValueError(f"{path}: impossible pose, quaternion {quat}, translation {translation}")
-    w, x, y, z = (value / norm for value in quat)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    viewmat[:3, 3] = translation
-    return viewmat
-
-
-def _posed(path: Path, name: str, viewmat: np.ndarray, camera_id: int, cameras: dict) -> PosedImage:
-    if camera_id not in cameras:
-        raise ValueError(f"{path}: image {name} has camera {camera_id}, known are {list(cameras)}")
-    return PosedImage(name, viewmat, *cameras[camera_id])
+    paths = [folder / f"{stem}.bin" for stem in ("cameras", "images", "points3D")]
+    for path in paths:
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"{path}: missing; expected cameras, images and points3D as .bin, which "
+                "`colmap model_converter` makes of .txt"
+            )
+    cameras, images, points = map(_Binary, paths)
+    return SparseModel(_images(images, _cameras(cameras)), *_points(points))
 
 
 class _Binary:
@@ -135,11 +86,7 @@ class _Binary:
         end = self.data.find(b"\0", self.offset)
         if end < 0:
             raise ValueError(f"{self.path}: truncated in the middle of an image name")
-        raw = self.data[self.skip(end - self.offset + 1) : end]
-        try:
-            return raw.decode("utf-8")
-        except UnicodeDecodeError:
-            raise ValueError(f"{self.path}: image name {raw!r} is not UTF-8") from None
+        return self.data[self.skip(end - self.offset + 1) : end].decode("utf-8")
 
     def records(self) -> Iterator[int]:
         yield from range(self.take("Q")[0])
@@ -147,88 +94,49 @@ class _Binary:
             raise ValueError(f"{self.path}: {len(self.data) - self.offset} bytes too many")
 
 
-def _cameras_bin(path: Path) -> dict[int, _Intrinsics]:
-    file, cameras = _Binary(path), {}
+def _cameras(file: _Binary) -> dict[int, tuple]:
+    """Camera -> fx, fy, cx, cy, width, height."""
+    cameras = {}
     for _ in file.records():
-        camera_id, model_id, width, height = file.take("IiQQ")
-        model = _PINHOLES.get(model_id, f"number {model_id}")
-        _refuse_distorted(path, model)
-        params = list(file.take("ddd" if model_id == 0 else "dddd"))
-        cameras[camera_id] = _intrinsics(path, model, width, height, params)
+        camera_id, model, *size = file.take("IiQQ")
+        if model not in _PINHOLES:
+            raise ValueError(f"{file.path}: camera model number {model}; {UNDISTORT}")
+        params = file.take("d" * _PINHOLES[model])
+        cameras[camera_id] = (*(params[:1] if len(params) == 3 else ()), *params, *size)
     return cameras
 
 
-def _images_bin(path: Path, cameras: dict[int, _Intrinsics]) -> list[PosedImage]:
-    file, images = _Binary(path), []
+def _images(file: _Binary, cameras: dict[int, tuple]) -> list[PosedImage]:
+    images = []
     for _ in file.records():
-        _, *pose, camera_id = file.take("I7dI")
+        _, *pose, camera = file.take("I7dI")
         name = file.text()
         file.skip(24 * file.take("Q")[0])  # observations: x, y as float64, point id
-        viewmat = _world_to_camera(path, pose[:4], pose[4:])
-        images.append(_posed(path, name, viewmat, camera_id, cameras))
+        if camera not in cameras:
+            known = list(cameras)
+            raise ValueError(f"{file.path}: image {name} has camera {camera}, known are {known}")
+        images.append(PosedImage(name, _world_to_camera(pose[:4], pose[4:]), *cameras[camera]))
     return images
 
 
-def _points_bin(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    file, rows = _Binary(path), []
+def _world_to_camera(quat: list[float], translation: list[float]) -> np.ndarray:
+    """The [4, 4] matrix of a wxyz quaternion and a translation."""
+    w, x, y, z = np.array(quat) / np.linalg.norm(quat)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    viewmat[:3, 3] = translation
+    return viewmat
+
+
+def _points(file: _Binary) -> tuple[np.ndarray, np.ndarray]:
+    rows = []
     for _ in file.records():
         _, *row, _, track_length = file.take("Q3d3BdQ")
         file.skip(8 * track_length)  # track: image id, observation index
         rows.append(row)
-    return _cloud(rows)
-
-
-def _cloud(rows: list) -> tuple[np.ndarray, np.ndarray]:
     table = np.asarray(rows, dtype=np.float64).reshape(-1, 6)
     return table[:, :3], table[:, 3:] / 255.0
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: expected UTF-8 text") from None
-    return [line for line in lines if not line.startswith("#")]
-
-
-def _cameras_txt(path: Path) -> dict[int, _Intrinsics]:
-    cameras = {}
-    for line in filter(str.strip, _lines(path)):
-        try:
-            camera_id, model, width, height, *params = line.split()
-            numbers = int(camera_id), int(width), int(height), [float(p) for p in params]
-        except ValueError:
-            raise ValueError(
-                f"{path}: expected ID MODEL WIDTH HEIGHT PARAMS, got {line!r}"
-            ) from None
-        _refuse_distorted(path, model)
-        cameras[numbers[0]] = _intrinsics(path, model, *numbers[1:])
-    return cameras
-
-
-def _images_txt(path: Path, cameras: dict[int, _Intrinsics]) -> list[PosedImage]:
-    images = []
-    # Every second line holds observations, which nobody needs here, and may be empty.
-    for line in filter(str.strip, _lines(path)[::2]):
-        fields = line.strip().split(maxsplit=9)
-        try:
-            qw, qx, qy, qz, x, y, z = (float(value) for value in fields[1:8])
-            camera_id, name = int(fields[8]), fields[9]
-        except (ValueError, IndexError):
-            raise ValueError(
-                f"{path}: expected ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got {line!r}"
-            ) from None
-        viewmat = _world_to_camera(path, [qw, qx, qy, qz], [x, y, z])
-        images.append(_posed(path, name, viewmat, camera_id, cameras))
-    return images
-
-
-def _points_txt(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    rows = []
-    for line in filter(str.strip, _lines(path)):
-        try:
-            x, y, z, red, green, blue = (float(value) for value in line.split()[1:7])
-        except ValueError:
-            raise ValueError(f"{path}: expected ID X Y Z R G B ERROR, got {line!r}") from None
-        rows.append((x, y, z, red, green, blue))
-    return _cloud(rows)

@@ -7,7 +7,6 @@ noise is not here: the optimizer package injects it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -19,51 +18,20 @@ from splatting.relocation import MAX_OPACITY, relocated_values
 _REFERENCE_RUN = 30_000  # iterations that 500, 25,000 and 100 were made for
 Optimizers = Mapping[str, torch.optim.Optimizer]
 
-_REQUIRED = ("means", "scales", "quats", "opacities")
-
-
-@dataclass(frozen=True)
-class DensityReport:
-    """What one `MCMCDensityControl.step` did."""
-
-    refined: bool  # whether this was a refinement iteration
-    relocated: int  # dead Gaussians that were moved
-    added: int  # new Gaussians
-    total: int  # Gaussians afterwards
-
 
 class MCMCDensityControl:
-    """Relocation and growth on a schedule, with gsplat 1.5.3's edits of the optimizer state.
-
-    Args:
-        cap_max: at most so many Gaussians.
-        refine_start: refine after this iteration.
-        refine_stop: refine before this iteration.
-        refine_every: refine at the multiples of this.
-        min_opacity: at or below it (after the sigmoid) a Gaussian is dead.
-        growth: factor on the number of Gaussians at each refinement, rounded down.
-        generator: for the sampling; None is torch's global one.
-    """
+    """Relocation and growth on a schedule, with gsplat 1.5.3's edits of the optimizer state."""
 
     def __init__(
         self,
-        cap_max: int,
-        refine_start: int = 500,
+        cap_max: int,  # at most so many Gaussians
+        refine_start: int = 500,  # refine after this iteration, before the next number
         refine_stop: int = 25_000,
         refine_every: int = 100,
-        min_opacity: float = 0.005,
-        growth: float = 1.05,
-        generator: torch.Generator | None = None,
+        min_opacity: float = 0.005,  # at or below it (after the sigmoid) a Gaussian is dead
+        growth: float = 1.05,  # of their number at each refinement, rounded down
+        generator: torch.Generator | None = None,  # for the sampling; None: torch's global one
     ) -> None:
-        _check_at_least("cap_max", cap_max, 0)
-        _check_at_least("refine_start", refine_start, 0)
-        _check_at_least("refine_stop", refine_stop, refine_start)
-        _check_at_least("refine_every", refine_every, 1)
-        _check_at_least("growth", growth, 1.0)
-        if not 0.0 < min_opacity < 1.0:
-            raise ValueError(
-                f"MCMCDensityControl: min_opacity={min_opacity}, must be inside (0, 1)"
-            )
         self.cap_max, self.min_opacity, self.growth = cap_max, min_opacity, growth
         self.refine_start, self.refine_stop = refine_start, refine_stop
         self.refine_every = refine_every
@@ -76,8 +44,7 @@ class MCMCDensityControl:
         iterations: int,
         cap_max: int,
         *,
-        num_points: int | None = None,
-        min_opacity: float = 0.005,
+        num_points: int,
         generator: torch.Generator | None = None,
     ) -> MCMCDensityControl:
         """Fit the stock schedule (500, 25,000, 100 of 30,000 iterations) to a run of any length.
@@ -85,34 +52,23 @@ class MCMCDensityControl:
         Start and stop scale with the run. The cadence does too, but stays within 20 to 100
         iterations: Adam's first moment needs some ten updates to settle after a move. That leaves
         a short run fewer refinements than the 244 of a stock one (61 of 1,500 iterations, enough
-        for a factor of 19.6 at 5 %). Where `num_points` is given and 5 % would not reach the cap
-        half-way between start and stop, the growth is raised until it does.
+        for a factor of 19.6 at 5 %). Where 5 % would not reach the cap half-way between start and
+        stop, the growth is raised until it does.
 
         Args:
             iterations: length of the whole run.
-            cap_max: at most so many Gaussians.
-            num_points: how many the run starts with; None leaves the growth at 5 %.
-            min_opacity: see the class.
-            generator: see the class.
+            num_points: how many the run starts with.
         """
-        _check_at_least("iterations", iterations, 1)
         scale = iterations / _REFERENCE_RUN
         start, stop = round(500 * scale), round(25_000 * scale)
         every = min(max(round(100 * scale), 20), 100)
-        growth = 1.05
-        if num_points is not None:
-            _check_at_least("num_points", num_points, 1)
-            half = max(((start + stop) // 2 - start) // every, 1)
-            growth = max(growth, (cap_max / num_points) ** (1.0 / half))
-        return cls(cap_max, start, stop, every, min_opacity, growth, generator)
+        half = max(((start + stop) // 2 - start) // every, 1)
+        growth = max(1.05, (cap_max / num_points) ** (1.0 / half))
+        return cls(cap_max, start, stop, every, growth=growth, generator=generator)
 
-    def step(
-        self,
-        iteration: int,
-        gaussians: dict[str, Parameter],
-        optimizers: Optimizers,
-    ) -> DensityReport:
-        """Relocate and grow if this is a refinement iteration; call it after the optimizers' step.
+    @torch.no_grad()
+    def step(self, iteration: int, gaussians: dict[str, Parameter], optimizers: Optimizers) -> int:
+        """Relocate and grow if this is a refinement iteration; return how many were relocated.
 
         Edits the way gsplat does: every entry of `gaussians` becomes a new Parameter object,
         relocation keeps its storage and zeroes the state of the *sampled* rows (not of the moved
@@ -122,19 +78,13 @@ class MCMCDensityControl:
             iteration: counted from 0.
             gaussians: the dict of `gaussians.py`; its entries are replaced.
             optimizers: one for each key, with one group that holds that one parameter.
-
-        Raises:
-            ValueError: keys are missing, an optimizer is not of that form, or an opacity is NaN.
         """
-        total = len(gaussians["means"])
         in_window = self.refine_start < iteration < self.refine_stop
         if not in_window or iteration % self.refine_every != 0:
-            return DensityReport(False, 0, 0, total)
-        _check_slots(gaussians, optimizers)
-        with torch.no_grad():
-            relocated = self._relocate(gaussians, optimizers)
-            added = self._grow(gaussians, optimizers)
-        return DensityReport(True, relocated, added, total + added)
+            return 0
+        relocated = self._relocate(gaussians, optimizers)
+        self._grow(gaussians, optimizers)
+        return relocated
 
     def _relocate(self, gaussians: dict[str, Parameter], optimizers: Optimizers) -> int:
         opacities = torch.sigmoid(gaussians["opacities"].flatten())
@@ -149,21 +99,27 @@ class MCMCDensityControl:
         for name, parameter in list(gaussians.items()):
             parameter[dead] = parameter[sources]
             # Upstream keeps the moved rows' moments and zeroes those of their sources.
-            _replace(name, parameter.data, gaussians, optimizers, _zero_rows(sources))
+            _replace(
+                name, parameter.data, gaussians, optimizers, lambda v: v.index_fill_(0, sources, 0)
+            )
         return len(dead)
 
-    def _grow(self, gaussians: dict[str, Parameter], optimizers: Optimizers) -> int:
+    def _grow(self, gaussians: dict[str, Parameter], optimizers: Optimizers) -> None:
         count = len(gaussians["means"])
         added = max(0, min(self.cap_max, int(self.growth * count)) - count)
         opacities = torch.sigmoid(gaussians["opacities"].flatten())
         if added == 0 or not opacities.sum() > 0:
-            return 0
+            return
         sources = self._sample(opacities, added)
         self._shrink(gaussians, opacities, sources)
+
+        def with_zero_rows(value: Tensor) -> Tensor:
+            # float32 whatever the state's dtype is, as upstream: optimizers must survive that
+            return torch.cat((value, torch.zeros(added, *value.shape[1:], device=value.device)))
+
         for name, parameter in list(gaussians.items()):
             grown = torch.cat((parameter.data, parameter.data[sources]))
-            _replace(name, grown, gaussians, optimizers, _append_zero_rows(added))
-        return added
+            _replace(name, grown, gaussians, optimizers, with_zero_rows)
 
     def _sample(self, weights: Tensor, count: int) -> Tensor:
         return torch.multinomial(weights, count, replacement=True, generator=self.generator)
@@ -179,47 +135,9 @@ class MCMCDensityControl:
 
 
 def regularisers(gaussians: dict[str, Parameter]) -> Tensor:
-    """0.01 * mean(opacity) + 0.01 * mean(scale), both after activation; 0 where there are none."""
+    """0.01 * mean(opacity) + 0.01 * mean(scale), both after activation."""
     opacities, scales = gaussians["opacities"], gaussians["scales"]
-    if opacities.numel() == 0:
-        return opacities.sum() + scales.sum()
     return 0.01 * torch.sigmoid(opacities).mean() + 0.01 * torch.exp(scales).mean()
-
-
-def _check_at_least(name: str, value: float, least: float) -> None:
-    if not value >= least:  # refuses NaN too
-        raise ValueError(f"MCMCDensityControl: {name}={value}, must be at least {least}")
-
-
-def _check_slots(gaussians: dict[str, Parameter], optimizers: Optimizers) -> None:
-    missing = [key for key in _REQUIRED if key not in gaussians]
-    if missing:
-        raise ValueError(f"MCMCDensityControl.step: gaussians lack {missing}")
-    for name, parameter in gaussians.items():
-        if name not in optimizers:
-            raise ValueError(f"MCMCDensityControl.step: no optimizer for {name!r}")
-        held = [p for group in optimizers[name].param_groups for p in group["params"]]
-        if len(held) != 1 or held[0] is not parameter:
-            raise ValueError(
-                f"MCMCDensityControl.step: the optimizer of {name!r} must hold that parameter and "
-                f"nothing else, it holds {len(held)}"
-            )
-
-
-def _zero_rows(rows: Tensor) -> Callable[[Tensor], Tensor]:
-    def edit(value: Tensor) -> Tensor:
-        value[rows] = 0
-        return value
-
-    return edit
-
-
-def _append_zero_rows(count: int) -> Callable[[Tensor], Tensor]:
-    def edit(value: Tensor) -> Tensor:
-        # float32 whatever the state's dtype is, as upstream: that is what optimizers must survive
-        return torch.cat((value, torch.zeros(count, *value.shape[1:], device=value.device)))
-
-    return edit
 
 
 def _replace(

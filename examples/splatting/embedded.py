@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import torch
 
@@ -51,15 +53,15 @@ def embedded_scene(size: Size = "images_4", seed: int = 0, held_out: int | None 
 def _toys(rng: np.random.Generator) -> list[Solid]:
     rough, fine = patterns.Noise(rng, falloff=1.5), patterns.Noise(rng, falloff=0.9)
     return [
-        Sphere((0.0, 0.0, -0.5), 10.0, patterns.sky(rough), is_sky=True),
-        Ground(patterns.garden(rough, fine)),
+        Sphere((0.0, 0.0, -0.5), 10.0, partial(patterns.sky, rough), is_sky=True),
+        Ground(partial(patterns.garden, rough, fine)),
         Sphere((0.75, -0.85, 0.55), 0.55, patterns.beach_ball),
         Sphere((-1.15, -0.65, 0.38), 0.38, patterns.checker_ball),
-        Box((-0.1, 0.35, 0.5), (0.4, 0.4, 0.5), 0.35, patterns.bricks(rough)),
-        Sphere((-0.1, 0.35, 1.42), 0.42, patterns.planet(rough)),
-        Box((1.15, 0.55, 0.32), (0.32, 0.32, 0.32), -0.5, patterns.gift(0.32)),
-        Box((-1.25, 0.75, 0.225), (0.5, 0.25, 0.225), 0.9, patterns.planks(fine)),
-        Sphere((-1.25, 0.75, 0.72), 0.27, patterns.marble(rough)),
+        Box((-0.1, 0.35, 0.5), (0.4, 0.4, 0.5), 0.35, partial(patterns.bricks, rough)),
+        Sphere((-0.1, 0.35, 1.42), 0.42, partial(patterns.planet, rough)),
+        Box((1.15, 0.55, 0.32), (0.32, 0.32, 0.32), -0.5, partial(patterns.gift, 0.32)),
+        Box((-1.25, 0.75, 0.225), (0.5, 0.25, 0.225), 0.9, partial(patterns.planks, fine)),
+        Sphere((-1.25, 0.75, 0.72), 0.27, partial(patterns.marble, rough)),
     ]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -11,11 +10,12 @@ from typing import Any, Literal, Protocol
 import torch
 from torch import Tensor
 from torch.nn import Parameter
+from tqdm import tqdm
 
 from opt3dgs_optim import Phase, PhaseScheduler, PositionNoise
 from opt3dgs_optim.runs import RunLog
 from splatting.arms import NOISE_LR, Arm
-from splatting.density import DensityReport, MCMCDensityControl, Optimizers, regularisers
+from splatting.density import MCMCDensityControl, Optimizers, regularisers
 from splatting.gaussians import (
     DEFAULT_PRESET,
     MCMC_PRESET,
@@ -66,19 +66,9 @@ class DensityControl(Protocol):
 
     def step(
         self, iteration: int, gaussians: dict[str, Parameter], optimizers: Optimizers, /
-    ) -> DensityReport:
-        """Called after the optimizers' step, with the iteration from 0."""
+    ) -> int:
+        """Called after the optimizers' step, with the iteration from 0; how many were relocated."""
         ...
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Where a fit is, for a progress bar."""
-
-    iteration: int
-    loss: float
-    psnr: float
-    phase: str
 
 
 class Fit:
@@ -147,37 +137,26 @@ class Fit:
         pixel_loss = None if self.phases is None else self.phases.pixel_loss
         loss = photometric_loss(image, view.image, pixel_loss)
         if self.arm.mcmc:
-            loss = loss + self._regularisers()
+            loss = loss + regularisers(self.gaussians)
         loss.backward()
         if self.phases is not None:
             for part in self.phases.parts:
                 if hasattr(part, "view"):  # a study's own
                     part.view = index  # pyright: ignore[reportAttributeAccessIssue]
             self.phases.observe(loss, iteration=self.iteration)
-        self._step_optimizers()
-        self._inject_noise()
+        for optimizer in self.optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        if self.noise is not None:
+            with torch.no_grad():
+                lr = self.optimizers["means"].param_groups[0]["lr"]
+                self.noise.add_to(self.gaussians["means"], lr)
         if self.density is not None:
-            report = self.density.step(self.iteration, self.gaussians, self.optimizers)
-            self.relocated += report.relocated
+            self.relocated += self.density.step(self.iteration, self.gaussians, self.optimizers)
         self.iteration += 1
         decay = LR_DECAY ** (self.iteration / self.options.iterations)
         self.optimizers["means"].param_groups[0]["lr"] = self.rates["means"] * decay
         return loss.detach()
-
-    def _regularisers(self) -> Tensor:
-        return regularisers(self.gaussians)
-
-    def _step_optimizers(self) -> None:
-        for optimizer in self.optimizers.values():
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
-
-    @torch.no_grad()
-    def _inject_noise(self) -> None:
-        """What an MCMC trainer does itself; with a scheduler, the optimizer of the means does."""
-        if self.noise is not None:
-            lr = self.optimizers["means"].param_groups[0]["lr"]
-            self.noise.add_to(self.gaussians["means"], lr)
 
     def _next_view(self) -> int:
         if not self.views:
@@ -293,55 +272,50 @@ class Fit:
 
 
 def run(
-    fit: Fit,
-    folder: Path,
-    show: Callable[[Progress], None] = lambda _progress: None,
-    metadata: dict[str, Any] | None = None,
+    fit: Fit, folder: Path, metadata: dict[str, Any] | None = None, *, quiet: bool = True
 ) -> dict[str, float]:
     """Train to the end, or on from where an earlier call was stopped; return the last metrics.
 
     Writes `folder/log.jsonl` and `folder/checkpoint.pt`. On Ctrl-C the iteration is finished, its
     checkpoint written, and KeyboardInterrupt raised; a second Ctrl-C stops at once.
     """
-    checkpoint, total = folder / "checkpoint.pt", fit.options.iterations
+    checkpoint, path, total = folder / "checkpoint.pt", folder / "log.jsonl", fit.options.iterations
     if checkpoint.exists():
         fit.load(checkpoint)
     if fit.iteration == total:
         return fit.evaluate()
     fit.compile_kernels()
+    about = {"arm": fit.arm.name, "scene": fit.scene.name, **asdict(fit.options)}
+    about |= metadata or {}
+    # Lines past the checkpoint, or of a run without one, are superseded.
+    if path.exists():
+        log = RunLog.resume(path, iteration=fit.iteration, metadata=about)
+    else:
+        log = RunLog(path, metadata=about)
     every = max(total // fit.options.evaluations, 1)
-    with _open_log(fit, folder / "log.jsonl", metadata or {}) as log, StopRequest() as stop:
+    bar = tqdm(total=total, initial=fit.iteration, desc=fit.arm.name, unit="it", disable=quiet)
+    with log, bar, StopRequest() as stop:
         metrics = _evaluate(fit, log)
         while fit.iteration < total:
             phase = fit.phase
             loss = fit.step()
-            _log_step(fit, log, phase, loss)
-            if fit.iteration % every == 0 or fit.iteration == total:
+            numbers = {} if fit.phases is None else fit.phases.numbers()
+            log.step(fit.iteration, phase=phase.value, loss=loss, **numbers)
+            look = fit.iteration % every == 0 or fit.iteration == total
+            if look:
                 metrics = _evaluate(fit, log)
-            if fit.iteration % every == 0 or fit.iteration == total or stop.requested:
+            if look or stop.requested:
                 with log.paused():
                     fit.save(checkpoint)
-            if fit.iteration % 10 == 0 or fit.iteration == total:
-                show(Progress(fit.iteration, float(loss), metrics["psnr"], phase.value))
+            bar.update()
+            if not quiet and fit.iteration % 10 == 0:
+                shown = f"loss {float(loss):.4f}, PSNR {metrics['psnr']:.2f} dB, {phase.value}"
+                bar.set_postfix_str(shown)
             if stop.requested:
                 log.event("interrupted", fit.iteration)
                 raise KeyboardInterrupt
         log.event("finished", fit.iteration, mean_nu=fit.mean_nu)
     return metrics
-
-
-def _open_log(fit: Fit, path: Path, metadata: dict[str, Any]) -> RunLog:
-    about = {"arm": fit.arm.name, "scene": fit.scene.name, **asdict(fit.options), **metadata}
-    if path.exists():  # lines past the checkpoint, or of a run without one, are superseded
-        return RunLog.resume(path, iteration=fit.iteration, metadata=about)
-    return RunLog(path, metadata=about)
-
-
-def _log_step(fit: Fit, log: RunLog, phase: Phase, loss: Tensor) -> None:
-    values: dict[str, Any] = {"loss": loss}
-    if fit.phases is not None:
-        values.update(fit.phases.numbers())
-    log.step(fit.iteration, phase=phase.value, **values)
 
 
 def _evaluate(fit: Fit, log: RunLog) -> dict[str, float]:

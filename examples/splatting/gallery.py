@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 
-from splatting.camera import Camera
-from splatting.gaussians import load_ply
 from splatting.metrics import psnr
-from splatting.rasterizer import render
 from splatting.scenes import View
 
 COLUMNS = 4
@@ -21,13 +19,14 @@ def draw_gallery(view: View, fitted: dict[str, Path], path: Path) -> None:
 
     Args:
         view: a view that no arm was trained on.
-        fitted: .ply of the Gaussians of every arm, in the order to show them.
+        fitted: .npy of every arm's render [H, W, 3], in the order to show them.
         path: the picture to write.
     """
     tiles: list[tuple[str, np.ndarray]] = [(f"photo: {view.name}", view.image.numpy())]
-    for name, ply in fitted.items():
-        image = _image(ply, view.camera)
-        tiles.append((f"{name}\n{float(psnr(image, view.image)):.2f} dB", image.numpy()))
+    for name, file in fitted.items():
+        image = np.load(file)
+        quality = float(psnr(torch.from_numpy(image), view.image))
+        tiles.append((f"{name}\n{quality:.2f} dB", image))
     rows, aspect = -(-len(tiles) // COLUMNS), view.camera.height / view.camera.width
     figure = Figure(figsize=(3.2 * COLUMNS, (3.2 * aspect + 0.55) * rows), layout="constrained")
     axes = np.atleast_1d(figure.subplots(rows, COLUMNS)).ravel()
@@ -37,8 +36,3 @@ def draw_gallery(view: View, fitted: dict[str, Path], path: Path) -> None:
         axis.imshow(np.clip(image, 0, 1), interpolation="nearest")
         axis.set_title(title, fontsize=10)
     figure.savefig(path, dpi=110)
-
-
-def _image(ply: Path, camera: Camera):
-    gaussians = {key: value.detach() for key, value in load_ply(ply).items()}
-    return render(gaussians, camera).image.clamp(0, 1)

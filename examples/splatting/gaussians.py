@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement
 from torch import Tensor
 from torch.nn import Parameter
+
+from splatting.spherical_harmonics import SH_0
 
 Gaussians = dict[str, Parameter]
 
@@ -30,9 +32,7 @@ class InitPreset(TypedDict):
 MCMC_PRESET: InitPreset = {"init_opacity": 0.5, "init_scale": 0.1}  # 3dgs-mcmc, gsplat's "mcmc"
 DEFAULT_PRESET: InitPreset = {"init_opacity": 0.1, "init_scale": 1.0}  # INRIA, gsplat's "default"
 
-_SH_C0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
 _MIN_SQUARED_DISTANCE = 1e-7  # world units squared; INRIA's bound, keeps coincident points finite
-_MAX_SH_DEGREE = 3
 
 
 def gaussians_from_points(
@@ -60,17 +60,6 @@ def gaussians_from_points(
     Returns:
         leaf parameters of the dtype of `points`.
     """
-    call = "gaussians_from_points"
-    _check_options(call, sh_degree, init_opacity, init_scale)
-    if points.dim() != 2 or points.shape[1] != 3 or points.shape != colors.shape:
-        raise ValueError(
-            f"{call}: points and colors must both be [P, 3], "
-            f"got {tuple(points.shape)} and {tuple(colors.shape)}"
-        )
-    if len(points) == 0 or not torch.isfinite(points).all():
-        raise ValueError(f"{call}: needs at least 1 point, all finite, got {len(points)} points")
-    if num_points is not None and num_points < 1:
-        raise ValueError(f"{call}: num_points={num_points}, must be at least 1 or None")
     if num_points is not None and num_points < len(points):
         kept = torch.randperm(len(points), generator=generator)[:num_points]
         points, colors = points[kept], colors[kept]
@@ -83,7 +72,7 @@ def gaussians_from_points(
         "scales": torch.log(neighbour_distance(points) * init_scale)[:, None].repeat(1, 3),
         "quats": quats,
         "opacities": torch.full((count,), math.log(init_opacity / (1 - init_opacity)), dtype=dtype),
-        "sh0": ((colors.to(dtype) - 0.5) / _SH_C0)[:, None],
+        "sh0": ((colors.to(dtype) - 0.5) / SH_0)[:, None],
     }
     if sh_degree > 0:
         tensors["shN"] = torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3, dtype=dtype)
@@ -94,41 +83,26 @@ def random_gaussians(
     extent: float,
     num_points: int,
     *,
-    center: Tensor | None = None,
-    spread: float = 3.0,
-    sh_degree: int = 0,
-    init_opacity: float = 0.5,
-    init_scale: float = 0.1,
+    center: Tensor,
+    spread: float,
     generator: torch.Generator | None = None,
+    **options: Any,
 ) -> Gaussians:
     """Gaussians of random colour, uniform in a cube: what trainers do without sparse points.
-
-    The cube has half-side `spread * extent`: 3 scene extents in gsplat's simple_trainer
-    (`init_type="random"`, `init_extent=3`) and in 3dgs-mcmc, both around the origin.
 
     Args:
         extent: `Scene.extent`, world units.
         num_points: how many.
-        center: of the cube, [3], world units; None is the origin.
-        spread: half-side of the cube in extents.
-        sh_degree: see `gaussians_from_points`, like the rest.
-        init_opacity: after the sigmoid.
-        init_scale: factor on the neighbour distance.
-        generator: None is torch's global one.
+        center: of the cube, [3], world units.
+        spread: half-side of the cube in extents; the trainers' is 3, around the origin.
+        options: of `gaussians_from_points`.
     """
-    if not (0 < extent < math.inf and 0 < spread < math.inf) or num_points < 1:
-        raise ValueError(
-            f"random_gaussians: extent={extent}, spread={spread}, num_points={num_points}, "
-            "all must be positive and finite"
-        )
     offsets = (2.0 * torch.rand(num_points, 3, generator=generator) - 1.0) * (spread * extent)
     return gaussians_from_points(
-        offsets if center is None else offsets + center.to(offsets.dtype),
+        offsets + center.to(offsets.dtype),
         torch.rand(num_points, 3, generator=generator),
-        sh_degree=sh_degree,
-        init_opacity=init_opacity,
-        init_scale=init_scale,
         generator=generator,
+        **options,
     )
 
 
@@ -159,8 +133,6 @@ def stock_learning_rates(extent: float) -> dict[str, float]:
     Args:
         extent: `Scene.extent`, world units.
     """
-    if not 0 < extent < math.inf:
-        raise ValueError(f"stock_learning_rates: extent={extent}, must be positive and finite")
     return {
         "means": 1.6e-4 * extent,
         "scales": 5e-3,
@@ -169,15 +141,6 @@ def stock_learning_rates(extent: float) -> dict[str, float]:
         "sh0": 2.5e-3,
         "shN": 2.5e-3 / 20,
     }
-
-
-def _check_options(call: str, sh_degree: int, init_opacity: float, init_scale: float) -> None:
-    if sh_degree not in range(_MAX_SH_DEGREE + 1):
-        raise ValueError(f"{call}: sh_degree={sh_degree}, must be 0..{_MAX_SH_DEGREE}")
-    if not 0.0 < init_opacity < 1.0:
-        raise ValueError(f"{call}: init_opacity={init_opacity}, must be inside (0, 1)")
-    if not 0.0 < init_scale < math.inf:
-        raise ValueError(f"{call}: init_scale={init_scale}, must be positive and finite")
 
 
 # Columns of INRIA's point_cloud.ply. f_rest is channel-major: all of red's coefficients, then
@@ -210,31 +173,3 @@ def save_ply(path: str | Path, gaussians: Gaussians) -> None:
     for index, name in enumerate(names):
         vertices[name] = table[:, index]
     PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
-
-
-def load_ply(path: str | Path) -> Gaussians:
-    """Read what `save_ply`, gsplat's exporter or INRIA's trainer wrote, as float32 parameters."""
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"load_ply: {path} is missing")
-    try:
-        vertices = PlyData.read(str(path))["vertex"]
-        names = [prop.name for prop in vertices.properties]
-        tables = {
-            key: np.stack([np.asarray(vertices[name], np.float32) for name in columns], axis=1)
-            for key, columns in _COLUMNS.items()
-            if key != "normals"
-        }
-    except (PlyParseError, KeyError, ValueError, EOFError) as error:
-        raise ValueError(f"load_ply: {path} is no .ply file of Gaussians: {error}") from None
-    rest = sum(name.startswith("f_rest_") for name in names)
-    if rest not in {3 * ((degree + 1) ** 2 - 1) for degree in range(_MAX_SH_DEGREE + 1)}:
-        raise ValueError(f"load_ply: {path} has {rest} f_rest columns, expected 0, 9, 24 or 45")
-    tensors = {key: torch.from_numpy(table) for key, table in tables.items()}
-    tensors["opacities"] = tensors["opacities"][:, 0]
-    tensors["sh0"] = tensors["sh0"][:, None]
-    if rest:
-        columns = [np.asarray(vertices[f"f_rest_{i}"], np.float32) for i in range(rest)]
-        by_channel = torch.from_numpy(np.stack(columns, axis=1)).reshape(-1, 3, rest // 3)
-        tensors["shN"] = by_channel.transpose(1, 2).contiguous()
-    order = ("means", "scales", "quats", "opacities", "sh0", "shN")
-    return {key: Parameter(tensors[key]) for key in order if key in tensors}

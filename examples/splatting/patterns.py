@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatting.raycast import Array, Pattern
+from splatting.raycast import Array
 
 _NOISE_SIZE = 512
 
@@ -68,107 +68,79 @@ def checker_ball(points: Array, normals: Array) -> Array:
     return _palette(["2b2d42", "f2e9e4"], odd)
 
 
-def planet(noise: Noise) -> Pattern:
+def planet(noise: Noise, points: Array, normals: Array) -> Array:
     """Seas, coasts, woods and snow."""
-
-    def pattern(points: Array, normals: Array) -> Array:
-        longitude, latitude = _angles(normals)
-        height = noise(longitude, latitude * 0.8) + 0.35 * np.abs(latitude)
-        sea = _mix(_rgb("12355b"), _rgb("3fa7d6"), height * 2)
-        land = _mix(_rgb("e2c48d"), _rgb("3a7d44"), (height - 0.55) * 9)
-        land = np.where(height > 0.82, _rgb("f5f7fa"), land)
-        return np.where(height < 0.53, sea, land)
-
-    return pattern
+    longitude, latitude = _angles(normals)
+    height = noise(longitude, latitude * 0.8) + 0.35 * np.abs(latitude)
+    sea = _mix(_rgb("12355b"), _rgb("3fa7d6"), height * 2)
+    land = _mix(_rgb("e2c48d"), _rgb("3a7d44"), (height - 0.55) * 9)
+    land = np.where(height > 0.82, _rgb("f5f7fa"), land)
+    return np.where(height < 0.53, sea, land)
 
 
-def marble(noise: Noise) -> Pattern:
+def marble(noise: Noise, points: Array, normals: Array) -> Array:
     """Veined stone."""
-
-    def pattern(points: Array, normals: Array) -> Array:
-        longitude, latitude = _angles(normals)
-        wave = np.sin(40 * latitude + 14 * noise(longitude, latitude))
-        return _mix(_rgb("3c1642"), _rgb("f7d6e0"), 0.5 + 0.5 * wave)
-
-    return pattern
+    longitude, latitude = _angles(normals)
+    wave = np.sin(40 * latitude + 14 * noise(longitude, latitude))
+    return _mix(_rgb("3c1642"), _rgb("f7d6e0"), 0.5 + 0.5 * wave)
 
 
-def gift(half: float) -> Pattern:
+def gift(half: float, points: Array, normals: Array) -> Array:
     """Wrapping paper with dots, and a ribbon crossed over every face."""
-
-    def pattern(points: Array, normals: Array) -> Array:
-        u, v = _face(points, normals)
-        du, dv = (np.mod(w / (half * 0.4), 1) - 0.5 for w in (u, v))
-        paper = np.where(du**2 + dv**2 < 0.07, _rgb("ffe9ec"), _rgb("c1121f"))
-        edge = np.minimum(np.abs(u), np.abs(v)) / half
-        return np.where(edge < 0.16, np.where(edge < 0.1, _rgb("f9c74f"), _rgb("b8871f")), paper)
-
-    return pattern
+    u, v = _face(points, normals)
+    du, dv = (np.mod(w / (half * 0.4), 1) - 0.5 for w in (u, v))
+    paper = np.where(du**2 + dv**2 < 0.07, _rgb("ffe9ec"), _rgb("c1121f"))
+    edge = np.minimum(np.abs(u), np.abs(v)) / half
+    return np.where(edge < 0.16, np.where(edge < 0.1, _rgb("f9c74f"), _rgb("b8871f")), paper)
 
 
-def bricks(noise: Noise) -> Pattern:
+def bricks(noise: Noise, points: Array, normals: Array) -> Array:
     """Bricks in running bond with light mortar; each brick has its own tint."""
-
-    def pattern(points: Array, normals: Array) -> Array:
-        u, v = _face(points, normals)
-        row = np.floor(v / 0.11)
-        shifted = u / 0.24 + 0.5 * np.mod(row, 2)
-        column = np.floor(shifted)
-        in_brick = (np.mod(shifted, 1) > 0.07) & (np.mod(v / 0.11, 1) > 0.14)
-        tint = noise(row * 0.137, column * 0.271) + 0.3 * (noise(u, v) - 0.5)
-        return np.where(in_brick, _mix(_rgb("7a3b2e"), _rgb("d98e5f"), tint), _rgb("d9d2c5"))
-
-    return pattern
+    u, v = _face(points, normals)
+    row = np.floor(v / 0.11)
+    shifted = u / 0.24 + 0.5 * np.mod(row, 2)
+    column = np.floor(shifted)
+    in_brick = (np.mod(shifted, 1) > 0.07) & (np.mod(v / 0.11, 1) > 0.14)
+    tint = noise(row * 0.137, column * 0.271) + 0.3 * (noise(u, v) - 0.5)
+    return np.where(in_brick, _mix(_rgb("7a3b2e"), _rgb("d98e5f"), tint), _rgb("d9d2c5"))
 
 
-def planks(noise: Noise) -> Pattern:
+def planks(noise: Noise, points: Array, normals: Array) -> Array:
     """Wooden boards with grain along them."""
-
-    def pattern(points: Array, normals: Array) -> Array:
-        u, v = _face(points, normals)
-        board = np.floor(v / 0.15)
-        grain = noise(u * 0.25 + board * 0.31, v * 2.5)
-        wood = _mix(_rgb("6b4423"), _rgb("d7a86e"), grain * 0.8 + 0.3 * np.mod(board, 2))
-        return np.where(np.mod(v / 0.15, 1) < 0.08, _rgb("3d2514"), wood)
-
-    return pattern
+    u, v = _face(points, normals)
+    board = np.floor(v / 0.15)
+    grain = noise(u * 0.25 + board * 0.31, v * 2.5)
+    wood = _mix(_rgb("6b4423"), _rgb("d7a86e"), grain * 0.8 + 0.3 * np.mod(board, 2))
+    return np.where(np.mod(v / 0.15, 1) < 0.08, _rgb("3d2514"), wood)
 
 
-def garden(rough: Noise, fine: Noise) -> Pattern:
+def garden(rough: Noise, fine: Noise, points: Array, normals: Array) -> Array:
     """A round mosaic on a ring of flagstones, in a meadow."""
-
-    def pattern(points: Array, normals: Array) -> Array:
-        x, y = points[0], points[1]
-        radius, turn = np.hypot(x, y), np.arctan2(y, x) / np.float32(2 * np.pi)
-        ring = np.floor(radius * 4)
-        petals = np.floor(turn * 24 + 0.5 * np.mod(ring, 2) + 0.25 * np.sin(radius * 12))
-        tiles = ["f4f1de", "e07a5f", "3d405b", "81b29a", "f2cc8f"]
-        mosaic = _palette(tiles, ring * 2 + np.mod(petals, 3))
-        stone = _mix(_rgb("8d8d92"), _rgb("cfccc4"), fine(x * 0.21, y * 0.21) * 1.1)
-        joint = (np.mod(turn * 36 + 0.5 * np.floor(radius * 2.5), 1) < 0.08) | (
-            np.mod(radius * 2.5, 1) < 0.08
-        )
-        path = np.where(joint, _rgb("4a4e3f"), stone)
-        grass = _mix(_rgb("2f5d2a"), _rgb("b5c95a"), 1.3 * fine(x * 0.08, y * 0.08) - 0.1)
-        flowers = (rough(x * 0.11, y * 0.11) > 0.62) & (fine(x * 0.31, y * 0.31) > 0.82)
-        grass = np.where(flowers, _palette(["ffd6e8", "fff3b0"], np.floor(x * 3)), grass)
-        return np.where(radius < 2.0, mosaic, np.where(radius < 2.8, path, grass))
-
-    return pattern
+    x, y = points[0], points[1]
+    radius, turn = np.hypot(x, y), np.arctan2(y, x) / np.float32(2 * np.pi)
+    ring = np.floor(radius * 4)
+    petals = np.floor(turn * 24 + 0.5 * np.mod(ring, 2) + 0.25 * np.sin(radius * 12))
+    tiles = ["f4f1de", "e07a5f", "3d405b", "81b29a", "f2cc8f"]
+    mosaic = _palette(tiles, ring * 2 + np.mod(petals, 3))
+    stone = _mix(_rgb("8d8d92"), _rgb("cfccc4"), fine(x * 0.21, y * 0.21) * 1.1)
+    joint = (np.mod(turn * 36 + 0.5 * np.floor(radius * 2.5), 1) < 0.08) | (
+        np.mod(radius * 2.5, 1) < 0.08
+    )
+    path = np.where(joint, _rgb("4a4e3f"), stone)
+    grass = _mix(_rgb("2f5d2a"), _rgb("b5c95a"), 1.3 * fine(x * 0.08, y * 0.08) - 0.1)
+    flowers = (rough(x * 0.11, y * 0.11) > 0.62) & (fine(x * 0.31, y * 0.31) > 0.82)
+    grass = np.where(flowers, _palette(["ffd6e8", "fff3b0"], np.floor(x * 3)), grass)
+    return np.where(radius < 2.0, mosaic, np.where(radius < 2.8, path, grass))
 
 
-def sky(rough: Noise) -> Pattern:
+def sky(rough: Noise, points: Array, normals: Array) -> Array:
     """A gradient with clouds, above two rows of hills."""
-
-    def pattern(points: Array, normals: Array) -> Array:
-        longitude, latitude = _angles(normals)
-        height = latitude * 4  # 0 at the horizon, 1 at the zenith
-        blue = _mix(_rgb("fbe3c0"), _rgb("4a90d9"), height * 2.2)
-        cloud = (rough(longitude, height * 0.5) - 0.5) * 3 * np.clip(height * 8 - 0.6, 0, 1)
-        color = _mix(blue, _rgb("ffffff"), cloud)
-        far = 0.10 + 0.10 * rough(longitude, np.zeros_like(longitude))
-        near = 0.03 + 0.12 * rough(longitude, np.full_like(longitude, 0.37))
-        color = np.where(height < far, _rgb("8fa8c8"), color)
-        return np.where(height < near, _rgb("5d7f5b"), color)
-
-    return pattern
+    longitude, latitude = _angles(normals)
+    height = latitude * 4  # 0 at the horizon, 1 at the zenith
+    blue = _mix(_rgb("fbe3c0"), _rgb("4a90d9"), height * 2.2)
+    cloud = (rough(longitude, height * 0.5) - 0.5) * 3 * np.clip(height * 8 - 0.6, 0, 1)
+    color = _mix(blue, _rgb("ffffff"), cloud)
+    far = 0.10 + 0.10 * rough(longitude, np.zeros_like(longitude))
+    near = 0.03 + 0.12 * rough(longitude, np.full_like(longitude, 0.37))
+    color = np.where(height < far, _rgb("8fa8c8"), color)
+    return np.where(height < near, _rgb("5d7f5b"), color)

@@ -106,57 +106,28 @@ def _check(
     gaussians: Mapping[str, Tensor], camera: Camera, sh_degree: int | None, backend: str
 ) -> int:
     """Raise ValueError on unusable input; otherwise return the degree to use."""
-    missing = [name for name in TRAILING_SHAPES if name not in gaussians]
-    if missing:
-        raise ValueError(
-            f"render: gaussians lacks {missing}, must have {[*TRAILING_SHAPES]} (shN optional)"
-        )
-    means = gaussians["means"]
-    n = len(means)
-    for name, trailing in TRAILING_SHAPES.items():
-        if gaussians[name].shape != (n, *trailing):
-            shape = tuple(gaussians[name].shape)
-            raise ValueError(f"render: {name} has shape {shape}, must be {(n, *trailing)}")
-    shN = _higher_harmonics(gaussians)
-    counts = {degree: (degree + 1) ** 2 - 1 for degree in range(MAX_DEGREE + 1)}
-    if shN.dim() != 3 or shN.shape != (n, shN.shape[1], 3) or shN.shape[1] not in counts.values():
-        raise ValueError(
-            f"render: shN has shape {tuple(shN.shape)}, must be ({n}, K, 3) "
-            f"with K in {[*counts.values()]}"
-        )
-    for name in (*TRAILING_SHAPES, "shN"):
-        tensor = gaussians.get(name, means)
-        if tensor.dtype != means.dtype or tensor.device != means.device:
-            raise ValueError(
-                f"render: {name} is {tensor.dtype} on {tensor.device}, "
-                f"must be as means, {means.dtype} on {means.device}"
-            )
-    _check_backend(means, camera, backend)
-    stored = next(degree for degree, count in counts.items() if count == shN.shape[1])
-    degree = stored if sh_degree is None else sh_degree
-    if degree not in range(stored + 1):
-        raise ValueError(f"render: sh_degree is {sh_degree}, must be from 0 to the stored {stored}")
-    return degree
-
-
-def _check_backend(means: Tensor, camera: Camera, backend: str) -> None:
+    means, shN = gaussians["means"], _higher_harmonics(gaussians)
+    counts = [(degree + 1) ** 2 - 1 for degree in range(MAX_DEGREE + 1)]
+    if shN.dim() != 3 or shN.shape[1] not in counts:
+        raise ValueError(f"render: shN has shape {tuple(shN.shape)}, must be (N, K, 3), K {counts}")
+    for name, trailing in (TRAILING_SHAPES | {"shN": (shN.shape[1], 3)}).items():
+        tensor = gaussians.get(name, shN)
+        its = tuple(tensor.shape), tensor.dtype, tensor.device
+        wanted = (len(means), *trailing), means.dtype, means.device
+        if its != wanted:
+            raise ValueError(f"render: {name} is {its}, must be {wanted}")
     if backend not in get_args(Backend):
         raise ValueError(f"render: backend is {backend!r}, must be one of {get_args(Backend)}")
-    if means.dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"render: means is {means.dtype}, must be torch.float32 or torch.float64")
-    if camera.viewmat.shape != (4, 4):
-        raise ValueError(
-            f"render: camera.viewmat has shape {tuple(camera.viewmat.shape)}, must be (4, 4)"
-        )
-    if camera.width < 1 or camera.height < 1:
-        raise ValueError(
-            f"render: camera is {camera.width} x {camera.height} pixels, must be at least 1 x 1"
-        )
     if backend == "fast" and (obstacle := _obstacle(means, camera)):
         raise ValueError(
             f'render: backend "fast" with {obstacle}, must be float32 on the CPU and a constant; '
             'the backend "reference" has neither limit'
         )
+    stored = counts.index(shN.shape[1])
+    degree = stored if sh_degree is None else sh_degree
+    if degree not in range(stored + 1):
+        raise ValueError(f"render: sh_degree is {sh_degree}, must be from 0 to the stored {stored}")
+    return degree
 
 
 def _obstacle(means: Tensor, camera: Camera) -> str | None:

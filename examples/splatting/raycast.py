@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar
 
 import numpy as np
 
@@ -14,28 +14,6 @@ Pattern = Callable[[Array, Array], Array]  # local points, local normals [3, n] 
 _FAR = np.float32(1e9)  # stands for "no hit": infinities would make NaN further on
 _NEAR = np.float32(1e-3)  # world units; nearer hits are the surface that the ray starts from
 _AMBIENT, _DIFFUSE = 0.45, 0.65  # light in the shadow, and what the sun adds at normal incidence
-
-
-class Solid(Protocol):
-    """Something a ray can hit."""
-
-    @property
-    def casts_shadow(self) -> bool:
-        """Whether it stands between the sun and the rest."""
-        ...
-
-    @property
-    def is_lit(self) -> bool:
-        """Whether sun and shadow fall on it; if not, its pattern is its colour."""
-        ...
-
-    def distance(self, origin: Array, direction: Array) -> Array:
-        """Distance to the first hit along each ray, [n], `1e9` for none."""
-        ...
-
-    def surface(self, points: Array) -> tuple[Array, Array]:
-        """Outward normals [3, n] in the world and colours [3, n] at points on the surface."""
-        ...
 
 
 def _dot(a: Array, b: Array) -> Array:
@@ -55,11 +33,8 @@ class Sphere:
     def casts_shadow(self) -> bool:
         return not self.is_sky
 
-    @property
-    def is_lit(self) -> bool:
-        return not self.is_sky
-
     def distance(self, origin: Array, direction: Array) -> Array:
+        """Distance to the first hit along each ray, [n], `1e9` for none."""
         offset = origin - np.array(self.center, np.float32)[:, None]
         half_b = _dot(offset, direction)
         discriminant = half_b * half_b - _dot(offset, offset) + np.float32(self.radius**2)
@@ -68,6 +43,7 @@ class Sphere:
         return np.where((discriminant > 0) & (hit > _NEAR), hit, _FAR)
 
     def surface(self, points: Array) -> tuple[Array, Array]:
+        """Outward normals [3, n] in the world and colours [3, n] at points on the surface."""
         normals = (points - np.array(self.center, np.float32)[:, None]) / np.float32(self.radius)
         return normals, self.pattern(normals, normals)
 
@@ -80,8 +56,8 @@ class Box:
     half: tuple[float, float, float]
     yaw: float  # radians
     pattern: Pattern
-    casts_shadow: bool = True
-    is_lit: bool = True
+    casts_shadow: ClassVar = True
+    is_sky: ClassVar = False
 
     def _to_local(self, vectors: Array) -> Array:
         cos, sin = np.float32(np.cos(self.yaw)), np.float32(np.sin(self.yaw))
@@ -114,8 +90,8 @@ class Ground:
     """The plane z = 0, seen from above."""
 
     pattern: Pattern
-    casts_shadow: bool = False
-    is_lit: bool = True
+    casts_shadow: ClassVar = False
+    is_sky: ClassVar = False
 
     def distance(self, origin: Array, direction: Array) -> Array:
         falling = direction[2] < -1e-6
@@ -125,6 +101,9 @@ class Ground:
         normals = np.zeros_like(points)
         normals[2] = 1
         return normals, self.pattern(points, normals)
+
+
+Solid = Sphere | Box | Ground
 
 
 def trace(
@@ -154,7 +133,7 @@ def trace(
 
 def _shade(solids: Sequence[Solid], sun: Array, solid: Solid, points: Array) -> Array:
     normals, albedo = solid.surface(points)
-    if not solid.is_lit:
+    if solid.is_sky:
         return albedo
     to_sun = sun.astype(np.float32)[:, None]
     light = np.maximum(_dot(normals, to_sun), 0)  # Lambert

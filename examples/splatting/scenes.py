@@ -16,7 +16,6 @@ from splatting.colmap import PosedImage, SparseModel, read_colmap
 from splatting.transforms import read_json_object, read_transforms
 
 Size = Literal["images", "images_2", "images_4"]  # the folder of the photos
-Layout = Literal["auto", "colmap", "transforms"]
 Background = Literal["black", "white"]
 
 _TEST_EVERY = 8  # the convention of Mip-NeRF 360 and of every 3DGS paper since
@@ -47,7 +46,6 @@ class Scene:
 def load_scene(
     source: str | Path,
     size: Size = "images_4",
-    layout: Layout = "auto",
     *,
     background: Background = "black",
     held_out: int | None = None,
@@ -55,26 +53,20 @@ def load_scene(
     """Load a scene from a folder, or make the embedded one.
 
     A folder holds `images/`, its halves `images_2/` and quarters `images_4/`, and either a COLMAP
-    model in `sparse/0/` (or `sparse/`), or `transforms.json` with its .ply. Test views are those
-    of `split.json` where there is one, and otherwise every 8th of the sorted names.
+    model in `sparse/0/` (or `sparse/`), or `transforms.json` with its .ply; COLMAP's is preferred.
+    Test views are those of `split.json` where there is one, and otherwise every 8th of the names.
 
     Args:
         source: "embedded" (procedural, nothing to download; see `embedded.py`) or a folder.
         size: the folder of the photos; intrinsics follow the actual image size.
-        layout: "auto" prefers COLMAP where both layouts are present.
         background: what is behind the Gaussians; "white" for NeRF-synthetic scenes.
         held_out: the test views are those whose index among the sorted names is this modulo 8
             (7 in the embedded scene); by default those of `split.json`, or 0.
 
-    Raises:
-        FileNotFoundError: a file or folder of the scene is missing.
-        ValueError: a file is malformed, or an option is not one of those above.
+    Raises FileNotFoundError, or ValueError where a file is malformed or an option none of these.
     """
-    for option, value, allowed in (
-        ("size", size, Size),
-        ("layout", layout, Layout),
-        ("background", background, Background),
-    ):
+    options = ("size", size, Size), ("background", background, Background)
+    for option, value, allowed in options:
         if value not in get_args(allowed):
             raise ValueError(f"load_scene: {option}={value!r}, allowed are {get_args(allowed)}")
     if held_out is not None and held_out not in range(_TEST_EVERY):
@@ -86,7 +78,7 @@ def load_scene(
     folder = Path(source)
     if not folder.is_dir():
         raise FileNotFoundError(f"load_scene: {folder} is no folder; expected one, or 'embedded'")
-    model = _read_model(folder, layout)
+    model = _read_model(folder)
     if len(model.points) == 0 or not np.isfinite(model.points).all():
         raise ValueError(f"{folder}: expected finite sparse points, got {len(model.points)} points")
     names = sorted(image.name for image in model.images)
@@ -121,12 +113,11 @@ def scene_extent(cameras: list[Camera]) -> float:
     return extent
 
 
-def _read_model(folder: Path, layout: Layout) -> SparseModel:
+def _read_model(folder: Path) -> SparseModel:
     sparse = folder / "sparse"
-    has_colmap, has_transforms = sparse.is_dir(), (folder / "transforms.json").is_file()
-    if layout == "colmap" or (layout == "auto" and has_colmap):
+    if sparse.is_dir():
         return read_colmap(sparse / "0" if (sparse / "0").is_dir() else sparse)
-    if layout == "transforms" or has_transforms:
+    if (folder / "transforms.json").is_file():
         return read_transforms(folder)
     raise FileNotFoundError(f"{folder}: expected sparse/0/ (COLMAP) or transforms.json, found none")
 
@@ -150,19 +141,15 @@ def _split(folder: Path, names: list[str], held_out: int | None) -> tuple[list[s
 
 def _read_split(path: Path, names: list[str]) -> tuple[list[str], list[str]]:
     table = read_json_object(path)
-    parts: list[list[str]] = []
-    for key in ("train", "test"):
-        part = table.get(key)
-        if not isinstance(part, list) or not all(isinstance(name, str) for name in part):
-            raise ValueError(f"{path}: expected lists of image names under 'train' and 'test'")
-        parts.append(sorted(part))
-    train, test = parts
+    train, test = parts = table.get("train"), table.get("test")
+    if not all(isinstance(p, list) and all(isinstance(n, str) for n in p) for p in parts):
+        raise ValueError(f"{path}: expected lists of image names under 'train' and 'test'")
     unknown = sorted({*train, *test}.difference(names))
     if unknown:
         raise ValueError(f"{path}: names {unknown}, which the scene's model does not have")
     if len({*train, *test}) != len(train) + len(test):
         raise ValueError(f"{path}: a view is listed more than once, or in both 'train' and 'test'")
-    return train, test
+    return sorted(train), sorted(test)
 
 
 def _load_view(folder: Path, posed: PosedImage) -> View:

@@ -1,9 +1,34 @@
-"""Ctrl-C and termination signals: how a long command is stopped without losing what it has."""
+"""How a command ends: one line for what is wrong; Ctrl-C without losing what it has."""
 
 from __future__ import annotations
 
+import functools
 import signal
+import sys
+from collections.abc import Callable, Sequence
 from signal import SIGINT, SIGTERM
+
+Main = Callable[[Sequence[str] | None], int]
+
+
+def command(name: str) -> Callable[[Main], Callable[..., int]]:
+    """Let a `main(arguments=None)` return 2 after one line of what is wrong, 130 after Ctrl-C."""
+
+    def decorated(main: Main) -> Callable[..., int]:
+        @functools.wraps(main)
+        def ended(arguments: Sequence[str] | None = None) -> int:
+            try:
+                return main(arguments)
+            except (OSError, ValueError) as error:
+                print(f"{name}: {error}", file=sys.stderr)
+                return 2
+            except KeyboardInterrupt:
+                print("interrupted: the same command goes on from the checkpoints", file=sys.stderr)
+                return 130
+
+        return ended
+
+    return decorated
 
 
 def stop_at_once() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from plyfile import PlyData, PlyParseError
 
-from splatting.colmap import PosedImage, SparseModel
+from splatting.colmap import UNDISTORT, PosedImage, SparseModel
 
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -22,12 +22,7 @@ def read_transforms(folder: Path) -> SparseModel:
     Intrinsics may stand at the top, or in a frame, which then wins. Image names lose a leading
     `images/`, so that they agree with COLMAP's.
 
-    Args:
-        folder: the scene folder.
-
-    Raises:
-        FileNotFoundError: a file is missing.
-        ValueError: a file is malformed, or a camera has lens distortion.
+    Raises FileNotFoundError, or ValueError where a file is malformed or a lens distorts.
     """
     path = folder / "transforms.json"
     table = read_json_object(path)
@@ -54,50 +49,24 @@ def read_json_object(path: Path) -> dict[str, Any]:
 
 def _posed_image(path: Path, index: int, table: dict[str, Any], frame: Any) -> PosedImage:
     where = f"{path}: frame {index}"
-    if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-        raise ValueError(f"{where}: expected an object with a 'file_path'")
-    merged = {**table, **frame}
-    numbers = {
-        key: _number(where, key, merged[key])
-        for key in (*_INTRINSICS, *_DISTORTION)
-        if key in merged
-    }
-    missing = [key for key in _INTRINSICS if key not in numbers]
-    if missing:
-        raise ValueError(f"{where}: missing {', '.join(missing)}")
-    distortion = {key: numbers[key] for key in _DISTORTION if numbers.get(key)}
-    if distortion:
-        raise ValueError(
-            f"{where}: lens distortion {distortion}; only pinhole cameras can be rasterized. "
-            "Undistort the photos first: colmap image_undistorter"
-        )
-    fx, fy, cx, cy, width, height = (numbers[key] for key in _INTRINSICS)
-    if min(fx, fy, width, height) <= 0:
-        raise ValueError(f"{where}: impossible camera {width}x{height}, focal lengths {fx}, {fy}")
-    name = frame["file_path"].removeprefix("./").removeprefix("images/")
-    viewmat = _viewmat(where, frame.get("transform_matrix"))
-    return PosedImage(name, viewmat, fx, fy, cx, cy, int(width), int(height))
-
-
-def _number(where: str, key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise ValueError(f"{where}: expected a finite number as {key!r}, got {value!r}")
-    return float(value)
-
-
-def _viewmat(where: str, rows: Any) -> np.ndarray:
     try:
-        pose = np.asarray(rows, dtype=np.float64)
-    except (TypeError, ValueError):
-        pose = np.empty(0)
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise ValueError(f"{where}: expected a finite 4x4 'transform_matrix', got {rows!r}")
+        merged = {**table, **frame}
+        fx, fy, cx, cy, width, height = (float(merged[key]) for key in _INTRINSICS)
+        pose = np.array(frame["transform_matrix"], dtype=np.float64).reshape(4, 4)
+        name = frame["file_path"].removeprefix("./").removeprefix("images/")
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{where}: {error!r}") from None
+    distortion = {key: merged[key] for key in _DISTORTION if merged.get(key)}
+    if distortion:
+        raise ValueError(f"{where}: lens distortion {distortion}; {UNDISTORT}")
     rotation = pose[:3, :3]
     # 1e-3 lets matrices through that were written with few digits; a scaled or mirrored one is
     # off by far more, and would silently bend the scene.
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
-        raise ValueError(f"{where}: 'transform_matrix' is no rotation and translation: {rows!r}")
-    return np.linalg.inv(pose @ _OPENGL_TO_OPENCV)
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if not off < 1e-3 or np.linalg.det(rotation) < 0:
+        raise ValueError(f"{where}: 'transform_matrix' is no rotation and translation: {pose}")
+    viewmat = np.linalg.inv(pose @ _OPENGL_TO_OPENCV)
+    return PosedImage(name, viewmat, fx, fy, cx, cy, int(width), int(height))
 
 
 def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -23,11 +23,17 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from splatting.arms import Arm
+from splatting.fit import Fit, FitOptions
+from splatting.scenes import load_scene
 
 from opt3dgs_optim import EnergyHistogram, Part
+from studies import pages
 from studies.scenes.analysis import falls
+from studies.scenes.training import BACKGROUNDS
 
 OUT = Path(__file__).resolve().parents[2] / "docs" / "results" / "histogram"
 ARMS = ("stock", "frozen", "default")
@@ -72,46 +78,28 @@ class Frozen(Part):
         return self.histogram.factor(group, course)
 
 
-def train(folder: Path | str, arm: str, seed: int, iterations: int, points: int) -> dict[str, Any]:
+def train(folder: str, arm: str, seed: int, iterations: int, points: int) -> dict[str, Any]:
     """Train; return what is recorded, the curve and the trace included."""
-    from splatting.arms import Arm
-    from splatting.fit import Fit, FitOptions
-    from splatting.scenes import load_scene
-
-    from studies.scenes.training import BACKGROUNDS
-
     torch.set_num_threads(1)
     warmup = round(iterations * WARMUP)
     part = {"stock": None, "frozen": Frozen(warmup), "default": EnergyHistogram(warmup=warmup)}[arm]
-    parts: list[Part] = [] if part is None else [part]
-    made = Arm(arm, arm, lambda *_: parts)
-    background = BACKGROUNDS.get(Path(folder).name, "black")
-    fit = Fit(
-        load_scene(folder, background=background),
-        made,
-        FitOptions(iterations, points, seed, switch=1.0),
-    )
-    histogram = part.histogram if isinstance(part, Frozen) else part
-    curve, trace = [], []
+    made = Arm(arm, parts=lambda *_: [] if part is None else [part])
+    name = Path(folder).name
+    scene = load_scene(folder, background=BACKGROUNDS.get(name, "black"))
+    fit = Fit(scene, made, FitOptions(iterations, points, seed, switch=1.0))
+    curve, trace, low, high = [], [], -np.inf, np.inf
     while fit.iteration < iterations:
         loss = fit.step()
-        if part is not None:
-            histogram = part.histogram if isinstance(part, Frozen) else part
+        histogram = part.histogram if isinstance(part, Frozen) else part
+        if histogram is not None:
+            low, high = histogram.clamp or (-np.inf, np.inf)
             trace.append([float(loss), float(histogram.multiplier), *histogram.coordinates[:2]])
         if fit.iteration % (iterations // LOOKS) == 0:
-            curve.append({"iteration": fit.iteration, **fit.evaluate()})
-    clamp = None if histogram is None else histogram.clamp
-    return recorded(Path(folder).name, arm, seed, iterations, curve, trace, clamp)
-
-
-def recorded(
-    scene: str, arm: str, seed: int, iterations: int, curve: list, trace: list, clamp: Any
-) -> dict[str, Any]:
-    """The figures of a training."""
+            curve.append(fit.evaluate())
     psnr = np.array([look["train_psnr"] for look in curve])
     fallen = falls(psnr)
-    record = {
-        "scene": scene,
+    record: dict[str, Any] = {
+        "scene": name,
         "arm": arm,
         "seed": seed,
         "iterations": iterations,
@@ -124,30 +112,26 @@ def recorded(
         "curve": [round(value, 3) for value in psnr.tolist()],
     }
     if trace:
-        nu = np.array(trace)[round(iterations * WARMUP) :, 1]
+        nu = np.array(trace)[warmup:, 1]
         record["nu_mean"] = round(float(nu.mean()), 3)
         record["nu_deviation"] = round(float(nu.std()), 3)
-        low, high = clamp
         record["at_clamp"] = round(float(((nu <= low) | (nu >= high)).mean()), 5)
-        if (scene, seed, iterations) == SHOWN:
-            shown = [[float(f"{value:.4g}") for value in line[:4]] for line in trace[::EVERY]]
-            record["trace"] = shown  # loss, nu, low and high end of the partitions
+        if (name, seed, iterations) == SHOWN:  # loss, nu, low and high end of the partitions
+            shown = [[float(f"{value:.4g}") for value in line] for line in trace[::EVERY]]
+            record["trace"] = shown
     return record
 
 
 def table(records: list[dict[str, Any]]) -> str:
     """Markdown: a row per scene and length, the worst of an arm's seeds in its cell."""
-    lines = [
-        f"| scene, iterations | {' | '.join(LABELS[arm] for arm in ARMS)} | test PSNR, seed 0 |",
-        f"|---|{'---|' * len(ARMS)}---|",
-    ]
+    rows = []
     for scene, length in sorted({(r["scene"], r["iterations"]) for r in records}):
         here = [r for r in records if (r["scene"], r["iterations"]) == (scene, length)]
         by_arm = [[r for r in here if r["arm"] == arm] for arm in ARMS]
         psnr = [next((f"{r['psnr']:.2f}" for r in own if r["seed"] == 0), "-") for own in by_arm]
-        cells = " | ".join(map(_cell, by_arm))
-        lines.append(f"| {scene}, {length:,} | {cells} | {' / '.join(psnr)} |")
-    return "\n".join(lines) + "\n"
+        rows.append((f"{scene}, {length:,}", *map(_cell, by_arm), " / ".join(psnr)))
+    heads = ("scene, iterations", *(LABELS[arm] for arm in ARMS), "test PSNR, seed 0")
+    return pages.table(heads, "l", rows) + "\n"
 
 
 def _cell(records: list[dict[str, Any]]) -> str:
@@ -163,8 +147,6 @@ def _cell(records: list[dict[str, Any]]) -> str:
 
 def draw(records: list[dict[str, Any]], path: Path) -> None:
     """Training PSNR, and energy, range and nu of one training before and after."""
-    import matplotlib.pyplot as plt
-
     one = {r["arm"]: r for r in records if (r["scene"], r["seed"], r["iterations"]) == SHOWN}
     fig, axes = plt.subplots(3, 2, figsize=(10, 7), sharex=True, layout="constrained")
     for column, arm in enumerate(("frozen", "default")):

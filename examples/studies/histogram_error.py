@@ -20,6 +20,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
@@ -38,14 +39,8 @@ def histogram_of(update: str, zeta: float) -> EnergyHistogram:
         return EnergyHistogram(zeta=zeta, warmup=250, clamp=None)
     reach = 6 * DEVIATION
     tau = (1 - zeta) / (2 * zeta) * DEVIATION
-    return EnergyHistogram(
-        200,
-        (MEAN - reach, MEAN + reach),
-        zeta=zeta,
-        temperature=tau,
-        warmup=250,
-        clamp=None,
-    )
+    ends = (MEAN - reach, MEAN + reach)
+    return EnergyHistogram(200, ends, zeta=zeta, temperature=tau, warmup=250, clamp=None)
 
 
 def measured(update: str, zeta: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -89,8 +84,6 @@ def study(seeds: int) -> tuple[list[dict[str, Any]], dict[str, Any]]:
 
 def draw(record: dict[str, Any], path: Path) -> None:
     """nu against z beside nu's deviation and slope against the number of energies."""
-    import matplotlib.pyplot as plt
-
     fig, (scatter, spread, bias) = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained")
     label = {name: f"paper's update, ζ = {name}" for name in COLORS} | {"default": "default, any ζ"}
     for name, (z, nu) in record["points"].items():

@@ -42,7 +42,6 @@ class Event:
         self.at = 0.0
 
     def record(self, *_: Any) -> None:
-        """Take the time."""
         self.at = time.perf_counter()
 
     def elapsed_time(self, other: Event) -> float:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import math
 from typing import Any
 
 import torch
-from hosts.cpu_host.rendering import Drawn, View, draw, view_colors
+from hosts.cpu_host.rendering import Drawn, draw, view_colors
+from splatting.camera import Camera
+from splatting.metrics import ssim_map
 from splatting.relocation import relocated_values
 from torch import Tensor
 
@@ -84,10 +85,10 @@ def rasterize(
     for c in range(count):
         K = Ks[c].detach()
         focal = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-        view = View(viewmats[c], *focal, width, height)
+        view = Camera(viewmats[c], *focal, width, height)
         shown = colors if colors.dim() == 2 or sh_degree is not None else colors[c]
         if sh_degree is not None:
-            shown = view_colors(means, colors.float(), sh_degree, viewmats[c])
+            shown = view_colors(means, colors.float(), sh_degree, view)
         background = None if backgrounds is None else backgrounds[c]
         one = draw(means, quats, scales, opacities, shown[..., :3], view, background, moved[c])
         drawn.append(one)
@@ -98,7 +99,7 @@ def rasterize(
     return torch.stack(images), torch.stack(alphas), info
 
 
-def _channels(one: Drawn, mode: str, geometry: Geometry, view: View) -> Tensor:
+def _channels(one: Drawn, mode: str, geometry: Geometry, view: Camera) -> Tensor:
     """The image, the (expected) depth, or both."""
     if mode == "RGB":
         return one.image
@@ -173,14 +174,8 @@ def masked_adam(
 
 def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:
     """SSIM of images [B, 3, H, W] with a window of 11; `valid` leaves the border out."""
-    from splatting.metrics import ssim_map
-
     border = 5 if padding == "valid" else 0
-    maps = [
-        ssim_map(a.permute(1, 2, 0), b.permute(1, 2, 0)) for a, b in zip(img1, img2, strict=True)
-    ]
-    height, width = maps[0].shape[:2]
-    inner = [m[border : height - border, border : width - border] for m in maps]
-    return (
-        torch.stack([m.mean() for m in inner]).mean() if math.prod(inner[0].shape) else img1.sum()
-    )
+    a, b = (images.permute(0, 2, 3, 1) for images in (img1, img2))
+    height, width = a.shape[1:3]
+    inner = ssim_map(a, b)[:, border : height - border, border : width - border]
+    return inner.mean() if inner.numel() else img1.sum()

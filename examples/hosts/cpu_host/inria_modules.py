@@ -10,7 +10,8 @@ from typing import Any
 
 import torch
 from hosts.cpu_host.gsplat_modules import fused_ssim, masked_adam
-from hosts.cpu_host.rendering import Drawn, View, draw, view_colors
+from hosts.cpu_host.rendering import Drawn, draw, view_colors
+from splatting.camera import Camera
 from splatting.gaussians import neighbour_distance
 from splatting.relocation import relocated_values
 from torch import Tensor
@@ -35,11 +36,11 @@ class GaussianRasterizationSettings:
     antialiasing: bool | None = None  # since 2024-10, which returns the inverse depth too
     pixel_weights: Any = "none"  # taming-3dgs, which returns importances too
 
-    def view(self) -> View:
+    def view(self) -> Camera:
         """The camera, as the examples write it."""
         width, height = self.image_width, self.image_height
         fx, fy = width / (2 * self.tanfovx), height / (2 * self.tanfovy)
-        return View(self.viewmatrix.T, fx, fy, width / 2, height / 2, width, height)
+        return Camera(self.viewmatrix.T, fx, fy, width / 2, height / 2, width, height)
 
 
 class GaussianRasterizer(torch.nn.Module):
@@ -72,7 +73,7 @@ class GaussianRasterizer(torch.nn.Module):
         if colors is None:
             coefficients = shs if dc is None else dc if shs is None else torch.cat([dc, shs], 1)
             assert coefficients is not None
-            colors = view_colors(means3D, coefficients, settings.sh_degree, view.viewmat)
+            colors = view_colors(means3D, coefficients, settings.sh_degree, view)
         half = torch.tensor([view.width / 2, view.height / 2])
         offset = means2D[:, :2] * half if means2D.requires_grad else None
         scales = scales * settings.scale_modifier
@@ -97,7 +98,7 @@ class GaussianRasterizer(torch.nn.Module):
         return depth + self.raster_settings.viewmatrix[3, 2] > 0.2
 
     @staticmethod
-    def _weights(geometry: tuple[Tensor, ...], view: View) -> Tensor:
+    def _weights(geometry: tuple[Tensor, ...], view: Camera) -> Tensor:
         """[N] the sum of each Gaussian's blending weights: the derivative by its colour."""
         with torch.enable_grad():
             still = [value.detach() for value in geometry]

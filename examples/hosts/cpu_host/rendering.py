@@ -2,33 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from splatting.camera import Camera
-from splatting.projection import perspective_jacobians, rotation_matrices
+from splatting.projection import Projection, project
 from splatting.rasterizer import render
 from splatting.spherical_harmonics import SH_0, sh_colors
 from torch import Tensor
-
-BLUR = 0.3  # pixels^2, as the trainers' rasterizers add it
-
-
-class View(NamedTuple):
-    """A pinhole camera whose pose may carry gradients."""
-
-    viewmat: Tensor  # [4, 4] world to camera
-    fx: float  # pixels
-    fy: float
-    cx: float
-    cy: float
-    width: int
-    height: int
-
-    def still(self) -> Camera:
-        """The camera at the origin, looking along z."""
-        eye = torch.eye(4, dtype=self.viewmat.dtype)
-        return Camera(eye, self.fx, self.fy, self.cx, self.cy, self.width, self.height)
 
 
 class Drawn(NamedTuple):
@@ -48,7 +30,7 @@ def draw(
     scales: Tensor,
     opacities: Tensor,
     colors: Tensor,
-    view: View,
+    camera: Camera,
     background: Tensor | None = None,
     offset: Tensor | None = None,
 ) -> Drawn:
@@ -64,18 +46,18 @@ def draw(
         scales: [N, 3] world units.
         opacities: [N] in 0..1.
         colors: [N, 3], at least 0.
-        view: the camera.
+        camera: whose pose may carry gradients.
         background: [3].
         offset: [N, 2] pixels, zeros whose gradient is that of the projected means.
     """
-    rotation, shift = view.viewmat[:3, :3], view.viewmat[:3, 3]
+    rotation, shift = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     inside = means @ rotation.T + shift
     depths = inside[:, 2]
     if offset is not None:
-        focal = torch.tensor([view.fx, view.fy], dtype=means.dtype)
+        focal = torch.tensor([camera.fx, camera.fy], dtype=means.dtype)
         pixels = offset * depths.detach().clamp(min=1e-6)[:, None] / focal
         inside = inside + torch.cat([pixels, torch.zeros_like(pixels[:, :1])], 1)
-    camera = view.still()
+    camera = replace(camera, viewmat=torch.eye(4, dtype=means.dtype))  # looks along z
     gaussians = {
         "means": inside,
         "quats": _product(_quaternion(rotation), quats),
@@ -85,28 +67,22 @@ def draw(
     }
     rendering = render(gaussians, camera, sh_degree=0, background=background)
     with torch.no_grad():
-        means2d, radii = _footprints(inside, gaussians["quats"], scales, camera)
+        geometry = (inside, gaussians["quats"], gaussians["scales"])
+        means2d, radii = _footprints(project(*geometry, camera))
         radii = torch.where(rendering.visible, radii, torch.zeros_like(radii))
     return Drawn(rendering.image, rendering.alpha, rendering.visible, means2d, radii, depths)
 
 
-def view_colors(means: Tensor, coefficients: Tensor, degree: int, viewmat: Tensor) -> Tensor:
+def view_colors(means: Tensor, coefficients: Tensor, degree: int, camera: Camera) -> Tensor:
     """Colours [N, 3] of spherical harmonics [N, K, 3] up to a degree, seen from a camera."""
-    position = -viewmat[:3, :3].T @ viewmat[:3, 3]
-    return sh_colors(means, position, coefficients[:, : (degree + 1) ** 2], degree)
+    return sh_colors(means, camera.position, coefficients[:, : (degree + 1) ** 2], degree)
 
 
-def _footprints(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> tuple:
+def _footprints(projection: Projection) -> tuple[Tensor, Tensor]:
     """Projected means [N, 2], and radii [N] of three standard deviations, in whole pixels."""
-    z = means[:, 2:].clamp(min=1e-6)
-    focal = torch.tensor([camera.fx, camera.fy], dtype=means.dtype)
-    means2d = means[:, :2] / z * focal + torch.tensor([camera.cx, camera.cy], dtype=means.dtype)
-    front = torch.cat([means[:, :2], z], 1)
-    half = perspective_jacobians(front, camera) @ (rotation_matrices(quats) * scales[:, None])
-    covariance = half @ half.transpose(1, 2) + BLUR * torch.eye(2, dtype=means.dtype)
-    middle = covariance.diagonal(dim1=1, dim2=2).mean(1)
-    spread = (middle.square() - torch.linalg.det(covariance)).clamp(min=0.1).sqrt()
-    return means2d, (3 * (middle + spread).sqrt()).ceil()
+    middle = projection.covariances[:, [0, 2]].mean(1)
+    spread = (middle.square() - projection.determinants).clamp(min=0.1).sqrt()
+    return projection.means.nan_to_num(), (3 * (middle + spread).sqrt()).ceil()
 
 
 def _quaternion(rotation: Tensor) -> Tensor:

@@ -36,18 +36,15 @@ class Nothing:
         return Nothing()
 
     def __call__(self, *_: Any, **__: Any) -> Any:
-        """Do nothing."""
         return Nothing()
 
     def __enter__(self) -> Nothing:
-        """A context that does nothing."""
         return self
 
     def __exit__(self, *_: Any) -> None:
         """Leave it."""
 
     def __iter__(self) -> Iterator[Any]:
-        """No elements."""
         return iter(())
 
 
@@ -74,7 +71,6 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         return None
 
     def create_module(self, spec: Any) -> Empty:
-        """The empty module."""
         print(f"on_cpu: {spec.name} is not installed: a module that does nothing takes its place")
         return Empty(spec.name)
 
@@ -89,7 +85,6 @@ class NoMetric(torch.nn.Module):
         super().__init__()
 
     def forward(self, *_: Any) -> Tensor:
-        """NaN."""
         return torch.tensor(float("nan"))
 
 

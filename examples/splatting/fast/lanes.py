@@ -56,7 +56,7 @@ def _splat(builder, scalar, vector):
 
 
 def _as_lanes(context, builder, value, its_type):
-    if its_type == lanes_type:
+    if not isinstance(its_type, types.Number):  # lanes or a mask
         return value
     return _splat(builder, context.cast(builder, value, its_type, types.float32), _LANES)
 
@@ -68,19 +68,27 @@ def _is_lanes(*arguments) -> bool:
 
 
 def _intrinsic_of_lanes(arity, emit, result=lanes_type):
-    """An intrinsic of `arity` lanes or scalars; `emit(builder, *lanes)` makes its instructions."""
+    """An intrinsic of `arity` lanes, masks or scalars.
 
-    def make(typing_context, *arguments):
+    `emit(builder, *values)` makes its instructions; scalars come to it as lanes.
+    """
+
+    def make(*arguments):
         def codegen(context, builder, signature, values):
             pairs = zip(values, signature.args, strict=True)
             return emit(builder, *(_as_lanes(context, builder, v, t) for v, t in pairs))
 
         return result(*arguments), codegen
 
-    one = lambda typing_context, a: make(typing_context, a)  # noqa: E731, PLW0108
-    two = lambda typing_context, a, b: make(typing_context, a, b)  # noqa: E731, PLW0108
-    three = lambda typing_context, a, b, c: make(typing_context, a, b, c)  # noqa: E731, PLW0108
-    return intrinsic((one, two, three)[arity - 1])
+    return intrinsic(  # numba counts the arguments
+        {
+            0: lambda typing_context: make(),
+            1: lambda typing_context, a: make(a),
+            2: lambda typing_context, a, b: make(a, b),
+            3: lambda typing_context, a, b, c: make(a, b, c),
+            8: lambda typing_context, a, b, c, d, e, f, g, h: make(a, b, c, d, e, f, g, h),
+        }[arity]
+    )
 
 
 def _call(name, arity):
@@ -156,85 +164,50 @@ for _operation, _function in (
     _overload_operator(_operation, _function)
 
 
-@intrinsic
-def both(typing_context, a, b):
-    """Mask and mask."""
-
-    def codegen(context, builder, signature, values):
-        return builder.and_(*values)
-
-    return mask_type(a, b), codegen
+def _truths(builder, mask):
+    byte = builder.bitcast(_is_true(builder, mask), ir.IntType(WIDTH))
+    return builder.zext(byte, ir.IntType(64))
 
 
-@intrinsic
-def but_not(typing_context, a, b):
-    """Mask a where b is not."""
-
-    def codegen(context, builder, signature, values):
-        return builder.and_(values[0], builder.not_(values[1]))
-
-    return mask_type(a, b), codegen
+def _shuffle(builder, a, b, order):
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), order))
 
 
-@intrinsic
-def choose(typing_context, mask, a, b):
-    """Lanes of a where the mask is true, of b elsewhere."""
-
-    def codegen(context, builder, signature, values):
-        kinds = signature.args
-        return builder.select(
-            _is_true(builder, values[0]),
-            _as_lanes(context, builder, values[1], kinds[1]),
-            _as_lanes(context, builder, values[2], kinds[2]),
-        )
-
-    return lanes_type(mask, a, b), codegen
+def _total(builder, lanes):
+    for half in (4, 2, 1):
+        order = [(i + half) % WIDTH for i in range(WIDTH)]
+        lanes = builder.fadd(lanes, _shuffle(builder, lanes, lanes, order))
+    return builder.extract_element(lanes, ir.IntType(32)(0))
 
 
-@intrinsic
-def truths(typing_context, mask):
-    """The mask as the bits of an integer, lane 0 lowest."""
-
-    def codegen(context, builder, signature, values):
-        byte = builder.bitcast(_is_true(builder, values[0]), ir.IntType(WIDTH))
-        return builder.zext(byte, ir.IntType(64))
-
-    return types.int64(mask), codegen
+def _add_neighbours(builder, a, b):
+    """Sums of neighbouring lanes: of a and b in turns, within each half of the register."""
+    even, odd = [0, 2, 8, 10, 4, 6, 12, 14], [1, 3, 9, 11, 5, 7, 13, 15]
+    return builder.fadd(_shuffle(builder, a, b, even), _shuffle(builder, a, b, odd))
 
 
-@intrinsic
-def repeat(typing_context, scalar):
-    """A scalar in all lanes."""
-
-    def codegen(context, builder, signature, values):
-        return _as_lanes(context, builder, values[0], signature.args[0])
-
-    return lanes_type(scalar), codegen
-
-
-@intrinsic
-def count_up(typing_context):
-    """0, 1, ... 7."""
-
-    def codegen(context, builder, signature, values):
-        return ir.Constant(_LANES, [float(i) for i in range(WIDTH)])
-
-    return lanes_type(), codegen
+def _totals(builder, *lanes):
+    pairs = [_add_neighbours(builder, *lanes[i : i + 2]) for i in (0, 2, 4, 6)]
+    first, second = _add_neighbours(builder, *pairs[:2]), _add_neighbours(builder, *pairs[2:])
+    low, high = [0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15]
+    return builder.fadd(
+        _shuffle(builder, first, second, low), _shuffle(builder, first, second, high)
+    )
 
 
-@intrinsic
-def total(typing_context, lanes):
-    """The sum of the lanes, in pairs."""
-
-    def codegen(context, builder, signature, values):
-        vector = values[0]
-        for half in (4, 2, 1):
-            order = [(i + half) % WIDTH for i in range(WIDTH)]
-            mask = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), order)
-            vector = builder.fadd(vector, builder.shuffle_vector(vector, vector, mask))
-        return builder.extract_element(vector, ir.IntType(32)(0))
-
-    return types.float32(lanes), codegen
+# Mask and mask; mask a where b is not; lanes of a where the mask is true, of b elsewhere
+both = _intrinsic_of_lanes(2, lambda builder, a, b: builder.and_(a, b), mask_type)
+but_not = _intrinsic_of_lanes(2, lambda builder, a, b: builder.and_(a, builder.not_(b)), mask_type)
+choose = _intrinsic_of_lanes(
+    3, lambda builder, mask, a, b: builder.select(_is_true(builder, mask), a, b)
+)
+# The mask as the bits of an integer, lane 0 lowest; a scalar in all lanes; 0, 1, ... 7
+truths = _intrinsic_of_lanes(1, _truths, types.int64)
+repeat = _intrinsic_of_lanes(1, lambda builder, lanes: lanes)
+count_up = _intrinsic_of_lanes(0, lambda builder: ir.Constant(_LANES, [*map(float, range(WIDTH))]))
+# The sum of the lanes, in pairs; the sums of eight lanes each, as eight lanes
+total = _intrinsic_of_lanes(1, _total, types.float32)
+totals = _intrinsic_of_lanes(8, _totals)
 
 
 def _pointer(context, builder, array_type, array, index):
@@ -274,31 +247,6 @@ def from_bits(typing_context, bits):
         return builder.sext(truth, _BITS)
 
     return mask_type(bits), codegen
-
-
-def _add_neighbours(builder, a, b):
-    """Sums of neighbouring lanes: of a and b in turns, within each half of the register."""
-    even, odd = [0, 2, 8, 10, 4, 6, 12, 14], [1, 3, 9, 11, 5, 7, 13, 15]
-    return builder.fadd(_shuffle(builder, a, b, even), _shuffle(builder, a, b, odd))
-
-
-def _shuffle(builder, a, b, order):
-    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), order))
-
-
-@intrinsic
-def totals(typing_context, a, b, c, d, e, f, g, h):
-    """The sums of eight lanes each, as eight lanes."""
-
-    def codegen(context, builder, signature, values):
-        pairs = [_add_neighbours(builder, *values[i : i + 2]) for i in (0, 2, 4, 6)]
-        first, second = _add_neighbours(builder, *pairs[:2]), _add_neighbours(builder, *pairs[2:])
-        low, high = [0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15]
-        return builder.fadd(
-            _shuffle(builder, first, second, low), _shuffle(builder, first, second, high)
-        )
-
-    return lanes_type(a, b, c, d, e, f, g, h), codegen
 
 
 @intrinsic

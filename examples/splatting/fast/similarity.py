@@ -125,8 +125,7 @@ def _gradient_rows(render, target, height, channels, weights, by_moments, grad):
 class MeanSimilarity(torch.autograd.Function):
     """Two images [H, W, C] to their mean structural similarity; see `metrics.ssim`.
 
-    `half_window` holds the weights of the normalised window from its centre outwards, `constants`
-    C1 and C2. The target gets no gradient.
+    `window` holds the normalised weights, `constants` C1 and C2. The target gets no gradient.
     """
 
     @staticmethod
@@ -134,7 +133,7 @@ class MeanSimilarity(torch.autograd.Function):
         ctx: Any,
         render: Tensor,
         target: Tensor,
-        half_window: list[float],
+        window: list[float],
         constants: tuple[float, float],
     ) -> Tensor:
         height, width, channels = render.shape
@@ -144,7 +143,7 @@ class MeanSimilarity(torch.autograd.Function):
         for image, tensor in zip(images, (render, target), strict=True):
             image[:, :length] = tensor.detach().reshape(height, length).numpy()
         flat = images.reshape(2, -1)
-        weights = np.array([*half_window[:0:-1], *half_window], np.float32)
+        weights = np.array(window, np.float32)
         by_moments = np.empty(3 * height * padded, np.float32)
         constants32 = np.array(constants, np.float32)
         shape = height, length, channels

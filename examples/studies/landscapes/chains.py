@@ -12,40 +12,25 @@ import numpy as np
 from studies.landscapes.kernel import ADAM, DOUBLE_WELL, NINE_MODES, PLAIN, advance
 
 BLOCK = 1000
-CALL = "Chains"
 
 
 @dataclass(frozen=True)
 class Dynamics:
-    """What one step of a chain is: the options of AWSGLD, EnergyHistogram and IsotropicNoise.
-
-    Attributes:
-        landscape: "nine" or "well".
-        lr: learning rate.
-        drift: AWSGLD's preconditioner.
-        std: deviation of the Langevin noise; None: sqrt(2 lr temperature).
-        temperature: of noise and histogram.
-        constant: the multiplier without a histogram.
-        partitions: of the histogram; 0 for none.
-        energy_range, zeta, clamp: of the histogram; no warm-up, backward slope.
-        betas: Adam's.
-        boundary: a step that leaves [-boundary, boundary] is not taken.
-        stream_noise: deviation of the noise on the energy and on each gradient component.
-    """
+    """What one step of a chain is: the options of AWSGLD, EnergyHistogram and IsotropicNoise."""
 
     landscape: Literal["nine", "well"]
     lr: float
-    drift: Literal["none", "adam"] = "none"
-    std: float | None = None
-    temperature: float = 1.0
-    constant: float = 1.0
-    partitions: int = 0
+    drift: Literal["none", "adam"] = "none"  # AWSGLD's preconditioner
+    std: float | None = None  # of the Langevin noise; None: sqrt(2 lr temperature)
+    temperature: float = 1.0  # of noise and histogram
+    constant: float = 1.0  # the multiplier without a histogram
+    partitions: int = 0  # of the histogram, which has no warm-up; 0: none
     energy_range: tuple[float, float] = (0.0, 1.0)
     zeta: float = 0.75
     clamp: tuple[float, float] | None = None
     betas: tuple[float, float] = (0.9, 0.999)
-    boundary: float = math.inf
-    stream_noise: float = 0.0
+    boundary: float = math.inf  # a step that leaves [-boundary, boundary] is not taken
+    stream_noise: float = 0.0  # deviation, on the energy and on each gradient component
 
 
 class Samples(NamedTuple):
@@ -62,21 +47,14 @@ class Samples(NamedTuple):
 
 
 class Chains:
-    """C chains with their moments and weights; `run` may be called again and goes on.
-
-    Args:
-        dynamics: the same for all chains.
-        start: [C, D].
-        seed: of all noise.
-        heights: [C] barriers, where the landscape is the double well.
-    """
+    """C chains with their moments and weights; `run` may be called again and goes on."""
 
     def __init__(
         self,
         dynamics: Dynamics,
-        start: np.ndarray,
+        start: np.ndarray,  # [C, D]
         seed: int,
-        heights: np.ndarray | None = None,
+        heights: np.ndarray | None = None,  # [C] barriers of the double well
     ) -> None:
         chains = len(start)
         self.dynamics = dynamics
@@ -117,7 +95,7 @@ class Chains:
             FloatingPointError: a position is not finite.
         """
         if every < 1 or BLOCK % every:
-            raise ValueError(f"{CALL}.run: every={every}, but a divisor of {BLOCK} is needed")
+            raise ValueError(f"Chains.run: every={every}, but a divisor of {BLOCK} is needed")
         last = self.step + steps
         while self.step < last:
             count = min(BLOCK, last - self.step)
@@ -127,7 +105,7 @@ class Chains:
             if watch is not None:
                 watch(samples)
             if not np.isfinite(self.x).all():
-                raise FloatingPointError(f"{CALL}.run: a position of step {at[-1]} is not finite")
+                raise FloatingPointError(f"Chains.run: a position of step {at[-1]} is not finite")
             if progress is not None:
                 progress(count)
 

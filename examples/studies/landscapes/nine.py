@@ -27,24 +27,14 @@ PATH_POINTS = 1000
 
 @dataclass(frozen=True)
 class Arm:
-    """One way to move on the landscape.
+    """One way to move on the landscape."""
 
-    Attributes:
-        label: what the table calls it.
-        lr, steps: learning rate and number of steps.
-        drift: AWSGLD's preconditioner.
-        cycles: cosine cycles of the learning rate, from five times `lr` to 0; 0 for none.
-        nu: "off", "constant" or "histogram".
-        constant: the multiplier where it is constant.
-        clamp: bounds of the histogram's nu.
-    """
-
-    label: str
+    label: str  # in the table
     steps: int = 200_000
     lr: float = 1e-3
     drift: Literal["none", "adam"] = "none"
-    cycles: int = 0
-    nu: str = "off"
+    cycles: int = 0  # cosine cycles of the learning rate, from five times `lr` to 0
+    nu: str = "off"  # or "constant" or "histogram"
     constant: float = 1.0
     clamp: tuple[float, float] | None = None
 

@@ -24,14 +24,15 @@ import torch
 from tqdm import tqdm
 
 ROOT = Path(__file__).resolve().parents[3]
-if str(ROOT / "examples") not in sys.path:
-    sys.path.insert(0, str(ROOT / "examples"))
+sys.path.insert(0, str(ROOT / "examples"))
 
-from studies.landscapes import laws, nine, tables  # noqa: E402
+from studies.landscapes import laws, nine, plots, tables  # noqa: E402
+from studies.pages import filled  # noqa: E402
 
 COMMAND = "python examples/studies/landscapes/run.py"
 RESULTS = ROOT / "docs" / "results" / "landscapes"
 PAGE = ROOT / "docs" / "landscapes.md"
+MARK = "<!-- {} -->"
 Run = Callable[..., dict[str, Any]]
 Experiment = tuple[Run, str, dict[str, Any], int]  # function, arm, settings, progress steps
 WELL_HEIGHTS = (1.0, 3.0, 6.0)
@@ -39,35 +40,33 @@ WELL_HEIGHTS = (1.0, 3.0, 6.0)
 
 def experiments(quick: bool) -> dict[str, Experiment]:
     """Every experiment by its file's name."""
-    seeds = {"seeds": 3}
     found: dict[str, Experiment] = {}
+
+    def add(name: str, run: Run, arm: str, progress: int, **settings: Any) -> None:
+        found[name] = (run, arm, settings | {"seeds": 3}, progress)
+
     for name, arm in nine.ARMS.items():
         steps = arm.steps // 500 if quick else arm.steps
-        settings = {"steps": steps, "chains": 4 if quick else 48, **seeds}
-        found[f"nine-{name}"] = (nine.run_arm, name, settings, steps)
+        add(f"nine-{name}", nine.run_arm, name, steps, steps=steps, chains=4 if quick else 48)
     for name, rates, betas in (
         ("sgld", [0.02, 0.1, 0.25, 0.4], [0.9, 0.999]),
         ("adam", [0.005, 0.02], [0.9, 0.999]),
         ("adam-slow", [0.005], [0.0, 0.9999]),
     ):
-        settings = {"chains": 64 if quick else 1024, "rates": rates, "betas": betas, **seeds}
-        if quick:
-            settings["rates"] = rates[-1:] if name == "sgld" else []
-        run = laws.gaussian_law
-        arm_name = name.split("-")[0]
-        found[f"gaussian-{name}"] = (run, arm_name, settings, 3 * len(settings["rates"]))
+        few = rates[-1:] if name == "sgld" else []
+        tried = {"chains": 64 if quick else 1024, "rates": few if quick else rates, "betas": betas}
+        progress = 3 * len(tried["rates"])
+        add(f"gaussian-{name}", laws.gaussian_law, name.split("-")[0], progress, **tried)
     steps = 200 if quick else 100_000
     for height in WELL_HEIGHTS:
-        for arm_name in ("sgld", "awsgld"):
+        for name in ("sgld", "awsgld"):
             settings = {"height": height, "chains": 4 if quick else 48, "steps": steps, "lr": 1e-3}
-            run = laws.well_law
-            found[f"well-{arm_name}-{height:.0f}"] = (run, arm_name, {**settings, **seeds}, steps)
+            add(f"well-{name}-{height:.0f}", laws.well_law, name, steps, **settings)
     heights = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]
-    for arm_name, chains, length in (("sgld", 192, 60_000), ("awsgld", 32, 100_000)):
+    for name, chains, length in (("sgld", 192, 60_000), ("awsgld", 32, 100_000)):
         steps = 200 if quick else length
         settings = {"heights": heights, "chains": 4 if quick else chains, "steps": steps}
-        settings |= {"lr": 1e-3, **seeds}
-        found[f"escape-{arm_name}"] = (laws.escape_rates, arm_name, settings, steps)
+        add(f"escape-{name}", laws.escape_rates, name, steps, **settings, lr=1e-3)
     return found
 
 
@@ -78,22 +77,14 @@ def write(path: Path, text: str) -> None:
     os.replace(partial, path)
 
 
-def finished(path: Path, settings: dict[str, Any]) -> dict[str, Any] | None:
-    """The result in `path` if it was made with these settings."""
-    if not path.exists():
-        return None
-    found = json.loads(path.read_text(encoding="utf-8"))
-    return found if found["settings"] == settings else None
-
-
 def run_all(output: Path, quick: bool) -> dict[str, Any]:
     """The result of every experiment, run where it is not there yet."""
     results: dict[str, Any] = {}
     everything = experiments(quick)
     for number, (name, (run, arm, settings, total)) in enumerate(everything.items(), start=1):
         path = output / f"{name}.json"
-        found = finished(path, settings)
-        if found is None:
+        found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+        if found.get("settings") != settings:
             begin = time.process_time()
             title = f"{number}/{len(everything)} {name}"
             with tqdm(total=total, desc=title, unit="step") as bar:
@@ -132,11 +123,9 @@ def main(arguments: list[str] | None = None) -> int:
         print("\ninterrupted; the same command goes on with the unfinished experiments")
         return 130
     sections = tables.sections(results)
-    from studies.landscapes import plots  # matplotlib is needed from here on only
-
     plots.all_plots(results, options.output)
     if options.output.resolve() == RESULTS:
-        write(PAGE, tables.renewed(PAGE.read_text(encoding="utf-8"), sections))
+        write(PAGE, filled(PAGE.read_text(encoding="utf-8"), sections, MARK))
     else:
         write(options.output / "tables.md", "\n\n".join(sections.values()) + "\n")
     print(f"wrote {options.output}")

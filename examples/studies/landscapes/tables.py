@@ -6,6 +6,8 @@ import statistics
 from collections.abc import Sequence
 from typing import Any
 
+from studies.pages import table
+
 Results = dict[str, Any]
 
 
@@ -15,55 +17,36 @@ def spread(values: Sequence[float], digits: int) -> str:
     return f"{statistics.fmean(values):.{digits}f} ± {deviation:.{digits}f}"
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table; the first column is text, the others numbers."""
-    lines = ["| " + " | ".join(header) + " |", "|---" + "|---:" * (len(header) - 1) + "|"]
-    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
-
-
-def column(seeds: list[Results], name: str, digits: int) -> str:
+def column(seeds: list[Results], name: str, digits: int, unit: float = 1.0) -> str:
     """One figure of every seed; "-" where a seed has none."""
     values = [seed[name] for seed in seeds]
-    if any(value is None for value in values):
-        return "-"
-    return spread(values, digits)
+    return "-" if None in values else spread([value / unit for value in values], digits)
 
 
 def nine(results: Results) -> str:
     """Modes, iterations and KL of every arm on the nine-mode landscape."""
-    header = [
-        "arm",
-        "steps",
-        "modes of 9",
-        "chains with all 9 (%)",
-        "median steps to all 9 (1,000)",
-    ]
-    header += ["KL of the visits", "KL, re-weighted", "mean nu"]
+    header = ["arm", "steps", "modes of 9", "chains with all 9 (%)"]
+    header += ["median steps to all 9 (1,000)", "KL of the visits", "KL, re-weighted", "mean nu"]
     rows = []
     for name, entry in results.items():
         if not name.startswith("nine-"):
             continue
-        result, steps = entry["result"], entry["settings"]["steps"]
-        seeds = [dict(seed) for seed in result["seeds"]]
-        for seed in seeds:
-            seed["share_all"] *= 100
-            if seed["median_iterations"] is not None:
-                seed["median_iterations"] /= 1000
+        result, seeds = entry["result"], entry["result"]["seeds"]
         arm = result["arm"]
         weighed = arm["nu"] == "histogram" or (arm["nu"] == "constant" and arm["drift"] == "none")
         rows.append(
             [
                 arm["label"],
-                f"{steps:,}",
+                f"{entry['settings']['steps']:,}",
                 column(seeds, "modes", 2),
-                column(seeds, "share_all", 0),
-                column(seeds, "median_iterations", 1),
+                column(seeds, "share_all", 0, 0.01),
+                column(seeds, "median_iterations", 1, 1000),
                 column(seeds, "kl_raw", 3),
                 column(seeds, "kl", 3) if weighed else "",
                 f"{result['mean_nu']:.2f}",
             ]
         )
-    return table(header, rows)
+    return table(header, "lr", rows)
 
 
 def gaussian(results: Results) -> str:
@@ -82,7 +65,7 @@ def gaussian(results: Results) -> str:
             figures = [f"{row['lr']:g}", spread(row["variance"], 4), f"{row['expected']:.4f}"]
             rows.append([title, *figures, f"{100 * error:+.1f} %"])
     header = ["drift", "lr", "variance", "theory", "off theory"]
-    return table(header, rows)
+    return table(header, "lr", rows)
 
 
 def well(results: Results) -> str:
@@ -104,7 +87,7 @@ def well(results: Results) -> str:
         )
     rows.sort(key=lambda row: float(row[0]))
     header = ["h / T", "arm", "KL of the visits", "KL, re-weighted", "left well (%; exact 50)"]
-    return table(header, rows)
+    return table(header, "lr", rows)
 
 
 def escape(results: Results) -> str:
@@ -127,7 +110,7 @@ def escape(results: Results) -> str:
         )
     header = ["h / T", "exact", "SGLD", "AWSGLD", "AWSGLD / exact"]
     header += ["mean nu", "constant nu of that mean, exact"]
-    return table(header, rows)
+    return table(header, "lr", rows)
 
 
 def about(results: Results) -> str:
@@ -147,19 +130,3 @@ def sections(results: Results) -> dict[str, str]:
     """Every table by the name of its marker in the page."""
     makers = {"about": about, "nine": nine, "gaussian": gaussian, "well": well, "escape": escape}
     return {name: make(results) for name, make in makers.items()}
-
-
-def renewed(page: str, tables: dict[str, str]) -> str:
-    """`page` with the text between `<!-- name -->` and `<!-- end -->` replaced.
-
-    Raises:
-        ValueError: a marker is missing.
-    """
-    for name, text in tables.items():
-        start = f"<!-- {name} -->\n"
-        before, found, rest = page.partition(start)
-        _, closed, after = rest.partition("<!-- end -->")
-        if not (found and closed):
-            raise ValueError(f"renewed: the page has no `<!-- {name} -->` ... `<!-- end -->`")
-        page = f"{before}{start}{text}\n{closed}{after}"
-    return page

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from hosts.cpu_host import gsplat_modules
-from splatting.density import DensityReport, Optimizers
+from splatting.density import Optimizers
 from splatting.fit import Fit
 from splatting.scenes import View
 from torch import Tensor
@@ -34,16 +34,12 @@ class DefaultDensityControl:
         self.state: dict[str, Any] = self.strategy.initialize_state(scene_scale=extent)
         self.info: dict[str, Any] = {}
 
-    def step(
-        self, iteration: int, gaussians: dict[str, Parameter], optimizers: Optimizers
-    ) -> DensityReport:
-        """What the strategy does after the optimizers' step."""
-        before = len(gaussians["means"])
+    def step(self, iteration: int, gaussians: dict[str, Parameter], optimizers: Optimizers) -> int:
+        """What the strategy does after the optimizers' step; nothing is relocated."""
         self.strategy.step_post_backward(
             gaussians, optimizers, self.state, iteration, self.info, packed=False
         )
-        total = len(gaussians["means"])
-        return DensityReport(total != before, 0, total - before, total)
+        return 0
 
 
 class AdaptiveFit(Fit):

@@ -145,13 +145,8 @@ def _gain_at_seconds(record: Record, control: Record) -> float:
 
 
 def _reach(record: Record, control: Record) -> float | None:
-    seconds = record.seconds_to(control.final)
+    seconds = record.reached(control.final, "seconds")
     return None if seconds is None else seconds / control.seconds
-
-
-def baseline_of(study: Study, settings: list[Setting]) -> float:
-    """Mean last test PSNR of the baseline, dB."""
-    return fmean(r.final for s in settings for r in study.runs(s, BASELINE).values())
 
 
 def falls(values: np.ndarray) -> np.ndarray:

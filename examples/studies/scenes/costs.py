@@ -21,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import torch
 from splatting.fit import Fit
+from splatting.stopping import command
 
 from studies.scenes.arms import BASELINE, STUDY_ARMS, find_study_arm
 from studies.scenes.records import COSTS
@@ -48,6 +49,17 @@ def measure(fits: dict[str, Fit]) -> dict[str, float]:
     }
 
 
+def fits_at(folders: dict[str, Path], mark: str) -> dict[str, Fit]:
+    """Every arm's training as it was at that checkpoint."""
+    fits = {}
+    for name, folder in folders.items():
+        call = json.loads((folder / "call.json").read_text(encoding="utf-8"))
+        spec, arm = Spec(**call["spec"]), find_study_arm(name)
+        fits[name] = fit_of(arm)(scene_of(spec), arm, spec.options(), call["mean_nu"])
+        fits[name].load(folder / mark)
+    return fits
+
+
 def measure_all(runs: Path, iterations: Sequence[int]) -> list[dict[str, Any]]:
     """One entry per scene, size and length whose first seed has stock and another arm."""
     found: dict[tuple[Any, ...], dict[str, Path]] = defaultdict(dict)
@@ -57,41 +69,30 @@ def measure_all(runs: Path, iterations: Sequence[int]) -> list[dict[str, Any]]:
         arm = STUDY_ARMS.get(record["arm"])
         whole = arm is not None and not arm.retired and arm.trunk is None and arm.needs is None
         if plain and whole and record.get("finished") and record["iterations"] in iterations:
-            key = (record["scene"], record["size"], record["iterations"])
-            found[key][record["arm"]] = path.parent
+            found[_key(record)][record["arm"]] = path.parent
     made = []
     for (scene, size, count), folders in found.items():
         if BASELINE not in folders or len(folders) < 2:
             continue
-        shares: dict[str, list[float]] = defaultdict(list)
         marks = [
             name
             for name in (f"at-{round(share * count)}.pt" for share in SHARES)
             if all((folder / name).exists() for folder in folders.values())
         ]
-        for mark in marks:
-            fits = {}
-            for arm, folder in folders.items():
-                call = json.loads((folder / "call.json").read_text(encoding="utf-8"))
-                spec = Spec(**call["spec"])
-                made_arm = find_study_arm(arm)
-                fit = fit_of(made_arm)(scene_of(spec), made_arm, spec.options(), call["mean_nu"])
-                fit.load(folder / mark)
-                fits[arm] = fit
-            for arm, share in measure(fits).items():
-                shares[arm].append(share)
-            print(scene, count, mark, {arm: round(s[-1], 3) for arm, s in shares.items()})
+        measured = [measure(fits_at(folders, mark)) for mark in marks]
+        shares = {arm: round(fmean(m[arm] for m in measured), 3) for arm in folders if measured}
         made.append(
             {
                 "scene": scene,
                 "size": size,
                 "iterations": count,
                 "checkpoints": marks,
-                "shares": {arm: round(fmean(each), 3) for arm, each in shares.items()},
+                "shares": shares,
                 "machine": machine(),
                 "date": time.strftime("%Y-%m-%d", time.gmtime()),
             }
         )
+        print(made[-1])
     return made
 
 
@@ -99,24 +100,21 @@ def _key(entry: dict[str, Any]) -> tuple[str, str, int]:
     return entry["scene"], entry["size"], entry["iterations"]
 
 
+@command("costs")
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; 0, or 2 after one line that says what is wrong."""
+    """The command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--runs", type=Path, required=True, metavar="DIR", help="of run.py")
     parser.add_argument("--iterations", type=int, nargs="+", default=[7_500, 30_000])
     args = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    try:
-        made = measure_all(args.runs, args.iterations)
-        if not made:
-            raise ValueError(f"--runs {args.runs}: holds no scene with {BASELINE} and another arm")
-        old = json.loads(COSTS.read_text(encoding="utf-8")) if COSTS.exists() else []
-        entries = {_key(entry): entry for entry in (*old, *made)}  # the new take their place
-        text = json.dumps([entries[key] for key in sorted(entries)], indent=1)
-        COSTS.write_text(text + "\n", encoding="utf-8")
-    except (OSError, ValueError) as error:
-        print(f"costs: {error}", file=sys.stderr)
-        return 2
+    made = measure_all(args.runs, args.iterations)
+    if not made:
+        raise ValueError(f"--runs {args.runs}: holds no scene with {BASELINE} and another arm")
+    old = json.loads(COSTS.read_text(encoding="utf-8")) if COSTS.exists() else []
+    entries = {_key(entry): entry for entry in (*old, *made)}  # the new take their place
+    text = json.dumps([entries[key] for key in sorted(entries)], indent=1)
+    COSTS.write_text(text + "\n", encoding="utf-8")
     print(COSTS)
     return 0
 

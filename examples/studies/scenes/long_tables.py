@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean, stdev
 
+from studies.pages import table
 from studies.scenes.analysis import Study, falls
 from studies.scenes.arms import BASELINE, DEFAULTS, STUDY_ARMS, label
 from studies.scenes.records import Record, Setting
@@ -101,19 +102,14 @@ def difference(
 
 def differences_table(study: Study, settings: Sequence[Setting], arms: Iterable[str]) -> str:
     """One line per arm that has been trained: what it gains over its control."""
-    lines = [
-        "| arm | against | scenes, trainings | PSNR | SSIM | LPIPS | cost | by the rule |",
-        "|---|---|---|---:|---:|---:|---:|---|",
-    ]
-    for arm in arms:
-        found = difference(study, settings, arm)
-        if not found.count or found.arm == found.control:
-            continue
-        lines.append(
-            f"| `{label(arm)}` | `{label(found.control)}` | {len(found.pairs)}, {found.count} "
-            f"| {' | '.join(cells_of(found))} | x{found.cost:.2f} | {found.verdict} |"
-        )
-    return "\n".join(lines)
+    rows = []
+    for found in (difference(study, settings, arm) for arm in arms):
+        if found.count and found.arm != found.control:
+            names = f"`{label(found.arm)}`", f"`{label(found.control)}`"
+            counts = f"{len(found.pairs)}, {found.count}"
+            rows.append((*names, counts, *cells_of(found), f"x{found.cost:.2f}", found.verdict))
+    heads = ("arm", "against", "scenes, trainings", "PSNR", "SSIM", "LPIPS", "cost", "by the rule")
+    return table(heads, "lllrrrrl", rows)
 
 
 def cells_of(found: Difference) -> list[str]:
@@ -135,82 +131,62 @@ def metrics_table(
         head: what stands above a setting's column.
         gaussians: whether their last number stands beside, for arms that grow it.
     """
-    lines = [
-        f"| arm | {' | '.join(map(head, settings))} |",
-        f"|---|{'---|' * len(settings)}",
-    ]
+    rows = []
     for arm in arms:
         found = [list(study.runs(setting, arm).values()) for setting in settings]
-        cells = [_cell(records, gaussians=gaussians) for records in found]
-        if any(cell != "-" for cell in cells):
-            lines.append(f"| `{label(arm)}` | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        if any(found):
+            cells = [_cell(records, gaussians=gaussians) for records in found]
+            rows.append((f"`{label(arm)}`", *cells))
+    return table(["arm", *map(head, settings)], "l", rows)
 
 
 def headline_table(study: Study, long: Sequence[Setting], short: int) -> str:
     """Stock beside the defaults at both lengths, means over the seeds: what a reader sees first."""
-    rows = [
-        (f"{what}, {count:,}", arm, count)
-        for count in ((long[0].iterations, short) if long else ())
-        for what, arm in (("stock", BASELINE), ("**defaults**", DEFAULTS))
-    ]
-    lines = [
-        f"| iterations | {' | '.join(setting.scene for setting in long)} |",
-        f"|---|{'---|' * len(long)}",
-    ]
-    for what, arm, count in rows:
-        found = [study.runs(replace(s, iterations=count), arm) for s in long]
-        cells = [_cell(list(records.values()), seeds=False) for records in found]
-        lines.append(f"| {what} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+    rows = []
+    for count in (long[0].iterations, short) if long else ():
+        for what, arm in (("stock", BASELINE), ("**defaults**", DEFAULTS)):
+            found = [study.runs(replace(s, iterations=count), arm) for s in long]
+            cells = [_cell(list(records.values()), seeds=False) for records in found]
+            rows.append((f"{what}, {count:,}", *cells))
+    return table(["iterations", *(setting.scene for setting in long)], "l", rows)
 
 
 def scenes_gain_table(study: Study, settings: Sequence[Setting], arm: str, control: str) -> str:
     """One line per scene and size: the arm and its control at their ends, and the gain."""
-    lines = [
-        f"| scene | Gaussians, images | `{label(control)}` | `{label(arm)}` | gain, dB |",
-        "|---|---|---|---|---:|",
-    ]
+    rows = []
     for setting in settings:
         found = difference(study, [setting], arm, control)
-        if not found.count:
-            continue
-        ours, theirs, _ = zip(*found.pairs[setting.scene], strict=True)
-        cells = f"{_cell(theirs)} | {_cell(ours, seeds=False)} | {cells_of(found)[0]}"
-        lines.append(f"| {setting.scene} | {_crowd(setting)} | {cells} |")
-    return "\n".join(lines)
+        if found.count:
+            ours, theirs, _ = zip(*found.pairs[setting.scene], strict=True)
+            ends = _cell(theirs), _cell(ours, seeds=False)
+            rows.append((setting.scene, _crowd(setting), *ends, cells_of(found)[0]))
+    heads = ("scene", "Gaussians, images", f"`{label(control)}`", f"`{label(arm)}`", "gain, dB")
+    return table(heads, "llllr", rows)
 
 
 def sizes_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) -> str:
     """One line per scene, points, size and length with three of the arms: seed 0."""
-    heads = " | ".join(f"`{label(arm)}`" for arm in arms)
-    lines = [
-        f"| scene | Gaussians, images, iterations | {heads} |",
-        f"|---|---|{'---|' * len(arms)}",
-    ]
+    rows = []
     for setting in settings:
         runs = [study.runs(setting, arm) for arm in arms]
         found = [[seeds[0]] if 0 in seeds else [] for seeds in runs]
-        if sum(map(len, found)) < MIN_ARMS:
-            continue
-        what = f"{_crowd(setting)}, {setting.iterations:,}"
-        lines.append(f"| {setting.scene} | {what} | {' | '.join(map(_cell, found))} |")
-    return "\n".join(lines)
+        if sum(map(len, found)) >= MIN_ARMS:
+            what = f"{_crowd(setting)}, {setting.iterations:,}"
+            rows.append((setting.scene, what, *map(_cell, found)))
+    heads = ("scene", "Gaussians, images, iterations", *(f"`{label(arm)}`" for arm in arms))
+    return table(heads, "l", rows)
 
 
 def falls_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) -> str:
     """How far the training PSNR was below its best before, at most, over evaluations and seeds."""
-    lines = [
-        f"| scene | {' | '.join(f'`{label(arm)}`' for arm in arms)} |",
-        f"|---|{'---:|' * len(arms)}",
-    ]
+    rows = []
     for setting in settings:
         runs = [study.runs(setting, arm).values() for arm in arms]
         found = [[falls(run.curve["train_psnr"]).max() for run in of] for of in runs]
         if any(found[1:]):
             cells = [f"{max(largest):.2f}" if largest else "-" for largest in found]
-            lines.append(f"| {setting.scene} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+            rows.append((setting.scene, *cells))
+    return table(["scene", *(f"`{label(arm)}`" for arm in arms)], "lr", rows)
 
 
 def reach_table(study: Study, long: Sequence[Setting], arms: Sequence[str], short: int) -> str:
@@ -220,38 +196,32 @@ def reach_table(study: Study, long: Sequence[Setting], arms: Sequence[str], shor
         short: iterations of the trainings that were that long from their start, whose last PSNR
             stands beside.
     """
-    total = long[0].iterations if long else 0
-    lines = [
-        f"| scene | stock, {total:,} iterations | arm | reaches stock's PSNR after "
-        f"| trained for {short:,} iterations only |",
-        "|---|---|---|---|---|",
-    ]
+    total, rows = long[0].iterations if long else 0, []
     for setting in long:
         stock, brief = study.runs(setting, BASELINE), replace(setting, iterations=short)
         for arm in arms:
-            found = difference(study, [setting], arm, BASELINE)
+            found, quick = difference(study, [setting], arm, BASELINE), study.runs(brief, arm)
             reached = [
-                ours.iteration_of(theirs.final)
+                ours.reached(theirs.final)
                 for pairs in found.pairs.values()
                 for ours, theirs, _ in pairs
             ]
-            quick = study.runs(brief, arm)
             both = sorted(quick.keys() & stock.keys())
             if not reached and not both:
                 continue
             known = [iteration for iteration in reached if iteration is not None]
-            said = "never" if reached else "-"
+            said, beside = "never" if reached else "-", "-"
             if reached and len(known) == len(reached):
                 said = f"x{fmean(known) * found.cost / total:.2f} of its seconds"
-            beside = "-"
             if both:
                 gain = fmean(quick[s].final - stock[s].final for s in both)
                 share = short / total * study.cost(brief, arm)
                 beside = f"{gain:+.2f} dB in x{share:.2f} of its seconds"
             final = fmean(record.final for record in stock.values())
-            row = f"| {setting.scene} | {final:.2f} dB ({len(stock)}) | `{label(arm)}`"
-            lines.append(f"{row} | {said} | {beside} |")
-    return "\n".join(lines)
+            ends = f"{final:.2f} dB ({len(stock)})"
+            rows.append((setting.scene, ends, f"`{label(arm)}`", said, beside))
+    heads = ["scene", f"stock, {total:,} iterations", "arm", "reaches stock's PSNR after"]
+    return table([*heads, f"trained for {short:,} iterations only"], "l", rows)
 
 
 def _cell(records: Sequence[Record], *, gaussians: bool = False, seeds: bool = True) -> str:

@@ -21,20 +21,13 @@ NET = "alex"
 
 
 def load_tool(path: Path) -> Any:
-    """The file as a module; ValueError unless it has both functions."""
+    """The file as a module."""
     spec = importlib.util.spec_from_file_location("perceptual_tool", path)
     if spec is None or spec.loader is None:
-        raise ValueError(f"--tool {path}: not a Python file")
+        raise ValueError(f"{path}: not a Python file")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    missing = [name for name in ("load", "lpips") if not hasattr(module, name)]
-    if missing:
-        raise ValueError(f"--tool {path}: lacks {', '.join(missing)}")
     return module
-
-
-def _as_input(image: Tensor) -> Tensor:
-    return image.permute(2, 0, 1)[None] * 2.0 - 1.0
 
 
 def mean_lpips(tool: Any, model: Any, scene: Scene, renders: Sequence[np.ndarray]) -> float:
@@ -43,8 +36,12 @@ def mean_lpips(tool: Any, model: Any, scene: Scene, renders: Sequence[np.ndarray
     Args:
         renders: [H, W, 3] uint8 each, in the order of `scene.test`.
     """
+
+    def as_input(image: Tensor) -> Tensor:
+        return image.permute(2, 0, 1)[None] * 2.0 - 1.0
+
     values = [
-        float(tool.lpips(model, _as_input(torch.from_numpy(render) / 255.0), _as_input(view.image)))
+        float(tool.lpips(model, as_input(torch.from_numpy(render) / 255.0), as_input(view.image)))
         for view, render in zip(scene.test, renders, strict=True)
     ]
     return sum(values) / len(values)

@@ -6,15 +6,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import matplotlib as mpl
+import matplotlib.pyplot as plt
 import numpy as np
 
-mpl.use("Agg")
-
-import matplotlib.pyplot as plt
-
 from studies.scenes.analysis import Gain, Study
-from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, FADED, POOLED, label
+from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, FADED, label
 from studies.scenes.decisions import points_of
 from studies.scenes.long_tables import difference
 from studies.scenes.records import Record, Setting
@@ -29,7 +25,7 @@ COLOURS = {
     ANNEALED: "#56b4e9",
     DEFAULTS: "#0072b2",
     FADED: "#cc79a7",
-    POOLED: "#009e73",
+    f"{ANNEALED}+pooled": "#009e73",
 }
 SHOWN_FROM = 0.25  # of an arm's seconds: what it falls to before may be out of the picture
 VERDICT_COLOURS = {"pays": "#009e73", "does not pay": "#999999", "undecided": "#e69f00"}

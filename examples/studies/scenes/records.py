@@ -66,15 +66,8 @@ class Record:
         """A metric at that iteration, linear between evaluations."""
         return float(np.interp(iteration, self.curve["iteration"], self.curve[metric]))
 
-    def iteration_of(self, psnr: float) -> float | None:
+    def reached(self, psnr: float, column: str = "iteration") -> float | None:
         """When the test PSNR first reaches that value, interpolated; None if it never does."""
-        return self._first("iteration", psnr)
-
-    def seconds_to(self, psnr: float) -> float | None:
-        """As `iteration_of`, in CPU seconds."""
-        return self._first("seconds", psnr)
-
-    def _first(self, column: str, psnr: float) -> float | None:
         values, times = self.curve["psnr"], self.curve[column]
         reached = np.flatnonzero(values >= psnr)
         if not len(reached):

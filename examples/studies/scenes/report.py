@@ -10,30 +10,29 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from statistics import fmean
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
+from splatting.stopping import command
 
-from studies.scenes.analysis import Gain, Study, baseline_of
+from studies.pages import filled, table
+from studies.scenes.analysis import Study
 from studies.scenes.arms import (
-    ALL_ANNEALED,
     ANNEALED,
     BASELINE,
     DEFAULTS,
     FADED,
     GROUPS,
-    POOLED,
     SELDOM_FADED,
     SHARE_KEPT,
     STABLE,
     STUDY_ARMS,
     UNFADED,
-    UNFADED_OPACITIES,
     label,
 )
 from studies.scenes.decisions import QUARTER, decide, every_scene, settings_of
@@ -62,6 +61,7 @@ from studies.scenes.tables import (
 REPOSITORY = Path(__file__).resolve().parents[3]
 PAGE = REPOSITORY / "docs" / "evidence.md"
 PAGES = (PAGE, FOLDER / "tables.md", REPOSITORY / "README.md")  # that have tables
+MARK = "<!-- study:{} -->"
 FRONT = (  # what it is, arm, control
     ("annealing of all parameters, and fading", ANNEALED, BASELINE),
     ("the paper's preset, all parts", "paper", BASELINE),
@@ -76,52 +76,52 @@ PAPER = (  # what the pages say of the paper's parts: what, arm, control
     ("L-BFGS directions with both", "l2+reset+lqn@1/30", "l2+reset@1/30"),
     ("the whole preset", "paper", BASELINE),
 )
+ALL_ANNEALED, POOLED = "annealed-4-0.4+faded", f"{ANNEALED}+pooled"  # retired
+UNFADED_OPACITIES = f"{ANNEALED}-opacities-unfaded"  # retired
 SHORT = 3_000
-ALONE = ("mcmc", "faded", "annealed-4-0.4", "annealed-8-0.4")
-LONG_ARMS = (*ALONE, ALL_ANNEALED, ANNEALED, UNFADED_OPACITIES, POOLED)
-BEST = ANNEALED
+LONG_ARMS = (
+    *("mcmc", "faded", "annealed-4-0.4", "annealed-8-0.4"),
+    *(ALL_ANNEALED, ANNEALED, UNFADED_OPACITIES, POOLED),
+)
 FEW_VIEWS_SCENES = ("brighton_beach", "plush")  # fewest views to speak of over-fitting, and most
 FEW_VIEWS_ARMS = (
     "mcmc",
     *(f"{ALL_ANNEALED}{x}" for x in ("", "-means-1", "+decoupled", "+regularisers-0")),
     *(f"{ANNEALED}+eps-{x}-0.1" for x in ("opacities", "all")),
     *(f"{arm}+regularisers-0" for arm in (ANNEALED, POOLED)),
-    *(UNFADED_OPACITIES, BEST, POOLED),
+    *(UNFADED_OPACITIES, ANNEALED, POOLED),
 )
-CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4", BEST)
+CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4", ANNEALED)
 ROTATED = "rotated.json"  # records whose held-out views rotate with the seed
 LONG, BRIEF = 30_000, 7_500
 ASIDE = ("explorations", "unseen", "adaptive")  # groups with a table of their own
 NU_ARMS = (BASELINE, STABLE, f"{STABLE}-constant", "paper", "paper-constant")
 OFTEN_ARMS = (BASELINE, SHARE_KEPT, SELDOM_FADED, *UNFADED.values(), DEFAULTS)
 REACH_ARMS = (FADED, DEFAULTS)
-MARKER = re.compile(r"(<!-- study:([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def tables(study: Study) -> dict[str, str]:
     """Every generated piece of the page, by the name in its marker."""
     short = study.settings(SHORT)
     long = {
-        "7,500 iterations": study.settings(7_500),
-        "30,000 iterations": study.settings(30_000),
+        "7,500 iterations": study.settings(BRIEF),
+        "30,000 iterations": study.settings(LONG),
     }
     few = [s for s in long["7,500 iterations"] if s.scene in FEW_VIEWS_SCENES]
     made = {
         "core": gains_table(study.gains(short, names("core"))),
-        "long": goals_table(study, {"3,000 iterations": short, **long}, BEST, BASELINE),
+        "long": goals_table(study, {"3,000 iterations": short, **long}, ANNEALED, BASELINE),
         "pooled": goals_table(study, {"3,000 iterations": short, **long}, POOLED, BASELINE),
         "few-views": scenes_table(study, few, FEW_VIEWS_ARMS),
         "full-scenes": scenes_table(study, long["30,000 iterations"], LONG_ARMS),
-        "front": front_table(study, {n: study.settings(n) for n in (SHORT, 7_500, 30_000)}, FRONT),
+        "front": front_table(study, {n: study.settings(n) for n in (SHORT, BRIEF, LONG)}, FRONT),
     }
-    for stage, settings in (
+    for kind, settings in (
         ("random", study.settings(SHORT, "random")),
         ("small", study.settings(SHORT, share=0.25)),
         ("harmonics", study.settings(SHORT, sh_degree=3)),
     ):
-        found = study.gain(settings, BEST, BASELINE)
-        kinds = {"3,000 iterations": settings}
-        made[stage] = goals_table(study, kinds, BEST, BASELINE) if found else _missing(stage)
+        made[kind] = goals_table(study, {"3,000 iterations": settings}, ANNEALED, BASELINE)
     return made
 
 
@@ -178,28 +178,28 @@ def names(kind: str) -> list[str]:
     return [arm.name for arm in GROUPS[kind]]
 
 
-def _missing(stage: str) -> str:
-    """What stands where nothing has been trained yet."""
-    return (
-        f"Not measured yet: `python examples/studies/scenes/run.py --scenes DIR --stages {stage}`."
-    )
-
-
 def decisions_table(study: Study) -> str:
     """One line per part: what it was judged by, and whether it is on."""
-    lines = [
-        "| part | decided by | iterations | scenes, trainings | PSNR | SSIM | LPIPS | default |",
-        "|---|---|---:|---|---:|---:|---:|---|",
-    ]
+    rows = []
     for part, decision in decide(study).items():
         by = f"`{label(decision.arm)}` against `{label(decision.control)}`"
-        found, shown = decision.found, "- | - | - | - | -"
+        found, shown = decision.found, ["-"] * 5
         if found is not None:
             count = f"{len(found.pairs)}, {found.count}"
-            shown = f"{decision.iterations:,} | {count} | {' | '.join(cells_of(found))}"
+            shown = [f"{decision.iterations:,}", count, *cells_of(found)]
         on = "on" if decision.on else "off"
-        lines.append(f"| {part} | {by} | {shown} | {on} ({decision.verdict}) |")
-    return "\n".join(lines)
+        rows.append((part, by, *shown, f"{on} ({decision.verdict})"))
+    heads = (
+        "part",
+        "decided by",
+        "iterations",
+        "scenes, trainings",
+        "PSNR",
+        "SSIM",
+        "LPIPS",
+        "default",
+    )
+    return table(heads, "llrlrrrl", rows)
 
 
 def paper_table(study: Study, settings: Sequence[Setting], *, brief: bool = False) -> str:
@@ -208,99 +208,73 @@ def paper_table(study: Study, settings: Sequence[Setting], *, brief: bool = Fals
     Args:
         brief: the PSNR alone, without the scenes' names, for the README.
     """
-    heads = ("PSNR, dB",) if brief else ("scenes", "PSNR, dB", "SSIM", "LPIPS")
-    rule = "|---|---:|" if brief else "|---|---|---:|---:|---:|"
-    lines = [f"| part | {' | '.join(heads)} |", rule]
+    rows = []
     for what, arm, control in PAPER:
         found = difference(study, settings, arm, control)
         if found.count:
-            cells = cells_of(found)[:1] if brief else [", ".join(found.pairs), *cells_of(found)]
-            lines.append(f"| {what} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+            psnr, *others = cells_of(found)
+            names = ", ".join(found.pairs)
+            rows.append((what, psnr) if brief else (what, names, psnr, *others))
+    if brief:
+        return table(("part", "PSNR, dB"), "lr", rows)
+    return table(("part", "scenes", "PSNR, dB", "SSIM", "LPIPS"), "llr", rows)
 
 
-def plots(study: Study, folder: Path) -> list[Path]:
+def plots(study: Study, rotating: Study) -> list[Path]:
     """Draw everything; return the files."""
-    short, drawn = study.settings(SHORT), []
+    short, long, full = (study.settings(length) for length in (SHORT, BRIEF, LONG))
+    pooled, drawn = ("mcmc", ANNEALED, POOLED), []
     for name, settings, arms in (
         ("curves.png", short, CURVE_ARMS),
-        (
-            "curves_long.png",
-            study.settings(7_500),
-            ("mcmc", "faded", "annealed-8-0.4", BEST, POOLED),
-        ),
-        ("curves_full.png", study.settings(30_000), ("mcmc", BEST, POOLED)),
+        ("curves_long.png", long, ("mcmc", "faded", "annealed-8-0.4", *pooled[1:])),
+        ("curves_full.png", full, pooled),
     ):
-        if settings:
-            plot_curves(study, settings, arms, folder / name)
-            drawn.append(folder / name)
+        plot_curves(study, settings, arms, FOLDER / name)
+        drawn.append(FOLDER / name)
     for name, kinds in (
         ("gains.png", ("core", "with-nu")),
         ("gains_tails.png", ("tails", "on-top")),
         ("gains_leads.png", ("leads",)),
     ):
-        gains: list[Gain] = []
-        for kind in kinds:
-            gains += study.gains(short, names(kind))
-        if gains:
-            plot_gains(gains, folder / name, _title(study, gains))
-            drawn.append(folder / name)
-    return drawn
+        gains = [gain for kind in kinds for gain in study.gains(short, names(kind))]
+        scenes = sorted({scene for gain in gains for scene in gain.scenes})
+        ends = [
+            r.final for s in short if s.scene in scenes for r in study.runs(s, BASELINE).values()
+        ]
+        title = f"{', '.join(scenes)}\n{SHORT:,} iterations; {BASELINE} {fmean(ends):.2f} dB"
+        plot_gains(gains, FOLDER / name, title)
+        drawn.append(FOLDER / name)
+    arms = (BASELINE, FADED, DEFAULTS)
+    plot_metrics(rotating, settings_of(rotating, LONG), arms, FOLDER / "rotated.png")
+    plot_sizes(rotating, FOLDER / "sizes.png")
+    return [*drawn, FOLDER / "rotated.png", FOLDER / "sizes.png"]
 
 
-def _title(study: Study, gains: Sequence[Gain]) -> str:
-    scenes = {scene for gain in gains for scene in gain.scenes}
-    settings = [s for s in study.settings(SHORT) if s.scene in scenes]
-    baseline = f"{BASELINE} {baseline_of(study, settings):.2f} dB"
-    return f"{', '.join(sorted(scenes))}\n{SHORT:,} iterations; {baseline}"
-
-
-def fill(page: str, made: dict[str, str]) -> str:
-    """The page with every table between its markers; ValueError for an unknown marker."""
-
-    def put(match: re.Match[str]) -> str:
-        if match[2] not in made:
-            raise ValueError(f"marker study:{match[2]} is unknown; there are {', '.join(made)}")
-        return f"{match[1]}{made[match[2]]}\n{match[3]}"
-
-    return MARKER.sub(put, page)
-
-
+@command("report")
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; 0, or 2 after one line that says what is wrong."""
+    """The command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--runs", type=Path, metavar="DIR", help="folder of study/run.py")
     args = parser.parse_args(arguments)
     records = FOLDER / "records.json"
-    try:
-        if args.runs is not None:
-            found = gather(args.runs)
-            if not found:
-                raise ValueError(f"--runs {args.runs}: holds no finished training")
-            FOLDER.mkdir(parents=True, exist_ok=True)
-            for path, rotated in ((records, False), (FOLDER / ROTATED, True)):
-                old = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-                new = [record for record in found if record.get("rotated", False) == rotated]
-                if new:
-                    write(merge(old.get("records", []), new), path)
-        study, rotating = Study(read(records)), rotating_study()
-        made = tables(study) | rotated_tables(rotating)
-        for page in PAGES:
-            page.write_text(fill(page.read_text(encoding="utf-8"), made), encoding="utf-8")
-        decisions = {part: decision.on for part, decision in decide(rotating).items()}
-        text = json.dumps(decisions, indent=1) + "\n"
-        (FOLDER / "decisions.json").write_text(text, encoding="utf-8")
-        drawn = plots(study, FOLDER)
-        if many := settings_of(rotating, LONG):
-            arms = (BASELINE, FADED, DEFAULTS)
-            plot_metrics(rotating, many, arms, FOLDER / "rotated.png")
-            plot_sizes(rotating, FOLDER / "sizes.png")
-            drawn += [FOLDER / "rotated.png", FOLDER / "sizes.png"]
-    except (OSError, ValueError) as error:
-        print(f"report: {error}", file=sys.stderr)
-        return 2
-    for path in [records, FOLDER / "decisions.json", *drawn, *PAGES]:
-        print(path)
+    if args.runs is not None:
+        found = gather(args.runs)
+        if not found:
+            raise ValueError(f"--runs {args.runs}: holds no finished training")
+        for path, rotated in ((records, False), (FOLDER / ROTATED, True)):
+            old = json.loads(path.read_text(encoding="utf-8"))["records"]
+            new = [record for record in found if record.get("rotated", False) == rotated]
+            if new:
+                write(merge(old, new), path)
+    study, rotating = Study(read(records)), rotating_study()
+    made = tables(study) | rotated_tables(rotating)
+    for page in PAGES:
+        text = filled(page.read_text(encoding="utf-8"), made, MARK, every=False)
+        page.write_text(text, encoding="utf-8")
+    decisions = {part: decision.on for part, decision in decide(rotating).items()}
+    text = json.dumps(decisions, indent=1) + "\n"
+    (FOLDER / "decisions.json").write_text(text, encoding="utf-8")
+    print(records, FOLDER / "decisions.json", *plots(study, rotating), *PAGES, sep="\n")
     return 0
 
 

@@ -19,11 +19,12 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-import matplotlib as mpl
+import matplotlib.pyplot as plt
 import torch
 from splatting.arms import fixed
 from splatting.fit import Fit, FitOptions
 from splatting.scenes import Scene, load_scene
+from splatting.stopping import command
 from tqdm import tqdm
 
 from studies.scenes.arms import find_study_arm
@@ -31,10 +32,6 @@ from studies.scenes.parts.step_lengths import StepLengths
 from studies.scenes.plots import COLOURS, DPI
 from studies.scenes.records import FOLDER
 from studies.scenes.training import machine
-
-mpl.use("Agg")
-
-import matplotlib.pyplot as plt
 
 ARMS = ("mcmc", "faded", "annealed-8-0.4")
 EVERY = 50
@@ -48,10 +45,9 @@ def step_lengths(scene: Scene, name: str, iterations: int, points: int) -> dict[
     fit = Fit(scene, watched, FitOptions(iterations, points, switch=1.0))
     for _ in tqdm(range(iterations), desc=name, unit="it"):
         fit.step()
-    rows = {key: [length for _, length in found] for key, found in lengths.rows.items()}
-    looked = [iteration for iteration, _ in lengths.rows["means"]]
+    looked = [*range(EVERY, iterations + 1, EVERY)]
     psnr = round(fit.evaluate()["psnr"], 3)
-    return {"psnr": psnr, "rows": {"iteration": looked, **rows}}
+    return {"psnr": psnr, "rows": {"iteration": looked, **lengths.rows}}
 
 
 def draw(data: dict[str, Any], path: Path) -> None:
@@ -74,8 +70,9 @@ def draw(data: dict[str, Any], path: Path) -> None:
     plt.close(figure)
 
 
+@command("steps")
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; 0, or 2 after one line that says what is wrong."""
+    """The command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     add = parser.add_argument
     add("--scene", default="embedded", metavar="DIR", help="scene folder, or 'embedded'")
@@ -85,24 +82,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("-o", "--out", type=Path, default=FOLDER, metavar="DIR")
     args = parser.parse_args(arguments)
     path = args.out / "steps.json"
-    try:
-        if not args.redraw:
-            torch.set_num_threads(1)
-            scene = load_scene(args.scene)
-            runs = {arm: step_lengths(scene, arm, args.iterations, args.points) for arm in ARMS}
-            about = {
-                "machine": machine(),
-                "date": date.today().isoformat(),
-                "scene": scene.name,
-                "iterations": args.iterations,
-                "points": args.points,
-            }
-            args.out.mkdir(parents=True, exist_ok=True)
-            path.write_text(json.dumps({**about, "arms": runs}) + "\n", encoding="utf-8")
-        draw(json.loads(path.read_text(encoding="utf-8")), args.out / "steps.png")
-    except (OSError, ValueError) as error:
-        print(f"steps: {error}", file=sys.stderr)
-        return 2
+    if not args.redraw:
+        torch.set_num_threads(1)
+        scene = load_scene(args.scene)
+        runs = {arm: step_lengths(scene, arm, args.iterations, args.points) for arm in ARMS}
+        about = {
+            "machine": machine(),
+            "date": date.today().isoformat(),
+            "scene": scene.name,
+            "iterations": args.iterations,
+            "points": args.points,
+        }
+        args.out.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps({**about, "arms": runs}) + "\n", encoding="utf-8")
+    draw(json.loads(path.read_text(encoding="utf-8")), args.out / "steps.png")
     print(path, args.out / "steps.png", sep="\n")
     return 0
 

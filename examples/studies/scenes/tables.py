@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from statistics import fmean, stdev
 
+from studies.pages import table
 from studies.scenes.analysis import Gain, Study
 from studies.scenes.arms import STUDY_ARMS, label
 from studies.scenes.records import Record, Setting
@@ -26,27 +27,22 @@ def machines_line(records: Sequence[Record]) -> str:
 
 def gains_table(gains: Sequence[Gain]) -> str:
     """One line per arm: what it gains over its control, and the rule's verdict."""
-    lines = [
-        "| arm | what it is | against | scenes, seeds | dB at equal iterations "
-        "| dB at equal seconds | dB on training views | seconds | verdict |",
-        "|---|---|---|---|---:|---:|---:|---:|---|",
-    ]
-    for g in gains:
-        lines.append(
-            f"| `{label(g.arm)}` | {STUDY_ARMS[g.arm].what} | `{label(g.control)}` "
-            f"| {len(g.scenes)}, {g.seeds} | {g.equal_iterations:+.2f} | {_gain_and_spread(g)} "
-            f"| {g.train:+.2f} | x{g.seconds:.2f} | {g.verdict} |"
+    heads = ["arm", "what it is", "against", "scenes, seeds", "dB at equal iterations"]
+    heads += ["dB at equal seconds", "dB on training views", "seconds", "verdict"]
+    rows = [
+        (
+            *(f"`{label(g.arm)}`", STUDY_ARMS[g.arm].what, f"`{label(g.control)}`"),
+            *(f"{len(g.scenes)}, {g.seeds}", f"{g.equal_iterations:+.2f}", _gain_and_spread(g)),
+            *(f"{g.train:+.2f}", f"x{g.seconds:.2f}", g.verdict),
         )
-    return "\n".join(lines)
+        for g in gains
+    ]
+    return table(heads, "llllrrrrl", rows)
 
 
 def scenes_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) -> str:
     """Test PSNR of every arm on every scene; the last columns are means over the scenes."""
-    names = [setting.scene for setting in settings]
-    lines = [
-        f"| arm | {' | '.join(names)} | SSIM | LPIPS | state, bytes per point | peak memory, MB |",
-        f"|---|{'---:|' * (len(names) + 4)}",
-    ]
+    rows = []
     for arm in arms:
         runs = [list(study.runs(setting, arm).values()) for setting in settings]
         if not any(runs):
@@ -59,56 +55,49 @@ def scenes_table(study: Study, settings: Sequence[Setting], arms: Sequence[str])
         shown = f"{fmean(lpips):.4f}" if complete and len(lpips) == len(every) else "-"
         state = fmean(r.state_bytes / r.curve["num_points"][-1] for r in every)
         peak = f"{fmean(r.peak_rss_bytes for r in every) / 1e6:.0f}"
-        row = [f"`{label(arm)}`", *cells, ssim, shown, f"{state:.0f}", peak]
-        lines.append(f"| {' | '.join(row)} |")
-    return "\n".join(lines)
+        rows.append((f"`{label(arm)}`", *cells, ssim, shown, f"{state:.0f}", peak))
+    names = (setting.scene for setting in settings)
+    more = ("SSIM", "LPIPS", "state, bytes per point", "peak memory, MB")
+    return table(["arm", *names, *more], "lr", rows)
 
 
 def goals_table(study: Study, kinds: dict[str, list[Setting]], arm: str, control: str) -> str:
     """The gain in long trainings, and when the control's last PSNR is reached."""
-    lines = [
-        "| training | scenes, seeds | control, dB | gain at equal iterations "
-        "| gain at equal seconds | seconds until the control's last PSNR |",
-        "|---|---|---:|---:|---:|---:|",
-    ]
+    rows = []
     for name, settings in kinds.items():
         gain = study.gain(settings, arm, control)
         if gain is None:
             continue
         reach = "not on every scene" if gain.reach is None else f"x{gain.reach:.2f}"
-        lines.append(
-            f"| {name} | {', '.join(gain.scenes)}; {gain.seeds} "
-            f"| {gain.psnr - gain.equal_iterations:.2f} | {gain.equal_iterations:+.2f} "
-            f"| {_gain_and_spread(gain)} | {reach} |"
-        )
-    return "\n".join(lines)
+        before = f"{gain.psnr - gain.equal_iterations:.2f}"
+        gains = f"{gain.equal_iterations:+.2f}", _gain_and_spread(gain)
+        rows.append((name, f"{', '.join(gain.scenes)}; {gain.seeds}", before, *gains, reach))
+    heads = ["training", "scenes, seeds", "control, dB", "gain at equal iterations"]
+    heads += ["gain at equal seconds", "seconds until the control's last PSNR"]
+    return table(heads, "llr", rows)
 
 
 def front_table(
     study: Study, kinds: dict[int, list[Setting]], rows: Sequence[tuple[str, str, str]]
 ) -> str:
-    """The README's: gains at equal seconds by length of the training, and scenes below the control.
+    """Gains at equal seconds by length of the training, and scenes below the control.
 
     Args:
         kinds: the settings of each length, by its iterations.
         rows: (what it is, arm, control); the first one's scenes are counted.
     """
-    lines = [
-        f"| iterations | {' | '.join(f'{n:,}' for n in kinds)} |",
-        f"|---|{'---:|' * len(kinds)}",
-    ]
+    made = []
     for what, arm, control in rows:
         gains = [study.gain(settings, arm, control) for settings in kinds.values()]
-        cells = ["-" if gain is None else f"{_gain_and_spread(gain)} dB" for gain in gains]
-        lines.append(f"| {what} | {' | '.join(cells)} |")
-    what, arm, control = rows[0]
+        made.append((what, *("-" if g is None else f"{_gain_and_spread(g)} dB" for g in gains)))
+    _, arm, control = rows[0]
     shares = [[study.gain([s], arm, control) for s in settings] for settings in kinds.values()]
     behind = [
         f"{sum(g.equal_seconds < 0 for g in found if g)} of {sum(g is not None for g in found)}"
         for found in shares
     ]
-    lines.insert(3, f"| scenes on which they end below stock | {' | '.join(behind)} |")
-    return "\n".join(lines)
+    made.insert(1, ("scenes on which they end below stock", *behind))
+    return table(["iterations", *(f"{n:,}" for n in kinds)], "lr", made)
 
 
 def _gain_and_spread(gain: Gain) -> str:

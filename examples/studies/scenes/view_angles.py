@@ -15,6 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import torch
 from splatting.scenes import Scene, load_scene
+from splatting.stopping import command
 
 from studies.scenes.plan import SCENES
 
@@ -32,19 +33,16 @@ def nearest_angles(scene: Scene) -> list[float]:
     return torch.rad2deg(torch.acos(cosines.clamp(-1.0, 1.0))).tolist()
 
 
+@command("view_angles")
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; 0, or 2 after one line that says what is wrong."""
+    """The command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--scenes", type=Path, required=True, metavar="DIR")
     args = parser.parse_args(arguments)
-    try:
-        for name in SCENES:
-            scene = load_scene(name if name == "embedded" else args.scenes / name)
-            angles = " ".join(f"{angle:.1f}" for angle in sorted(nearest_angles(scene)))
-            print(f"{name}: {len(scene.train)} training views; {angles}")
-    except (OSError, ValueError) as error:
-        print(f"view_angles: {error}", file=sys.stderr)
-        return 2
+    for name in SCENES:
+        scene = load_scene(name if name == "embedded" else args.scenes / name)
+        angles = " ".join(f"{angle:.1f}" for angle in sorted(nearest_angles(scene)))
+        print(f"{name}: {len(scene.train)} training views; {angles}")
     return 0
 
 

@@ -32,6 +32,7 @@ from tqdm import tqdm
 from opt3dgs_optim import AWSGLD, EnergyHistogram, LQNAdam
 
 ROOT = Path(__file__).resolve().parents[3]
+PAGE = ROOT / "docs" / "results" / "stability" / "stability.md"
 sys.path[:0] = [str(ROOT / p) for p in ("examples", "tests", "tests/support")]  # their problems
 
 from line_search import minimise  # noqa: E402
@@ -47,11 +48,13 @@ from problems import (  # noqa: E402
     to_world,
 )
 
+from studies.pages import filled  # noqa: E402
 from studies.stability.stability_page import (  # noqa: E402
+    MARK,
     coverage_result,
-    filled,
     slow_result,
     table,
+    texts,
 )
 
 Function = Callable[[Tensor], Tensor]
@@ -129,15 +132,6 @@ def timed(step: Step, error: Callable[[Tensor], float], steps: int) -> Course:
     return course
 
 
-def line_searched(
-    value: Function, start: Tensor, error: Callable[[Tensor], float], steps: int
-) -> Course:
-    begin = time.perf_counter()
-    points = minimise(value, start, min(steps, 150))
-    each = (time.perf_counter() - begin) / len(points)
-    return [(i, i * each, error(x)) for i, x in enumerate(points, start=1)]
-
-
 def compare(
     value: Function, start: Tensor, distance: float, error: Callable[[Tensor], float], steps: int
 ) -> dict[str, Course]:
@@ -150,7 +144,10 @@ def compare(
         ]
         courses[arm] = min(tried, key=lambda course: course[-1][2])
     courses[ARMS[3]] = timed(torch_lbfgs(value, start), error, min(steps, 150))
-    courses[ARMS[4]] = line_searched(value, start, error, steps)
+    begin = time.perf_counter()
+    points = minimise(value, start, min(steps, 150))
+    each = (time.perf_counter() - begin) / len(points)
+    courses[ARMS[4]] = [(i, i * each, error(x)) for i, x in enumerate(points, start=1)]
     return courses
 
 
@@ -212,40 +209,33 @@ def reached(course: Course) -> str:
     return digits(course[-1][2]) + (f" ({hits[0]})" if hits else "")
 
 
-def comparison(
-    title: str, results: dict[str, dict[str, Course]], cell: Callable[[Course], str]
-) -> str:
-    rows = [(name, *(cell(courses[arm]) for arm in ARMS)) for name, courses in results.items()]
-    return f"### {title}\n\n" + table(("problem", *ARMS), rows)
-
-
 def report(results: dict[str, Any]) -> str:
+    """The page's tables."""
     about = results["about"]
     decades = ", ".join(f"{arm} {count}" for arm, count in results["decades"].items())
-    parts = [
-        f"Made by `{about['command']}` on {about['date']}: {about['machine']}, {about['rows']} "
-        f"rows, {about['steps']} steps (line searches: up to 150).\n",
-        comparison(
-            "Digits reached (-log10 of f over its start), and iterations to six",
-            results["problems"],
-            reached,
-        ),
-        comparison(
-            "Several valleys: what is left of f above its lowest minimum, over that of the start",
-            results["valleys"],
-            lambda c: f"{c[-1][2]:.2f}",
-        ),
-        comparison(
-            "Quadratics: digits reached (-log10 of |x| over its start)",
-            results["quadratics"],
-            lambda c: digits(c[-1][2]),
-        ),
-        f"Decades of gradient size (of 82, 1e-44 to 1e37; float32) with the same steps: {decades}.",
-    ]
-    return "\n".join(parts) + "\n"
+
+    def comparison(kind: str, cell: Callable[[Course], str]) -> str:
+        rows = [(name, *(cell(c[arm]) for arm in ARMS)) for name, c in results[kind].items()]
+        return table(("problem", *ARMS), rows)
+
+    return f"""Made by `{about["command"]}` on {about["date"]}: {about["machine"]}, \
+{about["rows"]} rows, {about["steps"]} steps (line searches: up to 150).
+
+### Digits reached (-log10 of f over its start), and iterations to six
+
+{comparison("problems", reached)}
+### Several valleys: what is left of f above its lowest minimum, over that of the start
+
+{comparison("valleys", lambda c: f"{c[-1][2]:.2f}")}
+### Quadratics: digits reached (-log10 of |x| over its start)
+
+{comparison("quadratics", lambda c: digits(c[-1][2]))}
+Decades of gradient size (of 82, 1e-44 to 1e37; float32) with the same steps: {decades}.
+"""
 
 
-def plot(results: dict[str, dict[str, Course]], column: int, label: str, path: Path) -> None:
+def plot(results: dict[str, dict[str, Course]], path: Path) -> None:
+    """Error over iterations."""
     import matplotlib.pyplot as plt
 
     wide = 4
@@ -253,11 +243,10 @@ def plot(results: dict[str, dict[str, Course]], column: int, label: str, path: P
     figure, axes = plt.subplots(tall, wide, figsize=(3.4 * wide, 2.9 * tall), squeeze=False)
     for axis, (name, courses) in zip(axes.flat, results.items(), strict=False):
         for arm in ARMS:
-            at = [entry[column] for entry in courses[arm]]
+            iterations, _, errors = zip(*courses[arm], strict=True)
             style = STYLES.get(arm, {"lw": 1.5})
-            errors = [entry[2] for entry in courses[arm]]
-            axis.plot(at, errors, color=COLORS[arm], label=arm, **style)
-        axis.set(title=name, xscale="log", yscale="log", xlabel=label)
+            axis.plot(iterations, errors, color=COLORS[arm], label=arm, **style)
+        axis.set(title=name, xscale="log", yscale="log", xlabel="iterations")
         axis.set_ylim(bottom=1e-32, top=1e4)
         axis.grid(alpha=0.3)
     for axis in axes.flat[len(results) :]:
@@ -280,25 +269,15 @@ def measured(rows: int, steps: int, machine: str) -> dict[str, Any]:
         f"condition {c:.0e}": condition_courses(c, *sizes)
         for c in tqdm(CONDITIONS, desc="quadratics")
     }
-    about = {
-        "command": "python examples/studies/stability/stability.py",
-        "date": date.today().isoformat(),
-        "machine": machine,
-        "rows": rows,
-        "steps": steps,
-    }
+    command = "python examples/studies/stability/stability.py"
+    about = {"command": command, "date": date.today().isoformat(), "machine": machine}
+    about |= {"rows": rows, "steps": steps}
     results = {"about": about, "problems": problems, "valleys": valleys, "quadratics": quadratics}
     return results | {"decades": range_survived()}
 
 
-def write_json(path: Path, results: dict[str, Any], indent: int | None = None) -> None:
-    path.write_text(json.dumps(results, indent=indent) + "\n")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs/results/stability")
-    parser.add_argument("--page", type=Path, default=ROOT / "docs/results/stability/stability.md")
     parser.add_argument("--rows", type=int, default=50)
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--tables", action="store_true", help="measure nothing")
@@ -307,24 +286,24 @@ def main() -> None:
     parser.add_argument("--note", default="", help="what the coverage is of, if not of all tests")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    folder: Path = options.output
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = PAGE.parent
     machine = f"{platform.system()} {platform.machine()}, torch {torch.__version__}"
     if options.slow:
-        write_json(folder / "slow.json", slow_result(options.slow, machine), 1)
+        found = slow_result(options.slow, machine)
+        (folder / "slow.json").write_text(json.dumps(found, indent=1) + "\n")
     if options.coverage:
-        covered = coverage_result(options.coverage, machine, options.note)
-        write_json(folder / "coverage.json", covered, 1)
+        found = coverage_result(options.coverage, machine, options.note)
+        (folder / "coverage.json").write_text(json.dumps(found, indent=1) + "\n")
     if not (options.tables or options.slow or options.coverage):
         results = measured(options.rows, options.steps, f"{machine}, 1 thread")
-        write_json(folder / "stability.json", results)
+        (folder / "stability.json").write_text(json.dumps(results) + "\n")
     results = json.loads((folder / "stability.json").read_text())
     if not (options.slow or options.coverage):
-        plot(results["problems"], 0, "iterations", folder / "iterations.png")
-        plot(results["problems"], 1, "seconds", folder / "seconds.png")
-        plot(results["quadratics"], 0, "iterations", folder / "conditions.png")
-    options.page.write_text(filled(options.page.read_text(), folder, report(results)))
-    print(f"wrote {folder} and {options.page}")
+        plot(results["problems"], folder / "iterations.png")
+        plot(results["quadratics"], folder / "conditions.png")
+    made = texts(folder, report(results))
+    PAGE.write_text(filled(PAGE.read_text(), made, MARK))
+    print(f"wrote {folder} and {PAGE}")
 
 
 if __name__ == "__main__":

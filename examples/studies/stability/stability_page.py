@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ SLOW = "python -m pytest -m slow --junitxml=build/slow.xml"
 COVERAGE = (
     "python -m pytest --cov --cov-config=tests/coverage.ini --cov-report=json:build/coverage.json"
 )
-MARK, END = "<!-- {name}: made by examples/studies/stability/stability.py -->", "<!-- end -->"
+MARK = "<!-- {}: made by examples/studies/stability/stability.py -->"
 
 
 def table(header: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
@@ -27,9 +26,6 @@ def table(header: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
     head = list(header)
     lines = [head, ["---"] * len(head), *rows]
     return "".join("| " + " | ".join(str(cell) for cell in line) + " |\n" for line in lines)
-
-
-# -- what other commands have left ---------------------------------------------------------------
 
 
 def slow_result(files: Iterable[Path], machine: str) -> dict[str, Any]:
@@ -63,9 +59,6 @@ def coverage_result(report: Path, machine: str, note: str = "") -> dict[str, Any
     return {"about": about, "modules": modules}
 
 
-# -- what the page says --------------------------------------------------------------------------
-
-
 def slow_block(result: dict[str, Any]) -> str:
     tests, about = result["tests"], result["about"]
     passed = sum(test["outcome"] == "passed" for test in tests)
@@ -78,18 +71,10 @@ def slow_block(result: dict[str, Any]) -> str:
     return said + table(("test", "outcome"), bad) if bad else said.rstrip("\n") + "\n"
 
 
-def share(part: float, whole: float) -> float:
-    return 100.0 * part / whole if whole else 100.0
-
-
-def line_share(entry: dict[str, int]) -> float:
-    """Per cent of the statements that ran."""
-    return share(entry["covered_lines"], entry["num_statements"])
-
-
-def branch_share(entry: dict[str, int]) -> float:
-    """Per cent of the branches that were taken."""
-    return share(entry["covered_branches"], entry["num_branches"])
+def share(entry: dict[str, int], kind: str) -> float:
+    """Per cent of the "statements" that ran, or of the "branches" that were taken."""
+    ran = "covered_lines" if kind == "statements" else "covered_branches"
+    return 100.0 * entry[ran] / entry[f"num_{kind}"] if entry[f"num_{kind}"] else 100.0
 
 
 def total(modules: dict[str, dict[str, int]]) -> dict[str, int]:
@@ -101,12 +86,14 @@ def total(modules: dict[str, dict[str, int]]) -> dict[str, int]:
 def coverage_block(result: dict[str, Any]) -> str:
     modules, about = result["modules"], result["about"]
     whole = total(modules)
+    kinds = ("branches", "statements")
+    taken, ran = (f"{share(whole, kind):.1f} % of" for kind in kinds)
     said = (
         f"Last run {about['date']} ({', '.join(filter(None, (about['machine'], about['note'])))}): "
-        f"{branch_share(whole):.1f} % of the {whole['num_branches']} branches of `src` were taken, "
-        f"{line_share(whole):.1f} % of its {whole['num_statements']} statements ran.\n"
+        f"{taken} the {whole['num_branches']} branches of `src` were taken, "
+        f"{ran} its {whole['num_statements']} statements ran.\n"
     )
-    shares = {name: min(branch_share(e), line_share(e)) for name, e in modules.items()}
+    shares = {name: min(share(e, kind) for kind in kinds) for name, e in modules.items()}
     low = [f"`{name}` {least:.0f} %" for name, least in shares.items() if least < LEAST_COVERAGE]
     return said + (f"Below {LEAST_COVERAGE:.0f} %: {', '.join(low)}.\n" if low else "")
 
@@ -124,7 +111,7 @@ def mutants_block(result: dict[str, Any]) -> str:
     ]
     text = (
         f"Last run {about['date']} ({about['machine']}): {many} places were changed, one at a "
-        f"time, and the tests noticed {dead} ({share(dead, many):.1f} %). Of the others "
+        f"time, and the tests noticed {dead} ({100 * dead / many:.1f} %). Of the others "
         f"{many - dead - len(gaps)} change nothing that a test could see, {len(gaps)} are gaps.\n"
     )
     return text + ("\n" + table(("where", "was", "became"), gaps) if gaps else "")
@@ -141,17 +128,10 @@ BLOCKS: dict[str, Callable[[dict[str, Any]], str]] = {
 }
 
 
-def filled(page: str, folder: Path, tables: str) -> str:
-    """The page with `tables`, and every block of the JSON of its name in `folder`, written anew."""
-    texts = {"tables": tables}
+def texts(folder: Path, tables: str) -> dict[str, str]:
+    """What the page says: `tables`, and every block of the JSON of its name in `folder`."""
+    made = {"tables": tables}
     for name, make in BLOCKS.items():
         path = folder / f"{name}.json"
-        texts[name] = make(json.loads(path.read_text())) if path.exists() else "Not run yet.\n"
-    for name, text in texts.items():
-        mark = MARK.format(name=name)
-        block = f"{mark}\n\n{text}\n{END}"
-        pattern = re.escape(mark) + ".*?" + re.escape(END)
-        page, hits = re.subn(pattern, lambda _, block=block: block, page, flags=re.S)
-        if hits != 1:
-            raise ValueError(f"the page has {hits} places for {name!r}, but 1 is needed")
-    return page
+        made[name] = make(json.loads(path.read_text())) if path.exists() else "Not run yet.\n"
+    return {name: f"\n{text}" for name, text in made.items()}

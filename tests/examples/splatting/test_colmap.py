@@ -33,25 +33,16 @@ def test_truncated_and_padded_binaries_are_named(tmp_path, stem):
         load_scene(folder)
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "message"),
-    [
-        ("cameras", "7 OPENCV 40 24 50 50 20 12 0 0 0 0", "OPENCV.*colmap image_undistorter"),
-        ("cameras", "7 PINHOLE 40 24 50 50", "PINHOLE camera with 2 parameters"),
-        ("cameras", "7 PINHOLE 40", "expected ID MODEL WIDTH HEIGHT PARAMS, got '7 PINHOLE 40'"),
-        ("cameras", "7 PINHOLE 0 24 50 50 20 12", "impossible camera 0x24"),
-        ("images", "3 1 0 0 0 0 0 0", "expected ID QW QX QY QZ"),
-        ("images", "3 1 0 0 0 0 0 0 99 a.png", "image a.png has camera 99, known are"),
-        ("images", "3 0 0 0 0 0 0 0 7 a.png", "impossible pose"),
-        ("points3D", "1 2 3", "expected ID X Y Z R G B ERROR, got '1 2 3'"),
-        ("points3D", "1 2 3 x 4 5 6", "expected ID X Y Z"),
-    ],
-)
-def test_malformed_text_is_named(tmp_path, name, text, message):
-    folder = write_scene(tmp_path / "s", "txt")
-    (folder / "sparse" / f"{name}.txt").write_text(text + "\n")
-    with pytest.raises(ValueError, match=rf"{name}.txt: .*{message}"):
-        load_scene(folder)
+def test_impossible_cameras_and_unknown_ones_are_named(tmp_path):
+    folder = write_scene(tmp_path / "s", "bin")
+    path = folder / "sparse" / "0" / "cameras.bin"
+    for camera, width, message in (
+        (7, 0, r"image photo_00.png: impossible camera \(50.0, 48.0, 0, 24\)"),
+        (8, 40, r"images.bin: image photo_00.png has camera 7, known are \[8\]"),
+    ):
+        path.write_bytes(struct.pack("<QIiQQ4d", 1, camera, 1, width, 24, 50, 48, 19, 12.5))
+        with pytest.raises(ValueError, match=message):
+            load_scene(folder)
 
 
 def test_distorted_binary_camera_tells_to_undistort(tmp_path):

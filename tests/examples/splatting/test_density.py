@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 from relocation_oracle import printed_equation
-from splatting.density import DensityReport, MCMCDensityControl, regularisers
+from splatting.density import MCMCDensityControl, regularisers
 from splatting.gaussians import gaussians_from_points
 from splatting.relocation import relocated_values
 
@@ -51,8 +51,8 @@ def test_relocation_moves_the_dead_and_edits_the_state_as_gsplat_does():
     old = dict(gaussians)
     before = {name: p.detach().clone() for name, p in gaussians.items()}
     pointers = {name: p.data_ptr() for name, p in gaussians.items()}
-    report = _control(cap_max=0).step(600, gaussians, optimizers)
-    assert report == DensityReport(True, 6, 0, 40)
+    assert _control(cap_max=0).step(600, gaussians, optimizers) == 6
+    assert len(gaussians["means"]) == 40
     changed = (gaussians["opacities"] != before["opacities"])[6:].nonzero()[:, 0] + 6
     kept = [i for i in range(6, 40) if i not in changed.tolist()]
     assert 1 <= len(changed) <= 6
@@ -114,8 +114,7 @@ def test_growth_appends_rows_with_zero_state(dtype):
         optimizers[name].state[parameter]["history"] = torch.ones(100, 5, 8)
     old = dict(gaussians)
     before = gaussians["means"].detach().clone()
-    report = _control().step(600, gaussians, optimizers)
-    assert report == DensityReport(True, 0, 5, 105)
+    assert _control().step(600, gaussians, optimizers) == 0
     assert torch.equal(gaussians["means"][:100], before)  # growth moves nothing
     for name, parameter in gaussians.items():
         assert parameter is not old[name]
@@ -135,16 +134,21 @@ def test_growth_stops_at_the_cap_and_never_shrinks():
     gaussians = _gaussians(100)
     optimizers = _optimizers(gaussians)
     control = _control(cap_max=107, refine_every=10)
-    totals = [control.step(i, gaussians, optimizers).total for i in range(501, 541)]
+    totals = []
+    for i in range(501, 541):
+        control.step(i, gaussians, optimizers)
+        totals.append(len(gaussians["means"]))
     assert totals == [100] * 9 + [105] * 10 + [107] * 21
-    assert _control(cap_max=50).step(600, gaussians, optimizers) == DensityReport(True, 0, 0, 107)
+    _control(cap_max=50).step(600, gaussians, optimizers)
+    assert len(gaussians["means"]) == 107
 
 
 def test_schedule_is_gsplats():
-    gaussians = _gaussians(30)
-    optimizers = _optimizers(gaussians)
-    control = _control(refine_start=10, refine_stop=50, refine_every=10)
-    refined = [i for i in range(80) if control.step(i, gaussians, optimizers).refined]
+    control = _control(refine_start=10, refine_stop=50, refine_every=10, cap_max=0)
+    refined = []
+    for i in range(80):
+        gaussians = _gaussians(30, dead=1)
+        refined += [i] * control.step(i, gaussians, _optimizers(gaussians, steps=0))
     assert refined == [20, 30, 40]  # after the start, before the stop
 
 
@@ -154,8 +158,8 @@ def test_none_and_one(count, dead):
     gaussians = _gaussians(1, dead=int(dead))
     for name in gaussians:
         gaussians[name] = torch.nn.Parameter(gaussians[name].data[:count])
-    report = _control(growth=2.0).step(600, gaussians, _optimizers(gaussians))
-    assert report == DensityReport(True, 0, count, 2 * count)
+    assert _control(growth=2.0).step(600, gaussians, _optimizers(gaussians)) == 0
+    assert len(gaussians["means"]) == 2 * count
     assert torch.isfinite(gaussians["means"]).all()
 
 
@@ -163,7 +167,7 @@ def test_all_dead_stay_where_they_are():
     gaussians = _gaussians(5, dead=5)
     before = gaussians["means"].detach().clone()
     optimizers = _optimizers(gaussians, steps=0)
-    assert _control(cap_max=0).step(600, gaussians, optimizers).relocated == 0
+    assert _control(cap_max=0).step(600, gaussians, optimizers) == 0
     assert torch.equal(gaussians["means"], before)
 
 
@@ -203,10 +207,10 @@ def test_for_run_reaches_the_cap(iterations):
 
 
 def test_for_run_at_full_length_is_stock():
-    stock, fitted = MCMCDensityControl(7), MCMCDensityControl.for_run(30_000, 7)
+    stock, fitted = MCMCDensityControl(7), MCMCDensityControl.for_run(30_000, 7, num_points=7)
     for field in ("refine_start", "refine_stop", "refine_every", "growth", "min_opacity"):
         assert getattr(stock, field) == getattr(fitted, field), field
-    short = MCMCDensityControl.for_run(1500, 2000)
+    short = MCMCDensityControl.for_run(1500, 2000, num_points=2000)
     assert (short.refine_start, short.refine_stop, short.refine_every) == (25, 1250, 20)
     assert short.growth == 1.05
 
@@ -219,40 +223,6 @@ def test_regularisers():
     torch.testing.assert_close(value.detach(), expected)
     value.backward()
     assert gaussians["opacities"].grad is not None
-    for name in gaussians:
-        gaussians[name] = torch.nn.Parameter(gaussians[name].data[:0])
-    assert regularisers(gaussians) == 0
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"cap_max": -1}, "cap_max=-1, must be at least 0"),
-        ({"refine_every": 0}, "refine_every=0"),
-        ({"refine_start": 9, "refine_stop": 8}, "refine_stop=8, must be at least 9"),
-        ({"growth": 0.9}, "growth=0.9"),
-        ({"growth": math.nan}, "growth=nan"),
-        ({"min_opacity": 0.0}, r"min_opacity=0.0, must be inside \(0, 1\)"),
-    ],
-)
-def test_bad_options_are_named(options, message):
-    with pytest.raises(ValueError, match=message):
-        _control(**options)
-
-
-def test_bad_slots_are_named():
-    gaussians = _gaussians(4)
-    optimizers = _optimizers(gaussians)
-    with pytest.raises(ValueError, match="no optimizer for 'means'"):
-        _control().step(600, gaussians, {})
-    swapped = optimizers | {"means": optimizers["scales"]}
-    with pytest.raises(ValueError, match="optimizer of 'means' must hold that parameter"):
-        _control().step(600, gaussians, swapped)
-    with pytest.raises(ValueError, match=r"gaussians lack \['scales', 'quats', 'opacities'\]"):
-        _control().step(600, {"means": gaussians["means"]}, optimizers)
-    gaussians["opacities"].data[0] = math.nan
-    with pytest.raises(ValueError, match="NaN among the opacities"):
-        _control().step(600, gaussians, optimizers)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("gsplat") is None, reason="gsplat is not installed")

@@ -16,7 +16,6 @@ import torch
 from splatting.arms import ARMS, HISTOGRAM_ARM, find_arm, in_order
 from splatting.embedded import embedded_scene
 from splatting.fit import Fit, FitOptions, run
-from splatting.gaussians import load_ply
 from splatting.scenes import Scene
 
 from opt3dgs_optim import Phase, PhaseScheduler
@@ -89,8 +88,7 @@ def test_a_branch_starts_where_its_trunk_was(scene: Scene, tmp_path: Path) -> No
 
 
 def test_run_logs_what_the_report_needs(scene: Scene, tmp_path: Path) -> None:
-    seen = []
-    metrics = run(Fit(scene, ARMS["opt3dgs"], OPTIONS), tmp_path, seen.append)
+    metrics = run(Fit(scene, ARMS["opt3dgs"], OPTIONS), tmp_path)
     log = read_run(tmp_path / "log.jsonl")
     assert log.evaluations["iteration"].tolist() == [0, 30, 60, 90]
     for name in ("psnr", "ssim", "train_psnr", "seconds", "num_points"):
@@ -103,7 +101,6 @@ def test_run_logs_what_the_report_needs(scene: Scene, tmp_path: Path) -> None:
     assert np.isnan(log.steps["nu"][60:]).all()
     assert np.isfinite(log.steps["accepted"][61:]).all()
     assert log.events[-1]["event"] == "finished"
-    assert seen[-1].iteration == 90
     assert run(Fit(scene, ARMS["opt3dgs"], OPTIONS), tmp_path)["psnr"] == metrics["psnr"]
     assert len(read_run(tmp_path / "log.jsonl").records) == len(log.records)  # not run again
 
@@ -126,7 +123,7 @@ def test_ctrl_c_leaves_a_checkpoint_and_a_readable_log(tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 130, stderr
-    assert b"start again to go on" in stderr
+    assert b"goes on from the checkpoints" in stderr
     stopped = read_run(out / "log.jsonl")
     assert stopped.events[-1]["event"] == "interrupted"
     at = stopped.events[-1]["iteration"]
@@ -142,8 +139,8 @@ def test_ctrl_c_leaves_a_checkpoint_and_a_readable_log(tmp_path: Path) -> None:
     )
     whole = read_run(tmp_path / "whole" / "log.jsonl")
     assert whole.steps["loss"].tolist() == resumed.steps["loss"].tolist()
-    cut, uncut = (load_ply(f / "gaussians.ply") for f in (out, tmp_path / "whole"))
-    assert all(torch.equal(cut[key], uncut[key]) for key in cut)
+    cut, uncut = ((f / "gaussians.ply").read_bytes() for f in (out, tmp_path / "whole"))
+    assert cut == uncut
 
 
 def test_random_initialisation_grows_to_the_budget(scene: Scene) -> None:

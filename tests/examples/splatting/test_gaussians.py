@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from splatting.gaussians import (
     DEFAULT_PRESET,
     MCMC_PRESET,
     gaussians_from_points,
-    load_ply,
     neighbour_distance,
     random_gaussians,
     save_ply,
@@ -112,14 +110,12 @@ def test_float64_points_give_float64_parameters():
 def test_random_gaussians_fill_their_cube():
     center = torch.tensor([10.0, 0.0, -4.0])
     gaussians = random_gaussians(
-        2.0, 3000, center=center, generator=torch.Generator().manual_seed(0)
+        2.0, 3000, center=center, spread=3.0, generator=torch.Generator().manual_seed(0)
     )
     offsets = gaussians["means"].detach() - center
     assert offsets.abs().max() <= 6.0
     assert offsets.abs().max() > 5.9  # 3000 uniform draws come closer than 0.1 to the wall
     assert offsets.mean(dim=0).abs().max() < 0.32  # 5 deviations: 5 * 12 / sqrt(12 * 3000)
-    again = random_gaussians(2.0, 3000, center=center, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(gaussians["sh0"], again["sh0"])
 
 
 def test_stock_learning_rates():
@@ -133,20 +129,6 @@ def test_stock_learning_rates():
     }
 
 
-@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("count", [1, 30])
-def test_ply_round_trip(tmp_path, sh_degree, count):
-    gaussians = gaussians_from_points(*_cloud(count), sh_degree=sh_degree)
-    generator = torch.Generator().manual_seed(5)
-    for parameter in gaussians.values():
-        parameter.data.copy_(torch.randn(parameter.shape, generator=generator))
-    save_ply(tmp_path / "point_cloud.ply", gaussians)
-    loaded = load_ply(tmp_path / "point_cloud.ply")
-    assert list(loaded) == list(gaussians)
-    for key, parameter in gaussians.items():
-        assert torch.equal(loaded[key], parameter), key
-
-
 def test_ply_columns_are_inrias(tmp_path):
     gaussians = gaussians_from_points(*_cloud(4), sh_degree=1)
     rest = torch.arange(4 * 3 * 3).reshape(4, 3, 3).float()
@@ -157,33 +139,8 @@ def test_ply_columns_are_inrias(tmp_path):
     expected += [f"f_rest_{i}" for i in range(9)]
     expected += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     assert [prop.name for prop in vertices.properties] == expected
+    for name, key in (("x", "means"), ("opacity", "opacities"), ("rot_0", "quats")):
+        values = gaussians[key].detach().reshape(4, -1)[:, 0]
+        np.testing.assert_array_equal(vertices[name], values.numpy())
     # channel-major: coefficient 1 of green is column 3 + 1
     np.testing.assert_array_equal(vertices["f_rest_4"], rest[:, 1, 1].numpy())
-
-
-def test_bad_input_is_named(tmp_path):
-    points, colors = _cloud(4)
-    bad: list[tuple[dict[str, Any], str]] = [
-        ({"sh_degree": 4}, "sh_degree=4"),
-        ({"init_opacity": 1.0}, r"init_opacity=1.0, must be inside"),
-        ({"init_scale": 0.0}, "init_scale=0.0"),
-        ({"num_points": 0}, "num_points=0"),
-    ]
-    for options, message in bad:
-        with pytest.raises(ValueError, match=message):
-            gaussians_from_points(points, colors, **options)
-    with pytest.raises(ValueError, match=r"both be \[P, 3\]"):
-        gaussians_from_points(points, colors[:2])
-    with pytest.raises(ValueError, match="at least 1 point"):
-        gaussians_from_points(points[:0], colors[:0])
-    with pytest.raises(ValueError, match="finite"):
-        gaussians_from_points(points * math.nan, colors)
-    with pytest.raises(ValueError, match="extent=0"):
-        random_gaussians(0.0, 10)
-    with pytest.raises(ValueError, match="extent=0"):
-        stock_learning_rates(0.0)
-    with pytest.raises(FileNotFoundError, match=r"none\.ply"):
-        load_ply(tmp_path / "none.ply")
-    (tmp_path / "text.ply").write_text("hello")
-    with pytest.raises(ValueError, match=r"no \.ply file of Gaussians"):
-        load_ply(tmp_path / "text.ply")

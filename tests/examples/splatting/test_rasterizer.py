@@ -435,20 +435,16 @@ def test_broken_point_is_invisible(name: str, value: float, backend: Backend):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"means": None}, r"lacks \['means'\]"),
-        ({"quats": torch.zeros(5, 3)}, r"quats has shape \(5, 3\), must be \(5, 4\)"),
-        ({"opacities": torch.zeros(5, 1)}, r"opacities has shape \(5, 1\), must be \(5,\)"),
-        ({"sh0": torch.zeros(4, 1, 3)}, r"sh0 has shape \(4, 1, 3\), must be \(5, 1, 3\)"),
-        ({"shN": torch.zeros(5, 4, 3)}, r"shN has shape \(5, 4, 3\).*K in \[0, 3, 8, 15\]"),
+        ({"quats": torch.zeros(5, 3)}, r"quats is \(\(5, 3\), .* must be \(\(5, 4\)"),
+        ({"sh0": torch.zeros(4, 1, 3)}, r"sh0 is \(\(4, 1, 3\), .* must be \(\(5, 1, 3\)"),
+        ({"shN": torch.zeros(5, 4, 3)}, r"shN has shape \(5, 4, 3\).*K \[0, 3, 8, 15\]"),
         ({"shN": torch.zeros(5, 9)}, r"shN has shape \(5, 9\)"),
-        ({"scales": torch.zeros(5, 3).half()}, r"scales is torch.float16 on cpu, must be as means"),
+        ({"scales": torch.zeros(5, 3).half()}, r"scales is .*torch.float16.* must be .*float32"),
     ],
 )
-def test_wrong_gaussians_are_refused(changes: dict[str, Tensor | None], message: str):
-    gaussians = {**synthetic_scene(5, 1), **changes}
-    kept = {name: value for name, value in gaussians.items() if value is not None}
-    with pytest.raises(ValueError, match=f"^render: .*{message}"):
-        render(kept, look_at_origin())
+def test_wrong_gaussians_are_refused(changes: dict[str, Tensor], message: str):
+    with pytest.raises(ValueError, match=f"^render: {message}"):
+        render({**synthetic_scene(5, 1), **changes}, look_at_origin())
 
 
 @pytest.mark.parametrize(
@@ -465,15 +461,8 @@ def test_wrong_options_are_refused(options: dict, message: str):
         render(synthetic_scene(5, 1), look_at_origin(), **options)
 
 
-def test_wrong_dtype_and_camera_are_refused():
-    halves = {name: value.half() for name, value in synthetic_scene(5, 1).items()}
-    with pytest.raises(ValueError, match=r"means is torch.float16, must be torch.float32 or"):
-        render(halves, look_at_origin())
+def test_what_the_fast_twin_cannot_render_is_refused():
     camera = look_at_origin()
-    with pytest.raises(ValueError, match=r"viewmat has shape \(3, 4\)"):
-        render(scene(5, 1), Camera(camera.viewmat[:3], 1, 1, 1, 1, 2, 2))
-    with pytest.raises(ValueError, match="0 x 2 pixels"):
-        render(scene(5, 1), Camera(camera.viewmat, 1, 1, 1, 1, 0, 2))
     with pytest.raises(ValueError, match=r'"fast" with means torch.float64 on cpu, must be'):
         render(scene(5, 1), camera, backend="fast")
     camera.viewmat.requires_grad_()

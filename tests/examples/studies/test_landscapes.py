@@ -24,6 +24,7 @@ from studies.landscapes.energies import (
     nine_modes,
     well_potential,
 )
+from studies.pages import filled
 
 from opt3dgs_optim import AWSGLD, Course, EnergyHistogram, IsotropicNoise, Part
 
@@ -191,8 +192,6 @@ def test_bad_input_is_named() -> None:
     chains = Chains(Dynamics("well", 1.0), np.full((2, 1), 50.0), seed=0)
     with pytest.raises(FloatingPointError, match="is not finite"):
         chains.run(20)
-    with pytest.raises(ValueError, match="<!-- nine -->"):
-        tables.renewed("a page without markers", {"nine": "text"})
 
 
 @pytest.fixture
@@ -219,7 +218,7 @@ def test_quick_run_interrupted_and_resumed(
     assert run.main(arguments) == 0
     assert all(path.read_bytes() == content for path, content in before.items())
     names = {path.name for path in tmp_path.iterdir()}
-    assert {"nine.png", "modes.png", "well.png", "kramers.png", "tables.md"} <= names
+    assert {"nine.png", "kramers.png", "tables.md"} <= names
     assert not [name for name in names if name.endswith(".part")]
     assert len(run.load(tmp_path)) == len(run.experiments(True))
     capsys.readouterr()
@@ -249,7 +248,7 @@ def test_the_page_has_the_committed_figures() -> None:
     results = {name: results[name] for name in settings}  # the tables' order
     sections = tables.sections(results)
     page = run.PAGE.read_text(encoding="utf-8")
-    assert tables.renewed(page, sections) == page
+    assert filled(page, sections, run.MARK) == page
 
 
 def test_what_the_page_says_of_the_nine_modes() -> None:
@@ -267,12 +266,16 @@ def test_what_the_page_says_of_the_nine_modes() -> None:
     assert mean("adam-positive", "modes") < mean("adam-clamped", "modes") < 8
 
 
-def test_renewing_a_page_twice_is_renewing_it_once() -> None:
+def test_filling_a_page_twice_is_filling_it_once() -> None:
     page = "before\n<!-- one -->\n<!-- end -->\nbetween\n<!-- two -->\nold\n<!-- end -->\n"
     texts = {"one": "1", "two": "2"}
-    renewed = tables.renewed(page, texts)
-    assert renewed == page.replace("one -->", "one -->\n1").replace("old", "2")
-    assert tables.renewed(renewed, texts) == renewed
+    made = filled(page, texts, run.MARK)
+    assert made == page.replace("one -->", "one -->\n1").replace("old", "2")
+    assert filled(made, texts, run.MARK) == made
+    with pytest.raises(ValueError, match="0 places for 'three'"):
+        filled(page, texts | {"three": "3"}, run.MARK)
+    with pytest.raises(ValueError, match="marker <!-- two --> is unknown; there are one"):
+        filled(page, {"one": "1"}, run.MARK)
 
 
 def test_what_the_page_says_of_the_rates() -> None:

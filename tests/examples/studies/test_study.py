@@ -16,13 +16,20 @@ import torch
 from splatting.arms import Arm
 from splatting.fit import Fit, FitOptions
 from splatting.scenes import load_scene
+from studies.pages import filled
 from studies.scenes import report, steps
 from studies.scenes.analysis import Study
-from studies.scenes.arms import BASELINE, STUDY_ARMS, find_study_arm
+from studies.scenes.arms import (
+    BASELINE,
+    STUDY_ARMS,
+    adaptive,
+    find_study_arm,
+    last_phases,
+    whole_trainings,
+)
 from studies.scenes.arms import DEFAULTS as DEFAULT_ARM
 from studies.scenes.decisions import MANY_VIEWS_SCENES, decide, every_scene, points_of
 from studies.scenes.long_tables import reach_table, scenes_gain_table, sizes_table
-from studies.scenes.parts.chosen_fading import chosen_rows
 from studies.scenes.parts.own_step import OwnStep
 from studies.scenes.parts.step_lengths import StepLengths
 from studies.scenes.plan import plan, stages
@@ -31,9 +38,8 @@ from studies.scenes.run import main as run_study
 from studies.scenes.tables import machines_line
 from studies.scenes.training import Spec, machine, train
 from studies.scenes.view_angles import nearest_angles
-from torch import Tensor
 
-from opt3dgs_optim import DEFAULTS, Fading
+from opt3dgs_optim import DEFAULTS
 
 RECORDS = report.FOLDER / "records.json"
 
@@ -54,7 +60,7 @@ def test_the_pages_are_made_from_the_records() -> None:
     for path in report.PAGES:
         page = path.read_text(encoding="utf-8")
         assert "<!-- study:" in page
-        assert report.fill(page, made) == page, path
+        assert filled(page, made, report.MARK, every=False) == page, path
 
 
 def test_the_defaults_are_what_the_page_concludes() -> None:
@@ -68,7 +74,9 @@ def test_the_defaults_are_what_the_page_concludes() -> None:
 
 def test_every_rotated_training_is_of_a_stage() -> None:
     planned = {replace(spec, seed=0) for specs in stages().values() for spec in specs}
-    for (setting, arm), _ in report.rotating_study()._of.items():
+    for setting, arm in report.rotating_study()._of:
+        if STUDY_ARMS[arm].retired:
+            continue
         kind = {name: getattr(setting, name) for name in ("rotated", "size", "views", "tiled")}
         spec = Spec(setting.scene, arm, 0, setting.iterations, setting.points, **kind)
         assert spec in planned, spec
@@ -281,12 +289,6 @@ def _iterations(made: dict[str, object]) -> list[int]:
     return [row["iteration"] for row in curve]
 
 
-@pytest.mark.parametrize("name", ["own-step", "annealed-2", "settled-2-0.1", "faded-fresh"])
-def test_arms_train(tmp_path: Path, name: str) -> None:
-    made = train(Spec("embedded", name, 0, 60, 80), tmp_path, None, None)
-    assert np.isfinite(_psnr(made)).all()
-
-
 _embedded = cache(lambda: load_scene("embedded"))  # seconds to make
 
 
@@ -362,36 +364,6 @@ def test_bad_calls_say_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "no finished training" in capsys.readouterr().err
     with pytest.raises(ValueError, match="unknown; there are mcmc"):
         find_study_arm("nonsense")
-    with pytest.raises(ValueError, match="marker study:nonsense"):
-        report.fill("<!-- study:nonsense -->\n<!-- end -->", {})
-
-
-def test_stale_and_fresh_rows_are_found() -> None:
-    first = torch.tensor([[0.1, 0.0], [1.0, 1.0], [0.5, 0.0], [0.0, 0.0], [0.01, 0.01]])
-    moments = {"exp_avg": first, "exp_avg_sq": torch.tensor([[1.0, 1.0]] * 3 + [[0, 0], [1, 1]])}
-    # ratios: 0.005, 1, 0.125, never a gradient, 0.0001
-    assert chosen_rows(moments, 0.4, stale=True).tolist() == [4, 0]
-    assert chosen_rows(moments, 0.4, stale=False).tolist() == [1, 2]
-    assert sorted(chosen_rows(moments, 1.0, stale=True).tolist()) == [0, 1, 2, 4]
-
-
-@pytest.mark.parametrize("name", ["faded-stale", "faded-fresh"])
-def test_fading_of_chosen_points(name: str) -> None:
-    fit = _fit(name, iterations=60)
-    changed: dict[str, float] = {}
-    for _ in range(6):
-        before = {n: _second_moment(fit, n) for n in fit.gaussians}
-        fit.step()
-        for n, old in before.items():
-            # Without an event exp_avg_sq falls by a thousandth at most.
-            fallen = (_second_moment(fit, n) < 0.9 * old).reshape(len(old), -1).all(1)
-            changed[n] = max(changed.get(n, 0.0), fallen.float().mean().item())
-    assert min(changed.values()) > 0.0, changed
-
-
-def _second_moment(fit: Fit, name: str) -> Tensor:
-    state = fit.optimizers[name].state.get(fit.gaussians[name], {})
-    return state.get("exp_avg_sq", torch.zeros_like(fit.gaussians[name])).clone()
 
 
 def _own_step_lengths(times: float) -> dict[str, list[float]]:
@@ -408,7 +380,7 @@ def _own_step_lengths(times: float) -> dict[str, list[float]]:
         fit.step()
         # The Gaussians begin round: nothing turns them in the first step.
         for name, rows in lengths.rows.items() if iteration > 2 else []:
-            length = rows[-1][1] * rates[name]
+            length = rows[-1] * rates[name]
             # Points that no view has seen yet stand still, and do not count as steps.
             assert 0.3 < length / own.wanted(name, iteration / 40) < 1.5, (name, iteration)
             found[name].append(length)
@@ -443,9 +415,6 @@ def test_a_retired_arm_is_drawn_but_not_trained() -> None:
     assert study.gains(study.settings(report.SHORT), ["matrix"])
 
 
-def test_fading_follows_the_length_of_the_run() -> None:
-    make = find_study_arm("faded-3000").parts
-    assert make is not None
-    (fading,) = make(30_000, None)
-    assert isinstance(fading, Fading)
-    assert fading.events == 3_000
+def test_every_arm_with_code_is_listed() -> None:
+    coded = [*whole_trainings(), *(arm.name for arm in (*last_phases(), *adaptive()))]
+    assert not [name for name in coded if name not in STUDY_ARMS or STUDY_ARMS[name].retired]

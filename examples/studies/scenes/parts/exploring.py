@@ -39,7 +39,6 @@ class Wrapped(Part):
 
     @property
     def mean_multiplier(self) -> Tensor:
-        """Mean of nu since the warm-up, 0-d."""
         return self.histogram.mean_multiplier
 
     def observe(self, energy: Tensor, valid: Tensor | bool, course: Course) -> None:
@@ -47,19 +46,15 @@ class Wrapped(Part):
         self.histogram.observe(energy, valid, course)
 
     def factor(self, group: Group, course: Course) -> float | Tensor | None:
-        """Nu."""
         return self.histogram.factor(group, course)
 
     def numbers(self, course: Course) -> Mapping[str, float | Tensor]:
-        """The histogram's."""
         return self.histogram.numbers(course)
 
     def state_dict(self) -> dict[str, Any]:
-        """The histogram's."""
         return {"histogram": self.histogram.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore `state_dict()`."""
         self.histogram.load_state_dict(state["histogram"])
 
 
@@ -85,12 +80,10 @@ class ViewHistogram(Wrapped):
         self._means[self.view] = value if mean is None else mean + (value - mean) / VISITS
 
     def state_dict(self) -> dict[str, Any]:
-        """The histogram's, and the views' means."""
         means = [[view, mean] for view, mean in sorted(self._means.items())]
         return super().state_dict() | {"means": means}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore `state_dict()`."""
         super().load_state_dict(state)
         self._means = {int(view): float(mean) for view, mean in state["means"]}
 
@@ -108,11 +101,9 @@ class RestartedHistogram(Wrapped):
         super().observe(energy, valid, course)
 
     def state_dict(self) -> dict[str, Any]:
-        """The histogram's, and its warm-up."""
         return super().state_dict() | {"warmup": self.histogram.warmup}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore `state_dict()`."""
         self.histogram = EnergyHistogram(warmup=int(state["warmup"]))
         super().load_state_dict(state)
 
@@ -171,7 +162,6 @@ class NuPerPoint(Part):
         self._old = None
 
     def numbers(self, course: Course) -> dict[str, Tensor]:
-        """`nu_deviation`: over the points."""
         return {"nu_deviation": self._nu.std()} if len(self._nu) > 1 else {}
 
 

@@ -70,7 +70,6 @@ class OwnStep(Part):
         return grad
 
     def factor(self, group: Group, course: Course) -> float:
-        """What makes the step as long as is wanted."""
         name = group[SLOT]
         lr = float(group["lr"])
         if name not in self._sizes or lr == 0:
@@ -82,11 +81,9 @@ class OwnStep(Part):
         return {"own_step": self._sizes["means"]} if "means" in self._sizes else {}
 
     def state_dict(self) -> dict[str, Any]:
-        """Spread and sizes."""
         return {"spread": self._spread, "sizes": dict(self._sizes)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore `state_dict()`."""
         self._spread, self._sizes = float(state["spread"]), dict(state["sizes"])
 
 

@@ -18,12 +18,12 @@ class StepLengths(Part):
         every: n.
 
     Attributes:
-        rows: parameter -> (iteration from 1, length) of each step that was looked at.
+        rows: parameter -> length of each step that was looked at.
     """
 
     def __init__(self, every: int) -> None:
         self.every = every
-        self.rows: dict[str, list[tuple[int, float]]] = {}
+        self.rows: dict[str, list[float]] = {}
         self._old: dict[str, Tensor] = {}
 
     def before(
@@ -39,4 +39,4 @@ class StepLengths(Part):
         old = self._old.pop(str(group[SLOT]), None)
         if old is not None:
             length = float(((param.detach() - old) / group["lr"]).square().mean().sqrt())
-            self.rows.setdefault(str(group[SLOT]), []).append((course.iteration, round(length, 5)))
+            self.rows.setdefault(str(group[SLOT]), []).append(round(length, 5))
