@@ -196,8 +196,8 @@ OF_TORCH = "params argument given to the optimizer should be"
         (lambda: Fading(start=0.6, stop=0.5), "(0.6, 1.0]"),
         (lambda: Fading(names=("pose",)), "means, scales"),
         (lambda: Curvature(history_size=17), "1..16"),
-        (lambda: Curvature(backend="triton"), "but one of 'auto', 'cuda', 'torch'"),  # pyright: ignore
-        (lambda: backend_info("cpu", backend="triton"), "but one of 'auto', 'cuda', 'torch'"),  # pyright: ignore
+        (lambda: Curvature(backend="triton"), "but 'auto' or 'cuda' or 'torch'"),  # pyright: ignore
+        (lambda: backend_info("cpu", backend="triton"), "but 'auto' or 'cuda' or 'torch'"),  # pyright: ignore
         (lambda: awsgld(histogram=0.75), "histogram=0.75, but EnergyHistogram"),
         (lambda: awsgld(noise=0.1), "noise=0.1, but IsotropicNoise or Pos"),
         (lambda: lqnadam(differentiable=True), "LQNAdam: differentiable=True, but curvature pairs"),

@@ -43,18 +43,13 @@ def check_count(call: str, name: str, value: Any, low: int, high: int | None = N
     return value
 
 
-def check_choice(call: str, name: str, value: Any, allowed: Sequence[str]) -> str:
-    """Return `value`, or raise ValueError unless it is one of `allowed`."""
-    if not isinstance(value, str) or value not in allowed:
-        listed = ", ".join(repr(item) for item in allowed)
-        raise ValueError(f"{call}: {name}={value!r}, but one of {listed} is needed")
-    return value
-
-
-def check_flag(call: str, name: str, value: Any) -> bool:
-    """Return `value`, or raise ValueError unless it is True or False."""
-    if not isinstance(value, bool):
-        raise ValueError(f"{call}: {name}={value!r}, but True or False is needed")
+def check_choice(
+    call: str, name: str, value: Any, allowed: Sequence[str | bool] = (True, False)
+) -> Any:
+    """Return `value`, or raise ValueError unless it is one of `allowed`, and of its type."""
+    if not any(isinstance(value, type(each)) and value == each for each in allowed):
+        listed = " or ".join(map(repr, allowed))
+        raise ValueError(f"{call}: {name}={value!r}, but {listed} is needed")
     return value
 
 
@@ -63,8 +58,7 @@ def check_interval(call: str, name: str, value: Any) -> tuple[float, float]:
     pair = isinstance(value, (tuple, list)) and len(value) == 2
     if not pair:
         raise ValueError(f"{call}: {name}={value!r}, but a pair (low, high) is needed")
-    low = check_number(call, f"{name}[0]", value[0])
-    high = check_number(call, f"{name}[1]", value[1])
+    low, high = (check_number(call, f"{name}[{i}]", value[i]) for i in (0, 1))
     if low >= high:
         raise ValueError(f"{call}: {name}={value!r}, but low < high is needed")
     return low, high

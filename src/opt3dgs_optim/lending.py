@@ -118,6 +118,7 @@ def refuse_capture(call: str, course: Course) -> None:
 
 @functools.cache
 def own_step(base: type[Adam]) -> tuple[Callable[..., Any], bool]:
-    """The step of an Adam with arithmetic of its own; whether it is INRIA's `step(mask, N)`."""
+    """The step of an Adam; whether it is INRIA's `step(mask, N)`."""
+    # Unwrapped: torch's step hooks and its profiler are around our step already.
     step = inspect.unwrap(base.step)
     return step, len(inspect.signature(step).parameters) > 2

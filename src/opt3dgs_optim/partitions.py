@@ -29,8 +29,22 @@ MEAN_ABS = math.sqrt(2 / math.pi)  # mean absolute deviation of a Gaussian of de
 RESOLUTION = 1e-6  # smallest deviation, as a share of the present distance from the mean
 
 
+class Partitions:
+    """Pickled by its numbers: a pickle of its tensors gives every view memory of its own."""
+
+    def __getstate__(self: Any) -> Any:
+        plain = {key: value for key, value in vars(self).items() if not isinstance(value, Tensor)}
+        return plain, self.nu.device, self.state()
+
+    def __setstate__(self: Any, kept: Any) -> None:
+        plain, device, state = kept
+        vars(self).update(plain)
+        self.allocate(device)
+        self.load(state)
+
+
 @dataclass(eq=False)
-class FixedPartitions:
+class FixedPartitions(Partitions):
     """Eq. 7, 13, 14 and 16 as the paper has them.
 
     Options as in `EnergyHistogram`, methods as in `MovingPartitions`.
@@ -106,7 +120,7 @@ class FixedPartitions:
         self._scalars.copy_(torch.tensor(state["scalars"], dtype=torch.float64))
 
 
-class MovingPartitions:
+class MovingPartitions(Partitions):
     """Partitions of z = (energy - recent mean) / recent deviation, over -6 to 6 deviations.
 
     q is the density of the recent z. A visit is spread over the partitions by a Gaussian k of

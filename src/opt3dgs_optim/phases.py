@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-from opt3dgs_optim.checks import check_count, check_flag, check_number, warn_user
+from opt3dgs_optim.checks import check_choice, check_count, check_number, warn_user
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import block
 from opt3dgs_optim.part import Part, Phase
@@ -89,7 +89,7 @@ class PhaseScheduler(Course):
             DEFAULTS if parts is None else parts,
             total_steps=total_steps,
             switch_step=switch_step,
-            adaptive=check_flag(CALL, "adaptive", adaptive),
+            adaptive=check_choice(CALL, "adaptive", adaptive),
         )
         if log is not None and not hasattr(log, "step"):
             raise ValueError(f"{CALL}: log={log!r}, but a RunLog or None is needed")

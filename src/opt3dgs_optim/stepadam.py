@@ -1,6 +1,5 @@
 """The only Adam: torch's own step, with the parts of a course before, in and after it."""
 
-import inspect
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -14,9 +13,6 @@ from opt3dgs_optim.lending import Lent, guard, own_step, refuse_capture, use_fus
 from opt3dgs_optim.names import SLOT, block, canonical_name, group_name
 from opt3dgs_optim.part import Group, Part
 from opt3dgs_optim.rows import Frozen, Ledger, check_mask, check_rows, shaped
-
-# Unwrapped: torch's step hooks and its profiler are around our step already.
-ADAM_STEP = inspect.unwrap(Adam.step)
 
 
 class StepAdam(Adam):
@@ -160,11 +156,8 @@ class StepAdam(Adam):
         return found[slot]
 
     def _step_base(self, mask: Tensor | None) -> None:
-        if self.base is Adam:
-            ADAM_STEP(self)
-            return
         step, takes_number = own_step(self.base)
-        if mask is None:
+        if mask is None or self.base is Adam:
             step(self)
             return
         if isinstance(self.course.valid, Tensor):

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.backend import BACKENDS, Backend, obstacle
-from opt3dgs_optim.checks import check_choice, check_count, check_flag, check_number
+from opt3dgs_optim.checks import check_choice, check_count, check_number
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.lbfgs.history import MAX_HISTORY, history_shape, laid_out, new_history
 from opt3dgs_optim.lbfgs.two_loop import foresight, lqn_direction
@@ -61,9 +61,9 @@ class Curvature(Part):
         call = type(self).__name__
         self.history_size = check_count(call, "history_size", history_size, 1, MAX_HISTORY)
         self.min_cosine = check_number(call, "min_cosine", min_cosine, 0.0, 1.0, open_high=True)
-        self.graft = check_flag(call, "graft", graft)
+        self.graft = check_choice(call, "graft", graft)
         self.names = None if names is None else check_names(call, names)
-        self.backend: Backend = check_choice(call, "backend", backend, BACKENDS)  # pyright: ignore
+        self.backend: Backend = check_choice(call, "backend", backend, BACKENDS)
         self._step = -1  # of the tally
         self._tally = torch.zeros(2)  # [accepted, candidates] of the last step
         self._seen = torch.zeros(4)  # those and [foresight, points looked at], of all steps

@@ -90,8 +90,6 @@ class Fading(Part):
         # The step of iteration i comes after i + 1 observations.
         now = self.events_before(course.iteration, course.total_steps)
         done = group.get(DONE)
-        if done == now:
-            return grad
         if done is None:
             done = self.events_before(course.iteration - 1, course.total_steps)
         group[DONE] = now
