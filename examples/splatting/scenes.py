@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -141,9 +141,10 @@ def _split(folder: Path, names: list[str], held_out: int | None) -> tuple[list[s
 
 def _read_split(path: Path, names: list[str]) -> tuple[list[str], list[str]]:
     table = read_json_object(path)
-    train, test = parts = table.get("train"), table.get("test")
+    parts: list[Any] = [table.get("train"), table.get("test")]
     if not all(isinstance(p, list) and all(isinstance(n, str) for n in p) for p in parts):
         raise ValueError(f"{path}: expected lists of image names under 'train' and 'test'")
+    train, test = parts
     unknown = sorted({*train, *test}.difference(names))
     if unknown:
         raise ValueError(f"{path}: names {unknown}, which the scene's model does not have")

@@ -134,7 +134,7 @@ class StepAdam(Adam):
                 said = [part.factor(group, course) for part in factors]
                 lent.rate(group, [factor for factor in said if factor is not None], course.valid)
             if fused:  # as a GradScaler tells torch's step not to be made
-                lent.attribute(self, "found_inf", (~course.valid).to(torch.float32))
+                lent.attribute(self, "found_inf", (~cast(Tensor, course.valid)).to(torch.float32))
             self._step_base(mask)
         for group, param, parts in moved:
             for part in parts:
