@@ -10,6 +10,7 @@ import pytest
 import torch
 from oracles import adam_steps
 from torch import Tensor
+from trainers import gaussians
 
 from opt3dgs_optim import AWSGLD, EnergyHistogram, IsotropicNoise, PositionNoise
 
@@ -222,3 +223,19 @@ def test_optimizers_may_share_a_histogram() -> None:
         for optimizer in optimizers:
             optimizer.step()
     assert histogram.num_observed == 8
+
+
+def test_a_second_group_takes_the_positions_noise_from_an_unnamed_one() -> None:
+    """Of one group alone it is clear that it holds the positions."""
+    means = torch.nn.Parameter(torch.zeros(4, 3, dtype=torch.float64))
+    other = torch.nn.Parameter(torch.zeros(2))
+    optimizer = AWSGLD([means], lr=0.1, noise=PositionNoise(gaussians(4), scale=1.0))
+    moved = []
+    for groups in (1, 2):
+        if groups == 2:
+            optimizer.add_param_group({"params": [other]})
+        before = means.detach().clone()
+        means.grad, other.grad = torch.zeros_like(means), torch.zeros_like(other)
+        optimizer.step()
+        moved.append(not torch.equal(means, before))
+    assert moved == [True, False]
