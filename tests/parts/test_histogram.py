@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import pickle
 import re
 from typing import Any
 
@@ -33,6 +34,18 @@ def stream(count: int, seed: int = 0) -> list[float]:
 
 def nus_of(histogram: EnergyHistogram, energies: Any) -> np.ndarray:
     return np.array([float(histogram.observe(energy)) for energy in energies])
+
+
+@pytest.mark.parametrize("options", [{}, FIXED], ids=["moving", "fixed"])
+def test_a_pickled_one_goes_on_as_its_original(options: dict[str, Any]) -> None:
+    histogram = EnergyHistogram(**{"warmup": 4, **options})
+    nus_of(histogram, stream(40))
+    twin = pickle.loads(pickle.dumps(histogram))
+    assert twin.state_dict() == histogram.state_dict()
+    later = [nus_of(each, stream(40, seed=1)) for each in (histogram, twin)]
+    assert later[0].tolist() == later[1].tolist()
+    assert twin.state_dict() == histogram.state_dict()
+    assert repr(twin) == repr(histogram)
 
 
 # -- the paper's update ----------------------------------------------------------------------------
