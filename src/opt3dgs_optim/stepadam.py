@@ -116,8 +116,8 @@ class StepAdam(Adam):
         if mask is not None:
             self._check_mask(mask)
         unknown = isinstance(course.valid, Tensor)  # only the device knows whether the step counts
-        fused = unknown and self.base is Adam and all(g["fused"] for g in self.param_groups)
-        back = unknown and not fused and (self.base is Adam or mask is None)
+        drops = unknown and self.base is Adam and all(g["fused"] for g in self.param_groups)
+        back = unknown and not drops and (self.base is Adam or mask is None)
         with Lent() as lent:
             for group in self.param_groups:
                 befores, factors, afters = self._parts_of(group) if acting else ([], [], [])
@@ -133,7 +133,7 @@ class StepAdam(Adam):
                     moved.append((group, param, afters))
                 said = [part.factor(group, course) for part in factors]
                 lent.rate(group, [factor for factor in said if factor is not None], course.valid)
-            if fused:  # as a GradScaler tells torch's step not to be made
+            if drops:  # as a GradScaler tells torch's step not to be made
                 lent.attribute(self, "found_inf", (~cast(Tensor, course.valid)).to(torch.float32))
             self._step_base(mask)
         for group, param, parts in moved:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from studies.scenes.analysis import Gain, Study
 from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, FADED, label
@@ -105,10 +107,7 @@ def plot_metrics(
         column[1].set_xlabel("seconds, as a share of stock's")
     axes[0, 0].set_ylabel("test PSNR (dB)")
     axes[1, 0].set_ylabel("test LPIPS")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(arms), frameon=False)
-    figure.savefig(path, dpi=DPI)
-    plt.close(figure)
+    _finish(figure, axes[0, 0], path)
 
 
 def plot_sizes(study: Study, path: Path) -> None:
@@ -146,7 +145,12 @@ def plot_sizes(study: Study, path: Path) -> None:
         column[1].set_xlabel(f"{axis}\n{SIZE_AXES[axis]}")
     axes[0, 0].set_ylabel("gain in test PSNR (dB)")
     axes[1, 0].set_ylabel("change of test LPIPS")
-    handles, labels = axes[0, 2].get_legend_handles_labels()
+    _finish(figure, axes[0, list(SIZE_AXES).index("iterations")], path)  # which has all scenes
+
+
+def _finish(figure: Figure, axis: Axes, path: Path) -> None:
+    """Save a figure with the legend of one of its axes below all of them."""
+    handles, labels = axis.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
     figure.savefig(path, dpi=DPI)
     plt.close(figure)
