@@ -48,7 +48,6 @@ UNFADED = {name: f"{DEFAULTS}-{name}-unfaded" for name in ("means", "opacities")
 SHARE_KEPT = f"{DEFAULTS}-share-kept"  # the defaults before Fading counted the points
 OWN_STEP = "own-step+faded"
 SELDOM_FADED = f"{DEFAULTS}-100-events"
-GROW_GRAD = 2e-4  # gsplat's own threshold
 
 # As measured, so that a change of the package's defaults does not change what an arm was.
 ANNEALING = Annealing(4.0, 0.4, 1.0, names=("scales", "quats", "opacities", "sh0", "shN"))
@@ -64,9 +63,7 @@ class StudyArm(Arm):
     control: str = BASELINE
     switch: float = 1.0  # where exploitation starts
     trunk: str | None = None  # branch off this arm's run at the switch
-    # The gradient above which gsplat's DefaultStrategy, in the place of 3DGS-MCMC's, clones and
-    # splits; 0: it is not in its place.
-    adaptive: float = 0.0
+    adaptive: bool = False  # gsplat's DefaultStrategy in the place of 3DGS-MCMC's
     retired: bool = False  # its code is gone, its records are kept
 
     def make(
@@ -141,11 +138,7 @@ def last_phases() -> list[StudyArm]:
 
 
 def adaptive() -> list[StudyArm]:
-    """Clone, split and reset instead of 3DGS-MCMC.
-
-    gsplat's threshold is that of a gradient over the image's width, whatever its pixels: at a
-    quarter of the width four times of it leaves as many Gaussians per pixel as at full size.
-    """
+    """Clone, split and reset instead of 3DGS-MCMC."""
     kinds = {
         "": None,
         "+faded": of(FADING),
@@ -153,8 +146,7 @@ def adaptive() -> list[StudyArm]:
         "+defaults": of(ANNEALING, FADING),
     }
     return [
-        StudyArm(f"{name}{kind}", parts=parts, mcmc=False, adaptive=threshold)
-        for name, threshold in (("adc", 4 * GROW_GRAD), ("adc-dense", GROW_GRAD))
+        StudyArm(f"adc{kind}", parts=parts, mcmc=False, adaptive=True)
         for kind, parts in kinds.items()
     ]
 
