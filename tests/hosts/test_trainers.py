@@ -4,6 +4,7 @@
 trainer (names in `examples/hosts/trials.py`), and OPT3DGS_SCENE: a scene in COLMAP's layout, with
 photos in `images` and `images_4`. Some sixty trainings, each 20 to 40 seconds of a core to itself.
 With OPT3DGS_RECORD what came of them goes into docs/hosts/survey.json (use `-n 1` then).
+nerfstudio 1.1.5 needs a Pillow below 11.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ NEEDED = {
 }
 GAUSSIANS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
 OURS = 1.5  # dB that an edited run of 100 iterations may be worse than the stock one
+# Likewise one that takes over at half: opacities that annealing slows do not recover from a reset.
+RESUMED = 2.5
 
 pytestmark = pytest.mark.hosts
 
@@ -72,13 +75,13 @@ def test_stock_edited_and_resumed(trial: Trial, scene: Path, tmp_path: Path) -> 
     assert got.ours.code == 0, got.ours.output[-3000:]
     assert f"total_steps={ITERATIONS}," in got.ours.output  # the sign of life
     assert got.checkpoint is not None
-    no_worse(got.ours, got.stock)
+    no_worse(got.ours, got.stock, OURS)
     if trial.gsplat:
         return
     for done, begun in ((got.own, got.ours), (got.theirs, got.stock)):
         assert done is not None
         assert done.code == 0, done.output[-3000:]
-        no_worse(done, begun)
+        no_worse(done, begun, RESUMED)
     if trial.trainer == "nerfstudio":  # whose own optimizers never step again after a resume
         for out in ("own", "theirs"):
             (last,) = (tmp_path / out).glob(f"run/*/one/*/step-{ITERATIONS - 1:09d}.ckpt")
@@ -87,11 +90,11 @@ def test_stock_edited_and_resumed(trial: Trial, scene: Path, tmp_path: Path) -> 
             assert steps == {ITERATIONS}
 
 
-def no_worse(done: Done, begun: Done) -> None:
+def no_worse(done: Done, begun: Done, allowed: float) -> None:
     assert (done.psnr is None) == (begun.psnr is None)
     if done.psnr is not None and begun.psnr is not None:
         assert math.isfinite(done.psnr)
-        assert done.psnr > begun.psnr - OURS
+        assert done.psnr > begun.psnr - allowed
 
 
 def test_edited_scripts_use_no_unknown_name(tmp_path: Path) -> None:
