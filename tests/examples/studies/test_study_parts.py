@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -205,6 +205,18 @@ def test_adaptive_density_control_grows_and_resumes(tmp_path: Path) -> None:
         fit.step()
     assert len(fit.gaussians["means"]) > 120
     assert fit.relocated == 0
+
+
+def test_smaller_images_raise_the_density_threshold() -> None:
+    pytest.importorskip("gsplat")
+    from studies.scenes.adaptive import AdaptiveFit
+
+    scene, arm, options = embedded(), find_study_arm("adc"), FitOptions(60, 120)
+    width = scene.train[0].camera.width
+    for name, factor in (("embedded", 1.0), ("lego", 800 / width)):
+        fit = AdaptiveFit(replace(scene, name=name), arm, options)
+        strategy: Any = vars(fit.density)["strategy"]
+        assert strategy.grow_grad2d == pytest.approx(2e-4 * factor)
 
 
 def test_a_trainer_with_other_rates_makes_other_steps() -> None:
