@@ -141,13 +141,17 @@ def metrics_table(
 
 
 def headline_table(study: Study, long: Sequence[Setting], short: int) -> str:
-    """Stock beside the defaults at both lengths, means over the seeds: what a reader sees first."""
+    """Stock beside the defaults at both lengths: what a reader sees first.
+
+    Means over the seeds that both have, since a seed has held-out views of its own.
+    """
     rows = []
     for count in (long[0].iterations, short) if long else ():
-        for what, arm in (("stock", BASELINE), ("**defaults**", DEFAULTS)):
-            found = [study.runs(replace(s, iterations=count), arm) for s in long]
-            cells = [_cell(list(records.values()), seeds=False) for records in found]
-            rows.append((f"{what}, {count:,}", *cells))
+        settings = [replace(setting, iterations=count) for setting in long]
+        pairs = difference(study, settings, DEFAULTS, BASELINE).pairs
+        for what, ours in (("stock", False), ("**defaults**", True)):
+            found = [[a if ours else b for a, b, _ in pairs.get(s.scene, [])] for s in settings]
+            rows.append((f"{what}, {count:,}", *(_cell(records, seeds=False) for records in found)))
     return table(["iterations", *(setting.scene for setting in long)], "l", rows)
 
 
@@ -201,11 +205,8 @@ def reach_table(study: Study, long: Sequence[Setting], arms: Sequence[str], shor
         stock, brief = study.runs(setting, BASELINE), replace(setting, iterations=short)
         for arm in arms:
             found, quick = difference(study, [setting], arm, BASELINE), study.runs(brief, arm)
-            reached = [
-                ours.reached(theirs.final)
-                for pairs in found.pairs.values()
-                for ours, theirs, _ in pairs
-            ]
+            pairs = found.pairs.get(setting.scene, [])
+            reached = [ours.reached(theirs.final) for ours, theirs, _ in pairs]
             both = sorted(quick.keys() & stock.keys())
             if not reached and not both:
                 continue
@@ -217,8 +218,8 @@ def reach_table(study: Study, long: Sequence[Setting], arms: Sequence[str], shor
                 gain = fmean(quick[s].final - stock[s].final for s in both)
                 share = short / total * study.cost(brief, arm)
                 beside = f"{gain:+.2f} dB in x{share:.2f} of its seconds"
-            final = fmean(record.final for record in stock.values())
-            ends = f"{final:.2f} dB ({len(stock)})"
+            finals = [theirs.final for _, theirs, _ in pairs] or [stock[s].final for s in both]
+            ends = f"{fmean(finals):.2f} dB ({len(finals)})"
             rows.append((setting.scene, ends, f"`{label(arm)}`", said, beside))
     heads = ["scene", f"stock, {total:,} iterations", "arm", "reaches stock's PSNR after"]
     return table([*heads, f"trained for {short:,} iterations only"], "l", rows)

@@ -29,7 +29,7 @@ from studies.scenes.arms import (
 )
 from studies.scenes.arms import DEFAULTS as DEFAULT_ARM
 from studies.scenes.decisions import MANY_VIEWS_SCENES, decide, every_scene, points_of
-from studies.scenes.long_tables import reach_table, scenes_gain_table, sizes_table
+from studies.scenes.long_tables import headline_table, reach_table, scenes_gain_table, sizes_table
 from studies.scenes.parts.own_step import OwnStep
 from studies.scenes.parts.step_lengths import StepLengths
 from studies.scenes.plan import plan, stages
@@ -180,15 +180,16 @@ def test_a_line_compares_arms_of_one_seed() -> None:
     assert table.splitlines()[2:] == [line]
 
 
-def test_when_stocks_quality_is_reached() -> None:
-    stock, ours = (
-        rotated_record(arm, "a", 0, psnr=psnr)
-        for arm, psnr in ((BASELINE, 20.0), (DEFAULT_ARM, 30.0))
-    )
-    study = Study([stock, ours])
+def test_when_stocks_quality_is_reached_over_the_seeds_of_both() -> None:
+    runs = (BASELINE, 0, 20.0), (DEFAULT_ARM, 0, 30.0), (BASELINE, 1, 28.0)
+    study = Study([rotated_record(arm, "a", seed, psnr=psnr) for arm, seed, psnr in runs])
     said = reach_table(study, study.all_settings(), [BASELINE, DEFAULT_ARM], 3_000)
-    assert "| `defaults` | x0.50 of its seconds | - |" in said
-    assert "20.00 dB" in said
+    assert "| 20.00 dB (1) | `defaults` | x0.50 of its seconds | - |" in said
+    first = headline_table(study, study.all_settings(), 3_000).splitlines()[2:4]
+    assert first == [
+        "| stock, 7,500 | 20.00 / 0.700 / 0.200 |",
+        "| **defaults**, 7,500 | 30.00 / 0.700 / 0.200 |",
+    ]
 
 
 def test_gain_at_equal_seconds_and_its_spread() -> None:
