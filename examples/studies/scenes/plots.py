@@ -87,18 +87,20 @@ def plot_curves(study: Study, settings: Sequence[Setting], arms: Sequence[str], 
 def plot_metrics(
     study: Study, settings: Sequence[Setting], arms: Sequence[str], path: Path
 ) -> None:
-    """PSNR and LPIPS of the held-out views over stock's seconds, a column per scene."""
+    """PSNR and LPIPS of the held-out views over stock's seconds, a column per scene.
+
+    Means over the seeds that all of a scene's arms have: a seed has held-out views of its own.
+    """
     figure, axes = plt.subplots(
         2, len(settings), figsize=(3.6 * len(settings), 5.0), squeeze=False, layout="constrained"
     )
     for column, setting in zip(axes.T, settings, strict=True):
-        for arm in arms:
-            cost = study.cost(setting, arm)
+        runs = {arm: found for arm in arms if (found := study.runs(setting, arm))}
+        shared = sorted(set.intersection(*map(set, runs.values()))) if runs else []
+        for arm, found in runs.items() if shared else ():
+            records = [found[seed] for seed in shared]
+            shares = records[0].curve["iteration"] * study.cost(setting, arm) / setting.iterations
             for axis, metric in zip(column, ("psnr", "lpips"), strict=True):
-                records = list(study.runs(setting, arm).values())
-                if not records:
-                    continue
-                shares = records[0].curve["iteration"] * cost / setting.iterations
                 mean = np.mean([record.curve[metric] for record in records], axis=0)
                 # The first looks are off the scale of what is compared.
                 axis.plot(shares[2:], mean[2:], color=COLOURS[arm], label=label(arm))
