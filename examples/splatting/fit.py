@@ -185,9 +185,11 @@ class Fit:
     def _train_image(self, view: View) -> Tensor:
         return self._render(view).image
 
-    def _render(self, view: View) -> Rendering:
-        degree, background = self.active_sh_degree, self.scene.background
-        return render(self.gaussians, view.camera, sh_degree=degree, background=background)
+    def _render(self, view: View, offset: Tensor | None = None) -> Rendering:
+        degree, behind = self.active_sh_degree, self.scene.background
+        return render(
+            self.gaussians, view.camera, sh_degree=degree, background=behind, offset=offset
+        )
 
     @property
     def active_sh_degree(self) -> int:

@@ -25,6 +25,24 @@ class Rendering:
     image: Tensor  # [H, W, 3] linear in the colours, not limited to 1
     alpha: Tensor  # [H, W] in [0, 1)
     visible: Tensor  # [N] bool, projected inside the image with positive radius
+    footprints: Tensor  # [V, 6] of the visible: mean x, y, covariance xx, xy, yy, its determinant
+
+    @property
+    def means2d(self) -> Tensor:
+        """The projected means [N, 2] in pixels, 0 where not visible."""
+        return self._of_all(self.footprints[:, :2])
+
+    @property
+    def radii(self) -> Tensor:
+        """Three standard deviations along the longer axis [N], in whole pixels; 0: not visible."""
+        middle = self.footprints[:, [2, 4]].mean(1)
+        spread = (middle.square() - self.footprints[:, 5]).clamp(min=0.1).sqrt()
+        return self._of_all((3 * (middle + spread).sqrt()).ceil())
+
+    def _of_all(self, values: Tensor) -> Tensor:
+        everything = self.image.new_zeros(len(self.visible), *values.shape[1:])
+        everything[self.visible] = values.to(everything)
+        return everything
 
 
 def render(
@@ -33,6 +51,7 @@ def render(
     *,
     sh_degree: int | None = None,
     background: Tensor | None = None,
+    offset: Tensor | None = None,
     backend: Backend = "auto",
 ) -> Rendering:
     """Render Gaussians as gsplat 1.5.3 does with its defaults ("classic" mode, no antialiasing).
@@ -45,6 +64,7 @@ def render(
         camera: The pinhole camera.
         sh_degree: The highest degree of spherical harmonics to use; by default all there are.
         background: The colour [3] behind everything; by default black.
+        offset: Zeros [N, 2], whose gradient will be that of the projected means, in 1 / pixels.
         backend: "fast", compiled, for float32 on the CPU with constant cameras; "reference",
             plain torch of any floating dtype on any device, whose memory grows as pixels times
             points, differentiable in the camera's pose too; or "auto", the fast one where it can.
@@ -65,15 +85,21 @@ def render(
     elif background.shape != (3,):
         raise ValueError(f"render: background has shape {tuple(background.shape)}, must be (3,)")
     background = background.to(means)
+    if offset is not None and offset.shape != (len(means), 2):
+        raise ValueError(f"render: offset is {tuple(offset.shape)}, must be ({len(means)}, 2)")
     if backend == "reference" or (backend == "auto" and _obstacle(means, camera)):
-        return _render_reference(values, camera.to(means.dtype), degree, background)
+        return _render_reference(values, camera.to(means.dtype), degree, background, offset)
     from splatting.fast.rasterizer import Rasterize  # numba stays optional
 
-    return Rendering(*Rasterize.apply(*values.values(), background, camera, degree))
+    return Rendering(*Rasterize.apply(*values.values(), background, offset, camera, degree))
 
 
 def _render_reference(
-    values: Mapping[str, Tensor], camera: Camera, degree: int, background: Tensor
+    values: Mapping[str, Tensor],
+    camera: Camera,
+    degree: int,
+    background: Tensor,
+    offset: Tensor | None,
 ) -> Rendering:
     means, quats, scales = values["means"], values["quats"], values["scales"]
     # Cull first and differentiate only what is left: a point behind the camera would otherwise
@@ -85,7 +111,7 @@ def _render_reference(
     projection = project(means, quats, scales, camera)
     coefficients = torch.cat([values["sh0"], values["shN"]], 1)[visible]
     image, alpha = composite(
-        projection.means,
+        projection.means if offset is None else projection.means + offset[visible],
         projection.conics,
         sh_colors(means, camera.position, coefficients, degree),
         torch.sigmoid(values["opacities"][visible]),
@@ -94,7 +120,9 @@ def _render_reference(
         width=camera.width,
         height=camera.height,
     )
-    return Rendering(image, alpha, visible)
+    ellipses = projection.covariances, projection.determinants[:, None]
+    footprints = torch.cat([projection.means, *ellipses], 1).detach()
+    return Rendering(image, alpha, visible, footprints)
 
 
 def _higher_harmonics(gaussians: Mapping[str, Tensor]) -> Tensor:

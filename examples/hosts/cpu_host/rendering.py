@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import torch
 from splatting.camera import Camera
-from splatting.projection import Projection, project
 from splatting.rasterizer import render
 from splatting.spherical_harmonics import SH_0, sh_colors
 from torch import Tensor
@@ -37,8 +36,7 @@ def draw(
     """Render Gaussians given by their activated values.
 
     The Gaussians are moved into the camera's frame first, so that the pose gets gradients from
-    any rasterizer. A shift in pixels becomes one in that frame; the covariance's small dependence
-    on it is in its gradient too, which the trainers' own rasterizers leave out.
+    any rasterizer.
 
     Args:
         means: [N, 3] world units.
@@ -52,11 +50,6 @@ def draw(
     """
     rotation, shift = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     inside = means @ rotation.T + shift
-    depths = inside[:, 2]
-    if offset is not None:
-        focal = torch.tensor([camera.fx, camera.fy], dtype=means.dtype)
-        pixels = offset * depths.detach().clamp(min=1e-6)[:, None] / focal
-        inside = inside + torch.cat([pixels, torch.zeros_like(pixels[:, :1])], 1)
     camera = replace(camera, viewmat=torch.eye(4, dtype=means.dtype))  # looks along z
     gaussians = {
         "means": inside,
@@ -65,24 +58,13 @@ def draw(
         "opacities": torch.logit(opacities.clamp(1e-7, 1 - 1e-7)),
         "sh0": ((colors - 0.5) / SH_0)[:, None],
     }
-    rendering = render(gaussians, camera, sh_degree=0, background=background)
-    with torch.no_grad():
-        geometry = (inside, gaussians["quats"], gaussians["scales"])
-        means2d, radii = _footprints(project(*geometry, camera))
-        radii = torch.where(rendering.visible, radii, torch.zeros_like(radii))
-    return Drawn(rendering.image, rendering.alpha, rendering.visible, means2d, radii, depths)
+    got = render(gaussians, camera, sh_degree=0, background=background, offset=offset)
+    return Drawn(got.image, got.alpha, got.visible, got.means2d, got.radii, inside[:, 2])
 
 
 def view_colors(means: Tensor, coefficients: Tensor, degree: int, camera: Camera) -> Tensor:
     """Colours [N, 3] of spherical harmonics [N, K, 3] up to a degree, seen from a camera."""
     return sh_colors(means, camera.position, coefficients[:, : (degree + 1) ** 2], degree)
-
-
-def _footprints(projection: Projection) -> tuple[Tensor, Tensor]:
-    """Projected means [N, 2], and radii [N] of three standard deviations, in whole pixels."""
-    middle = projection.covariances[:, [0, 2]].mean(1)
-    spread = (middle.square() - projection.determinants).clamp(min=0.1).sqrt()
-    return projection.means.nan_to_num(), (3 * (middle + spread).sqrt()).ceil()
 
 
 def _quaternion(rotation: Tensor) -> Tensor:

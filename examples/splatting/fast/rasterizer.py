@@ -36,7 +36,7 @@ def _lens(camera: Camera) -> np.ndarray:
 
 
 class Rasterize(torch.autograd.Function):
-    """Gaussians and background to image [H, W, 3], alpha [H, W], visible [N]; see `render`."""
+    """Gaussians and background to what a `Rendering` is made of; see `render`."""
 
     @staticmethod
     def forward(  # type: ignore[override]
@@ -48,9 +48,10 @@ class Rasterize(torch.autograd.Function):
         sh0: Tensor,
         shN: Tensor,
         background: Tensor,
+        offset: Tensor | None,
         camera: Camera,
         degree: int,
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         arrays = [_array(t) for t in (means, quats, scales, opacities)]
         pose = camera.to(torch.float64)
         viewmat, viewpoint, lens = _array(pose.viewmat), _array(pose.position), _lens(camera)
@@ -70,13 +71,13 @@ class Rasterize(torch.autograd.Function):
         ctx.camera_arrays = viewmat, viewpoint, lens, degree
         ctx.points = index, geometry, points, colors, splats, len(means)
         ctx.pixels = behind, transmittance, finished, stops, lists
-        visible = torch.from_numpy(visible)
-        ctx.mark_non_differentiable(visible)
-        return torch.from_numpy(image), torch.from_numpy(alpha), visible
+        found = torch.from_numpy(visible), torch.from_numpy(geometry[:, :6])
+        ctx.mark_non_differentiable(*found)
+        return torch.from_numpy(image), torch.from_numpy(alpha), *found
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad_image: Tensor, grad_alpha: Tensor, _: Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, grad_image: Tensor, grad_alpha: Tensor, *_: Tensor) -> Any:  # type: ignore[override]
         viewmat, viewpoint, lens, degree = ctx.camera_arrays
         index, geometry, points, colors, splats, count = ctx.points
         means, quats, scales, _, shN = points
@@ -106,4 +107,6 @@ class Rasterize(torch.autograd.Function):
             everything[index] = grad
             return torch.from_numpy(everything)
 
-        return *map(of_all, grads), torch.from_numpy(by_background).float(), None, None
+        by_offset = of_all(by_means2d) if ctx.needs_input_grad[7] else None
+        by_all = torch.from_numpy(by_background).float(), by_offset
+        return *map(of_all, grads), *by_all, None, None

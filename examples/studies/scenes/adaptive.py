@@ -21,6 +21,9 @@ FULL_WIDTH = {"bonsai": 1559, "lego": 800, "plush": 640}
 class DefaultDensityControl:
     """gsplat's DefaultStrategy, as `Fit` calls density control.
 
+    gsplat 1.5.3 never resets the opacities (`0 & step > 0` is false); the releases before and
+    after it do, and so does this.
+
     Args:
         extent: the scene's, in world units.
         threshold: the gradient of the projected means above which it clones and splits.
@@ -33,14 +36,18 @@ class DefaultDensityControl:
     def __init__(self, extent: float, threshold: float) -> None:
         gsplat_modules.install()
         self.strategy = importlib.import_module("gsplat").DefaultStrategy(grow_grad2d=threshold)
+        self.reset = importlib.import_module("gsplat.strategy.ops").reset_opa
         self.state: dict[str, Any] = self.strategy.initialize_state(scene_scale=extent)
         self.info: dict[str, Any] = {}
 
     def step(self, iteration: int, gaussians: dict[str, Parameter], optimizers: Optimizers) -> int:
         """What the strategy does after the optimizers' step; nothing is relocated."""
-        self.strategy.step_post_backward(
+        strategy = self.strategy
+        strategy.step_post_backward(
             gaussians, optimizers, self.state, iteration, self.info, packed=False
         )
+        if 0 < iteration < strategy.refine_stop_iter and iteration % strategy.reset_every == 0:
+            self.reset(gaussians, optimizers, self.state, 2 * strategy.prune_opa)
         return 0
 
 
@@ -57,27 +64,16 @@ class AdaptiveFit(Fit):
         return DefaultDensityControl(self.scene.extent, shrunk * GROW_GRAD)
 
     def _train_image(self, view: View) -> Tensor:
-        gaussians, camera, density = self.gaussians, view.camera, self.density
+        density, camera = self.density, view.camera
         assert isinstance(density, DefaultDensityControl)
-        lens = torch.tensor(
-            [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
-        )
-        parts: list[Tensor] = [gaussians[name] for name in ("sh0", "shN") if name in gaussians]
-        images, _, density.info = gsplat_modules.rasterize(
-            gaussians["means"],
-            gaussians["quats"],
-            gaussians["scales"].exp(),
-            torch.sigmoid(gaussians["opacities"]),
-            torch.cat(parts, 1),
-            camera.viewmat[None],
-            lens[None],
-            camera.width,
-            camera.height,
-            sh_degree=self.active_sh_degree,
-            packed=False,
-            backgrounds=self.scene.background[None],
-        )
-        density.strategy.step_pre_backward(
-            gaussians, self.optimizers, density.state, self.iteration, density.info
-        )
-        return images[0]
+        means2d = torch.zeros(1, len(self.gaussians["means"]), 2, requires_grad=True)
+        rendering = self._render(view, means2d[0])
+        density.info = {
+            "means2d": means2d,
+            "radii": rendering.radii[None, :, None].expand(-1, -1, 2),
+            "gaussian_ids": None,
+            "width": camera.width,
+            "height": camera.height,
+            "n_cameras": 1,
+        }
+        return rendering.image

@@ -51,6 +51,7 @@ SELDOM_FADED = f"{DEFAULTS}-100-events"
 
 # As measured, so that a change of the package's defaults does not change what an arm was.
 ANNEALING = Annealing(4.0, 0.4, 1.0, names=("scales", "quats", "opacities", "sh0", "shN"))
+ANNEALING_BUT_OPACITIES = Annealing(4.0, 0.4, 1.0, names=("scales", "quats", "sh0", "shN"))
 ANNEALING_OF_ALL = Annealing(4.0, 0.4, 1.0, GAUSSIAN)
 FADING = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=300)
 FADING_EARLY = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=140, stop=0.25)
@@ -143,6 +144,7 @@ def adaptive() -> list[StudyArm]:
         "": None,
         "+faded": of(FADING),
         "+annealed": of(ANNEALING),
+        "+annealed-but-opacities": of(ANNEALING_BUT_OPACITIES),
         "+defaults": of(ANNEALING, FADING),
     }
     return [

@@ -94,7 +94,7 @@ FEW_VIEWS_ARMS = (
 CURVE_ARMS = ("mcmc", "awsgld", "constant", "rates-x2", "faded", "annealed-8-0.4", ANNEALED)
 ROTATED = "rotated.json"  # records whose held-out views rotate with the seed
 LONG, BRIEF = 30_000, 7_500
-ASIDE = ("explorations", "unseen", "adaptive")  # groups with a table of their own
+ASIDE = ("explorations", "unseen", "adaptive", "never-reset")  # groups with a table of their own
 NU_ARMS = (BASELINE, STABLE, f"{STABLE}-constant", "paper", "paper-constant")
 OFTEN_ARMS = (BASELINE, SHARE_KEPT, SELDOM_FADED, *UNFADED.values(), DEFAULTS)
 REACH_ARMS = (FADED, DEFAULTS)
@@ -155,6 +155,7 @@ def rotated_tables(study: Study) -> dict[str, str]:
     made["often"] = sizes_table(study, often, OFTEN_ARMS)
     made["explorations"] = differences_table(study, brief, (STABLE, *names("explorations")))
     made["adaptive"] = metrics_table(study, long, names("adaptive"), gaussians=True)
+    made["never-reset"] = metrics_table(study, long, names("never-reset"), gaussians=True)
     rates = of_kind(study, Setting("plush", 4_000, BRIEF, "sfm", rotated=True), "rates")
     made["rates"] = metrics_table(study, rates, RATES_ARMS, head=lambda s: f"x{s.rates:g}")
     views = of_kind(study, Setting("bonsai", 10_000, BRIEF, "sfm", rotated=True), "views")

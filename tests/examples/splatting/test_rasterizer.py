@@ -69,11 +69,17 @@ def image_and_gradients(
     dtype: torch.dtype,
     sh_degree: int | None = None,
 ) -> dict[str, Tensor]:
-    """Image, alpha, visible and the gradients of a random functional of image and alpha."""
+    """What a rendering has, and the gradients of a random functional of image and alpha."""
     leaves = {k: v.to(dtype).clone().requires_grad_() for k, v in gaussians.items()}
     leaves["background"] = torch.tensor([0.2, 0.5, 0.9], dtype=dtype, requires_grad=True)
+    leaves["offset"] = torch.zeros(len(leaves["means"]), 2, dtype=dtype, requires_grad=True)
     rendering = render(
-        leaves, camera, background=leaves["background"], backend=backend, sh_degree=sh_degree
+        leaves,
+        camera,
+        background=leaves["background"],
+        offset=leaves["offset"],
+        backend=backend,
+        sh_degree=sh_degree,
     )
     generator = torch.Generator().manual_seed(7)
     weights = torch.randn(camera.height, camera.width, 4, generator=generator).to(dtype)
@@ -82,8 +88,9 @@ def image_and_gradients(
     ).backward()
     result = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
     assert result.keys() == leaves.keys()
-    image, alpha = rendering.image.detach(), rendering.alpha.detach()
-    return {**result, "image": image, "alpha": alpha, "visible": rendering.visible}
+    for name in ("image", "alpha", "visible", "means2d", "radii"):
+        result[name] = getattr(rendering, name).detach()
+    return result
 
 
 def assert_close(actual: dict[str, Tensor], expected: dict[str, Tensor], tolerance: float) -> None:
@@ -260,17 +267,30 @@ def test_gradcheck(degree: int):
     gaussians = scene(4, degree, seed=degree)
     gaussians["sh0"] = gaussians["sh0"].abs()  # no colour near 0, where max(., 0) has a kink
     camera = look_at_origin(5, 4)
-    names = [*gaussians, "background"]
+    names = [*gaussians, "background", "offset"]
     inputs = [*gaussians.values(), torch.tensor([0.3, 0.6, 0.9]).double()]
+    inputs.append(torch.zeros(4, 2).double())
 
     def function(*values: Tensor) -> tuple[Tensor, Tensor]:
         named = dict(zip(names, values, strict=True))
-        rendering = render(named, camera, background=named["background"], backend="reference")
+        behind, offset = named["background"], named["offset"]
+        rendering = render(named, camera, background=behind, offset=offset, backend="reference")
         return rendering.image, rendering.alpha
 
     leaves = [value.requires_grad_() for value in inputs]
     assert render(gaussians, camera).visible.all()
     assert torch.autograd.gradcheck(function, leaves)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_means2d_and_radii_of_a_sphere(backend: Backend):
+    spheres = stack(one_point(), one_point(depth=-2.0))  # the other is behind the camera
+    rendering = render(as_read(spheres, backend), straight_camera(), backend=backend)
+    assert rendering.means2d.tolist() == [[4.5, 4.5], [0.0, 0.0]]
+    # 10 pixels of focal length, 0.1 at a distance of 2, and 0.3 pixels^2 of blur.
+    # The two axes differ by nothing, of which the rasterizers make sqrt(0.1).
+    expected = math.ceil(3 * math.sqrt(0.25 + 0.3 + math.sqrt(0.1)))
+    assert rendering.radii.tolist() == [expected, 0.0]
 
 
 def test_reference_differentiates_the_camera():
@@ -383,7 +403,7 @@ def test_order_of_points_does_not_matter(backend: Backend):
     expected = image_and_gradients(gaussians, camera, backend, DTYPES[backend])
     shuffled = {name: value[order] for name, value in gaussians.items()}
     actual = image_and_gradients(shuffled, camera, backend, DTYPES[backend])
-    for name in (*gaussians, "visible"):
+    for name in (*gaussians, "offset", "visible", "means2d", "radii"):
         expected[name] = expected[name][order]
     assert_close(actual, expected, 1e-12 if backend == "reference" else 1e-5)
 
@@ -453,6 +473,7 @@ def test_wrong_gaussians_are_refused(changes: dict[str, Tensor], message: str):
         ({"sh_degree": 2}, "sh_degree is 2, must be from 0 to the stored 1"),
         ({"sh_degree": -1}, "sh_degree is -1"),
         ({"background": torch.zeros(4)}, r"background has shape \(4,\), must be \(3,\)"),
+        ({"offset": torch.zeros(4, 2)}, r"offset is \(4, 2\), must be \(5, 2\)"),
         ({"backend": "cuda"}, "backend is 'cuda', must be one of"),
     ],
 )

@@ -207,6 +207,25 @@ def test_adaptive_density_control_grows_and_resumes(tmp_path: Path) -> None:
     assert fit.relocated == 0
 
 
+def test_adaptive_density_control_resets_the_opacities() -> None:
+    pytest.importorskip("gsplat")
+    from studies.scenes.adaptive import AdaptiveFit
+
+    fit = fit_with("adc", AdaptiveFit)
+    strategy: Any = vars(fit.density)["strategy"]
+    strategy.reset_every, strategy.refine_stop_iter = 10, 20
+    largest = []
+    for _ in range(22):
+        fit.step()
+        largest.append(torch.sigmoid(fit.gaussians["opacities"]).max().item())
+        if len(largest) == 11:  # density control counts from 0
+            assert (
+                not fit.optimizers["opacities"].state[fit.gaussians["opacities"]]["exp_avg"].any()
+            )
+    low = [i for i, value in enumerate(largest) if value == pytest.approx(0.01)]
+    assert low == [10]  # neither at the start nor after density control has ended
+
+
 def test_smaller_images_raise_the_density_threshold() -> None:
     pytest.importorskip("gsplat")
     from studies.scenes.adaptive import AdaptiveFit
