@@ -24,8 +24,8 @@ from torch.optim import Adam, Optimizer
 
 from opt3dgs_optim import (
     AWSGLD, DEFAULTS, Annealing, ConstantMultiplier, Curvature, EnergyHistogram, Fading,
-    FreshMoments, IsotropicNoise, LQNAdam, Part, Phase, PhaseScheduler, Pooling, PositionNoise,
-    SquaredLoss, backend_info, two_loop,
+    FreshMoments, IsotropicNoise, LQNAdam, OutOfView, Part, Phase, PhaseScheduler, Pooling,
+    PositionNoise, SquaredLoss, backend_info, two_loop,
 )
 
 
@@ -67,7 +67,7 @@ class SignAgreement(Part):
         return torch.where(grad * state["exp_avg"] < 0, 0.0, grad)
 
 
-parts: list[Part] = [*DEFAULTS, Pooling(), SignAgreement(), ConstantMultiplier(1.5)]
+parts: list[Part] = [*DEFAULTS, OutOfView(), Pooling(), SignAgreement(), ConstantMultiplier(1.5)]
 phases = PhaseScheduler(30_000, 0.9, parts, adaptive=True)
 phases = PhaseScheduler(30_000, 29_000, [Annealing(4.0, names=("means",)), Fading(seed=3)])
 phases = PhaseScheduler(300, parts=[FreshMoments(), SquaredLoss(), Curvature(history_size=3)])

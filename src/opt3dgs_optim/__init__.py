@@ -13,6 +13,7 @@ from opt3dgs_optim.parts.fading import Fading
 from opt3dgs_optim.parts.histogram import EnergyHistogram
 from opt3dgs_optim.parts.last_phase import FreshMoments, SquaredLoss
 from opt3dgs_optim.parts.noise import IsotropicNoise, PositionNoise
+from opt3dgs_optim.parts.out_of_view import OutOfView
 from opt3dgs_optim.parts.pooling import Pooling
 from opt3dgs_optim.phases import PhaseScheduler
 from opt3dgs_optim.presets import DEFAULTS, paper_parts
@@ -32,6 +33,7 @@ __all__ = [
     "FreshMoments",
     "IsotropicNoise",
     "LQNAdam",
+    "OutOfView",
     "Part",
     "Phase",
     "PhaseScheduler",

@@ -45,17 +45,11 @@ class AWSGLD(StepAdam):
     Examples:
         >>> import torch
         >>> from opt3dgs_optim import AWSGLD, EnergyHistogram
-        >>> x = torch.nn.Parameter(torch.tensor([2.0, 2.0]))
-        >>> histogram = EnergyHistogram(energy_range=(0.0, 8.0), temperature=1.0, warmup=10)
+        >>> x, histogram = torch.nn.Parameter(torch.ones(2)), EnergyHistogram()
         >>> optimizer = AWSGLD([x], lr=0.01, histogram=histogram)
-        >>> for _ in range(20):
-        ...     optimizer.zero_grad()
-        ...     loss = (x**2).sum()
-        ...     loss.backward()
-        ...     _ = histogram.observe(loss)
-        ...     optimizer.step()
-        >>> bool((x**2).sum() < 8.0)
-        True
+        >>> (loss := (x**2).sum()).backward()
+        >>> nu = histogram.observe(loss)
+        >>> optimizer.step()
 
     Raises:
         ValueError: an option is outside what is allowed.

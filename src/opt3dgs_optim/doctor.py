@@ -1,7 +1,4 @@
-"""Is everything in order here? `opt3dgs doctor`: versions, backend and why, a self-test.
-
-The self-test asks what an installation can break: torch's Adam under ours, and the kernels.
-"""
+"""`opt3dgs doctor`: versions, backend and why, a self-test of what an installation can break."""
 
 import argparse
 import importlib.metadata

@@ -129,12 +129,12 @@ class MovingPartitions(Partitions):
         Theta ~ q^(1 / (1 - zeta)),    nu = 1 + zeta tau dlog Theta/du = 1 + dlog q/dz / 2
 
     with tau = (1 - zeta) / (2 zeta) deviations. Smoothing by k twice widens a Gaussian's variance
-    to 1 + 2 * 0.4^2, by which the slope is corrected, and its own recent mean is taken away.
-    docs/algorithms/awsgld.md has the reasons.
+    to 1 + 2 * 0.4^2, by which the slope is corrected, and its own recent mean is taken away. All
+    means are of the last 100 energies, weighed exponentially; the deviation is the mean absolute
+    one. docs/algorithms/awsgld.md has the reasons.
 
-    All means are of the last 100 energies, weighed exponentially. The deviation is the mean
-    absolute one. Few operators: one packed state follows one packed target by one `lerp_`, and all
-    products with q are one `addmv`. Where the CUDA kernels run, all of it is one launch.
+    Few operators: one packed state follows one packed target by one `lerp_`, and all products with
+    q are one `addmv`. Where the CUDA kernels run, all of it is one launch.
     """
 
     def __init__(self, num_partitions: int, zeta: float, clamp: tuple[float, float] | None) -> None:

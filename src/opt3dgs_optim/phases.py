@@ -54,16 +54,11 @@ class PhaseScheduler(Course):
         >>> from opt3dgs_optim import PhaseScheduler
         >>> means = torch.nn.Parameter(torch.ones(4, 3))
         >>> adam = torch.optim.Adam([{"params": means, "lr": 0.01, "name": "means"}], eps=1e-15)
-        >>> phases = PhaseScheduler(total_steps=60, switch=50)
+        >>> phases = PhaseScheduler(total_steps=60)
         >>> adam = phases.upgrade(adam)
-        >>> for _ in range(60):
-        ...     loss = phases.pixel_loss(means, torch.zeros(4, 3))
-        ...     loss.backward()
-        ...     phases.observe(loss)
-        ...     adam.step()
-        ...     adam.zero_grad()
-        >>> phases.phase
-        <Phase.EXPLOITATION: 'exploitation'>
+        >>> (loss := phases.pixel_loss(means, torch.zeros(4, 3))).backward()
+        >>> phases.observe(loss)
+        >>> adam.step()
 
     Raises:
         ValueError: an option is outside what is allowed.

@@ -65,7 +65,7 @@ class StepAdam(Adam):
         visible: Tensor | None = None,
         visibility: Tensor | None = None,
     ) -> Any:
-        """One step: of all rows, or only of those that a camera saw.
+        """One step: of all rows, or only of those that a camera saw; return the closure's value.
 
         With a mask, the other rows keep parameters and state, whatever the parts do, for a copy of
         both; the bias correction is the whole parameter's. Parameters without a gradient are left
@@ -75,11 +75,7 @@ class StepAdam(Adam):
             closure: evaluates the model and returns the loss; or the mask, as gsplat
                 (`step(mask)`) and INRIA (`step(mask, N)`) pass it.
             num_points: number of rows, which must be the mask's.
-            visible: [N] mask; anything but 0 is visible.
-            visibility: another name of `visible`, gsplat's.
-
-        Returns:
-            The closure's value, or None.
+            visible, visibility: [N] mask; anything but 0 is visible.
 
         Raises:
             ValueError: several masks, or one that fits no parameter with a gradient.

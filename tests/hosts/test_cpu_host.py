@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from hosts.cpu_host.gsplat_modules import rasterize
@@ -21,7 +23,7 @@ def camera() -> Camera:
     return Camera(viewmat, 26.0, 29.0, 11.3, 9.4, 24, 17)
 
 
-def activated(gaussians: dict[str, Tensor]) -> list[Tensor]:
+def activated(gaussians: dict[str, Tensor]) -> Any:
     """Means, quats, scales, opacities and colours, as trainers hand them to a rasterizer."""
     colors = (SH_0 * gaussians["sh0"][:, 0] + 0.5).clamp(min=0)
     opacities = torch.sigmoid(gaussians["opacities"])
@@ -38,7 +40,8 @@ def test_draws_what_the_rasterizer_draws() -> None:
     gaussians["means"][::7] *= 8  # behind and beside the camera
     offsets = [torch.zeros(60, 2, requires_grad=True) for _ in range(2)]
     expected = render(gaussians, camera(), sh_degree=0, offset=offsets[0])
-    drawn = draw(*activated(gaussians), camera(), offset=offsets[1])
+    call: Any = draw
+    drawn = call(*activated(gaussians), camera(), offset=offsets[1])
     assert torch.equal(drawn.visible, expected.visible)
     assert not drawn.visible.all()
     torch.testing.assert_close(drawn.image, expected.image, rtol=1e-4, atol=1e-5)
@@ -56,10 +59,9 @@ def test_gsplats_info_has_the_gradient_of_the_projected_means(packed: bool) -> N
     expected = render(gaussians, view, sh_degree=0, offset=offset)
     (its,) = gradients(expected.image, offset)
     lens = torch.tensor([[view.fx, 0.0, view.cx], [0.0, view.fy, view.cy], [0.0, 0.0, 1.0]])
-    values = activated(gaussians)
-    image, _, info = rasterize(
-        *values, view.viewmat[None], lens[None], view.width, view.height, packed=packed
-    )
+    pose, size = (view.viewmat[None], lens[None]), (view.width, view.height)
+    call: Any = rasterize
+    image, _, info = call(*activated(gaussians), *pose, *size, packed=packed)
     weights = torch.randn(image[0].shape, generator=torch.Generator().manual_seed(7))
     (image[0] * weights).sum().backward()
     if packed:

@@ -21,6 +21,7 @@ from opt3dgs_optim import (
     Curvature,
     Fading,
     FreshMoments,
+    OutOfView,
     Part,
     Phase,
     PhaseScheduler,
@@ -31,7 +32,6 @@ from opt3dgs_optim import (
 from opt3dgs_optim.names import GAUSSIAN
 from opt3dgs_optim.presets import PAPER_WARMUP
 from studies.scenes.parts.exploring import NuOfNoise, NuPerPoint, RestartedHistogram, ViewHistogram
-from studies.scenes.parts.keep_unseen import KeepUnseen
 from studies.scenes.parts.own_step import OwnStep
 from studies.scenes.parts.share_kept import ShareKept
 
@@ -42,6 +42,7 @@ EARLY = (f"{FADED}-to-1/4", f"{DEFAULTS}-to-1/4")  # fading ends after that shar
 ANNEALED = "annealed-4-opacities-1+faded"  # the defaults until the views rotated
 SHORT_LABEL = "annealed+faded"
 DEFAULTS_POOLED = f"{DEFAULTS}+pooled"
+DEFAULTS_OUT_OF_VIEW = f"{DEFAULTS}+out-of-view"
 STABLE = "awsgld-stable"  # its histogram follows the energy; that of the arms before it did not
 # Where points are many, fading kills a great part of them again and again: what may spare them.
 UNFADED = {name: f"{DEFAULTS}-{name}-unfaded" for name in ("means", "opacities")}
@@ -101,8 +102,8 @@ def whole_trainings() -> dict[str, MakeParts | None]:
         SELDOM_FADED: of(ANNEALING, ShareKept(events=100)),
         "own-step": fixed(OwnStep),
         OWN_STEP: lambda _iterations, _nu: [OwnStep(), FADING],
-        "kept": of(KeepUnseen()),
-        "kept+faded": of(FADING, KeepUnseen()),
+        "out-of-view": of(OutOfView()),
+        DEFAULTS_OUT_OF_VIEW: of(ANNEALING, FADING, OutOfView()),
         "nu-per-view": lambda iterations, _nu: [ViewHistogram(_warmup(iterations))],
         "nu-per-point": fixed(NuPerPoint),
         "nu-restarted": lambda iterations, _nu: [RestartedHistogram(_warmup(iterations))],

@@ -11,6 +11,7 @@ from typing import Any
 from studies.scenes.arms import (
     ANNEALED,
     DEFAULTS,
+    DEFAULTS_OUT_OF_VIEW,
     DEFAULTS_POOLED,
     EARLY,
     FADED,
@@ -40,6 +41,7 @@ HALF_ARMS = (  # with 50,000 Gaussians
     *("paper", "paper-constant"),
 )
 RATES_ARMS = ("mcmc", OWN_STEP, DEFAULTS)
+UNSEEN_ARMS = ("mcmc", "out-of-view", DEFAULTS, DEFAULTS_OUT_OF_VIEW)
 CROWDED_ARMS = ("mcmc", DEFAULTS, SHARE_KEPT, UNFADED["means"])
 
 
@@ -115,9 +117,12 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
             for rates in (0.1, 0.3, 1.0, 3.0, 10.0)
             for spec in rotated(("plush",), RATES_ARMS, 1, 7_500, rates=rates)
         ],
-        "unseen": rotated(
-            ("bonsai",), ["mcmc", FADED, DEFAULTS, *arms["unseen"]], 1, 7_500, tiled=True
-        ),
+        "unseen": [  # views that see little of the scene
+            *rotated(("bonsai",), (FADED, *UNSEEN_ARMS), 1, 7_500, tiled=20),
+            *rotated(("bonsai",), UNSEEN_ARMS, 1, 7_500, tiled=4),
+            *rotated(MANY_VIEWS_SCENES, UNSEEN_ARMS, 2, 7_500, tiled=9),
+            *rotated(MANY_VIEWS_SCENES, UNSEEN_ARMS, 1, 30_000, tiled=9),
+        ],
         "explorations": [
             *rotated(("plush",), [STABLE, *arms["explorations"]], 1, 7_500),
             *rotated(("plush", "embedded"), arms["explorations"], 1, 30_000),
@@ -171,7 +176,7 @@ def folder_of(spec: Spec, out: Path) -> Path:
     kind += f"-{spec.size}" * (spec.size != "images_4")
     kind += "-rotated" * spec.rotated
     kind += f"-{spec.views}-views" * (spec.views > 0)
-    kind += "-tiled" * spec.tiled
+    kind += f"-tiled-{spec.tiled}" * (spec.tiled > 0)
     kind += f"-rates-{spec.rates:g}" * (spec.rates != 1.0)
     arm = spec.arm.replace("/", "_")
     return out / Path(spec.scene).name / kind / arm / f"seed-{spec.seed}"

@@ -30,7 +30,7 @@ class Setting:
     size: str = "images_4"
     views: int = 0  # trained on; 0: all
     rates: float = 1.0  # factor on the trainer's learning rates
-    tiled: bool = False  # every view was cut into twenty
+    tiled: int = 0  # every view was cut into so many
 
 
 @dataclass(frozen=True)

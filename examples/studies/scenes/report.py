@@ -47,7 +47,7 @@ from studies.scenes.long_tables import (
     scenes_gain_table,
     sizes_table,
 )
-from studies.scenes.plan import RATES_ARMS
+from studies.scenes.plan import RATES_ARMS, UNSEEN_ARMS
 from studies.scenes.plots import VIEWS, plot_curves, plot_gains, plot_metrics, plot_sizes
 from studies.scenes.records import COSTS, FOLDER, Setting, gather, merge, read, read_costs, write
 from studies.scenes.tables import (
@@ -164,8 +164,13 @@ def rotated_tables(study: Study) -> dict[str, str]:
         study, views, (BASELINE, DEFAULTS), head=lambda s: str(s.views or VIEWS[s.scene])
     )
     tiled = [s for s in study.all_settings() if s.tiled]
-    made["unseen"] = metrics_table(study, tiled, STUDY_ARMS)
+    made["unseen"] = metrics_table(study, tiled, (*UNSEEN_ARMS, "kept"), head=pieces)
     return made
+
+
+def pieces(setting: Setting) -> str:
+    """Of a training on views that were cut up."""
+    return f"{setting.scene}, {setting.tiled} pieces, {setting.iterations:,}"
 
 
 def of_kind(study: Study, like: Setting, field: str) -> list[Setting]:

@@ -29,7 +29,7 @@ from splatting.scenes import Background, Scene, Size, View, load_scene
 from studies.scenes.arms import StudyArm, find_study_arm
 from studies.scenes.perceptual import NET, load_tool, mean_lpips
 
-TILES = (5, 4)
+TILES = {4: (2, 2), 9: (3, 3), 20: (5, 4)}  # columns and rows of so many pieces
 DIGITS = {"median_scale": 6}
 BACKGROUNDS: dict[str, Background] = {"lego": "white"}
 BRANCH_SHARES = (0.5, 0.75, 0.9, 29 / 30)  # where the arms of the last phase branch off
@@ -50,7 +50,7 @@ class Spec:
     rotated: bool = False  # the seed says which views are held out: index = seed modulo 8
     views: int = 0  # evenly spaced ones of those to train on; 0: all
     rates: float = 1.0  # factor on all learning rates of the trainer
-    tiled: bool = False  # every view to train on is cut into 5 x 4 views of a twentieth
+    tiled: int = 0  # every view to train on is cut into so many; 0: it is not
 
     def options(self) -> FitOptions:
         """For `Fit`; a trunk and its branches share them."""
@@ -169,13 +169,17 @@ def scene_of(spec: Spec) -> Scene:
             raise ValueError(f"views={spec.views}, but 2 to {count} are allowed, or 0 for all")
         train = [train[i * count // spec.views] for i in range(spec.views)]
     if spec.tiled:
-        train = [tile for view in train for tile in tiles(view)]
+        train = [tile for view in train for tile in tiles(view, spec.tiled)]
     return replace(scene, train=train)
 
 
-def tiles(view: View) -> list[View]:
-    """The view cut into `TILES` columns and rows, each a view of its own: a scene of many views."""
-    (columns, rows), camera = TILES, view.camera
+def tiles(view: View, pieces: int) -> list[View]:
+    """The view cut into pieces, each a view of its own: each sees little of the scene."""
+    if pieces not in TILES:
+        raise ValueError(
+            f"tiled={pieces}, but one of {list(TILES)} is needed, or 0 for whole views"
+        )
+    (columns, rows), camera = TILES[pieces], view.camera
     across = [camera.width * i // columns for i in range(columns + 1)]
     down = [camera.height * i // rows for i in range(rows + 1)]
     return [

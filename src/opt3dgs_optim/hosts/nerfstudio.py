@@ -1,12 +1,7 @@
 """Opt3DGS in nerfstudio: the methods `splatfacto-opt3dgs` and `splatfacto-mcmc-opt3dgs`.
 
-nerfstudio finds them through the entry point `nerfstudio.method_configs`, so that after
-`pip install opt3dgs_optim` beside nerfstudio
-
-    ns-train splatfacto-opt3dgs --data DATA
-
-just works. Leave gradient accumulation at 1. Importing this module needs nerfstudio; nothing else
-in the package does.
+nerfstudio finds them through the entry point `nerfstudio.method_configs`: install the package
+beside it, then `ns-train splatfacto-opt3dgs --data DATA`. Leave gradient accumulation at 1.
 """
 
 from __future__ import annotations
@@ -57,10 +52,8 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
     def get_training_callbacks(self, training_callback_attributes: Any) -> Any:
         """As splatfacto's; upgrades the trainer's optimizers.
 
-        The trainer calls it last in its set-up, when a checkpoint has been loaded.
-
-        Raises:
-            ValueError: neither the config nor a trainer says the number of iterations.
+        The trainer calls it last in its set-up, when a checkpoint has been loaded. ValueError
+        where neither the config nor a trainer says the number of iterations.
         """
         attributes, config = training_callback_attributes, self.config
         total = config.total_steps

@@ -11,9 +11,8 @@ The header holds the point's last visible position and gradient and a counter. W
 into the spare lanes of slots 0 .. D (slots = K: 160 bytes per point in float32 for K = 5, D = 3);
 otherwise it gets a slot of its own (slots = K + 1).
 
-A new pair moves the older ones down a slot: readers of a ring would have to gather. In memory, a
-history that torch computes on is transposed (strides of a [slots, lanes, N] tensor), one that the
-CUDA kernel computes on is contiguous; every function here takes both.
+A new pair moves the older ones down: readers of a ring would have to gather. A history that torch
+computes on has the strides of [slots, lanes, N], one of the CUDA kernel is contiguous.
 """
 
 from typing import NamedTuple

@@ -84,24 +84,18 @@ def lqn_direction(
 
     Args:
         position: [N, D] before the step.
-        grad: [N, D] there; a row that is zero or not finite is not visible: its history stays,
-            and it is given back.
+        grad: [N, D] there; a row that is 0 or not finite is given back, and its history stays.
         history: [N, slots, 2 (D + 1)], changed in place.
         history_size: K, 1 to 16.
-        min_cosine: a pair is accepted if s.y > min_cosine |s| |y|. Relative: an absolute bound
-            such as torch LBFGS's 1e-10 would reject practically every pair of a splat.
-        graft: give each point's result the length of its gradient. The two-loop result has the
-            parameters' units; in Adam, its first values would otherwise own the second moment
-            for a thousand iterations.
-        backend: "auto", "cuda" or "torch".
+        min_cosine, graft, backend: as in `Curvature`. torch LBFGS's bound is absolute, 1e-10, and
+            would reject practically every pair of a splat. Without grafting the result has the
+            parameters' units: its first values would own Adam's second moment for long.
 
     Returns:
-        (fed [N, D], accepted [N] bool, candidates [N] bool): the pairs that were taken, and those
-        that could have been.
+        (fed [N, D], accepted [N] bool, candidates [N] bool): pairs taken, and that could be.
 
     Raises:
-        RuntimeError: `backend="cuda"` where the kernel cannot run.
-        ValueError: the shapes do not fit.
+        RuntimeError, ValueError: `backend="cuda"` cannot run; the shapes do not fit.
     """
     check_history("lqn_direction", grad, history, history_size)
     like = grad.device, grad.dtype, grad.shape[1], history_size
@@ -143,21 +137,17 @@ def direction(
 def foresight(history: Tensor, history_size: int, position: Tensor, gradient: Tensor) -> Tensor:
     """How much better the stored pairs foretell the pair that comes next than gamma I would.
 
-    A pair (s, y) that a curvature matrix describes has H y = s. The pairs know something about a
-    point if H y, with H from the pairs before this one, is closer to the direction of s than y
-    itself is: cos(H y, s) - cos(y, s). Where y is mostly the difference between two views, or
-    where the curvature is the same in all directions, it is 0: then Adam fed with the gradient
-    does as well.
+    A pair (s, y) that a curvature matrix describes has H y = s: cos(H y, s) - cos(y, s) with H
+    from the pairs before this one. It is 0 where y is mostly the difference between two views, or
+    the curvature is the same in all directions: then Adam fed with the gradient does as well.
 
     Args:
         history: [N, slots, 2 (D + 1)] before the new pair is stored.
         history_size: K.
-        position, gradient: [N, D] of this step; a point counts where its gradient is finite and
-            not 0.
+        position, gradient: [N, D] of this step; one that is not finite, or 0, does not count.
 
     Returns:
-        [2] float64 (float32 on MPS): sum of that difference over the points that hold a pair,
-        and their number.
+        [2] float64 (float32 on MPS): sum over the points that hold a pair, and their number.
     """
     widest = torch.float32 if history.device.type == "mps" else torch.float64
     total = torch.zeros(2, dtype=widest, device=history.device)

@@ -37,8 +37,6 @@ class EnergyHistogram(Part):
     range and a temperature it is the paper's update, to the letter (`FixedPartitions`);
     `EnergyHistogram.paper()` has its numbers.
 
-    The state lives on the device of the energies, and `observe` does not wait for a GPU.
-
     Args:
         num_partitions: number of partitions; None for 48 that follow the energy, 200 of a range.
         energy_range: (low, high) in units of the loss, cut uniformly; the first and the last
@@ -112,19 +110,13 @@ class EnergyHistogram(Part):
         valid: Tensor | bool | None = None,
         course: Course | None = None,
     ) -> Tensor:
-        """Take one energy: nu from the weights as they are, then the weights' update.
+        """Take one energy; return nu, 0-d on its device, of the weights before their update.
 
         Args:
-            energy: the training loss of this iteration, 0-d (or one element). One that is not
-                finite changes nothing.
+            energy: the training loss of this iteration, 0-d (or one element; ValueError of more).
+                One that is not finite changes nothing. A GPU is not waited for.
             valid: whether it is finite, where that is known already.
             course: the training's, which wants no copy of nu.
-
-        Returns:
-            nu, 0-d, on the energy's device.
-
-        Raises:
-            ValueError: the energy has several elements.
         """
         value = self._on_device(energy)
         if valid is None:

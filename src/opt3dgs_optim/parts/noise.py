@@ -34,8 +34,7 @@ class PositionNoise(Part):
         generator: random generator of the parameters' device, or None for torch's own.
 
     Raises:
-        ValueError: an option is outside what is allowed; in a step, a tensor is missing among the
-            Gaussians or has another number of rows.
+        ValueError: an option is not allowed; in a step, Gaussians lack a tensor, or rows of one.
     """
 
     names = ("means",)
@@ -108,11 +107,9 @@ class IsotropicNoise(Part):
     Args:
         temperature: that of the law exp(-energy / temperature) which plain SGLD drift
             (`AWSGLD(preconditioner="none")`) then samples, in units of the energy.
-        std: a fixed deviation per step, in units of the parameters, instead of a temperature.
+        std: a fixed deviation per step, in units of the parameters, instead of a temperature
+            (ValueError: both, neither, or below 0).
         generator: random generator of the parameters' device, or None for torch's own.
-
-    Raises:
-        ValueError: not exactly one of temperature and std, or it is below 0.
     """
 
     temperature: float | None = None
@@ -144,20 +141,15 @@ def _normal_like(tensor: Tensor, generator: torch.Generator | None) -> Tensor:
 
 
 def covariance_noise(scales: Tensor, quats: Tensor, opacities: Tensor, eta: Tensor) -> Tensor:
-    """Noise shaped by each Gaussian's covariance and gated by its opacity (eq. 2).
+    """Noise [N, 3], squared world units, of each Gaussian's covariance and opacity (eq. 2).
 
         sigmoid(-k (o - t)) * Sigma @ eta,   Sigma = R diag(s)^2 R^T,   k = 100, t = 0.005
-
-    Nearly transparent Gaussians wander along their own shape, opaque ones stand still.
 
     Args:
         scales: [N, 3] log of the standard deviations, world units.
         quats: [N, 4] rotations, wxyz, need not be normalised.
         opacities: [N] or [N, 1] logits.
         eta: [N, 3] standard normal.
-
-    Returns:
-        [N, 3] in squared world units; the caller multiplies by noise scale and learning rate.
     """
     noise = torch.empty_like(eta)
     for rows in row_chunks(eta):

@@ -16,15 +16,12 @@ class Pooling(Part):
 
         v_ij <- mean_j v_ij,    point i, coordinate j of one parameter
 
-    Adam makes a full step even along an axis that the images hardly constrain. With one second
-    moment the step has the direction of `exp_avg`, whatever the axes: short along such an axis, up
-    to the root of the number of coordinates longer along one with large gradients.
+    With one second moment the step has the direction of `exp_avg`, whatever the axes: short along
+    one that the images hardly constrain. Applied after every step, so that a point's first is
+    Adam's own. It costs no memory.
 
-    Applied after every step, so that the first step of a point is Adam's own. The state keeps its
-    shapes, [N, ..] with equal coordinates, because trainers edit it by rows. It costs no memory.
-
-    VectorAdam: Ling, Sharp and Jacobson, NeurIPS 2022. It sums over the coordinates; the mean
-    keeps the length of steps whose coordinates are alike, and so the trainer's learning rates.
+    VectorAdam (Ling, Sharp and Jacobson, NeurIPS 2022) sums over the coordinates; the mean keeps
+    the length of steps whose coordinates are alike, and so the trainer's learning rates.
 
     Args:
         names: the Gaussian parameters, under gsplat's or INRIA's names.

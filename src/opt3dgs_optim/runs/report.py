@@ -57,14 +57,12 @@ def write_report(
     Args:
         runs: of any number of scenes, arms and seeds.
         out: folder, made if it is missing.
-        metric: to compare by, as the runs log it; None takes psnr if there, else the first.
-        baseline: reference arm, alike in colour on all scenes; None takes "mcmc" if there, else
-            the first arm.
+        metric: to compare by, as the runs log it; None: psnr if there, else the first.
+        baseline: reference arm; None: "mcmc" if there, else the first.
 
     Raises:
-        ValueError: no runs, no log with that metric, no run of that arm, or two scenes whose
-            pictures would have one name. Nothing is written then.
-        OSError: `out` cannot be written.
+        ValueError, OSError: no runs, no log with that metric, no run of that arm, or two scenes
+            whose pictures would have one name; `out` cannot be written. Nothing is written then.
     """
     if not runs:
         raise ValueError("write_report: no runs; pass at least one")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from dataclasses import asdict, replace
 from functools import cache
@@ -23,7 +22,6 @@ from studies.scenes.parts.exploring import (
     ViewHistogram,
     nu_per_point,
 )
-from studies.scenes.parts.keep_unseen import KeepUnseen
 from studies.scenes.records import read_costs
 from studies.scenes.training import TILES, Spec, scene_of, tiles, train
 
@@ -54,9 +52,7 @@ def same_after_resuming(make: Any, path: Path, before: int, after: int) -> bool:
     return all(torch.equal(p, resumed.gaussians[n]) for n, p in whole.gaussians.items())
 
 
-@pytest.mark.parametrize(
-    "arm", ["nu-per-view", "nu-per-point", "nu-restarted", "nu-of-noise", "kept+faded"]
-)
+@pytest.mark.parametrize("arm", ["nu-per-view", "nu-per-point", "nu-restarted", "nu-of-noise"])
 def test_a_study_part_resumes(tmp_path: Path, arm: str) -> None:
     assert same_after_resuming(lambda: fit_with(arm), tmp_path / "at.pt", 35, 8)
 
@@ -131,54 +127,29 @@ def test_nu_per_point_has_mean_one_and_falls_with_the_gradient() -> None:
     assert (nu_per_point(grad[:50]) == 1).all()
 
 
-def test_the_second_moment_of_points_out_of_view_is_kept() -> None:
-    params = {
-        "means": torch.nn.Parameter(torch.zeros(2, 3)),
-        "opacities": torch.nn.Parameter(torch.zeros(2)),
-    }
-    runs = {}
-    for parts in ((), (KeepUnseen(0.05),)):
-        own = copy.deepcopy(params)
-        optimizers = {
-            name: torch.optim.Adam([{"params": [p], "name": name}], lr=0.1, betas=(0.9, 0.99))
-            for name, p in own.items()
-        }
-        phases = PhaseScheduler(10_000, 1.0, list(parts))
-        phases.upgrade(optimizers)
-        start = own["opacities"].detach()
-        for i in range(2_000):
-            seen = i < 300
-            own["means"].grad = torch.tensor([[1.0] * 3, [float(seen)] * 3])
-            # The image's gradient is 1; the regulariser's, which every point gets, a thousandth.
-            own["opacities"].grad = torch.tensor([1.0, 1.0 if seen else 1e-3])
-            phases.observe(torch.tensor(0.1))
-            for optimizer in optimizers.values():
-                optimizer.step()
-            if i == 400:  # the momentum is gone
-                start = own["opacities"].detach().clone()
-        moved = (own["opacities"].detach() - start).abs()
-        runs[bool(parts)] = moved.tolist()
-    assert runs[True][0] == runs[False][0]  # in view: Adam's own, bit for bit
-    assert runs[True][1] < 0.2 * runs[False][1]
-
-
-def test_tiles_make_up_the_view() -> None:
-    view = embedded().train[0]
-    made = tiles(view)
-    assert len(made) == TILES[0] * TILES[1]
+@pytest.mark.parametrize("pieces", TILES)
+def test_tiles_make_up_the_view(pieces: int) -> None:
+    view, across = embedded().train[0], TILES[pieces][0]
+    made = tiles(view, pieces)
+    assert len(made) == pieces
     rows = [
-        torch.cat([tile.image for tile in made[i : i + TILES[0]]], 1)
-        for i in range(0, len(made), TILES[0])
+        torch.cat([tile.image for tile in made[i : i + across]], 1)
+        for i in range(0, pieces, across)
     ]
     assert torch.equal(torch.cat(rows, 0), view.image)
     fit = fit_with("mcmc")
     whole = fit.image(view)
     parts = [
-        torch.cat([fit.image(tile) for tile in made[i : i + TILES[0]]], 1)
-        for i in range(0, len(made), TILES[0])
+        torch.cat([fit.image(tile) for tile in made[i : i + across]], 1)
+        for i in range(0, pieces, across)
     ]
     # Beside the image the projection is linearised at other places, as in every rasterizer.
     assert float((torch.cat(parts, 0) - whole).abs().mean()) < 0.01 * float(whole.mean())
+
+
+def test_other_pieces_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"tiled=5, but one of \[4, 9, 20\] is needed"):
+        scene_of(Spec("embedded", "mcmc", 0, 10, 10, tiled=5))
 
 
 def test_fewer_views_are_evenly_spaced() -> None:

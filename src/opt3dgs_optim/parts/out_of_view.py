@@ -1,0 +1,54 @@
+"""Points out of view: where views see little of a scene, regularisers make no full steps."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim.course import Course
+from opt3dgs_optim.names import SLOT
+from opt3dgs_optim.part import Group, Part
+from opt3dgs_optim.rows import shaped
+
+SHARE = "visible_share"  # of the positions' group: mean share of the points that a view sees
+MEMORY = 100  # views that the mean is over
+BELOW, LEAST = 1 / 3, 0.01  # where it acts; the least share of a view that counts
+
+
+class OutOfView(Part):
+    """Keep the scales and opacities of points that few views see from melting.
+
+    3DGS-MCMC's regularisers pull at every point in every iteration, and Adam makes a full step of
+    a gradient however small. Relocation and `Fading` empty second moments: a point out of view
+    then shrinks and fades until a view sees it. Where a view sees a tenth of the points or less,
+    most are dead by then, and relocated, and so on. While the mean visible share s of the points
+    is below a third, the second moment of one out of view is at least (gradient / (3 s))^2, for
+    steps of at most about 3 s of a full one; above, nothing is changed, bit for bit.
+
+    Out of view is a point whose position's gradient is exactly zero; the positions must be
+    stepped first, as in every known trainer. It costs no memory.
+    """
+
+    names = ("means", "scales", "opacities")
+
+    def before(
+        self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
+    ) -> Tensor:
+        """See at the positions [N, 3] who is out of view; raise the others' second moments."""
+        if grad.dim() == 0 or len(grad) == 0:
+            return grad
+        if group[SLOT] == "means":
+            unseen, share = (grad == 0).flatten(1).all(1), group.get(SHARE, 1.0)
+            now: Any = (~unseen).float().mean().clamp(min=LEAST)
+            now = now.item() if grad.is_cpu else now  # on a GPU nothing is read
+            group[SHARE] = share + (now - share) * (course.valid / MEMORY)
+            course.unseen = course.current, unseen & course.valid, group[SHARE]
+            return grad
+        iteration, unseen, share = course.unseen
+        off = isinstance(share, float) and share >= BELOW
+        if off or iteration != course.current or len(unseen) != len(grad):
+            return grad
+        least = torch.where(shaped(unseen, grad), grad * (BELOW / share), 0.0).square_()
+        least.mul_(share < BELOW)
+        state["exp_avg_sq"].copy_(torch.maximum(state["exp_avg_sq"], least))
+        return grad

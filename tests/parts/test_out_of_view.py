@@ -1,0 +1,177 @@
+"""Points out of view: when they are held, how far, and that nothing else is touched."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+import torch
+from torch.nn import Parameter
+from trainers import (
+    assert_same,
+    gsplat_optimizers,
+    inria_optimizer,
+    make_splats,
+    only,
+    state_of,
+    train,
+    trained_by_adam,
+    upgraded,
+)
+
+from opt3dgs_optim import Fading, OutOfView, Part
+from opt3dgs_optim.parts.out_of_view import BELOW
+
+POINTS, SEEN = 200, 4  # a view sees 2 % of them
+PULL = 1e-3  # of the regulariser; the images' gradients are about 1
+
+
+def large(total_steps: int, *parts: Part, make: Any = gsplat_optimizers) -> tuple[Any, Any, Any]:
+    """As `upgraded`, with many points, of which views have seen 2 % so far."""
+    phases = only(total_steps, *parts)
+    splats = make_splats(POINTS)
+    optimizers = phases.upgrade(make(splats))
+    first = optimizers["means"] if isinstance(optimizers, dict) else optimizers
+    first.param_groups[0]["visible_share"] = SEEN / POINTS
+    return splats, phases, optimizers
+
+
+def iterate(
+    splats: dict[str, Parameter], optimizers: Any, phases: Any, first: int, last: int, *, seen: int
+) -> None:
+    """Views see so many points in turn; a regulariser pulls at scales and opacities of all."""
+    every = optimizers.values() if isinstance(optimizers, dict) else [optimizers]
+    for i in range(first, last):
+        rows = torch.arange(seen * i, seen * (i + 1)) % len(splats["means"])
+        generator = torch.Generator().manual_seed(i)
+        for name, param in splats.items():
+            pull = PULL if name in ("scales", "opacities") else 0.0
+            param.grad = torch.full_like(param, pull)
+            param.grad[rows] += torch.randn(param.grad[rows].shape, generator=generator)
+        if phases is not None:
+            phases.observe(0.1)
+        for optimizer in every:
+            optimizer.step()
+
+
+@pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
+def test_where_views_see_much_it_is_adam(make: Any) -> None:
+    """Two thirds of the points here."""
+    splats, phases, optimizers = upgraded(60, OutOfView(), make=make)
+    train(splats, optimizers, phases, 0, 40)
+    assert_same(splats, trained_by_adam(40))
+
+
+@pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
+def test_an_emptied_point_out_of_view_makes_a_share_of_a_step(make: Any) -> None:
+    moved = {}
+    for parts in ((), (OutOfView(),)):
+        splats, phases, optimizers = large(2_000, *parts, make=make)
+        iterate(splats, optimizers, phases, 0, 100, seen=SEEN)
+        for name in ("scales", "opacities"):  # as relocation does
+            for moment in ("exp_avg", "exp_avg_sq"):
+                state_of(optimizers, splats[name])[moment][0] = 0.0
+        before = {name: param.detach().clone() for name, param in splats.items()}
+        iterate(splats, optimizers, phases, 101, 141, seen=SEEN)  # none of them sees point 0
+        moved[bool(parts)] = {n: (p.detach() - before[n]).abs() for n, p in splats.items()}
+    rates = {"scales": 0.005, "opacities": 0.05}
+    for name, rate in rates.items():
+        assert moved[False][name][0].min() > 30 * rate  # a full step each, and more at first
+        most = 40 * rate * (SEEN / POINTS) / BELOW
+        assert 0.2 * most < moved[True][name][0].min()  # what no view sees is still let go
+        assert moved[True][name][0].max() < 1.3 * most
+    for name in ("means", "quats", "sh0"):
+        assert torch.equal(moved[True][name], moved[False][name]), name
+
+
+def test_fading_does_not_undo_it() -> None:
+    splats, phases, optimizers = large(600, Fading(share=1.0), OutOfView())
+    iterate(splats, optimizers, phases, 0, 290, seen=SEEN)
+    second = state_of(optimizers, splats["opacities"])["exp_avg_sq"]
+    least = (PULL * BELOW * POINTS / SEEN) ** 2
+    assert second.min() > 0.9 * least
+
+
+@pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
+def test_a_resumed_training_goes_on_as_it_was(make: Any) -> None:
+    runs = []
+    for stop in (None, 60):
+        splats, phases, optimizers = large(2_000, OutOfView(), make=make)
+        iterate(splats, optimizers, phases, 0, 60, seen=SEEN)
+        if stop is not None:
+            saved = {n: p.detach().clone() for n, p in splats.items()}
+            every = optimizers if isinstance(optimizers, dict) else {"": optimizers}
+            states = {n: copy.deepcopy(each.state_dict()) for n, each in every.items()}
+            splats, phases, optimizers = large(2_000, OutOfView(), make=make)
+            for name, param in splats.items():
+                param.data.copy_(saved[name])
+            every = optimizers if isinstance(optimizers, dict) else {"": optimizers}
+            for name, each in every.items():
+                each.load_state_dict(states[name])
+        iterate(splats, optimizers, phases, 60, 90, seen=SEEN)
+        runs.append(splats)
+    assert_same(runs[0], runs[1])
+
+
+def test_the_share_is_the_mean_over_a_hundred_views() -> None:
+    splats, phases, optimizers = upgraded(60, OutOfView())
+    shares = []
+    for i in range(3):
+        iterate(splats, optimizers, phases, i, i + 1, seen=3)  # of 12
+        shares.append(optimizers["means"].param_groups[0]["visible_share"])
+    assert shares == pytest.approx([1 - 0.75 * (1 - 0.99**k) for k in (1, 2, 3)], rel=1e-6)
+
+
+def test_on_a_device_the_share_is_never_read() -> None:
+    """The branch for numbers that live on a device, on the host: the same to rounding."""
+    runs = []
+    for start in (1.0, torch.tensor(1.0)):
+        splats, phases, optimizers = large(2_000, OutOfView())
+        optimizers["means"].param_groups[0]["visible_share"] = start
+        iterate(splats, optimizers, phases, 0, 400, seen=SEEN)
+        share = optimizers["means"].param_groups[0]["visible_share"]
+        assert isinstance(share, type(start))
+        runs.append((splats, float(share)))
+    assert runs[0][1] == pytest.approx(runs[1][1], rel=1e-4)
+    for name, param in runs[0][0].items():
+        torch.testing.assert_close(param, runs[1][0][name], rtol=1e-4, atol=1e-5)
+
+
+def test_an_iteration_that_does_not_count_leaves_no_trace() -> None:
+    splats, phases, optimizers = large(2_000, part := OutOfView())
+    optimizers["means"].param_groups[0]["visible_share"] = torch.tensor(0.02)
+    iterate(splats, optimizers, phases, 0, 3, seen=SEEN)
+    share = float(optimizers["means"].param_groups[0]["visible_share"])
+    phases.current += 1
+    phases.valid = torch.tensor(False)
+    for name in ("means", "scales", "opacities"):
+        group, param = optimizers[name].param_groups[0], splats[name]
+        state = optimizers[name].state[param]
+        before = state["exp_avg_sq"].clone()
+        pulled = torch.full_like(param, 0.0 if name == "means" else PULL)
+        part.before(group, param, pulled, state, phases)
+        assert torch.equal(state["exp_avg_sq"], before)
+    assert float(optimizers["means"].param_groups[0]["visible_share"]) == share
+
+
+def test_without_the_positions_of_this_iteration_it_does_nothing() -> None:
+    """They are stepped last, or there are other points than at their last step."""
+    splats, phases, optimizers = large(2_000, part := OutOfView())
+    iterate(splats, optimizers, phases, 0, 3, seen=SEEN)
+    for iteration, points in ((phases.current + 1, POINTS), (phases.current, POINTS + 1)):
+        phases.current = iteration
+        param = torch.zeros(points)
+        state = {"exp_avg_sq": torch.zeros(points)}
+        group = optimizers["opacities"].param_groups[0]
+        part.before(group, param, torch.full_like(param, PULL), state, phases)
+        assert not state["exp_avg_sq"].any()
+
+
+@pytest.mark.parametrize("shape", [(), (0, 3)])
+def test_no_points_are_no_error(shape: tuple[int, ...]) -> None:
+    splats, phases, optimizers = upgraded(60, part := OutOfView())
+    train(splats, optimizers, phases, 0, 1)
+    param = torch.zeros(shape)
+    group = optimizers["means"].param_groups[0]
+    assert part.before(group, param, param, {}, phases) is param
