@@ -51,11 +51,6 @@ class Course:
         self.num_observed = 0
         self.steps = 0  # of all optimizers
         self.valid: Tensor | bool = True  # whether the last energy was finite
-        self.unseen: Any = (
-            None,
-            (),
-            1.0,
-        )  # `OutOfView`: iteration, who is, mean share of who is not
         self._plan()
 
     def _plan(self) -> None:

@@ -12,7 +12,8 @@ into the spare lanes of slots 0 .. D (slots = K: 160 bytes per point in float32 
 otherwise it gets a slot of its own (slots = K + 1).
 
 A new pair moves the older ones down: readers of a ring would have to gather. A history that torch
-computes on has the strides of [slots, lanes, N], one of the CUDA kernel is contiguous.
+computes on has the strides of [slots, lanes, N], one of the CUDA kernel is contiguous; every
+function here takes both.
 """
 
 from typing import NamedTuple

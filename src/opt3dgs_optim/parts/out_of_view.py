@@ -26,10 +26,13 @@ class OutOfView(Part):
     steps of at most about 3 s of a full one; above, nothing is changed, bit for bit.
 
     Out of view is a point whose position's gradient is exactly zero; the positions must be
-    stepped first, as in every known trainer. It costs no memory.
+    stepped first, as in every known trainer. It costs no memory, and serves one scheduler.
     """
 
     names = ("means", "scales", "opacities")
+
+    def __init__(self) -> None:
+        self._seen: Any = (None, (), 1.0)  # iteration, who is out of view in it, visible share
 
     def before(
         self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
@@ -42,9 +45,9 @@ class OutOfView(Part):
             now: Any = (~unseen).float().mean().clamp(min=LEAST)
             now = now.item() if grad.is_cpu else now  # on a GPU nothing is read
             group[SHARE] = share + (now - share) * (course.valid / MEMORY)
-            course.unseen = course.current, unseen & course.valid, group[SHARE]
+            self._seen = course.current, unseen & course.valid, group[SHARE]
             return grad
-        iteration, unseen, share = course.unseen
+        iteration, unseen, share = self._seen
         off = isinstance(share, float) and share >= BELOW
         if off or iteration != course.current or len(unseen) != len(grad):
             return grad
