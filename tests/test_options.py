@@ -25,6 +25,7 @@ from opt3dgs_optim import (
     FreshMoments,
     IsotropicNoise,
     LQNAdam,
+    OutOfView,
     PhaseScheduler,
     Pooling,
     PositionNoise,
@@ -90,6 +91,7 @@ TABLE: dict[str, tuple[Callable[..., Any], type, dict[str, Any]]] = {
     "LQNAdam": (lqnadam, LQNAdam, {**ADAM, **CURVATURE}),
     "Curvature": (Curvature, Curvature, {**CURVATURE, "names": NOT_NAMES}),
     "FreshMoments": (FreshMoments, FreshMoments, {"settling": COUNTS}),
+    "OutOfView": (OutOfView, OutOfView, {}),
     "SquaredLoss": (SquaredLoss, SquaredLoss, {}),
     "PhaseScheduler": (
         phases,
