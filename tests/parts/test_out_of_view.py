@@ -174,4 +174,23 @@ def test_no_points_are_no_error(shape: tuple[int, ...]) -> None:
     train(splats, optimizers, phases, 0, 1)
     param = torch.zeros(shape)
     group = optimizers["means"].param_groups[0]
+    share = group["visible_share"]
     assert part.before(group, param, param, {}, phases) is param
+    assert group["visible_share"] == share
+
+
+def test_views_that_see_nothing_count_as_a_hundredth() -> None:
+    splats, phases, optimizers = large(2_000, OutOfView())
+    iterate(splats, optimizers, phases, 0, 400, seen=0)
+    share = optimizers["means"].param_groups[0]["visible_share"]
+    assert share == pytest.approx(0.01 + 0.01 * 0.99**400, rel=1e-6)
+
+
+@pytest.mark.parametrize(("share", "acts"), [(0.32, True), (0.35, False)])
+def test_it_acts_below_a_third(share: float, acts: bool) -> None:
+    splats, phases, optimizers = large(2_000, OutOfView())
+    optimizers["means"].param_groups[0]["visible_share"] = share
+    iterate(splats, optimizers, phases, 0, 1, seen=SEEN)  # the share falls by a hundredth
+    least = state_of(optimizers, splats["opacities"])["exp_avg_sq"][-1].item()
+    plain = (1 - 0.999) * PULL**2
+    assert (least > 2 * plain) is acts
