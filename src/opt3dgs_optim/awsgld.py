@@ -50,6 +50,8 @@ class AWSGLD(StepAdam):
         >>> (loss := (x**2).sum()).backward()
         >>> nu = histogram.observe(loss)
         >>> optimizer.step()
+        >>> bool((x**2).sum() < 2.0)
+        True
 
     Raises:
         ValueError: an option is outside what is allowed.

@@ -30,8 +30,12 @@ class LQNAdam(StepAdam):
         >>> from opt3dgs_optim import LQNAdam
         >>> points = torch.nn.Parameter(torch.ones(4, 3))
         >>> optimizer = LQNAdam([points], lr=0.05)
-        >>> (points**2).sum().backward()
-        >>> optimizer.step()
+        >>> for _ in range(100):
+        ...     optimizer.zero_grad()
+        ...     (points**2 * torch.tensor([1.0, 10.0, 100.0])).sum().backward()
+        ...     optimizer.step()
+        >>> bool(points.abs().max() < 0.2)
+        True
 
     Raises:
         ValueError, RuntimeError: as `Curvature`.

@@ -62,3 +62,5 @@ def test_chunks_of_rows_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = covariance_noise(**g, eta=eta)
     monkeypatch.setattr(pairs, "CHUNK", 32)
     assert torch.equal(covariance_noise(**g, eta=eta), whole)
+    monkeypatch.setattr(pairs, "CHUNK", 8)
+    torch.testing.assert_close(covariance_noise(**g, eta=eta), whole, rtol=1e-11, atol=0.0)

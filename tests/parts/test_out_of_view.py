@@ -15,9 +15,11 @@ from trainers import (
     make_splats,
     only,
     state_of,
+    step_all,
     train,
     trained_by_adam,
     upgraded,
+    values_of,
 )
 
 from opt3dgs_optim import Fading, OutOfView, Part
@@ -41,7 +43,6 @@ def iterate(
     splats: dict[str, Parameter], optimizers: Any, phases: Any, first: int, last: int, *, seen: int
 ) -> None:
     """Views see so many points in turn; a regulariser pulls at scales and opacities of all."""
-    every = optimizers.values() if isinstance(optimizers, dict) else [optimizers]
     for i in range(first, last):
         rows = torch.arange(seen * i, seen * (i + 1)) % len(splats["means"])
         generator = torch.Generator().manual_seed(i)
@@ -51,8 +52,7 @@ def iterate(
             param.grad[rows] += torch.randn(param.grad[rows].shape, generator=generator)
         if phases is not None:
             phases.observe(0.1)
-        for optimizer in every:
-            optimizer.step()
+        step_all(optimizers)
 
 
 @pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
@@ -72,7 +72,7 @@ def test_an_emptied_point_out_of_view_makes_a_share_of_a_step(make: Any) -> None
         for name in ("scales", "opacities"):  # as relocation does
             for moment in ("exp_avg", "exp_avg_sq"):
                 state_of(optimizers, splats[name])[moment][0] = 0.0
-        before = {name: param.detach().clone() for name, param in splats.items()}
+        before = values_of(splats)
         iterate(splats, optimizers, phases, 101, 141, seen=SEEN)  # none of them sees point 0
         moved[bool(parts)] = {n: (p.detach() - before[n]).abs() for n, p in splats.items()}
     rates = {"scales": 0.005, "opacities": 0.05}
@@ -100,7 +100,7 @@ def test_a_resumed_training_goes_on_as_it_was(make: Any) -> None:
         splats, phases, optimizers = large(2_000, OutOfView(), make=make)
         iterate(splats, optimizers, phases, 0, 60, seen=SEEN)
         if stop is not None:
-            saved = {n: p.detach().clone() for n, p in splats.items()}
+            saved = values_of(splats)
             every = optimizers if isinstance(optimizers, dict) else {"": optimizers}
             states = {n: copy.deepcopy(each.state_dict()) for n, each in every.items()}
             splats, phases, optimizers = large(2_000, OutOfView(), make=make)

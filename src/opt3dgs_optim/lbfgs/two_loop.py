@@ -93,9 +93,6 @@ def lqn_direction(
 
     Returns:
         (fed [N, D], accepted [N] bool, candidates [N] bool): pairs taken, and that could be.
-
-    Raises:
-        RuntimeError, ValueError: `backend="cuda"` cannot run; the shapes do not fit.
     """
     check_history("lqn_direction", grad, history, history_size)
     like = grad.device, grad.dtype, grad.shape[1], history_size

@@ -11,8 +11,7 @@ from opt3dgs_optim.part import Group, Part
 from opt3dgs_optim.rows import shaped
 
 SHARE = "visible_share"  # of the positions' group: mean share of the points that a view sees
-MEMORY = 100  # views that the mean is over
-BELOW, LEAST = 1 / 3, 0.01  # where it acts; the least share of a view that counts
+MEMORY, BELOW, LEAST = 100, 1 / 3, 0.01  # views of the mean; where it acts; least of a view
 
 
 class OutOfView(Part):
@@ -23,10 +22,9 @@ class OutOfView(Part):
     then shrinks and fades until a view sees it. Where a view sees a tenth of the points or less,
     most are dead by then, and relocated, and so on. While the mean visible share s of the points
     is below a third, the second moment of one out of view is at least (gradient / (3 s))^2, for
-    steps of at most about 3 s of a full one; above, nothing is changed, bit for bit.
-
-    Out of view is a point whose position's gradient is exactly zero; the positions must be
-    stepped first, as in every known trainer. It costs no memory, and serves one scheduler.
+    steps of at most about 3 s of a full one; above, nothing is changed, bit for bit. Out of view
+    is a point whose position's gradient is exactly zero; the positions must be stepped first, as
+    in every known trainer. It costs no memory, and serves one scheduler.
     """
 
     names = ("means", "scales", "opacities")
@@ -51,7 +49,7 @@ class OutOfView(Part):
         off = isinstance(share, float) and share >= BELOW
         if off or iteration != course.current or len(unseen) != len(grad):
             return grad
-        least = torch.where(shaped(unseen, grad), grad * (BELOW / share), 0.0).square_()
-        least.mul_(share < BELOW)
+        factor = BELOW / share * (share < BELOW)
+        least = torch.where(shaped(unseen, grad), grad * factor, 0.0).square_()
         state["exp_avg_sq"].copy_(torch.maximum(state["exp_avg_sq"], least))
         return grad
