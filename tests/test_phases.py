@@ -38,6 +38,7 @@ from opt3dgs_optim import (
     Fading,
     FreshMoments,
     LQNAdam,
+    OutOfView,
     Part,
     Phase,
     PhaseScheduler,
@@ -215,7 +216,7 @@ def test_presets() -> None:
     warmup = short.part(EnergyHistogram)
     assert warmup is not None
     assert (short.switch_step, warmup.warmup) == (2_900, 250)
-    assert PhaseScheduler(10).parts == [*DEFAULTS] == [Annealing(), Fading()]
+    assert PhaseScheduler(10).parts == [*DEFAULTS] == [Annealing(), Fading(), OutOfView()]
     assert PhaseScheduler(10, parts=[]).parts == []
     assert PhaseScheduler(10, parts=[*DEFAULTS, Pooling()]).parts[-1] == Pooling()
 

@@ -51,6 +51,7 @@ class Course:
         self.num_observed = 0
         self.steps = 0  # of all optimizers
         self.valid: Tensor | bool = True  # whether the last energy was finite
+        self.unseen: Any = (-1, None, 1.0)  # `OutOfView`: iteration, points out of view, seen share
         self._plan()
 
     def _plan(self) -> None:

@@ -28,7 +28,7 @@ Optimizers = TypeVar("Optimizers", bound="Optimizer | Mapping[str, Optimizer]")
 class PhaseScheduler(Course):
     """Put parts into the steps of a 3DGS trainer's optimizers, in two phases.
 
-    By default annealing and fading, what paid (docs/evidence.md); with `PhaseScheduler.paper`,
+    By default `DEFAULTS`, what paid (docs/evidence.md); with `PhaseScheduler.paper`,
     Opt3DGS. What is left out costs nothing.
 
     Args:
@@ -36,7 +36,7 @@ class PhaseScheduler(Course):
         switch: where exploitation starts: a fraction of `total_steps` in (0, 1] if a float, an
             iteration if an int (`total_steps`: never). The paper: 29/30.
         parts: what the steps have, in the order in which it is applied; None: `DEFAULTS`. One that
-            learns (`EnergyHistogram`, `Curvature`, `PositionNoise`, `OutOfView`) serves one run.
+            learns (`EnergyHistogram`, `Curvature`, `PositionNoise`) serves one run.
         adaptive: whether parts that this training shows no need of are switched off, see
             `switched_off`. Every 100 iterations that is one synchronisation with the GPU.
         log: a `RunLog` that gets one line per `observe`, with what the parts say of themselves.

@@ -42,7 +42,7 @@ EARLY = (f"{FADED}-to-1/4", f"{DEFAULTS}-to-1/4")  # fading ends after that shar
 ANNEALED = "annealed-4-opacities-1+faded"  # the defaults until the views rotated
 SHORT_LABEL = "annealed+faded"
 DEFAULTS_POOLED = f"{DEFAULTS}+pooled"
-DEFAULTS_OUT_OF_VIEW = f"{DEFAULTS}+out-of-view"
+UNHELD = f"{DEFAULTS}-without-out-of-view"
 STABLE = "awsgld-stable"  # its histogram follows the energy; that of the arms before it did not
 # Where points are many, fading kills a great part of them again and again: what may spare them.
 UNFADED = {name: f"{DEFAULTS}-{name}-unfaded" for name in ("means", "opacities")}
@@ -80,6 +80,12 @@ def of(*parts: Part) -> MakeParts:
     return lambda _iterations, _nu: [*parts]
 
 
+def with_fading(*parts: Part) -> MakeParts:
+    """The defaults with other fading, or with more."""
+    fading, *others = parts
+    return of(ANNEALING, fading, OutOfView(), *others)
+
+
 def whole_trainings() -> dict[str, MakeParts | None]:
     """The parts of the arms that differ by nothing else."""
     faded_but = {
@@ -93,17 +99,17 @@ def whole_trainings() -> dict[str, MakeParts | None]:
         "annealed-8-0.4": of(Annealing(8.0, 0.4, 8.0, GAUSSIAN)),
         FADED: of(FADING),
         ANNEALED: of(ANNEALING_OF_ALL, FADING),
-        DEFAULTS: of(ANNEALING, FADING),
-        DEFAULTS_POOLED: of(ANNEALING, FADING, Pooling()),
+        DEFAULTS: with_fading(FADING),
+        UNHELD: of(ANNEALING, FADING),
+        DEFAULTS_POOLED: with_fading(FADING, Pooling()),
         EARLY[0]: of(FADING_EARLY),
-        EARLY[1]: of(ANNEALING, FADING_EARLY),
-        **{name: of(ANNEALING, fading) for name, fading in faded_but.items()},
-        SHARE_KEPT: of(ANNEALING, ShareKept(events=300)),
-        SELDOM_FADED: of(ANNEALING, ShareKept(events=100)),
+        EARLY[1]: with_fading(FADING_EARLY),
+        **{name: with_fading(fading) for name, fading in faded_but.items()},
+        SHARE_KEPT: with_fading(ShareKept(events=300)),
+        SELDOM_FADED: with_fading(ShareKept(events=100)),
         "own-step": fixed(OwnStep),
         OWN_STEP: lambda _iterations, _nu: [OwnStep(), FADING],
         "out-of-view": of(OutOfView()),
-        DEFAULTS_OUT_OF_VIEW: of(ANNEALING, FADING, OutOfView()),
         "nu-per-view": lambda iterations, _nu: [ViewHistogram(_warmup(iterations))],
         "nu-per-point": fixed(NuPerPoint),
         "nu-restarted": lambda iterations, _nu: [RestartedHistogram(_warmup(iterations))],
@@ -146,7 +152,7 @@ def adaptive() -> list[StudyArm]:
         "+faded": of(FADING),
         "+annealed": of(ANNEALING),
         "+annealed-but-opacities": of(ANNEALING_BUT_OPACITIES),
-        "+defaults": of(ANNEALING, FADING),
+        "+defaults": with_fading(FADING),
     }
     return [
         StudyArm(f"adc{kind}", parts=parts, mcmc=False, adaptive=True)

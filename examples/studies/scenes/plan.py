@@ -11,7 +11,6 @@ from typing import Any
 from studies.scenes.arms import (
     ANNEALED,
     DEFAULTS,
-    DEFAULTS_OUT_OF_VIEW,
     DEFAULTS_POOLED,
     EARLY,
     FADED,
@@ -22,6 +21,7 @@ from studies.scenes.arms import (
     STABLE,
     STUDY_ARMS,
     UNFADED,
+    UNHELD,
 )
 from studies.scenes.decisions import MANY_VIEWS_SCENES, points_of
 from studies.scenes.training import Spec
@@ -41,7 +41,7 @@ HALF_ARMS = (  # with 50,000 Gaussians
     *("paper", "paper-constant"),
 )
 RATES_ARMS = ("mcmc", OWN_STEP, DEFAULTS)
-UNSEEN_ARMS = ("mcmc", "out-of-view", DEFAULTS, DEFAULTS_OUT_OF_VIEW)
+UNSEEN_ARMS = ("mcmc", "out-of-view", UNHELD, DEFAULTS)
 CROWDED_ARMS = ("mcmc", DEFAULTS, SHARE_KEPT, UNFADED["means"])
 
 
@@ -121,7 +121,7 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
             *rotated(("bonsai",), (FADED, *UNSEEN_ARMS), 1, 7_500, tiled=20),
             *rotated(("bonsai",), UNSEEN_ARMS, 1, 7_500, tiled=4),
             *rotated(MANY_VIEWS_SCENES, UNSEEN_ARMS, 2, 7_500, tiled=9),
-            *rotated(MANY_VIEWS_SCENES, UNSEEN_ARMS, 1, 30_000, tiled=9),
+            *rotated(MANY_VIEWS_SCENES, ("mcmc", UNHELD, DEFAULTS), 2, 30_000, tiled=9),
         ],
         "explorations": [
             *rotated(("plush",), [STABLE, *arms["explorations"]], 1, 7_500),

@@ -12,7 +12,7 @@ import numpy as np
 FOLDER = Path(__file__).resolve().parents[3] / "docs" / "results" / "study"  # what is committed
 COSTS = FOLDER / "costs.json"
 MEASURED = ("iteration", "seconds", "psnr", "ssim", "train_psnr", "num_points")  # in all records
-COLUMNS = (*MEASURED, "lpips", "relocated", "median_scale", "median_opacity")
+COLUMNS = (*MEASURED, "lpips", "relocated", "median_scale", "median_opacity", "visible_share")
 
 Costs = dict[tuple[str, str, int, str], float]  # scene, size, iterations, arm -> share of stock's
 

@@ -26,6 +26,7 @@ import torch
 from splatting.fit import Fit, FitOptions
 from splatting.scenes import Background, Scene, Size, View, load_scene
 
+from opt3dgs_optim.parts.out_of_view import SHARE
 from studies.scenes.arms import StudyArm, find_study_arm
 from studies.scenes.perceptual import NET, load_tool, mean_lpips
 
@@ -133,9 +134,13 @@ def fit_of(arm: StudyArm) -> type[Fit]:
 
 
 def _population(fit: Fit) -> dict[str, float]:
-    """Gaussians moved so far, and the median of their longest axis (in extents) and opacity."""
+    """Gaussians moved so far, the median of their longest axis (in extents) and opacity.
+
+    And the mean share of them that a view sees, where a part keeps it.
+    """
     scales, logits = fit.gaussians["scales"].detach(), fit.gaussians["opacities"].detach()
-    return {
+    group = fit.optimizers["means"].param_groups[0]
+    return {name: float(group[name]) for name in (SHARE,) if name in group} | {
         "relocated": float(fit.relocated),
         "median_scale": float(scales.amax(1).median().exp()) / fit.scene.extent,
         "median_opacity": float(torch.sigmoid(logits).median()),

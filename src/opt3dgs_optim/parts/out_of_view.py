@@ -1,5 +1,7 @@
 """Points out of view: where views see little of a scene, regularisers make no full steps."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,8 +14,10 @@ from opt3dgs_optim.rows import shaped
 
 SHARE = "visible_share"  # of the positions' group: mean share of the points that a view sees
 MEMORY, BELOW, LEAST = 100, 1 / 3, 0.01  # views of the mean; where it acts; least of a view
+SAMPLE = 16_384  # points that are asked whether a view sees them
 
 
+@dataclass(frozen=True, repr=False)
 class OutOfView(Part):
     """Keep the scales and opacities of points that few views see from melting.
 
@@ -24,13 +28,10 @@ class OutOfView(Part):
     is below a third, the second moment of one out of view is at least (gradient / (3 s))^2, for
     steps of at most about 3 s of a full one; above, nothing is changed, bit for bit. Out of view
     is a point whose position's gradient is exactly zero; the positions must be stepped first, as
-    in every known trainer. It costs no memory, and serves one scheduler.
+    in every known trainer. It costs no memory.
     """
 
     names = ("means", "scales", "opacities")
-
-    def __init__(self) -> None:
-        self._seen: Any = (None, (), 1.0)  # iteration, who is out of view in it, visible share
 
     def before(
         self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
@@ -39,17 +40,22 @@ class OutOfView(Part):
         if grad.dim() == 0 or len(grad) == 0:
             return grad
         if group[SLOT] == "means":
-            unseen, share = (grad == 0).flatten(1).all(1), group.get(SHARE, 1.0)
-            now: Any = (~unseen).float().mean().clamp(min=LEAST)
+            some, share = grad[:: 1 + len(grad) // SAMPLE], group.get(SHARE, 1.0)
+            now: Any = some.any(1).float().mean().clamp(min=LEAST)
             now = now.item() if grad.is_cpu else now  # on a GPU nothing is read
-            group[SHARE] = share + (now - share) * (course.valid / MEMORY)
-            self._seen = course.current, unseen & course.valid, group[SHARE]
+            group[SHARE] = share = share + (now - share) * (course.valid / MEMORY)
+            off = grad.is_cpu and share >= BELOW
+            unseen = None if off else ~grad.any(1) & course.valid
+            course.unseen = course.current, unseen, share
             return grad
-        iteration, unseen, share = self._seen
-        off = isinstance(share, float) and share >= BELOW
-        if off or iteration != course.current or len(unseen) != len(grad):
+        iteration, unseen, share = course.unseen
+        if unseen is None or iteration != course.current or len(unseen) != len(grad):
             return grad
         factor = BELOW / share * (share < BELOW)
         least = torch.where(shaped(unseen, grad), grad * factor, 0.0).square_()
         state["exp_avg_sq"].copy_(torch.maximum(state["exp_avg_sq"], least))
         return grad
+
+    def numbers(self, course: Course) -> Mapping[str, float | Tensor]:
+        """The mean visible share."""
+        return {SHARE: course.unseen[2]}
