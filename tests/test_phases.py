@@ -392,7 +392,7 @@ def test_optimizers_that_step_without_an_energy() -> None:
 def test_an_energy_that_stops_coming() -> None:
     splats, optimizers = begun(phases := PhaseScheduler(500))
     train(splats, optimizers, phases, 0, 5)
-    with pytest.warns(UserWarning, match="without an energy: Annealing, Fading stand still"):
+    with pytest.warns(UserWarning, match="without an energy: Annealing, Fading, OutOfView stand"):
         train(splats, optimizers, None, 5, 30)
 
 

@@ -107,9 +107,8 @@ class _ObservedCourse(Course):
             histogram.observe(closure_value)
         if self.steps == 1 and histogram.num_observed == 0:
             warn_user(
-                "AWSGLD: step() was called but no energy has been observed yet, so the multiplier "
-                "is not being adapted. Call histogram.observe(loss) once per iteration, before "
-                "step(), or pass step() a closure that returns the loss."
+                "AWSGLD: no energy has been observed yet, so the multiplier is not adapted; call "
+                "histogram.observe(loss) before step(), or pass it a closure that returns the loss"
             )
         self.valid = histogram.last_finite
         return True

@@ -43,9 +43,7 @@ def check_count(call: str, name: str, value: Any, low: int, high: int | None = N
     return value
 
 
-def check_choice(
-    call: str, name: str, value: Any, allowed: Sequence[str | bool] = (True, False)
-) -> Any:
+def check_choice(call: str, name: str, value: Any, allowed: Sequence[Any] = (True, False)) -> Any:
     """Return `value`, or raise ValueError unless it is one of `allowed`, and of its type."""
     if not any(isinstance(value, type(each)) and value == each for each in allowed):
         listed = " or ".join(map(repr, allowed))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -28,15 +28,14 @@ Optimizers = TypeVar("Optimizers", bound="Optimizer | Mapping[str, Optimizer]")
 class PhaseScheduler(Course):
     """Put parts into the steps of a 3DGS trainer's optimizers, in two phases.
 
-    By default `DEFAULTS`, what paid (docs/evidence.md); with `PhaseScheduler.paper`,
-    Opt3DGS. What is left out costs nothing.
+    By default `DEFAULTS`, what paid (docs/evidence.md); with `PhaseScheduler.paper`, Opt3DGS.
 
     Args:
         total_steps: iterations of the training.
         switch: where exploitation starts: a fraction of `total_steps` in (0, 1] if a float, an
             iteration if an int (`total_steps`: never). The paper: 29/30.
-        parts: what the steps have, in the order in which it is applied; None: `DEFAULTS`. One that
-            learns (`EnergyHistogram`, `Curvature`, `PositionNoise`) serves one run.
+        parts: what the steps have, in that order; None: `DEFAULTS`. One that learns
+            (`EnergyHistogram`, `Curvature`, `PositionNoise`) serves one run.
         adaptive: whether parts that this training shows no need of are switched off, see
             `switched_off`. Every 100 iterations that is one synchronisation with the GPU.
         log: a `RunLog` that gets one line per `observe`, with what the parts say of themselves.
@@ -117,9 +116,7 @@ class PhaseScheduler(Course):
     @property
     def phase(self) -> Phase:
         """The phase of the iteration whose loss comes next; what `pixel_loss` goes by."""
-        phase = self.phase_of(self.iteration)
-        assert phase is not None
-        return phase
+        return cast(Phase, self.phase_of(self.iteration))
 
     def upgrade(self, optimizers: Optimizers) -> Optimizers:
         """Put the parts into the trainer's optimizer(s), in place; return the argument.

@@ -22,6 +22,7 @@ from opt3dgs_optim import (
 )
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history
 from opt3dgs_optim.lbfgs.history import laid_out
+from opt3dgs_optim.parts.out_of_view import SHARE
 
 HISTORY_SIZE = 5
 NOISE_LR = 5e5
@@ -115,13 +116,18 @@ def gsplat_noise_alone(case: Case) -> Callable[[], None]:
     return lambda: gsplat_noise(splats, LEARNING_RATES["means"] * NOISE_LR)
 
 
-def upgraded(case: Case, parts: list[Part], *, exploit: bool = False) -> Callable[[], None]:
-    """Six upgraded optimizers with these parts, and `observe`."""
+def upgraded(
+    case: Case, parts: list[Part], *, exploit: bool = False, seen: float = 1.0
+) -> Callable[[], None]:
+    """Six upgraded optimizers with these parts, and `observe`; views see that share of points."""
     splats, steps = case.splats(), 1_000_000
     phases = PhaseScheduler(steps, 0 if exploit else steps, parts)
     optimizers = phases.upgrade(case.adams(splats))
     losses = list(torch.rand(64, device=case.device).mul(0.2).unbind())
     grads = [1e-4 * torch.randn_like(splats["means"]) for _ in range(8)]
+    for grad in grads if seen < 1.0 else ():
+        grad.mul_(torch.rand(case.points, 1, device=case.device) < seen)
+        optimizers["means"].param_groups[0][SHARE] = seen
     # Half-way, where events of fading are as frequent as they get; a call is one iteration.
     count = 0 if exploit else steps // 4
 
@@ -183,6 +189,7 @@ SUBJECTS: dict[str, Callable[[Case], Callable[[], Any]]] = {
     "six Adams": six_adams,
     "six Adams again": six_adams,  # other tensors, elsewhere in memory: how exact a ratio is
     "defaults": lambda case: upgraded(case, [*DEFAULTS]),
+    "defaults, a tenth in view": lambda case: upgraded(case, [*DEFAULTS], seen=0.1),
     "defaults + histogram": lambda case: upgraded(case, [*DEFAULTS, EnergyHistogram(warmup=4)]),
     "the paper's exploration": lambda case: upgraded(case, [EnergyHistogram.paper(warmup=4)]),
     "the paper's exploitation": lambda case: upgraded(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from studies.scenes.analysis import Study
-from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, DEFAULTS_POOLED, FADED, STABLE
+from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, DEFAULTS_POOLED, FADED, STABLE, UNHELD
 from studies.scenes.long_tables import Difference, difference
 from studies.scenes.records import Setting
 
@@ -25,7 +25,9 @@ COMPARISONS = {
     "SquaredLoss": ("l2@1/30", BASELINE),
     "FreshMoments": ("l1+reset@1/30", BASELINE),
     "Curvature": ("l2+reset+lqn@1/30", "l2+reset@1/30"),
+    "OutOfView": (DEFAULTS, UNHELD),
 }
+TILED = {"OutOfView": 9}  # part -> pieces of every view: where it acts
 
 
 @dataclass(frozen=True)
@@ -56,18 +58,18 @@ def points_of(scene: str) -> int:
     return NUM_POINTS.get(scene, POINTS)
 
 
-def settings_of(study: Study, iterations: int) -> list[Setting]:
+def settings_of(study: Study, iterations: int, tiled: int = 0) -> list[Setting]:
     """The rule's scenes, with rotated views at a quarter of their size and their own points."""
-    every = [s for s in every_scene(study, iterations) if s.scene in MANY_VIEWS_SCENES]
+    every = [s for s in every_scene(study, iterations, tiled) if s.scene in MANY_VIEWS_SCENES]
     return [s for s in every if s.size == QUARTER and s.points == points_of(s.scene)]
 
 
-def every_scene(study: Study, iterations: int) -> list[Setting]:
+def every_scene(study: Study, iterations: int, tiled: int = 0) -> list[Setting]:
     """Every scene and size of the rotated trainings of all views at the trainer's rates."""
 
     def whole(s: Setting) -> bool:
-        plain = Setting(s.scene, s.points, iterations, "sfm", rotated=True, size=s.size)
-        return s == plain
+        kind = {"rotated": True, "size": s.size, "tiled": tiled}
+        return s == Setting(s.scene, s.points, iterations, "sfm", **kind)
 
     return [setting for setting in study.all_settings() if whole(setting)]
 
@@ -76,13 +78,15 @@ def decide(study: Study) -> dict[str, Decision]:
     """The decision on every part, at the longest trainings that three scenes have.
 
     Each part is judged against the same training without it: the multiplier against a constant of
-    its mean, curvature against the same phase without it, annealing on top of fading.
+    its mean, curvature against the same phase without it, annealing on top of fading, `OutOfView`
+    where it acts, on views that were cut up.
     """
     made = {}
     for part, (arm, control) in COMPARISONS.items():
         made[part] = Decision(arm, control, None, None)
         for iterations in LENGTHS:
-            found = difference(study, settings_of(study, iterations), arm, control)
+            settings = settings_of(study, iterations, TILED.get(part, 0))
+            found = difference(study, settings, arm, control)
             if len(found.pairs) >= MIN_SCENES:
                 made[part] = Decision(arm, control, iterations, found)
                 break

@@ -42,7 +42,6 @@ class FreshMoments(Part):
     """
 
     settling: int = 0
-
     during = Phase.EXPLOITATION
 
     def __post_init__(self) -> None:

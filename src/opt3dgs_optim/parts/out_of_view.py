@@ -13,8 +13,8 @@ from opt3dgs_optim.part import Group, Part
 from opt3dgs_optim.rows import shaped
 
 SHARE = "visible_share"  # of the positions' group: mean share of the points that a view sees
-MEMORY, BELOW, LEAST = 100, 1 / 3, 0.01  # views of the mean; where it acts; least of a view
-SAMPLE = 16_384  # points that are asked whether a view sees them
+MEMORY, SAMPLE = 100, 16_384  # views of the mean; points of each that are asked
+BELOW, LEAST = 1 / 3, 0.01  # where it acts; least of a view
 
 
 @dataclass(frozen=True, repr=False)
@@ -23,12 +23,11 @@ class OutOfView(Part):
 
     3DGS-MCMC's regularisers pull at every point in every iteration, and Adam makes a full step of
     a gradient however small. Relocation and `Fading` empty second moments: a point out of view
-    then shrinks and fades until a view sees it. Where a view sees a tenth of the points or less,
-    most are dead by then, and relocated, and so on. While the mean visible share s of the points
-    is below a third, the second moment of one out of view is at least (gradient / (3 s))^2, for
-    steps of at most about 3 s of a full one; above, nothing is changed, bit for bit. Out of view
-    is a point whose position's gradient is exactly zero; the positions must be stepped first, as
-    in every known trainer. It costs no memory.
+    then shrinks and fades until a view sees it, and where views see a tenth of the points, most
+    are dead by then. While the mean visible share s of the points is below a third, the second
+    moment of one out of view is at least (gradient / (3 s))^2, for steps of at most about 3 s of
+    a full one; above, nothing is changed, bit for bit. Out of view is a point whose position's
+    gradient is zero; the positions must be stepped first, as in every known trainer. No memory.
     """
 
     names = ("means", "scales", "opacities")
@@ -41,10 +40,10 @@ class OutOfView(Part):
             return grad
         if group[SLOT] == "means":
             some, share = grad[:: 1 + len(grad) // SAMPLE], group.get(SHARE, 1.0)
-            now: Any = some.any(1).float().mean().clamp(min=LEAST)
-            now = now.item() if grad.is_cpu else now  # on a GPU nothing is read
+            now: Any = some.any(1).mean(dtype=torch.float32)
+            now = max(now.item(), LEAST) if grad.is_cpu else now.clamp(min=LEAST)
             group[SHARE] = share = share + (now - share) * (course.valid / MEMORY)
-            off = grad.is_cpu and share >= BELOW
+            off = grad.is_cpu and share >= BELOW  # on a GPU nothing is read
             unseen = None if off else ~grad.any(1) & course.valid
             course.unseen = course.current, unseen, share
             return grad
