@@ -23,7 +23,7 @@ from trainers import (
 )
 
 from opt3dgs_optim import Fading, OutOfView, Part
-from opt3dgs_optim.parts.out_of_view import BELOW
+from opt3dgs_optim.parts.out_of_view import BELOW, SAMPLE
 
 POINTS, SEEN = 200, 4  # a view sees 2 % of them
 PULL = 1e-3  # of the regulariser; the images' gradients are about 1
@@ -136,6 +136,41 @@ def test_on_a_device_the_share_is_never_read() -> None:
     assert runs[0][1] == pytest.approx(runs[1][1], rel=1e-4)
     for name, param in runs[0][0].items():
         torch.testing.assert_close(param, runs[1][0][name], rtol=1e-4, atol=1e-5)
+
+
+def test_two_trainings_may_share_it() -> None:
+    """As they do in the defaults: each goes on as it would alone, in turns with the other."""
+    alone, both = [], []
+    for shared in (False, True):
+        part = OutOfView()
+        runs = [large(2_000, part if shared else OutOfView()) for _ in range(2)]
+        for i in range(30):
+            for run, seen in zip(runs, (SEEN, 3 * SEEN), strict=True):
+                iterate(*run[:1], run[2], run[1], i, i + 1, seen=seen)
+        (both if shared else alone).extend(run[0] for run in runs)
+    for ours, theirs in zip(both, alone, strict=True):
+        assert_same(ours, theirs)
+
+
+def test_of_many_points_some_are_asked_and_all_are_held() -> None:
+    points = 3 * SAMPLE
+    _, phases, optimizers = large(2_000, part := OutOfView())
+    group = optimizers["means"].param_groups[0]
+    grad = torch.zeros(points, 3)
+    grad[torch.arange(points) % 16 < 3, 2] = 1.0  # 3 of 16; of every fourth, a quarter
+    phases.take(torch.tensor(0.1))
+    part.before(group, grad, grad, {}, phases)
+    assert group["visible_share"] == pytest.approx(0.02 + 0.01 * (0.25 - 0.02))
+    state = {"exp_avg_sq": torch.zeros(points)}
+    pull = torch.full((points,), PULL)
+    part.before(optimizers["opacities"].param_groups[0], pull, pull, state, phases)
+    assert torch.equal(state["exp_avg_sq"] > 0, grad[:, 2] == 0)
+
+
+def test_the_run_log_has_the_share() -> None:
+    splats, phases, optimizers = upgraded(60, OutOfView())
+    iterate(splats, optimizers, phases, 0, 3, seen=3)
+    assert phases.numbers() == {"visible_share": pytest.approx(1 - 0.75 * (1 - 0.99**3))}
 
 
 def test_an_iteration_that_does_not_count_leaves_no_trace() -> None:
