@@ -61,19 +61,21 @@ def fits_at(folders: dict[str, Path], mark: str) -> dict[str, Fit]:
 
 
 def measure_all(runs: Path, iterations: Sequence[int]) -> list[dict[str, Any]]:
-    """One entry per scene, size and length whose first seed has stock and another arm."""
+    """One entry per scene, size, length and cut: of the first seed with stock and another arm."""
     found: dict[tuple[Any, ...], dict[str, Path]] = defaultdict(dict)
     for path in sorted(runs.rglob("record.json")):
         record = json.loads(path.read_text(encoding="utf-8"))
-        plain = not (record.get("views") or record.get("tiled") or record["seed"])
+        plain = not record.get("views") and record.get("rates", 1.0) == 1.0
         arm = STUDY_ARMS.get(record["arm"])
         whole = arm is not None and not arm.retired and arm.trunk is None and arm.needs is None
         if plain and whole and record.get("finished") and record["iterations"] in iterations:
-            found[_key(record)][record["arm"]] = path.parent
+            found[(*_key(record), record["seed"])][record["arm"]] = path.parent
+    first: dict[tuple[Any, ...], dict[str, Path]] = {}
+    for (*key, _seed), folders in sorted(found.items()):
+        if BASELINE in folders and len(folders) > 1:
+            first.setdefault(tuple(key), folders)
     made = []
-    for (scene, size, count), folders in found.items():
-        if BASELINE not in folders or len(folders) < 2:
-            continue
+    for (scene, size, count, tiled), folders in first.items():
         marks = [
             name
             for name in (f"at-{round(share * count)}.pt" for share in SHARES)
@@ -86,6 +88,7 @@ def measure_all(runs: Path, iterations: Sequence[int]) -> list[dict[str, Any]]:
                 "scene": scene,
                 "size": size,
                 "iterations": count,
+                "tiled": tiled,
                 "checkpoints": marks,
                 "shares": shares,
                 "machine": machine(),
@@ -96,8 +99,8 @@ def measure_all(runs: Path, iterations: Sequence[int]) -> list[dict[str, Any]]:
     return made
 
 
-def _key(entry: dict[str, Any]) -> tuple[str, str, int]:
-    return entry["scene"], entry["size"], entry["iterations"]
+def _key(entry: dict[str, Any]) -> tuple[str, str, int, int]:
+    return entry["scene"], entry["size"], entry["iterations"], int(entry.get("tiled", 0))
 
 
 @command("costs")

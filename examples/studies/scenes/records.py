@@ -14,7 +14,8 @@ COSTS = FOLDER / "costs.json"
 MEASURED = ("iteration", "seconds", "psnr", "ssim", "train_psnr", "num_points")  # in all records
 COLUMNS = (*MEASURED, "lpips", "relocated", "median_scale", "median_opacity", "visible_share")
 
-Costs = dict[tuple[str, str, int, str], float]  # scene, size, iterations, arm -> share of stock's
+# scene, size, iterations, pieces of a view, arm -> share of stock's
+Costs = dict[tuple[str, str, int, int, str], float]
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,7 @@ def read_costs(path: Path) -> Costs:
     """What an iteration costs, as `costs.py` measured it; empty where it was not."""
     entries = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
     return {
-        (e["scene"], e["size"], e["iterations"], arm): share
+        (e["scene"], e["size"], e["iterations"], e.get("tiled", 0), arm): share
         for e in entries
         for arm, share in e["shares"].items()
     }

@@ -113,7 +113,8 @@ def test_a_part_is_on_if_one_metric_gains_and_none_loses(
     better: dict[str, float], verdict: str
 ) -> None:
     costs = {
-        (scene, "images_4", 7_500, "faded"): better.get("cost", 1.0) for scene in MANY_VIEWS_SCENES
+        (scene, "images_4", 7_500, 0, "faded"): better.get("cost", 1.0)
+        for scene in MANY_VIEWS_SCENES
     }
     better = {name: value for name, value in better.items() if name != "cost"}
     records = [
@@ -136,7 +137,7 @@ def test_a_part_is_on_if_one_metric_gains_and_none_loses(
 
 def test_a_cost_that_was_not_measured_is_the_controls() -> None:
     setting = rotated_record("faded", "plush", 0).setting
-    study = Study([], {("plush", "images_4", 7_500, "faded"): 1.25})
+    study = Study([], {("plush", "images_4", 7_500, 0, "faded"): 1.25})
     assert study.cost(setting, "faded") == 1.25
     assert study.cost(setting, DEFAULT_ARM, "faded") == 1.0
     assert study.cost(setting, DEFAULT_ARM) == 1.0
