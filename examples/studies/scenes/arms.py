@@ -80,9 +80,8 @@ def of(*parts: Part) -> MakeParts:
     return lambda _iterations, _nu: [*parts]
 
 
-def with_fading(*parts: Part) -> MakeParts:
-    """The defaults with other fading, or with more."""
-    fading, *others = parts
+def with_fading(fading: Part, *others: Part) -> MakeParts:
+    """The defaults with this fading, and with others beside it."""
     return of(ANNEALING, fading, OutOfView(), *others)
 
 

@@ -140,7 +140,8 @@ def _population(fit: Fit) -> dict[str, float]:
     """
     scales, logits = fit.gaussians["scales"].detach(), fit.gaussians["opacities"].detach()
     group = fit.optimizers["means"].param_groups[0]
-    return {name: float(group[name]) for name in (SHARE,) if name in group} | {
+    seen = {SHARE: float(group[SHARE])} if SHARE in group else {}
+    return seen | {
         "relocated": float(fit.relocated),
         "median_scale": float(scales.amax(1).median().exp()) / fit.scene.extent,
         "median_opacity": float(torch.sigmoid(logits).median()),
