@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from studies.scenes.analysis import Study
 from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, DEFAULTS_POOLED, FADED, STABLE, UNHELD
@@ -27,7 +27,9 @@ COMPARISONS = {
     "Curvature": ("l2+reset+lqn@1/30", "l2+reset@1/30"),
     "OutOfView": (DEFAULTS, UNHELD),
 }
-TILED = {"OutOfView": 9}  # part -> pieces of every view: where it acts
+# Parts that change no bit of an ordinary training, only where it would be ruined, and how many
+# pieces of every view make it one that they are for: on unless they lose.
+GUARDS = {"OutOfView": 9}
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class Decision:
     control: str
     iterations: int | None  # None: not measured on enough scenes
     found: Difference | None
+    guard: bool = False
 
     @property
     def verdict(self) -> str:
@@ -45,12 +48,15 @@ class Decision:
         if self.found is None:
             return "too few"
         verdict, seeds = self.found.verdict, min(map(len, self.found.pairs.values()))
-        return "pays, one seed" if verdict == "pays" and seeds < MIN_SEEDS else verdict
+        if self.guard and verdict == "no difference":
+            verdict = "loses nothing"
+        passed = verdict in ("pays", "loses nothing")
+        return f"{verdict}, one seed" if passed and seeds < MIN_SEEDS else verdict
 
     @property
     def on(self) -> bool:
-        """A part that was not shown to pay is off."""
-        return self.verdict == "pays"
+        """A part that was not shown to pay is off; a guard that loses."""
+        return self.verdict in ("pays", "loses nothing")
 
 
 def points_of(scene: str) -> int:
@@ -78,16 +84,16 @@ def decide(study: Study) -> dict[str, Decision]:
     """The decision on every part, at the longest trainings that three scenes have.
 
     Each part is judged against the same training without it: the multiplier against a constant of
-    its mean, curvature against the same phase without it, annealing on top of fading, `OutOfView`
+    its mean, curvature against the same phase without it, annealing on top of fading, a guard
     where it acts, on views that were cut up.
     """
     made = {}
     for part, (arm, control) in COMPARISONS.items():
-        made[part] = Decision(arm, control, None, None)
+        made[part] = Decision(arm, control, None, None, guard=part in GUARDS)
         for iterations in LENGTHS:
-            settings = settings_of(study, iterations, TILED.get(part, 0))
+            settings = settings_of(study, iterations, GUARDS.get(part, 0))
             found = difference(study, settings, arm, control)
             if len(found.pairs) >= MIN_SCENES:
-                made[part] = Decision(arm, control, iterations, found)
+                made[part] = replace(made[part], iterations=iterations, found=found)
                 break
     return made

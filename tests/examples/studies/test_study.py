@@ -22,6 +22,7 @@ from studies.scenes.analysis import Study
 from studies.scenes.arms import (
     BASELINE,
     STUDY_ARMS,
+    UNHELD,
     adaptive,
     find_study_arm,
     last_phases,
@@ -133,6 +134,24 @@ def test_a_part_is_on_if_one_metric_gains_and_none_loses(
     once = decide(Study(records[:-2], costs))["Fading"]
     assert not once.on
     assert once.verdict == (f"{verdict}, one seed" if verdict == "pays" else verdict)
+
+
+@pytest.mark.parametrize(
+    ("psnr", "on"), [((33.0, 20.3, 20.2), True), ((19.6, 19.5, 19.4), False), ((20.0,) * 3, True)]
+)
+def test_a_guard_is_on_unless_it_loses(psnr: tuple[float, ...], on: bool) -> None:
+    """One scene saved and two as before is no gain by the rule: the spread is over the scenes."""
+    every = []
+    for scene, end in zip(MANY_VIEWS_SCENES, psnr, strict=True):
+        for seed in (0, 1):
+            with_it = rotated_record(DEFAULT_ARM, scene, seed, psnr=end)
+            every += [with_it, rotated_record(UNHELD, scene, seed)]
+    cut = [replace(r, setting=replace(r.setting, tiled=9)) for r in every]
+    decision = decide(Study(cut))["OutOfView"]
+    assert (decision.on, decision.verdict) == (on, "loses nothing" if on else "loses PSNR")
+    assert not decide(Study(every))["OutOfView"].on  # whole views are not what it is for
+    once = decide(Study([r for r in cut if r.setting.scene != "plush" or r.seed == 0]))
+    assert not once["OutOfView"].on
 
 
 def test_a_cost_that_was_not_measured_is_the_controls() -> None:
