@@ -134,12 +134,13 @@ def plot(results: dict[int, dict[str, dict[str, float]]], path: Path, title: str
 
     counts = list(results)
     figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
-    for name in results[counts[0]]:
+    for i, name in enumerate(results[counts[0]]):
+        style = "o-" if i < 10 else "s--"  # matplotlib has ten colours
         rows = [results[n][name] for n in counts]
         middle = [row["ns_per_point"] for row in rows]
         below = [row["ns_per_point"] - row["ns_low"] for row in rows]
         above = [row["ns_high"] - row["ns_per_point"] for row in rows]
-        axes.errorbar(counts, middle, yerr=[below, above], marker="o", capsize=3, label=name)
+        axes.errorbar(counts, middle, [below, above], fmt=style, capsize=3, label=name)
     axes.set(xscale="log", yscale="log", xlabel="points", ylabel="ns per point", title=title)
     axes.grid(which="both", alpha=0.3)
     figure.legend(loc="outside right upper", fontsize="small")
