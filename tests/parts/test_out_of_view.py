@@ -145,8 +145,8 @@ def test_two_trainings_may_share_it() -> None:
         part = OutOfView()
         runs = [large(2_000, part if shared else OutOfView()) for _ in range(2)]
         for i in range(30):
-            for run, seen in zip(runs, (SEEN, 3 * SEEN), strict=True):
-                iterate(*run[:1], run[2], run[1], i, i + 1, seen=seen)
+            for (splats, phases, optimizers), seen in zip(runs, (SEEN, 3 * SEEN), strict=True):
+                iterate(splats, optimizers, phases, i, i + 1, seen=seen)
         (both if shared else alone).extend(run[0] for run in runs)
     for ours, theirs in zip(both, alone, strict=True):
         assert_same(ours, theirs)

@@ -125,9 +125,10 @@ def upgraded(
     optimizers = phases.upgrade(case.adams(splats))
     losses = list(torch.rand(64, device=case.device).mul(0.2).unbind())
     grads = [1e-4 * torch.randn_like(splats["means"]) for _ in range(8)]
-    for grad in grads if seen < 1.0 else ():
-        grad.mul_(torch.rand(case.points, 1, device=case.device) < seen)
+    if seen < 1.0:
         optimizers["means"].param_groups[0][SHARE] = seen
+        for grad in grads:
+            grad.mul_(torch.rand(case.points, 1, device=case.device) < seen)
     # Half-way, where events of fading are as frequent as they get; a call is one iteration.
     count = 0 if exploit else steps // 4
 

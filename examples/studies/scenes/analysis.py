@@ -61,7 +61,7 @@ class Study:
 
     def cost(self, setting: Setting, arm: str, control: str = BASELINE) -> float:
         """Seconds of an iteration, as a share of the control's; 1 where not both were measured."""
-        where = (setting.scene, setting.size, setting.iterations, int(setting.tiled))
+        where = (setting.scene, setting.size, setting.iterations, setting.tiled)
         ours, theirs = (
             1.0 if name == BASELINE else self._costs.get((*where, name)) for name in (arm, control)
         )

@@ -42,6 +42,7 @@ HALF_ARMS = (  # with 50,000 Gaussians
 )
 RATES_ARMS = ("mcmc", OWN_STEP, DEFAULTS)
 UNSEEN_ARMS = ("mcmc", "out-of-view", UNHELD, DEFAULTS)
+UNSEEN_LONG_ARMS = ("mcmc", UNHELD, DEFAULTS)
 CROWDED_ARMS = ("mcmc", DEFAULTS, SHARE_KEPT, UNFADED["means"])
 
 
@@ -121,7 +122,7 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
             *rotated(("bonsai",), (FADED, *UNSEEN_ARMS), 1, 7_500, tiled=20),
             *rotated(("bonsai",), UNSEEN_ARMS, 1, 7_500, tiled=4),
             *rotated(MANY_VIEWS_SCENES, UNSEEN_ARMS, 2, 7_500, tiled=9),
-            *rotated(MANY_VIEWS_SCENES, ("mcmc", UNHELD, DEFAULTS), 2, 30_000, tiled=9),
+            *rotated(MANY_VIEWS_SCENES, UNSEEN_LONG_ARMS, 2, 30_000, tiled=9),
         ],
         "explorations": [
             *rotated(("plush",), [STABLE, *arms["explorations"]], 1, 7_500),
