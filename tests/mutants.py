@@ -43,11 +43,11 @@ ENERGY = ["test_partitions.py", "parts/test_histogram.py", "parts/test_histogram
 CURVATURE = [
     f"lbfgs/test_{name}.py" for name in ("history", "two_loop", "lqn_direction", "foresight")
 ]
+DEFAULTS = ("annealing", "fading", "out_of_view")
 # Of these tests: those that compile C++, a law that the loop oracle sees sooner, other classes.
 LEFT_OUT = "not sanitizers and not mutants and not kernel and not compiles and not power_four"
-LEFT_OUT += (
-    " and not (test_options and not EnergyHistogram and not IsotropicNoise and not PositionNoise)"
-)
+OPTIONS_OF = ("EnergyHistogram", "IsotropicNoise", "PositionNoise", "Annealing", "Fading")
+LEFT_OUT += f" and not (test_options and not {' and not '.join(OPTIONS_OF)})"
 # Module: the tests that are meant to notice. What energy, curvature and noise are made of included.
 TARGETS = {
     "partitions.py": ENERGY,
@@ -60,6 +60,7 @@ TARGETS = {
         "parts/test_noise_covariance.py",
         "test_options.py",
     ],
+    **{f"parts/{name}.py": [f"parts/test_{name}.py", "test_options.py"] for name in DEFAULTS},
 }
 
 

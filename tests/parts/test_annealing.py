@@ -89,6 +89,11 @@ def test_the_factor_is_none_of_decoupled_decays_business(decoupled: str) -> None
 
 
 def test_the_log_gets_the_factor() -> None:
-    phases = only(TOTAL, Annealing(4.0, 1.0))
-    phases.observe(0.1, iteration=TOTAL // 2)
-    assert phases.numbers() == {"annealing": pytest.approx(2.0)}
+    for names, factor in ((("scales", "opacities"), 2.0), (("opacities", "scales"), 1.0)):
+        phases = only(TOTAL, Annealing(4.0, 1.0, names=names))
+        phases.observe(0.1, iteration=TOTAL // 2)
+        assert phases.numbers() == {"annealing": pytest.approx(factor)}
+
+
+def test_the_defaults_are_those_that_were_measured() -> None:
+    assert [Annealing().at("scales", t) for t in (0.0, 1.0)] == [4.0, 0.4]

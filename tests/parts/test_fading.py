@@ -150,9 +150,48 @@ def test_a_rewound_training_does_not_fade_what_is_over() -> None:
     assert torch.allclose(before, after, atol=1e-3)
 
 
+def second_moments(
+    fading: Fading,
+    iteration: int,
+    *,
+    total_steps: int = 100,
+    valid: bool = True,
+    group: dict[str, Any] | None = None,
+) -> torch.Tensor:
+    """Of 50 points that were 1, after a step; the first of an Adam that was taken over."""
+    param, phases = torch.nn.Parameter(torch.zeros(50, 3)), only(total_steps, fading)
+    phases.observe(0.1, iteration=iteration - 1)
+    phases.valid = torch.tensor(valid)  # as on a device, where nobody knows
+    state = {key: torch.ones(50, 3) for key in ("exp_avg", "exp_avg_sq")}
+    fading.before(group or {}, param, param.detach(), state, phases)
+    return state["exp_avg_sq"]
+
+
 def test_many_events_at_once_are_not_all_made_up_for() -> None:
-    every = Fading(share=1.0, events=300, start=0.0, stop=1.0)
-    assert float(trained(every, [99]).max()) < 32.5  # 0.04^32 is denormal
+    halved = Fading(share=1.0, exp_avg=0.5, exp_avg_sq=0.5, events=300, start=0.0, stop=1.0)
+    found = second_moments(halved, 999, total_steps=1000, group={"faded": 0})  # of 249
+    assert torch.equal(found, torch.full((50, 3), 0.5**32))
+
+
+@pytest.mark.parametrize(("iteration", "factor"), [(50, 0.04), (51, 1.0), (49, 1.0)])
+def test_a_training_taken_over_makes_up_for_nothing(iteration: int, factor: float) -> None:
+    found = second_moments(Fading(share=1.0, events=10, start=0.0, stop=1.0), iteration)
+    torch.testing.assert_close(found, torch.full((50, 3), factor))
+
+
+def test_an_iteration_that_does_not_count_fades_nothing_on_a_device() -> None:
+    fading = Fading(share=0.5, events=10, start=0.0, stop=1.0)
+    assert second_moments(fading, 50, valid=False).min() == 1.0
+    assert second_moments(fading, 50).min() < 1.0
+
+
+def test_a_parameter_without_points_is_left_alone() -> None:
+    fading, phases = Fading(share=1.0, events=10, start=0.0, stop=1.0), only(100)
+    phases.observe(0.1, iteration=9)  # the first event
+    scalar = torch.nn.Parameter(torch.tensor(1.0))
+    state = {"exp_avg": torch.tensor(1.0), "exp_avg_sq": torch.tensor(1.0)}
+    fading.before({}, scalar, scalar.detach(), state, phases)
+    assert state == {"exp_avg": 1.0, "exp_avg_sq": 1.0}
 
 
 def test_a_dropped_step_fades_nothing_and_its_event_comes_with_the_next() -> None:
@@ -182,9 +221,20 @@ def test_every_seed_chooses_other_points(seed: int) -> None:
     assert torch.equal(chosen[1], Fading(seed=seed).chosen(1, 4000, CPU))
 
 
+@pytest.mark.parametrize(("seed", "event"), [(0, 7), (5, 100), (2**40 + 7, 3)])
+def test_every_version_makes_the_same_choice(seed: int, event: int) -> None:
+    """A checkpoint of the last release goes on as it was."""
+    generator = torch.Generator().manual_seed((event + seed * 2654435761) % 4294967296)
+    expected = torch.rand(500, generator=generator) < 0.2
+    assert torch.equal(Fading(seed=seed).chosen(event, 500, CPU), expected)
+
+
+def test_the_defaults_are_those_that_were_measured() -> None:
+    assert Fading() == Fading(0.2, 0.2, 0.04, 300, 0.03, 0.5, 0)
+
+
 def test_the_log_gets_the_share_of_this_iteration() -> None:
     phases = only(100, Fading(share=0.25, events=10, start=0.0, stop=1.0))
-    phases.observe(0.1, iteration=4)
-    assert phases.numbers()["faded"] == pytest.approx(0.0)
-    phases.observe(0.1, iteration=9)
-    assert phases.numbers()["faded"] == pytest.approx(0.25)
+    for iteration, share in ((4, 0.0), (9, 0.25), (10, 0.0), (19, 0.25)):
+        phases.observe(0.1, iteration=iteration)
+        assert phases.numbers()["faded"] == pytest.approx(share), iteration

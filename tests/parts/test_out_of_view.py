@@ -138,6 +138,31 @@ def test_on_a_device_the_share_is_never_read() -> None:
         torch.testing.assert_close(param, runs[1][0][name], rtol=1e-4, atol=1e-5)
 
 
+class OnDevice(torch.Tensor):
+    """A host's tensor that says that it is none."""
+
+    is_cpu = False  # pyright: ignore[reportAssignmentType, reportIncompatibleMethodOverride]
+
+
+@pytest.mark.parametrize("seen", [POINTS // 2, 0])
+def test_on_a_device_the_bounds_are_those_of_the_host(seen: int) -> None:
+    """Above a third nothing changes, though no branch is taken; less than a hundredth is one."""
+    _, phases, optimizers = large(2_000, part := OutOfView())
+    grad = torch.zeros(POINTS, 3)
+    grad[:seen] = 1.0
+    group = optimizers["means"].param_groups[0]
+    group["visible_share"] = torch.tensor(0.02 if seen == 0 else 0.9)
+    for _ in range(1 if seen else 1000):
+        phases.take(torch.tensor(0.1))
+        part.before(group, grad, grad.as_subclass(OnDevice), {}, phases)
+    share, state = float(group["visible_share"]), {"exp_avg_sq": torch.zeros(POINTS)}
+    pull = torch.full((POINTS,), PULL)
+    part.before(optimizers["opacities"].param_groups[0], pull, pull, state, phases)
+    assert share == pytest.approx(0.896 if seen else 0.01, rel=1e-3)
+    least = 0.0 if seen else (PULL * BELOW / 0.01) ** 2
+    torch.testing.assert_close(state["exp_avg_sq"], torch.full((POINTS,), least), rtol=3e-3, atol=0)
+
+
 def test_two_trainings_may_share_it() -> None:
     """As they do in the defaults: each goes on as it would alone, in turns with the other."""
     alone, both = [], []
