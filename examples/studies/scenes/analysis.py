@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from studies.scenes.arms import BASELINE, STUDY_ARMS
-from studies.scenes.records import Costs, Record, Setting
+from studies.scenes.records import COSTED, Costs, Record, Setting
 
 Verdict = Literal["pays", "does not pay", "undecided"]
 MIN_SEEDS = 3
@@ -61,7 +61,7 @@ class Study:
 
     def cost(self, setting: Setting, arm: str, control: str = BASELINE) -> float:
         """Seconds of an iteration, as a share of the control's; 1 where not both were measured."""
-        where = (setting.scene, setting.size, setting.iterations, setting.tiled)
+        where = [getattr(setting, name) for name in COSTED]
         ours, theirs = (
             1.0 if name == BASELINE else self._costs.get((*where, name)) for name in (arm, control)
         )

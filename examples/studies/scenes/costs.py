@@ -24,7 +24,7 @@ from splatting.fit import Fit
 from splatting.stopping import command
 
 from studies.scenes.arms import BASELINE, STUDY_ARMS, find_study_arm
-from studies.scenes.records import COSTS
+from studies.scenes.records import COSTED, COSTS, costed
 from studies.scenes.training import Spec, fit_of, machine, scene_of
 
 ROUNDS, STEPS, FIRST = 7, 10, 5  # rounds of so many iterations in turns, after the first few
@@ -61,7 +61,7 @@ def fits_at(folders: dict[str, Path], mark: str) -> dict[str, Fit]:
 
 
 def measure_all(runs: Path, iterations: Sequence[int]) -> list[dict[str, Any]]:
-    """One entry per scene, size, length and cut: of the first seed with stock and another arm."""
+    """One entry for each of `COSTED`: of the first seed with stock and another arm."""
     found: dict[tuple[Any, ...], dict[str, Path]] = defaultdict(dict)
     for path in sorted(runs.rglob("record.json")):
         record = json.loads(path.read_text(encoding="utf-8"))
@@ -69,26 +69,24 @@ def measure_all(runs: Path, iterations: Sequence[int]) -> list[dict[str, Any]]:
         arm = STUDY_ARMS.get(record["arm"])
         whole = arm is not None and not arm.retired and arm.trunk is None and arm.needs is None
         if plain and whole and record.get("finished") and record["iterations"] in iterations:
-            found[(*_key(record), record["seed"])][record["arm"]] = path.parent
+            found[(*costed(record), record["seed"])][record["arm"]] = path.parent
     first: dict[tuple[Any, ...], dict[str, Path]] = {}
     for (*key, _seed), folders in sorted(found.items()):
         if BASELINE in folders and len(folders) > 1:
             first.setdefault(tuple(key), folders)
     made = []
-    for (scene, size, count, tiled), folders in first.items():
+    for key, folders in first.items():
+        about = dict(zip(COSTED, key, strict=True))
         marks = [
             name
-            for name in (f"at-{round(share * count)}.pt" for share in SHARES)
+            for name in (f"at-{round(share * about['iterations'])}.pt" for share in SHARES)
             if all((folder / name).exists() for folder in folders.values())
         ]
         measured = [measure(fits_at(folders, mark)) for mark in marks]
         shares = {arm: round(fmean(m[arm] for m in measured), 3) for arm in folders if measured}
         made.append(
             {
-                "scene": scene,
-                "size": size,
-                "iterations": count,
-                "tiled": tiled,
+                **about,
                 "checkpoints": marks,
                 "shares": shares,
                 "machine": machine(),
@@ -97,10 +95,6 @@ def measure_all(runs: Path, iterations: Sequence[int]) -> list[dict[str, Any]]:
         )
         print(made[-1])
     return made
-
-
-def _key(entry: dict[str, Any]) -> tuple[str, str, int, int]:
-    return entry["scene"], entry["size"], entry["iterations"], int(entry.get("tiled", 0))
 
 
 @command("costs")
@@ -115,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not made:
         raise ValueError(f"--runs {args.runs}: holds no scene with {BASELINE} and another arm")
     old = json.loads(COSTS.read_text(encoding="utf-8")) if COSTS.exists() else []
-    entries = {_key(entry): entry for entry in (*old, *made)}  # the new take their place
+    entries = {costed(entry): entry for entry in (*old, *made)}  # the new take their place
     text = json.dumps([entries[key] for key in sorted(entries)], indent=1)
     COSTS.write_text(text + "\n", encoding="utf-8")
     print(COSTS)

@@ -66,18 +66,21 @@ def points_of(scene: str) -> int:
 
 def settings_of(study: Study, iterations: int, tiled: int = 0) -> list[Setting]:
     """The rule's scenes, with rotated views at a quarter of their size and their own points."""
-    every = [s for s in every_scene(study, iterations, tiled) if s.scene in MANY_VIEWS_SCENES]
-    return [s for s in every if s.size == QUARTER and s.points == points_of(s.scene)]
+    every = every_scene(study, iterations, tiled=tiled)
+    every = [s for s in every if s.scene in MANY_VIEWS_SCENES and s.size == QUARTER]
+    return [s for s in every if s.points == points_of(s.scene)]
 
 
-def every_scene(study: Study, iterations: int, tiled: int = 0) -> list[Setting]:
-    """Every scene and size of the rotated trainings of all views at the trainer's rates."""
+def every_scene(study: Study, iterations: int, **others: int) -> list[Setting]:
+    """Every scene and size of the rotated trainings of all views at the trainer's rates.
 
-    def whole(s: Setting) -> bool:
-        kind = {"rotated": True, "size": s.size, "tiled": tiled}
-        return s == Setting(s.scene, s.points, iterations, "sfm", **kind)
-
-    return [setting for setting in study.all_settings() if whole(setting)]
+    `others` are fields of `Setting`: of whole views and colours without harmonics where not given.
+    """
+    return [
+        s
+        for s in study.all_settings()
+        if s == Setting(s.scene, s.points, iterations, "sfm", rotated=True, size=s.size, **others)
+    ]
 
 
 def decide(study: Study) -> dict[str, Decision]:

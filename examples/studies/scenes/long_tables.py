@@ -237,8 +237,9 @@ def _cell(records: Sequence[Record], *, gaussians: bool = False, seeds: bool = T
 
 
 def _crowd(setting: Setting) -> str:
-    """The most Gaussians, and the images' size."""
-    return f"{setting.points:,}, {SIZES.get(setting.size, setting.size)}"
+    """The most Gaussians, the images' size, and the harmonics' degree."""
+    degree = f", degree {setting.sh_degree}" * (setting.sh_degree > 0)
+    return f"{setting.points:,}, {SIZES.get(setting.size, setting.size)}{degree}"
 
 
 def _signed(mean: float, spread: float, digits: int) -> str:

@@ -102,6 +102,7 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
             *half_size(scenes=("bonsai", "lego"), share=5),
             *half_size(scenes=("plush",), share=12.5),
         ],
+        "sh3": rotated(MANY_VIEWS_SCENES, ("mcmc", DEFAULTS), 1, 30_000, sh_degree=3),
         "adaptive": rotated(MANY_VIEWS_SCENES, arms["adaptive"], 1, 30_000),
         "sizes": [  # fewer Gaussians, iterations and views
             *rotated(("bonsai",), ("mcmc", DEFAULTS), 1, 7_500, 0.1),

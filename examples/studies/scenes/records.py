@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,8 @@ COSTS = FOLDER / "costs.json"
 MEASURED = ("iteration", "seconds", "psnr", "ssim", "train_psnr", "num_points")  # in all records
 COLUMNS = (*MEASURED, "lpips", "relocated", "median_scale", "median_opacity", "visible_share")
 
-# scene, size, iterations, pieces of a view, arm -> share of stock's
-Costs = dict[tuple[str, str, int, int, str], float]
+COSTED = ("scene", "size", "iterations", "tiled", "sh_degree")  # what a cost is measured for
+Costs = dict[tuple[Any, ...], float]  # these of a `Setting`, and the arm -> share of stock's
 
 
 @dataclass(frozen=True)
@@ -139,8 +140,9 @@ def _record(entry: dict[str, Any], columns: list[str]) -> Record:
 def read_costs(path: Path) -> Costs:
     """What an iteration costs, as `costs.py` measured it; empty where it was not."""
     entries = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
-    return {
-        (e["scene"], e["size"], e["iterations"], e.get("tiled", 0), arm): share
-        for e in entries
-        for arm, share in e["shares"].items()
-    }
+    return {(*costed(e), arm): share for e in entries for arm, share in e["shares"].items()}
+
+
+def costed(entry: Mapping[str, Any]) -> tuple[Any, ...]:
+    """`COSTED` of a record or a measured cost; older ones lack what they were not asked."""
+    return tuple(entry.get(name, 0) for name in COSTED)

@@ -139,7 +139,8 @@ def rotated_tables(study: Study) -> dict[str, str]:
     long, brief = settings_of(study, LONG), settings_of(study, BRIEF)
     every = every_scene(study, LONG)
     quarter = [setting for setting in every if setting.size == QUARTER]
-    made["every-scene"] = scenes_gain_table(study, every, DEFAULTS, BASELINE)
+    degrees = [*every, *every_scene(study, LONG, sh_degree=3)]
+    made["every-scene"] = scenes_gain_table(study, degrees, DEFAULTS, BASELINE)
     made["headline"] = headline_table(study, long, BRIEF)
     made["reach"] = reach_table(study, long, REACH_ARMS, BRIEF)
     made["paper"] = paper_table(study, quarter)

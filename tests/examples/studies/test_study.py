@@ -114,7 +114,7 @@ def test_a_part_is_on_if_one_metric_gains_and_none_loses(
     better: dict[str, float], verdict: str
 ) -> None:
     costs = {
-        (scene, "images_4", 7_500, 0, "faded"): better.get("cost", 1.0)
+        (scene, "images_4", 7_500, 0, 0, "faded"): better.get("cost", 1.0)
         for scene in MANY_VIEWS_SCENES
     }
     better = {name: value for name, value in better.items() if name != "cost"}
@@ -156,8 +156,9 @@ def test_a_guard_is_on_unless_it_loses(psnr: tuple[float, ...], on: bool) -> Non
 
 def test_a_cost_that_was_not_measured_is_the_controls() -> None:
     setting = rotated_record("faded", "plush", 0).setting
-    study = Study([], {("plush", "images_4", 7_500, 0, "faded"): 1.25})
+    study = Study([], {("plush", "images_4", 7_500, 0, 0, "faded"): 1.25})
     assert study.cost(setting, "faded") == 1.25
+    assert study.cost(replace(setting, sh_degree=3), "faded") == 1.0
     assert study.cost(setting, DEFAULT_ARM, "faded") == 1.0
     assert study.cost(setting, DEFAULT_ARM) == 1.0
 

@@ -239,5 +239,5 @@ def test_costs_are_measured_in_turns(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert made["shares"]["faded"] > 0
     path = tmp_path / "costs.json"
     path.write_text(json.dumps([made]), encoding="utf-8")
-    assert read_costs(path)["embedded", "images_4", 20, 0, "mcmc"] == 1.0
+    assert read_costs(path)["embedded", "images_4", 20, 0, 0, "mcmc"] == 1.0
     assert costs.main(["--runs", str(tmp_path), "--iterations", "30"]) == 2
