@@ -193,36 +193,40 @@ def falls_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) 
     return table(["scene", *(f"`{label(arm)}`" for arm in arms)], "lr", rows)
 
 
-def reach_table(study: Study, long: Sequence[Setting], arms: Sequence[str], short: int) -> str:
+def reach_table(
+    study: Study, long: Sequence[Setting], arms: Sequence[str], shorter: Sequence[int]
+) -> str:
     """When an arm has the PSNR that stock has after its last iteration, as a share of its seconds.
 
     Args:
-        short: iterations of the trainings that were that long from their start, whose last PSNR
-            stands beside.
+        shorter: lengths of trainings that were that long from their start, whose last PSNR stands
+            beside; all at the first length's cost of an iteration.
     """
     total, rows = long[0].iterations if long else 0, []
     for setting in long:
-        stock, brief = study.runs(setting, BASELINE), replace(setting, iterations=short)
+        stock = study.runs(setting, BASELINE)
         for arm in arms:
-            found, quick = difference(study, [setting], arm, BASELINE), study.runs(brief, arm)
+            found = difference(study, [setting], arm, BASELINE)
             pairs = found.pairs.get(setting.scene, [])
             reached = [ours.reached(theirs.final) for ours, theirs, _ in pairs]
-            both = sorted(quick.keys() & stock.keys())
-            if not reached and not both:
-                continue
             known = [iteration for iteration in reached if iteration is not None]
-            said, beside = "never" if reached else "-", "-"
+            said, beside = "never" if reached else "-", []
             if reached and len(known) == len(reached):
                 said = f"x{fmean(known) * found.cost / total:.2f} of its seconds"
-            if both:
-                gain = fmean(quick[s].final - stock[s].final for s in both)
-                share = short / total * study.cost(brief, arm)
-                beside = f"{gain:+.2f} dB in x{share:.2f} of its seconds"
-            finals = [theirs.final for _, theirs, _ in pairs] or [stock[s].final for s in both]
-            ends = f"{fmean(finals):.2f} dB ({len(finals)})"
-            rows.append((setting.scene, ends, f"`{label(arm)}`", said, beside))
+            cost = study.cost(replace(setting, iterations=shorter[0]), arm)
+            for count in shorter:
+                quick = study.runs(replace(setting, iterations=count), arm)
+                both = sorted(quick.keys() & stock.keys())
+                gain = fmean(quick[s].final - stock[s].final for s in both) if both else 0.0
+                beside.append(f"{gain:+.2f} dB in x{count / total * cost:.2f}" if both else "-")
+            if reached or any(cell != "-" for cell in beside):
+                finals = [theirs.final for _, theirs, _ in pairs] or [
+                    r.final for r in stock.values()
+                ]
+                ends = f"{fmean(finals):.2f} dB ({len(finals)})"
+                rows.append((setting.scene, ends, f"`{label(arm)}`", said, *beside))
     heads = ["scene", f"stock, {total:,} iterations", "arm", "reaches stock's PSNR after"]
-    return table([*heads, f"trained for {short:,} iterations only"], "l", rows)
+    return table([*heads, *(f"trained for {n:,} iterations only" for n in shorter)], "l", rows)
 
 
 def _cell(records: Sequence[Record], *, gaussians: bool = False, seeds: bool = True) -> str:

@@ -93,6 +93,7 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         "rotated-brief": [
             *rotated(MANY_VIEWS_SCENES, BRIEF_ARMS, seeds, 7_500),
             *rotated(("bonsai",), [SELDOM_FADED], 1, 7_500),
+            *rotated(MANY_VIEWS_SCENES, [DEFAULTS], 2, 10_000),
         ],
         "crowded": [  # 40,000 Gaussians on images of a quarter of their size
             *rotated(("bonsai",), CROWDED_ARMS, 1, 7_500, 4),

@@ -204,8 +204,14 @@ def test_a_line_compares_arms_of_one_seed() -> None:
 def test_when_stocks_quality_is_reached_over_the_seeds_of_both() -> None:
     runs = (BASELINE, 0, 20.0), (DEFAULT_ARM, 0, 30.0), (BASELINE, 1, 28.0)
     study = Study([rotated_record(arm, "a", seed, psnr=psnr) for arm, seed, psnr in runs])
-    said = reach_table(study, study.all_settings(), [BASELINE, DEFAULT_ARM], 3_000)
-    assert "| 20.00 dB (1) | `defaults` | x0.50 of its seconds | - |" in said
+    said = reach_table(study, study.all_settings(), [BASELINE, DEFAULT_ARM], [3_000, 5_000])
+    assert "| 20.00 dB (1) | `defaults` | x0.50 of its seconds | - | - |" in said
+    shorter = rotated_record(DEFAULT_ARM, "a", 0, psnr=21.0)
+    shorter = replace(shorter, setting=replace(shorter.setting, iterations=5_000))
+    costs = {("a", "images_4", 3_000, 0, 0, DEFAULT_ARM): 1.2}
+    both = Study([*study.records(), shorter], costs)
+    said = reach_table(both, study.all_settings(), [DEFAULT_ARM], [3_000, 5_000])
+    assert "| `defaults` | x0.50 of its seconds | - | +1.00 dB in x0.80 |" in said
     first = headline_table(study, study.all_settings(), 3_000).splitlines()[2:4]
     assert first == [
         "| stock, 7,500 | 20.00 / 0.700 / 0.200 |",
