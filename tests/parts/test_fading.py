@@ -60,13 +60,14 @@ def _ratio(after: dict[str, Any], before: dict[str, Any], key: str) -> torch.Ten
     return (after[key].reshape(old.shape) * old).sum(1) / (old * old).sum(1)
 
 
-def test_of_more_than_ten_thousand_points_a_smaller_share_fades() -> None:
-    fading = Fading(share=0.5)
-    assert [fading.share_of(n) for n in (0, 1, 9_999, 10_000)] == [0.5] * 4
-    assert fading.share_of(80_000) == pytest.approx(0.125)  # 8^(2/3) = 4
-    for num_points, share in ((10_000, 0.5), (80_000, 0.125)):
-        chosen = fading.chosen(3, num_points, CPU).float().mean()
-        assert float(chosen) == pytest.approx(share, abs=5 * (0.25 / num_points) ** 0.5)
+def test_of_more_than_ten_thousand_points_fewer_events_happen_evenly_spread() -> None:
+    fading = Fading()
+    for num_points, every in ((1, 1), (9_999, 1), (10_000, 1), (80_000, 4), (270_000, 9)):
+        happened = [event for event in range(300) if fading.happens(event, num_points)]
+        assert 300 / every - 1 <= len(happened) <= 300 / every
+        assert {b - a for a, b in itertools.pairwise(happened)} <= {every, every + 1}
+    assert sum(fading.happens(event, 10_001) for event in range(300)) == 299
+    assert not any(fading.happens(event, 0) for event in range(300))
 
 
 @pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
@@ -157,12 +158,13 @@ def second_moments(
     total_steps: int = 100,
     valid: bool = True,
     group: dict[str, Any] | None = None,
+    num_points: int = 50,
 ) -> torch.Tensor:
-    """Of 50 points that were 1, after a step; the first of an Adam that was taken over."""
-    param, phases = torch.nn.Parameter(torch.zeros(50, 3)), only(total_steps, fading)
+    """Of points that were 1, after a step; the first of an Adam that was taken over."""
+    param, phases = torch.nn.Parameter(torch.zeros(num_points, 3)), only(total_steps, fading)
     phases.observe(0.1, iteration=iteration - 1)
     phases.valid = torch.tensor(valid)  # as on a device, where nobody knows
-    state = {key: torch.ones(50, 3) for key in ("exp_avg", "exp_avg_sq")}
+    state = {key: torch.ones(num_points, 3) for key in ("exp_avg", "exp_avg_sq")}
     fading.before(group or {}, param, param.detach(), state, phases)
     return state["exp_avg_sq"]
 
@@ -171,6 +173,14 @@ def test_many_events_at_once_are_not_all_made_up_for() -> None:
     halved = Fading(share=1.0, exp_avg=0.5, exp_avg_sq=0.5, events=300, start=0.0, stop=1.0)
     found = second_moments(halved, 999, total_steps=1000, group={"faded": 0})  # of 249
     assert torch.equal(found, torch.full((50, 3), 0.5**32))
+
+
+@pytest.mark.parametrize(("num_points", "times"), [(10_000, 8), (80_000, 2)])
+def test_an_event_that_does_not_happen_fades_nothing(num_points: int, times: int) -> None:
+    """Eight events are made up for at once."""
+    fading = Fading(share=1.0, exp_avg=0.5, exp_avg_sq=0.5, events=25, start=0.0, stop=1.0)
+    found = second_moments(fading, 32, group={"faded": 0}, num_points=num_points)
+    assert torch.equal(found, torch.full((num_points, 3), 0.5**times))
 
 
 @pytest.mark.parametrize(("iteration", "factor"), [(50, 0.04), (51, 1.0), (49, 1.0)])

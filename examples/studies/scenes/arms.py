@@ -47,6 +47,7 @@ STABLE = "awsgld-stable"  # its histogram follows the energy; that of the arms b
 # Where points are many, fading kills a great part of them again and again: what may spare them.
 UNFADED = {name: f"{DEFAULTS}-{name}-unfaded" for name in ("means", "opacities")}
 SHARE_KEPT = f"{DEFAULTS}-share-kept"  # the defaults before Fading counted the points
+SMALLER_SHARE = f"{DEFAULTS}-smaller-share"  # retired: how it counted them first
 OWN_STEP = "own-step+faded"
 SELDOM_FADED = f"{DEFAULTS}-100-events"
 

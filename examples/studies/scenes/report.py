@@ -30,6 +30,7 @@ from studies.scenes.arms import (
     GROUPS,
     SELDOM_FADED,
     SHARE_KEPT,
+    SMALLER_SHARE,
     STABLE,
     STUDY_ARMS,
     UNFADED,
@@ -97,7 +98,7 @@ LONG, BRIEF = 30_000, 7_500
 SHORTER = (BRIEF, 10_000)  # lengths that may do instead of stock's
 ASIDE = ("explorations", "unseen", "adaptive", "never-reset")  # groups with a table of their own
 NU_ARMS = (BASELINE, STABLE, f"{STABLE}-constant", "paper", "paper-constant")
-OFTEN_ARMS = (BASELINE, SHARE_KEPT, SELDOM_FADED, *UNFADED.values(), DEFAULTS)
+OFTEN_ARMS = (BASELINE, SHARE_KEPT, SMALLER_SHARE, SELDOM_FADED, *UNFADED.values(), DEFAULTS)
 REACH_ARMS = (FADED, DEFAULTS)
 
 

@@ -16,7 +16,7 @@ from opt3dgs_optim.rows import shaped
 CALL = "Fading"
 DONE = "faded"  # of a group: events that its parameter has had
 MOST = 32  # events made up for at once, where a trainer's iteration count jumps
-MANY = 10_000  # points from which on an event fades a smaller share of them
+MANY = 10_000  # points from which on fewer of the events happen
 APART = 4  # iterations between two events; in 600, events 1 apart lose half of what 4 apart gain
 
 
@@ -30,14 +30,12 @@ class Fading(Part):
     The same points are faded in all these parameters. Which ones depends on `seed`, the event
     and the number of points alone: a resumed run repeats them. It costs no memory.
 
-    Where points are many and small, so many longer steps lose detail (docs/evidence.md): of
-    N > 10,000 points an event fades (10,000 / N)^(2/3) times `share`.
-
     Args:
-        share: of the points in each event, chance per point in (0, 1]; see above.
+        share: of the points in each event, chance per point in (0, 1].
         exp_avg, exp_avg_sq: factors on the moments, in [0, 1]. exp_avg^2 <= exp_avg_sq keeps the
             next step from being longer than the last.
-        events: how many over the run, but never less than 4 iterations apart.
+        events: how many over the run, but never less than 4 iterations apart. Many small points
+            lose detail by so many: with N > 10,000, (10,000 / N)^(2/3) of them happen.
         start, stop: where the first and the last event are, as shares of the run.
         seed: of the choice of points.
         names: the Gaussian parameters, under gsplat's or INRIA's names.
@@ -71,9 +69,10 @@ class Fading(Part):
         share = (iteration / total_steps - self.start) / length
         return int(min(max(share, 0.0), 1.0) * min(self.events, length * total_steps / APART))
 
-    def share_of(self, num_points: int) -> float:
-        """The share of so many points that an event fades."""
-        return self.share * min(1.0, MANY / max(num_points, 1)) ** (2 / 3)
+    def happens(self, event: int, num_points: int) -> bool:
+        """Whether an event fades any of so many points: of more than 10,000, some do."""
+        share = min(1.0, MANY / num_points) ** (2 / 3) if num_points else 0.0
+        return int((event + 1) * share) > int(event * share)
 
     def chosen(self, event: int, num_points: int, device: torch.device) -> Tensor:
         """Which points an event fades, [num_points] bool: the same in every parameter."""
@@ -81,7 +80,7 @@ class Fading(Part):
         seed = (event + self.seed * 0x9E3779B1) % 2**32
         generator = torch.Generator(device).manual_seed(seed)
         drawn = torch.rand(num_points, generator=generator, device=device)
-        return drawn < self.share_of(num_points)
+        return drawn < self.share
 
     def before(
         self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
@@ -89,12 +88,13 @@ class Fading(Part):
         """Fade the moments by the events since this parameter's last step."""
         # The step of iteration i comes after i + 1 observations.
         now = self.events_before(course.iteration, course.total_steps)
-        done = group.get(DONE)
-        if done is None:
-            done = self.events_before(course.iteration - 1, course.total_steps)
+        done = group.get(DONE, self.events_before(course.iteration - 1, course.total_steps))
         group[DONE] = now
-        for event in range(max(done, now - MOST), now if param.dim() > 0 else 0):
-            chosen = self.chosen(event, param.shape[0], param.device)
+        count = len(param) if param.dim() > 0 else 0
+        for event in range(max(done, now - MOST), now):
+            if not self.happens(event, count):
+                continue
+            chosen = self.chosen(event, count, param.device)
             if isinstance(course.valid, Tensor):
                 chosen = chosen & course.valid
             chosen = shaped(chosen, param)

@@ -4,8 +4,8 @@ from opt3dgs_optim import Fading
 
 
 class ShareKept(Fading):
-    """`Fading` of the same share of the points, however many they are."""
+    """`Fading` of the same share of the points as often, however many they are."""
 
-    def share_of(self, num_points: int) -> float:
-        """`share`."""
-        return self.share
+    def happens(self, event: int, num_points: int) -> bool:
+        """Always."""
+        return num_points > 0
