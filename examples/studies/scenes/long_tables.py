@@ -208,23 +208,21 @@ def reach_table(
         for arm in arms:
             found = difference(study, [setting], arm, BASELINE)
             pairs = found.pairs.get(setting.scene, [])
+            if not pairs:
+                continue
             reached = [ours.reached(theirs.final) for ours, theirs, _ in pairs]
             known = [iteration for iteration in reached if iteration is not None]
-            said, beside = "never" if reached else "-", []
-            if reached and len(known) == len(reached):
+            said, beside = "never", []
+            if len(known) == len(reached):
                 said = f"x{fmean(known) * found.cost / total:.2f} of its seconds"
             cost = study.cost(replace(setting, iterations=shorter[0]), arm)
             for count in shorter:
                 quick = study.runs(replace(setting, iterations=count), arm)
-                both = sorted(quick.keys() & stock.keys())
-                gain = fmean(quick[s].final - stock[s].final for s in both) if both else 0.0
-                beside.append(f"{gain:+.2f} dB in x{count / total * cost:.2f}" if both else "-")
-            if reached or any(cell != "-" for cell in beside):
-                finals = [theirs.final for _, theirs, _ in pairs] or [
-                    r.final for r in stock.values()
-                ]
-                ends = f"{fmean(finals):.2f} dB ({len(finals)})"
-                rows.append((setting.scene, ends, f"`{label(arm)}`", said, *beside))
+                gains = [quick[s].final - stock[s].final for s in quick.keys() & stock.keys()]
+                share = count / total * cost
+                beside.append(f"{fmean(gains):+.2f} dB in x{share:.2f}" if gains else "-")
+            ends = f"{fmean(theirs.final for _, theirs, _ in pairs):.2f} dB ({len(pairs)})"
+            rows.append((setting.scene, ends, f"`{label(arm)}`", said, *beside))
     heads = ["scene", f"stock, {total:,} iterations", "arm", "reaches stock's PSNR after"]
     return table([*heads, *(f"trained for {n:,} iterations only" for n in shorter)], "l", rows)
 
