@@ -50,6 +50,8 @@ SHARE_KEPT = f"{DEFAULTS}-share-kept"  # the defaults before Fading counted the 
 SMALLER_SHARE = f"{DEFAULTS}-smaller-share"  # retired: how it counted them first
 OWN_STEP = "own-step+faded"
 SELDOM_FADED = f"{DEFAULTS}-100-events"
+MORE_AT_ONCE = f"{DEFAULTS}-150-events-of-two-fifths"
+OFTEN_FADED = f"{DEFAULTS}-600-events"
 
 # As measured, so that a change of the package's defaults does not change what an arm was.
 ANNEALING = Annealing(4.0, 0.4, 1.0, names=("scales", "quats", "opacities", "sh0", "shN"))
@@ -107,6 +109,8 @@ def whole_trainings() -> dict[str, MakeParts | None]:
         **{name: with_fading(fading) for name, fading in faded_but.items()},
         SHARE_KEPT: with_fading(ShareKept(events=300)),
         SELDOM_FADED: with_fading(ShareKept(events=100)),
+        MORE_AT_ONCE: with_fading(replace(FADING, share=0.4, events=150)),
+        OFTEN_FADED: with_fading(replace(FADING, events=600)),
         "own-step": fixed(OwnStep),
         OWN_STEP: lambda _iterations, _nu: [OwnStep(), FADING],
         "out-of-view": of(OutOfView()),
