@@ -42,6 +42,8 @@ class Runner:
                 optimizer.step()
             for scheduler in schedulers:
                 scheduler.step()
+            if isinstance(self.cfg.strategy, DefaultStrategy):
+                self.cfg.strategy.step_post_backward(params=self.splats)
 
     def eval(self, step):
         max_steps = 1
@@ -78,6 +80,8 @@ def training(dataset, opt, pipe, checkpoint):
         loss = (1.0 - opt.lambda_dssim) * Ll1
         loss.backward()
         with torch.no_grad():
+            if iteration < opt.densify_until_iter:
+                gaussians.densify_and_prune(opt.densify_grad_threshold, 0.005)
             if iteration < opt.iterations:
                 gaussians.exposure_optimizer.step()
                 gaussians.optimizer.step()
@@ -86,6 +90,10 @@ def training(dataset, opt, pipe, checkpoint):
 def training_report(l1_loss):
     l1_test += l1_loss(image, gt_image)
 """
+MCMC = INRIA.replace(
+    "gaussians.densify_and_prune(opt.densify_grad_threshold, 0.005)",
+    "gaussians.relocate_gs(dead_mask=gaussians.get_opacity <= 0.005)",
+).replace("                gaussians.exposure_optimizer.step()\n", "")
 MINI_SPLATTING = INRIA.replace(
     "            if iteration < opt.iterations:\n",
     """\
@@ -107,6 +115,7 @@ SYNTHETIC = {
     "gsplat 1.6": GSPLAT_16,
     "gsplat 2DGS": GSPLAT_2DGS,
     "inria": INRIA,
+    "3dgs-mcmc": MCMC,
     "mini-splatting": MINI_SPLATTING,
     "taming": TAMING,
 }

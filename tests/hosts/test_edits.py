@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from trainer_files import GSPLAT, INRIA, MINI_SPLATTING, SYNTHETIC, TAMING, added
+from trainer_files import GSPLAT, INRIA, MCMC, MINI_SPLATTING, SYNTHETIC, TAMING, added
 
 from opt3dgs_optim.hosts import diff, write
 from opt3dgs_optim.hosts.edits import main
@@ -50,7 +50,9 @@ def test_what_is_written_is_what_was_shown(tmp_path: Path, kind: str) -> None:
 def test_the_lines_of_inria(tmp_path: Path) -> None:
     path = saved(tmp_path, INRIA)
     assert added(diff(path).diff) == [IMPORT, *OURS]
-    assert diff(path).notes == ["left alone: gaussians.exposure_optimizer"]
+    left, clones = diff(path).notes
+    assert left == "left alone: gaussians.exposure_optimizer"
+    assert "(gaussians.densify_and_prune) the parts lose" in clones
     write(path)
     text = path.read_text()
     # after restore(), which makes a new optimizer
@@ -69,10 +71,18 @@ def test_the_lines_of_gsplat(tmp_path: Path) -> None:
         "phases.observe(loss)",
     ]
     assert added(diff(path).diff) == lines
-    assert diff(path).notes == ["left alone: self.pose_optimizers"]
+    left, clones = diff(path).notes
+    assert left == "left alone: self.pose_optimizers"
+    assert "(DefaultStrategy) the parts lose" in clones
     write(path)
     text = path.read_text()  # above the learning-rate schedulers
     assert text.index("max_steps = cfg") < text.index(lines[1]) < text.index("schedulers = [")
+
+
+def test_relocation_gets_no_note(tmp_path: Path) -> None:
+    path = saved(tmp_path, MCMC)
+    assert added(diff(path).diff) == [IMPORT, *OURS]
+    assert diff(path).notes == []
 
 
 def test_world_size_only_where_it_is_defined(tmp_path: Path) -> None:
@@ -141,7 +151,7 @@ def test_groups_without_positions_are_noted(tmp_path: Path) -> None:
     (tmp_path / "scene").mkdir()
     model = "groups = [{'params': [a], 'name': 'anchor'}, {'params': [b], 'name': 'opacity'}]\n"
     (tmp_path / "scene" / "gaussian_model.py").write_text(model)
-    (note, _) = diff(saved(tmp_path, INRIA)).notes
+    note = diff(saved(tmp_path, INRIA)).notes[0]
     assert "named xyz or means" in note
     assert "anchor, opacity" in note
 

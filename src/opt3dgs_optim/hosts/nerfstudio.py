@@ -82,21 +82,15 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
         if phases is None:
             return losses
         if phases.pixel_part() is not None:
-            render, target = self._images(outputs, batch)
+            photo = self.get_gt_img(batch["image"])
+            target = self.composite_with_background(photo, outputs["background"])
+            mask = self._downscale_if_required(batch["mask"]) if "mask" in batch else torch.ones(())
+            render, target = (each * mask.to(each.device) for each in (outputs["rgb"], target))
             change = phases.pixel_loss(render, target) - (render - target).abs().mean()
             losses["main_loss"] = losses["main_loss"] + (1 - self.config.ssim_lambda) * change
         energy = torch.stack([term.detach().reshape(()) for term in losses.values()]).sum()
         phases.observe(energy, iteration=int(self.step))
         return losses
-
-    def _images(self, outputs: Any, batch: Any) -> tuple[Tensor, Tensor]:
-        """What splatfacto compares: its rendering and the photo, masked where there is a mask."""
-        photo = self.get_gt_img(batch["image"])
-        target = self.composite_with_background(photo, outputs["background"])
-        if "mask" not in batch:
-            return outputs["rgb"], target
-        mask = self._downscale_if_required(batch["mask"]).to(target.device)
-        return outputs["rgb"] * mask, target * mask
 
 
 def _hold(optimizer: torch.optim.Optimizer, param: torch.nn.Parameter) -> None:
