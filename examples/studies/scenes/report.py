@@ -28,6 +28,8 @@ from studies.scenes.arms import (
     DEFAULTS,
     FADED,
     GROUPS,
+    MORE_AT_ONCE,
+    OFTEN_FADED,
     SELDOM_FADED,
     SHARE_KEPT,
     SMALLER_SHARE,
@@ -98,7 +100,10 @@ LONG, BRIEF = 30_000, 7_500
 SHORTER = (BRIEF, 10_000)  # lengths that may do instead of stock's
 ASIDE = ("explorations", "unseen", "adaptive", "never-reset")  # groups with a table of their own
 NU_ARMS = (BASELINE, STABLE, f"{STABLE}-constant", "paper", "paper-constant")
-OFTEN_ARMS = (BASELINE, SHARE_KEPT, SMALLER_SHARE, SELDOM_FADED, *UNFADED.values(), DEFAULTS)
+OFTEN_ARMS = (
+    *(BASELINE, SHARE_KEPT, SMALLER_SHARE, SELDOM_FADED, OFTEN_FADED, MORE_AT_ONCE),
+    *(*UNFADED.values(), DEFAULTS),
+)
 REACH_ARMS = (FADED, DEFAULTS)
 
 
