@@ -79,6 +79,24 @@ def test_the_lines_of_gsplat(tmp_path: Path) -> None:
     assert text.index("max_steps = cfg") < text.index(lines[1]) < text.index("schedulers = [")
 
 
+@pytest.mark.parametrize("call", ["densify", "prune_and_densify", "densify_with_score"])
+def test_what_clones_and_splits_is_noted(tmp_path: Path, call: str) -> None:
+    path = saved(tmp_path, MCMC.replace("relocate_gs", call))
+    (note,) = diff(path).notes
+    assert note.startswith(f"with clone, split and reset (gaussians.{call}) the parts lose")
+
+
+def test_a_strategy_outside_the_loop_is_noted(tmp_path: Path) -> None:
+    text = SYNTHETIC["gsplat 2DGS"].replace(
+        "isinstance(self.cfg.strategy, DefaultStrategy)", "True"
+    )
+    path = saved(
+        tmp_path,
+        text.replace("self.splats, self", "s = DefaultStrategy()\n        self.splats, self"),
+    )
+    assert "(DefaultStrategy) the parts lose" in diff(path).notes[-1]
+
+
 def test_relocation_gets_no_note(tmp_path: Path) -> None:
     path = saved(tmp_path, MCMC)
     assert added(diff(path).diff) == [IMPORT, *OURS]

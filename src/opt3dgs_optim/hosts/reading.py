@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 SECOND = ("shoptimizer",)  # of Gaussians; any other, as of exposures or networks, is left alone
 USUAL_L1 = ("ll1", "l1loss", "l1_loss", "ll1_render")
-CLONES = r"DefaultStrategy|[\w.]+\.densify\w*(?=\()"  # what clones and splits, as it is called
+CLONES = r"DefaultStrategy|[\w.]+\.(?:prune_and_)?densify\w*(?=\()"  # what clones and splits
 
 
 class Spot(NamedTuple):
@@ -90,7 +90,7 @@ def read_trainer(tree: ast.Module, folder: Path) -> Trainer:
     trainer = Trainer(function, own, loop, losses.pop(), statements, *_range(loop, own))
     _find_optimizers(trainer, inside, folder)
     _find_pixel_loss(trainer, inside)
-    if clones := dict.fromkeys(re.findall(CLONES, ast.unparse(loop))):
+    if clones := dict.fromkeys(re.findall(CLONES, ast.unparse(tree))):
         trainer.notes.append(
             f"with clone, split and reset ({', '.join(clones)}) the parts lose PSNR on two of "
             "three scenes (docs/evidence.md): take 3DGS-MCMC's relocation where there is a choice"
