@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from typing import Any, cast
+from typing import Any
 
 import torch
 from hosts.cpu_host import gsplat_modules
@@ -12,8 +12,6 @@ from splatting.fit import Fit
 from splatting.scenes import View
 from torch import Tensor
 from torch.nn import Parameter
-
-from studies.scenes.arms import StudyArm
 
 GROW_GRAD = 2e-4  # gsplat's own threshold
 # Pixels across the images that people train on; bonsai's are half of Mip-NeRF 360's.
@@ -63,8 +61,7 @@ class AdaptiveFit(Fit):
     def _density_control(self) -> DefaultDensityControl:
         width = self.scene.train[0].camera.width
         shrunk = FULL_WIDTH.get(self.scene.name, width) / width
-        factor = cast(StudyArm, self.arm).adaptive
-        return DefaultDensityControl(self.scene.extent, factor * shrunk * GROW_GRAD)
+        return DefaultDensityControl(self.scene.extent, shrunk * GROW_GRAD)
 
     def _train_image(self, view: View) -> Tensor:
         density, camera = self.density, view.camera

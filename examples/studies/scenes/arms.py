@@ -68,7 +68,7 @@ class StudyArm(Arm):
     control: str = BASELINE
     switch: float = 1.0  # where exploitation starts
     trunk: str | None = None  # branch off this arm's run at the switch
-    adaptive: float = 0.0  # factor on the threshold of gsplat's DefaultStrategy; 0: 3DGS-MCMC's
+    adaptive: bool = False  # gsplat's DefaultStrategy in the place of 3DGS-MCMC's
     retired: bool = False  # its code is gone, its records are kept
 
     def make(
@@ -158,11 +158,9 @@ def adaptive() -> list[StudyArm]:
         "+annealed-but-opacities": of(ANNEALING_BUT_OPACITIES),
         "+defaults": with_fading(FADING),
     }
-    fewer = {kind: kinds[kind] for kind in ("", "+defaults")}
     return [
-        StudyArm(f"{name}{kind}", parts=parts, mcmc=False, adaptive=factor)
-        for name, factor, chosen in (("adc", 1.0, kinds), ("adc-threshold-x3", 3.0, fewer))
-        for kind, parts in chosen.items()
+        StudyArm(f"adc{kind}", parts=parts, mcmc=False, adaptive=True)
+        for kind, parts in kinds.items()
     ]
 
 
