@@ -56,8 +56,10 @@ OFTEN_FADED = f"{DEFAULTS}-600-events"
 # As measured, so that a change of the package's defaults does not change what an arm was.
 ANNEALING = Annealing(4.0, 0.4, 1.0, names=("scales", "quats", "opacities", "sh0", "shN"))
 ANNEALING_BUT_OPACITIES = Annealing(4.0, 0.4, 1.0, names=("scales", "quats", "sh0", "shN"))
+ANNEALING_BUT_SCALES = Annealing(4.0, 0.4, 1.0, names=("quats", "opacities", "sh0", "shN"))
 ANNEALING_OF_ALL = Annealing(4.0, 0.4, 1.0, GAUSSIAN)
 FADING = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=300)
+FADING_BUT_SCALES = replace(FADING, names=("means", "quats", "opacities", "sh0", "shN"))
 FADING_EARLY = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=140, stop=0.25)
 
 
@@ -157,6 +159,7 @@ def adaptive() -> list[StudyArm]:
         "+annealed": of(ANNEALING),
         "+annealed-but-opacities": of(ANNEALING_BUT_OPACITIES),
         "+defaults": with_fading(FADING),
+        "+defaults-but-scales": of(ANNEALING_BUT_SCALES, FADING_BUT_SCALES, OutOfView()),
     }
     return [
         StudyArm(f"adc{kind}", parts=parts, mcmc=False, adaptive=True)
