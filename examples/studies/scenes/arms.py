@@ -48,6 +48,7 @@ STABLE = "awsgld-stable"  # its histogram follows the energy; that of the arms b
 UNFADED = {name: f"{DEFAULTS}-{name}-unfaded" for name in ("means", "opacities")}
 SHARE_KEPT = f"{DEFAULTS}-share-kept"  # the defaults before Fading counted the points
 SMALLER_SHARE = f"{DEFAULTS}-smaller-share"  # retired: how it counted them first
+SCALES_ALONE = f"{DEFAULTS}-scales-alone"
 OWN_STEP = "own-step+faded"
 SELDOM_FADED = f"{DEFAULTS}-100-events"
 MORE_AT_ONCE = f"{DEFAULTS}-150-events-of-two-fifths"
@@ -56,10 +57,13 @@ OFTEN_FADED = f"{DEFAULTS}-600-events"
 # As measured, so that a change of the package's defaults does not change what an arm was.
 ANNEALING = Annealing(4.0, 0.4, 1.0, names=("scales", "quats", "opacities", "sh0", "shN"))
 ANNEALING_BUT_OPACITIES = Annealing(4.0, 0.4, 1.0, names=("scales", "quats", "sh0", "shN"))
-ANNEALING_BUT_SCALES = Annealing(4.0, 0.4, 1.0, names=("quats", "opacities", "sh0", "shN"))
 ANNEALING_OF_ALL = Annealing(4.0, 0.4, 1.0, GAUSSIAN)
 FADING = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=300)
-FADING_BUT_SCALES = replace(FADING, names=("means", "quats", "opacities", "sh0", "shN"))
+BUT_SCALES = (
+    Annealing(4.0, 0.4, 1.0, names=("quats", "opacities", "sh0", "shN")),
+    replace(FADING, names=("means", "quats", "opacities", "sh0", "shN")),
+    OutOfView(),
+)
 FADING_EARLY = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=140, stop=0.25)
 
 
@@ -113,6 +117,7 @@ def whole_trainings() -> dict[str, MakeParts | None]:
         SELDOM_FADED: with_fading(ShareKept(events=100)),
         MORE_AT_ONCE: with_fading(replace(FADING, share=0.4, events=150)),
         OFTEN_FADED: with_fading(replace(FADING, events=600)),
+        SCALES_ALONE: of(*BUT_SCALES),
         "own-step": fixed(OwnStep),
         OWN_STEP: lambda _iterations, _nu: [OwnStep(), FADING],
         "out-of-view": of(OutOfView()),
@@ -159,7 +164,7 @@ def adaptive() -> list[StudyArm]:
         "+annealed": of(ANNEALING),
         "+annealed-but-opacities": of(ANNEALING_BUT_OPACITIES),
         "+defaults": with_fading(FADING),
-        "+defaults-but-scales": of(ANNEALING_BUT_SCALES, FADING_BUT_SCALES, OutOfView()),
+        "+defaults-but-scales": of(*BUT_SCALES),
     }
     return [
         StudyArm(f"adc{kind}", parts=parts, mcmc=False, adaptive=True)

@@ -18,6 +18,7 @@ from studies.scenes.arms import (
     MORE_AT_ONCE,
     OFTEN_FADED,
     OWN_STEP,
+    SCALES_ALONE,
     SELDOM_FADED,
     SHARE_KEPT,
     STABLE,
@@ -131,7 +132,7 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         "explorations": [
             *rotated(("plush",), [STABLE, *arms["explorations"]], 1, 7_500),
             *rotated(("plush", "embedded"), arms["explorations"], 1, 30_000),
-            *rotated(("plush",), (OFTEN_FADED, MORE_AT_ONCE), 1, 30_000),
+            *rotated(("plush",), (OFTEN_FADED, MORE_AT_ONCE, SCALES_ALONE), 1, 30_000),
         ],
         # Short trainings of small scenes, whose held-out views are the same for every seed.
         "core": cross(SCENES, arms["core"], seeds, 3_000),
