@@ -81,7 +81,11 @@ def trainer_names() -> dict[str, Any]:
     loss.backward()
     return {
         "torch": torch,
-        "self": SimpleNamespace(optimizers=adams({"means": 3, "scales": 3, "quats": 4})),
+        "self": SimpleNamespace(
+            optimizers=adams({"means": 3, "scales": 3, "quats": 4}),
+            cfg=SimpleNamespace(strategy={}),
+        ),
+        "DefaultStrategy": dict,
         "cfg": SimpleNamespace(max_steps=100),
         "max_steps": 100,
         "world_size": 1,

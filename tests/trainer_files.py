@@ -57,7 +57,14 @@ GSPLAT_16 = GSPLAT.replace(
                 l1loss = l1_loss(colors, pixels).mean()
 """,
 )
-GSPLAT_2DGS = GSPLAT.replace("        world_size = self.world_size\n", "")
+GSPLAT_2DGS = (
+    GSPLAT.replace("        world_size = self.world_size\n", "")
+    .replace("            if isinstance(self.cfg.strategy, DefaultStrategy):\n    ", "")
+    .replace("self.cfg.strategy.step", "self.strategy.step")
+    .replace(
+        "    def train(self)", "        self.strategy = DefaultStrategy()\n\n    def train(self)"
+    )
+)
 INRIA = """\
 import torch
 from scene import Scene, GaussianModel

@@ -35,8 +35,7 @@ OTHERS = re.compile(
     r"(^|/)(submodules|tests?|scripts|docs|utils?|preprocess|ext|internal|Tracking[^/]*)/"
 )
 MORE = ("sugar_trainers/*.py", "nerfstudio/engine/trainer.py", "internal/gaussian_splatting.py")
-# Left out of what is said: the names of an optimizer's groups, what follows from density control.
-LONG = re.compile(r" \(all: [^)]*\)| the parts lose PSNR.*")
+GROUPS = re.compile(r" \(all: [^)]*\)")  # the names of an optimizer's groups: long
 STOPS = re.compile(r"(?<=stops: )(\w+):.*")  # what an exception says after its name
 PAGE_TEXT = """# Which trainers were tried
 
@@ -174,7 +173,7 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
     for row in rows:
         what = row.said or "nothing" if row.edited else f"**refused**: {row.said}"
         script = f"`{row.trainer}/{row.path}@{row.commit.split()[0]}`"
-        said.setdefault(LONG.sub("", what), []).append(script)
+        said.setdefault(GROUPS.sub("", what), []).append(script)
     diffs = [_row(" ".join(scripts), what) for what, scripts in said.items()]
     return PAGE_TEXT.format(
         version=__version__,

@@ -16,7 +16,7 @@ from opt3dgs_optim.parts.noise import IsotropicNoise, PositionNoise
 from opt3dgs_optim.parts.out_of_view import OutOfView
 from opt3dgs_optim.parts.pooling import Pooling
 from opt3dgs_optim.phases import PhaseScheduler
-from opt3dgs_optim.presets import DEFAULTS, paper_parts
+from opt3dgs_optim.presets import DEFAULTS, DEFAULTS_ADC, paper_parts
 from opt3dgs_optim.runs import RunLog
 from opt3dgs_optim.stepadam import StepAdam
 from opt3dgs_optim.version import __version__
@@ -24,6 +24,7 @@ from opt3dgs_optim.version import __version__
 __all__ = [
     "AWSGLD",
     "DEFAULTS",
+    "DEFAULTS_ADC",
     "Annealing",
     "ConstantMultiplier",
     "Course",

@@ -12,6 +12,12 @@ PAPER_STEPS = 30_000
 PAPER_SWITCH = 29_000 / PAPER_STEPS
 PAPER_WARMUP = 2_500 / PAPER_STEPS
 DEFAULTS: tuple[Part, ...] = (Annealing(), Fading(), OutOfView())  # what paid: docs/evidence.md
+# For clone, split and prune: longer steps let scales grow until they are pruned as too big.
+DEFAULTS_ADC: tuple[Part, ...] = (
+    Annealing(names=("quats", "opacities", "sh0", "shN")),
+    Fading(names=("means", "quats", "opacities", "sh0", "shN")),
+    OutOfView(),
+)
 
 
 def paper_parts(total_steps: int = PAPER_STEPS) -> list[Part]:

@@ -14,13 +14,17 @@ from trainer_files import GSPLAT, INRIA, MCMC, MINI_SPLATTING, SYNTHETIC, TAMING
 from opt3dgs_optim.hosts import diff, write
 from opt3dgs_optim.hosts.edits import main
 
-IMPORT = "from opt3dgs_optim import PhaseScheduler"
+IMPORT = "from opt3dgs_optim import DEFAULTS_ADC, PhaseScheduler"
+PLAIN_IMPORT = "from opt3dgs_optim import PhaseScheduler"
 OURS = [
-    "phases = PhaseScheduler(opt.iterations)",
+    "phases = PhaseScheduler(opt.iterations, parts=DEFAULTS_ADC)",
     "gaussians.optimizer = phases.upgrade(gaussians.optimizer)",
     "Ll1 = phases.pixel_loss(image, gt_image)",
     "phases.observe(loss, iteration=iteration - 1)",
 ]
+
+
+CHOICE = ", parts=DEFAULTS_ADC if isinstance(self.cfg.strategy, DefaultStrategy) else None"
 
 
 def saved(folder: Path, text: str, name: str = "train.py") -> Path:
@@ -37,7 +41,7 @@ def lines_for(folder: Path, text: str) -> list[str]:
 def test_what_is_written_is_what_was_shown(tmp_path: Path, kind: str) -> None:
     path = saved(tmp_path, SYNTHETIC[kind])
     lines = added(diff(path).diff)
-    assert lines[0] == IMPORT
+    assert lines[0] == (PLAIN_IMPORT if kind == "3dgs-mcmc" else IMPORT)
     backup = write(path)
     assert backup.name == "train.py.orig"
     assert backup.read_text() == SYNTHETIC[kind]
@@ -50,9 +54,7 @@ def test_what_is_written_is_what_was_shown(tmp_path: Path, kind: str) -> None:
 def test_the_lines_of_inria(tmp_path: Path) -> None:
     path = saved(tmp_path, INRIA)
     assert added(diff(path).diff) == [IMPORT, *OURS]
-    left, clones = diff(path).notes
-    assert left == "left alone: gaussians.exposure_optimizer"
-    assert "(gaussians.densify_and_prune) the parts lose" in clones
+    assert diff(path).notes == ["left alone: gaussians.exposure_optimizer"]
     write(path)
     text = path.read_text()
     # after restore(), which makes a new optimizer
@@ -65,46 +67,32 @@ def test_the_lines_of_gsplat(tmp_path: Path) -> None:
     ranks = ", process_group=torch.distributed.group.WORLD if world_size > 1 else None"
     lines = [
         IMPORT,
-        f"phases = PhaseScheduler(max_steps{ranks})",
+        f"phases = PhaseScheduler(max_steps{CHOICE}{ranks})",
         "self.optimizers = phases.upgrade(self.optimizers)",
         "l1loss = phases.pixel_loss(colors, pixels)",
         "phases.observe(loss)",
     ]
     assert added(diff(path).diff) == lines
-    left, clones = diff(path).notes
-    assert left == "left alone: self.pose_optimizers"
-    assert "(DefaultStrategy) the parts lose" in clones
+    assert diff(path).notes == ["left alone: self.pose_optimizers"]
     write(path)
     text = path.read_text()  # above the learning-rate schedulers
     assert text.index("max_steps = cfg") < text.index(lines[1]) < text.index("schedulers = [")
 
 
 @pytest.mark.parametrize("call", ["densify", "prune_and_densify", "densify_with_score"])
-def test_what_clones_and_splits_is_noted(tmp_path: Path, call: str) -> None:
-    path = saved(tmp_path, MCMC.replace("relocate_gs", call))
-    (note,) = diff(path).notes
-    assert note.startswith(f"with clone, split and reset (gaussians.{call}) the parts lose")
+def test_the_parts_where_it_clones_and_splits(tmp_path: Path, call: str) -> None:
+    assert lines_for(tmp_path, MCMC.replace("relocate_gs", call)) == [IMPORT, *OURS]
 
 
-def test_a_strategy_outside_the_loop_is_noted(tmp_path: Path) -> None:
-    text = SYNTHETIC["gsplat 2DGS"].replace(
-        "isinstance(self.cfg.strategy, DefaultStrategy)", "True"
-    )
-    path = saved(
-        tmp_path,
-        text.replace("self.splats, self", "s = DefaultStrategy()\n        self.splats, self"),
-    )
-    assert "(DefaultStrategy) the parts lose" in diff(path).notes[-1]
-
-
-def test_relocation_gets_no_note(tmp_path: Path) -> None:
-    path = saved(tmp_path, MCMC)
-    assert added(diff(path).diff) == [IMPORT, *OURS]
-    assert diff(path).notes == []
+def test_the_lines_of_3dgs_mcmc(tmp_path: Path) -> None:
+    plain = [line.replace(", parts=DEFAULTS_ADC", "") for line in OURS]
+    assert lines_for(tmp_path, MCMC) == [PLAIN_IMPORT, *plain]
 
 
 def test_world_size_only_where_it_is_defined(tmp_path: Path) -> None:
-    assert "phases = PhaseScheduler(max_steps)" in lines_for(tmp_path, SYNTHETIC["gsplat 2DGS"])
+    assert "phases = PhaseScheduler(max_steps, parts=DEFAULTS_ADC)" in lines_for(
+        tmp_path, SYNTHETIC["gsplat 2DGS"]
+    )
 
 
 @pytest.mark.parametrize("name", ["convexes", "student_gaussians"])
@@ -117,9 +105,11 @@ def test_other_names_of_loss_options_and_ours(tmp_path: Path) -> None:
     text = INRIA.replace("        loss.b", "        total_loss = loss\n        total_loss.b")
     assert "phases.observe(total_loss, iteration=iteration - 1)" in lines_for(tmp_path, text)
     text = INRIA.replace("opt.iterations", "final_iter").replace("opt, pipe", "final_iter, opt")
-    assert "phases = PhaseScheduler(final_iter)" in lines_for(tmp_path, text)
+    assert "phases = PhaseScheduler(final_iter, parts=DEFAULTS_ADC)" in lines_for(tmp_path, text)
     text = INRIA.replace("first_iter = 0\n", "phases = first_iter = 0\n")
-    assert "opt3dgs_phases = PhaseScheduler(opt.iterations)" in lines_for(tmp_path, text)
+    assert "opt3dgs_phases = PhaseScheduler(opt.iterations, parts=DEFAULTS_ADC)" in lines_for(
+        tmp_path, text
+    )
 
 
 def test_names_of_a_function_around_it(tmp_path: Path) -> None:

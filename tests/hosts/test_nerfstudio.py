@@ -18,7 +18,7 @@ from gsplat_host import HOSTS
 from torch.nn import Parameter
 from trainers import edit_rows, make_splats
 
-from opt3dgs_optim import Phase
+from opt3dgs_optim import DEFAULTS, DEFAULTS_ADC, Phase
 
 TOTAL = 40
 NAMES = {"sh0": "features_dc", "shN": "features_rest"}
@@ -279,8 +279,9 @@ def test_the_package_defaults_unless_the_paper_is_asked_for(ours: Any) -> None:
     plain = Training(ours, ours.splatfacto_opt3dgs, paper=False)
     assert "Curvature" in repr(ask.model.phases)
     assert "Fading" not in repr(ask.model.phases)
-    assert "Curvature" not in repr(plain.model.phases)
-    assert "Fading" in repr(plain.model.phases)
+    assert plain.model.phases.parts == list(DEFAULTS_ADC)  # splatfacto clones and splits
+    relocating = Training(ours, ours.splatfacto_mcmc_opt3dgs, paper=False)
+    assert relocating.model.phases.parts == list(DEFAULTS)
 
 
 @pytest.mark.filterwarnings("ignore::FutureWarning")

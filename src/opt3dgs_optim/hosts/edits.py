@@ -23,10 +23,10 @@ COMMAND = """Print the lines to change in a training script as a diff; --write a
 gsplat's simple_trainer.py, the train.py of INRIA's gaussian-splatting, 3dgs-mcmc and derivatives. A
 file whose names cannot be read with certainty is refused, with the lines to add by hand.
 """
-IMPORT = "from opt3dgs_optim import PhaseScheduler"
+OURS = ("DEFAULTS_ADC", "PhaseScheduler")  # names that the lines import
 LINES_BY_HAND = (
-    f"{IMPORT}  # at the top",
-    "phases = PhaseScheduler(TOTAL_STEPS)  # above the training loop",
+    "from opt3dgs_optim import PhaseScheduler  # at the top",
+    "phases = PhaseScheduler(TOTAL_STEPS)  # above the loop; clone and split: parts=DEFAULTS_ADC",
     "OPTIMIZER = phases.upgrade(OPTIMIZER)  # a torch.optim.Adam with named groups, or a dict",
     "L1 = phases.pixel_loss(RENDER, PHOTO)  # in place of the mean absolute error",
     "phases.observe(LOSS)  # after LOSS.backward(), before OPTIMIZER.step()",
@@ -119,15 +119,16 @@ def _edited_lines(lines: list[bytes], tree: ast.Module, trainer: Trainer) -> lis
     point = _upgrade_point(trainer)
     known = _known(tree, trainer, point)
     ranks = ", process_group=torch.distributed.group.WORLD if world_size > 1 else None"
-    options = ranks if "world_size" in known else ""
+    options = trainer.parts + (ranks if "world_size" in known else "")
     start = [f"{name} = PhaseScheduler({ast.unparse(trainer.total)}{options})", *upgrade]
     for node in ast.walk(ast.parse("\n".join(start))):
-        if isinstance(node, ast.Name) and node.id not in {*known, name, "PhaseScheduler"}:
+        if isinstance(node, ast.Name) and node.id not in {*known, name, *OURS}:
             raise ValueError(f"the name {node.id} is not defined where the lines need it")
     count = f", iteration={trainer.count}" if trainer.count else ""
     for value, pair in reversed(trainer.pixel):
         _replace(lines, value, f"{name}.pixel_loss({', '.join(map(ast.unparse, pair))})")
-    _insert(lines, _last_import(tree), [IMPORT])
+    ours = OURS if trainer.parts else OURS[1:]
+    _insert(lines, _last_import(tree), [f"from opt3dgs_optim import {', '.join(ours)}"])
     for statement in trainer.backwards:
         _insert(lines, statement, [f"{name}.observe({trainer.loss}{count})"])
     for statement in trainer.setups:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.phases import PhaseScheduler
-from opt3dgs_optim.presets import PAPER_SWITCH
+from opt3dgs_optim.presets import DEFAULTS, DEFAULTS_ADC, PAPER_SWITCH, paper_parts
 
 try:
     from nerfstudio.models.splatfacto import (  # pyright: ignore
@@ -64,13 +64,19 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
                 "Opt3DGSSplatfactoModel: total_steps=None and no trainer, but the number of "
                 "iterations is needed; set pipeline.model.total_steps"
             )
-        make = PhaseScheduler.paper if config.paper else PhaseScheduler
-        self.phases = make(total, switch=config.switch)
-        optimizers = attributes.optimizers
+        relocates = getattr(config, "strategy", "default") == "mcmc"
+        parts = paper_parts(total) if config.paper else DEFAULTS if relocates else DEFAULTS_ADC
+        self.phases = PhaseScheduler(total, config.switch, parts)
         for name, (param,) in self.get_gaussian_param_groups().items():
-            _hold(optimizers.optimizers[name], param)
-            optimizers.parameters[name] = [param]
-        self.phases.upgrade(optimizers.optimizers)
+            # On a resume nerfstudio builds its optimizers first and makes new Parameters then, that
+            # none of them would ever step; the loaded state is the new one's.
+            optimizer = attributes.optimizers.optimizers[name]
+            (group,) = optimizer.param_groups
+            (old,), group["params"] = group["params"], [param]
+            if old in optimizer.state:
+                optimizer.state[param] = optimizer.state.pop(old)
+            attributes.optimizers.parameters[name] = [param]
+        self.phases.upgrade(attributes.optimizers.optimizers)
         return super().get_training_callbacks(attributes)
 
     def get_loss_dict(
@@ -91,19 +97,6 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
         energy = torch.stack([term.detach().reshape(()) for term in losses.values()]).sum()
         phases.observe(energy, iteration=int(self.step))
         return losses
-
-
-def _hold(optimizer: torch.optim.Optimizer, param: torch.nn.Parameter) -> None:
-    """Let an optimizer of one parameter step this one.
-
-    On a resume nerfstudio builds its optimizers first and makes new Parameters then, which none of
-    them would ever step; the loaded state is the new one's.
-    """
-    (group,) = optimizer.param_groups
-    (old,) = group["params"]
-    group["params"] = [param]
-    if old in optimizer.state:
-        optimizer.state[param] = optimizer.state.pop(old)
 
 
 def __getattr__(name: str) -> Any:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 SECOND = ("shoptimizer",)  # of Gaussians; any other, as of exposures or networks, is left alone
 USUAL_L1 = ("ll1", "l1loss", "l1_loss", "ll1_render")
-CLONES = r"DefaultStrategy|[\w.]+\.(?:prune_and_)?densify\w*(?=\()"  # what clones and splits
+CLONES = r"DefaultStrategy|\.(?:prune_and_)?densify\w*(?=\()"  # what clones and splits
 
 
 class Spot(NamedTuple):
@@ -52,6 +52,7 @@ class Trainer:
     backwards: list[ast.stmt]  # `loss.backward()`; several only in branches of an `if`
     total: ast.expr  # how many iterations
     count: str  # the iteration, from 0, where the loop may start later; else empty
+    parts: str = ""  # where it clones and splits: the argument that says so
     optimizers: list[str] = field(default_factory=list)  # expressions, the positions' first
     setups: list[ast.stmt] = field(default_factory=list)  # in the loop: they make them anew
     # The L1 terms: what to replace, and its two arguments.
@@ -90,11 +91,9 @@ def read_trainer(tree: ast.Module, folder: Path) -> Trainer:
     trainer = Trainer(function, own, loop, losses.pop(), statements, *_range(loop, own))
     _find_optimizers(trainer, inside, folder)
     _find_pixel_loss(trainer, inside)
-    if clones := dict.fromkeys(re.findall(CLONES, ast.unparse(tree))):
-        trainer.notes.append(
-            f"with clone, split and reset ({', '.join(clones)}) the parts lose PSNR on two of "
-            "three scenes (docs/evidence.md): take 3DGS-MCMC's relocation where there is a choice"
-        )
+    if re.search(CLONES, ast.unparse(tree)):
+        choice = re.search(r"isinstance\([\w.]+, DefaultStrategy\)", ast.unparse(loop))
+        trainer.parts = ", parts=DEFAULTS_ADC" + (f" if {choice[0]} else None" if choice else "")
     return trainer
 
 
