@@ -40,7 +40,7 @@ from studies.scenes.tables import machines_line
 from studies.scenes.training import Spec, machine, train
 from studies.scenes.view_angles import nearest_angles
 
-from opt3dgs_optim import DEFAULTS
+from opt3dgs_optim import DEFAULTS, DEFAULTS_ADC
 
 RECORDS = report.FOLDER / "records.json"
 
@@ -87,6 +87,9 @@ def test_the_defaults_are_the_measured_arm() -> None:
     measured = find_study_arm(DEFAULT_ARM).parts
     assert measured is not None
     assert measured(300, None) == list(DEFAULTS)
+    cloning = find_study_arm("adc+defaults-but-scales").parts
+    assert cloning is not None
+    assert cloning(300, None) == list(DEFAULTS_ADC)
 
 
 def rotated_record(arm: str, scene: str, seed: int, **metrics: float) -> Record:
