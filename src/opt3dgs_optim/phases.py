@@ -34,8 +34,8 @@ class PhaseScheduler(Course):
         total_steps: iterations of the training.
         switch: where exploitation starts: a fraction of `total_steps` in (0, 1] if a float, an
             iteration if an int (`total_steps`: never). The paper: 29/30.
-        parts: what the steps have, in that order; None: `DEFAULTS`. One that learns
-            (`EnergyHistogram`, `Curvature`, `PositionNoise`) serves one run.
+        parts: what the steps have, in order; None: `DEFAULTS` (clone and split: `DEFAULTS_ADC`).
+            One that learns (`EnergyHistogram`, `Curvature`, `PositionNoise`) serves one run.
         adaptive: whether parts that this training shows no need of are switched off, see
             `switched_off`. Every 100 iterations that is one synchronisation with the GPU.
         log: a `RunLog` that gets one line per `observe`, with what the parts say of themselves.
