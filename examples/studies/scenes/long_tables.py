@@ -123,19 +123,20 @@ def metrics_table(
     arms: Iterable[str],
     *,
     head: Callable[[Setting], str] = lambda setting: setting.scene,
-    gaussians: bool = False,
+    seed: int | None = None,
 ) -> str:
-    """PSNR / SSIM / LPIPS of every arm in every setting, means over the seeds.
+    """PSNR / SSIM / LPIPS of every arm in every setting.
 
     Args:
         head: what stands above a setting's column.
-        gaussians: whether their last number stands beside, for arms that grow it.
+        seed: of this one, with the last number of Gaussians, which differs; None: means over all.
     """
     rows = []
     for arm in arms:
-        found = [list(study.runs(setting, arm).values()) for setting in settings]
+        runs = [study.runs(setting, arm) for setting in settings]
+        found = [[r for key, r in by_seed.items() if seed in (None, key)] for by_seed in runs]
         if any(found):
-            cells = [_cell(records, gaussians=gaussians) for records in found]
+            cells = [_cell(records, gaussians=seed is not None) for records in found]
             rows.append((f"`{label(arm)}`", *cells))
     return table(["arm", *map(head, settings)], "l", rows)
 
