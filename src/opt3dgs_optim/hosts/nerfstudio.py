@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.phases import PhaseScheduler
-from opt3dgs_optim.presets import DEFAULTS, DEFAULTS_ADC, PAPER_SWITCH, paper_parts
+from opt3dgs_optim.presets import DEFAULTS_ADC, PAPER_SWITCH, paper_parts
 
 try:
     from nerfstudio.models.splatfacto import (  # pyright: ignore
@@ -64,8 +64,8 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
                 "Opt3DGSSplatfactoModel: total_steps=None and no trainer, but the number of "
                 "iterations is needed; set pipeline.model.total_steps"
             )
-        relocates = getattr(config, "strategy", "default") == "mcmc"
-        parts = paper_parts(total) if config.paper else DEFAULTS if relocates else DEFAULTS_ADC
+        clones = getattr(config, "strategy", "default") == "default"
+        parts = paper_parts(total) if config.paper else DEFAULTS_ADC if clones else None
         self.phases = PhaseScheduler(total, config.switch, parts)
         for name, (param,) in self.get_gaussian_param_groups().items():
             # On a resume nerfstudio builds its optimizers first and makes new Parameters then, that
@@ -88,10 +88,11 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
         if phases is None:
             return losses
         if phases.pixel_part() is not None:
-            photo = self.get_gt_img(batch["image"])
+            render, photo = outputs["rgb"], self.get_gt_img(batch["image"])
             target = self.composite_with_background(photo, outputs["background"])
-            mask = self._downscale_if_required(batch["mask"]) if "mask" in batch else torch.ones(())
-            render, target = (each * mask.to(each.device) for each in (outputs["rgb"], target))
+            if "mask" in batch:
+                mask = self._downscale_if_required(batch["mask"]).to(target.device)
+                render, target = render * mask, target * mask
             change = phases.pixel_loss(render, target) - (render - target).abs().mean()
             losses["main_loss"] = losses["main_loss"] + (1 - self.config.ssim_lambda) * change
         energy = torch.stack([term.detach().reshape(()) for term in losses.values()]).sum()

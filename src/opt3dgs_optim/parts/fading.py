@@ -91,9 +91,8 @@ class Fading(Part):
         done = group.get(DONE, self.events_before(course.iteration - 1, course.total_steps))
         group[DONE] = now
         count = len(param) if param.dim() > 0 else 0
-        for event in range(max(done, now - MOST), now):
-            if not self.happens(event, count):
-                continue
+        due = [e for e in range(max(done, now - MOST), now) if self.happens(e, count)]
+        for event in due:
             chosen = self.chosen(event, count, param.device)
             if isinstance(course.valid, Tensor):
                 chosen = chosen & course.valid
