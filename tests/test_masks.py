@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from studies.scenes.parts.pooling import Pooling
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
@@ -29,12 +30,12 @@ from trainers import (
 from opt3dgs_optim import (
     AWSGLD,
     Annealing,
+    Averaging,
     ConstantMultiplier,
     EnergyHistogram,
     Fading,
     IsotropicNoise,
     LQNAdam,
-    Pooling,
     PositionNoise,
 )
 from opt3dgs_optim.names import GAUSSIAN
@@ -164,7 +165,11 @@ def test_pairs_are_kept_between_two_visible_steps_of_a_point() -> None:
 @pytest.mark.parametrize("call", ["visible", "positional", "sparse_adam", "visibility"])
 def test_invisible_rows_stand_still_in_both_phases(kind: Any, exploiting: bool, call: str) -> None:
     splats = make_splats()
-    others = (Annealing(names=GAUSSIAN), Fading(1.0, events=40, start=0.0, stop=1.0), Pooling())
+    others = (
+        Annealing(names=GAUSSIAN),
+        Fading(1.0, events=40, start=0.0, stop=1.0),
+        Averaging(1.0),
+    )
     noise = PositionNoise(splats, scale=1.0)
     phases = everything(40, 10, *others, noise, nu=EnergyHistogram(warmup=4), settling=0)
     optimizers: Any = phases.upgrade(kind(splats))
@@ -191,8 +196,8 @@ def test_invisible_rows_stand_still_in_both_phases(kind: Any, exploiting: bool, 
         for key in set(old) - {"step"}:
             assert torch.equal(old[key][~mask], new[key][~mask]), key
     assert any("history" in state for state in after) == exploiting
-    pooled = state_of(optimizers, splats["means"])["exp_avg_sq"][mask]
-    assert bool((pooled == pooled[:, :1]).all())
+    averaged = state_of(optimizers, splats["means"])["num_averaged"]
+    assert averaged[mask].tolist() == [averaged[1] + 1] * 6
 
 
 def test_a_mask_before_the_first_energy() -> None:
@@ -261,7 +266,7 @@ def pulled(splats: dict[str, Parameter], *left_out: str) -> None:
 @MAKERS
 def test_a_stale_mask_with_nothing_to_step_is_nothing(make: Any) -> None:
     """INRIA after an edit: the mask has the old rows, the new Parameters no gradient yet."""
-    splats, phases, optimizer = upgraded(40, Annealing(names=GAUSSIAN), Pooling(), make=make)
+    splats, phases, optimizer = upgraded(40, Annealing(names=GAUSSIAN), Averaging(1.0), make=make)
     pulled(splats)
     phases.observe(0.1)
     optimizer.step(EVERY, 12)
@@ -290,7 +295,7 @@ def test_other_groups_ride_along_without_the_mask() -> None:
     splats, exposure = make_splats(), Parameter(torch.ones(3, 4))
     optimizer = inria_optimizer(splats)
     optimizer.add_param_group({"params": [exposure], "lr": 0.1, "name": "exposure"})
-    phases = only(10, Annealing(names=GAUSSIAN), Pooling())
+    phases = only(10, Annealing(names=GAUSSIAN), Averaging(1.0))
     whole: Any = phases.upgrade(optimizer)
     twin = Parameter(torch.ones(3, 4))
     plain = Adam([twin], lr=0.1, eps=1e-15)

@@ -18,6 +18,7 @@ import opt3dgs_optim
 from opt3dgs_optim import (
     AWSGLD,
     Annealing,
+    Averaging,
     ConstantMultiplier,
     Course,
     Curvature,
@@ -27,7 +28,6 @@ from opt3dgs_optim import (
     LQNAdam,
     OutOfView,
     PhaseScheduler,
-    Pooling,
     PositionNoise,
     SquaredLoss,
     backend_info,
@@ -115,7 +115,7 @@ TABLE: dict[str, tuple[Callable[..., Any], type, dict[str, Any]]] = {
             "names": NOT_NAMES,
         },
     ),
-    "Pooling": (Pooling, Pooling, {"names": NOT_NAMES}),
+    "Averaging": (Averaging, Averaging, {"share": [*NOT_NUMBERS, 0.0, 1.1]}),
     "Fading": (
         Fading,
         Fading,

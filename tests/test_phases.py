@@ -32,6 +32,7 @@ from opt3dgs_optim import (
     AWSGLD,
     DEFAULTS,
     Annealing,
+    Averaging,
     ConstantMultiplier,
     Curvature,
     EnergyHistogram,
@@ -42,7 +43,6 @@ from opt3dgs_optim import (
     Part,
     Phase,
     PhaseScheduler,
-    Pooling,
     SquaredLoss,
     StepAdam,
 )
@@ -159,7 +159,7 @@ def test_resume_is_bit_exact(make: Any, at: int, order: str) -> None:
     """Before, at and after the switch; loaded into our optimizer or into the trainer's Adam."""
 
     def every_part() -> PhaseScheduler:
-        return scheduler(Annealing(), Fading(share=0.5, events=20), Pooling())
+        return scheduler(Annealing(), Fading(share=0.5, events=20), Averaging(0.9))
 
     whole, optimizers = begun(phases := every_part(), make)
     train(whole, optimizers, phases, 0, TOTAL)
@@ -186,7 +186,7 @@ def test_resume_is_bit_exact(make: Any, at: int, order: str) -> None:
 
 def test_density_control_between_steps_is_survived_in_both_phases() -> None:
     fading = Fading(share=1.0, events=60, start=0.0, stop=1.0)
-    splats, optimizers = begun(phases := scheduler(Annealing(), fading, Pooling()))
+    splats, optimizers = begun(phases := scheduler(Annealing(), fading, Averaging(1.0)))
     generator = torch.Generator().manual_seed(0)
     for iteration in range(TOTAL):
         train(splats, optimizers, phases, iteration, iteration + 1)
@@ -198,7 +198,8 @@ def test_density_control_between_steps_is_survived_in_both_phases() -> None:
     assert all(bool(torch.isfinite(p).all()) for p in splats.values())
     state = state_of(optimizers, splats["means"])
     assert state["history"].shape[0] == len(splats["means"])
-    assert bool((state["exp_avg_sq"] == state["exp_avg_sq"][:, :1]).all())  # pooled
+    assert torch.equal(state["mean_iterate"], splats["means"])
+    assert state["num_averaged"].shape == (len(splats["means"]),)
     holders = {name for name, p in splats.items() if "history" in state_of(optimizers, p)}
     assert holders == {"means"}
 
@@ -216,9 +217,11 @@ def test_presets() -> None:
     warmup = short.part(EnergyHistogram)
     assert warmup is not None
     assert (short.switch_step, warmup.warmup) == (2_900, 250)
-    assert PhaseScheduler(10).parts == [*DEFAULTS] == [Annealing(), Fading(), OutOfView()]
+    assert (
+        PhaseScheduler(10).parts == [*DEFAULTS] == [Annealing(), Fading(), OutOfView(), Averaging()]
+    )
     assert PhaseScheduler(10, parts=[]).parts == []
-    assert PhaseScheduler(10, parts=[*DEFAULTS, Pooling()]).parts[-1] == Pooling()
+    assert PhaseScheduler(10, parts=[*DEFAULTS, ConstantMultiplier(2.0)]).parts[-1].value == 2.0
 
 
 def test_optimizers_that_cannot_be_upgraded_are_named() -> None:
@@ -392,12 +395,14 @@ def test_optimizers_that_step_without_an_energy() -> None:
 def test_an_energy_that_stops_coming() -> None:
     splats, optimizers = begun(phases := PhaseScheduler(500))
     train(splats, optimizers, phases, 0, 5)
-    with pytest.warns(UserWarning, match="without an energy: Annealing, Fading, OutOfView stand"):
+    with pytest.warns(
+        UserWarning, match="without an energy: Annealing, Fading, OutOfView, Averaging stand"
+    ):
         train(splats, optimizers, None, 5, 30)
 
 
 def test_steps_before_the_first_energy_are_plain_adams() -> None:
-    splats, _, optimizers = upgraded(500, Annealing(names=GAUSSIAN), Pooling())
+    splats, _, optimizers = upgraded(500, Annealing(names=GAUSSIAN), Averaging(1.0))
     train(splats, optimizers, None, 0, 15)
     assert_same(splats, trained_by_adam(15))
 
@@ -464,7 +469,9 @@ def test_an_iteration_that_is_none(iteration: Any) -> None:
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
 def test_copies_go_on_alike(copied: Any) -> None:
-    splats, optimizers = begun(phases := scheduler(Annealing(names=GAUSSIAN), Fading(), Pooling()))
+    splats, optimizers = begun(
+        phases := scheduler(Annealing(names=GAUSSIAN), Fading(), Averaging(1.0))
+    )
     train(splats, optimizers, phases, 0, SWITCH + 4)
     twins, other, adams = copied((splats, phases, optimizers))
     train(splats, optimizers, phases, SWITCH + 4, TOTAL)

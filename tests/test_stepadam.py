@@ -30,13 +30,13 @@ from trainers import (
 from opt3dgs_optim import (
     AWSGLD,
     Annealing,
+    Averaging,
     ConstantMultiplier,
     EnergyHistogram,
     Fading,
     FreshMoments,
     LQNAdam,
     Part,
-    Pooling,
     PositionNoise,
 )
 from opt3dgs_optim.names import GAUSSIAN
@@ -175,7 +175,9 @@ def test_what_is_lent_is_taken_back_after_an_exception(
 
 
 def test_a_parameter_without_gradient_is_left_alone() -> None:
-    splats, phases, optimizers = upgraded(TOTAL, Annealing(names=GAUSSIAN), Fading(), Pooling())
+    splats, phases, optimizers = upgraded(
+        TOTAL, Annealing(names=GAUSSIAN), Fading(), Averaging(1.0)
+    )
     before = splats["means"].detach().clone()
     for _ in range(3):
         phases.observe(0.1)
@@ -212,7 +214,7 @@ def test_numbers_that_are_not_finite_are_zero_and_nobody_else_notices(
     def optimizer(x: Parameter) -> tuple[Any, Any]:
         if make != "phases":
             return make([x], lr=0.01, **path), None
-        phases = only(TOTAL, Annealing(names=GAUSSIAN), Pooling())
+        phases = only(TOTAL, Annealing(names=GAUSSIAN), Averaging(1.0))
         adam = torch.optim.Adam([x], lr=0.01, **path)
         return phases.upgrade({"means": adam})["means"], phases
 
@@ -282,7 +284,7 @@ def test_a_broken_loss_skips_the_step(make: Any, bad: float) -> None:
     ends, histograms = [], []
     for hostile in (False, True):
         histogram = EnergyHistogram(warmup=10)
-        others = Annealing(names=GAUSSIAN), Fading(), Pooling()
+        others = Annealing(names=GAUSSIAN), Fading(), Averaging(1.0)
         phases = everything(60, 40, *others, nu=histogram, settling=0)
         splats, optimizers = begun(phases, make)
         for iteration in range(60):
@@ -312,7 +314,13 @@ def test_a_broken_loss_is_dropped_on_a_device_too(
     noise = PositionNoise(splats, scale=1.0)
     fading = Fading(share=1.0, events=TOTAL, start=0.0, stop=1.0)
     phases = everything(
-        TOTAL, 20, Annealing(names=GAUSSIAN), fading, Pooling(), noise, nu=ConstantMultiplier(2.0)
+        TOTAL,
+        20,
+        Annealing(names=GAUSSIAN),
+        fading,
+        Averaging(1.0),
+        noise,
+        nu=ConstantMultiplier(2.0),
     )
     options: dict[str, Any] = {"decoupled_weight_decay": True, "weight_decay": 0.1, **path}
     optimizers = phases.upgrade(gsplat_optimizers(splats, **options))
@@ -341,7 +349,7 @@ def test_a_finite_loss_on_a_device_is_the_step_on_a_host(
     for device in (False, True):
         if device:
             on_a_device(monkeypatch)
-        others = Annealing(names=GAUSSIAN), Fading(), Pooling()
+        others = Annealing(names=GAUSSIAN), Fading(), Averaging(1.0)
         phases = everything(TOTAL, 20, *others, nu=ConstantMultiplier(2.0))
         splats, optimizers = begun(phases, **path)
         train(splats, optimizers, phases, 0, TOTAL)
@@ -354,7 +362,7 @@ def test_a_masked_step_with_a_broken_loss_on_a_device(
     path: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     on_a_device(monkeypatch)
-    splats, phases, optimizers = upgraded(TOTAL, Annealing(names=GAUSSIAN), Pooling(), **path)
+    splats, phases, optimizers = upgraded(TOTAL, Annealing(names=GAUSSIAN), Averaging(1.0), **path)
     train(splats, optimizers, phases, 0, 5)
     before = splats["means"].detach().clone()
     phases.observe(torch.tensor(math.inf))

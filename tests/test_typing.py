@@ -23,8 +23,8 @@ from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 
 from opt3dgs_optim import (
-    AWSGLD, DEFAULTS, Annealing, ConstantMultiplier, Curvature, EnergyHistogram, Fading,
-    FreshMoments, IsotropicNoise, LQNAdam, OutOfView, Part, Phase, PhaseScheduler, Pooling,
+    AWSGLD, DEFAULTS, Annealing, Averaging, ConstantMultiplier, Curvature, EnergyHistogram, Fading,
+    FreshMoments, IsotropicNoise, LQNAdam, Part, Phase, PhaseScheduler,
     PositionNoise, SquaredLoss, backend_info, two_loop,
 )
 
@@ -67,7 +67,7 @@ class SignAgreement(Part):
         return torch.where(grad * state["exp_avg"] < 0, 0.0, grad)
 
 
-parts: list[Part] = [*DEFAULTS, OutOfView(), Pooling(), SignAgreement(), ConstantMultiplier(1.5)]
+parts: list[Part] = [*DEFAULTS, Averaging(0.1), SignAgreement(), ConstantMultiplier(1.5)]
 phases = PhaseScheduler(30_000, 0.9, parts, adaptive=True)
 phases = PhaseScheduler(30_000, 29_000, [Annealing(4.0, names=("means",)), Fading(seed=3)])
 phases = PhaseScheduler(300, parts=[FreshMoments(), SquaredLoss(), Curvature(history_size=3)])

@@ -7,6 +7,7 @@ from opt3dgs_optim.lbfgs import two_loop
 from opt3dgs_optim.lqnadam import LQNAdam
 from opt3dgs_optim.part import Part, Phase
 from opt3dgs_optim.parts.annealing import Annealing
+from opt3dgs_optim.parts.averaging import Averaging
 from opt3dgs_optim.parts.constant import ConstantMultiplier
 from opt3dgs_optim.parts.curvature import Curvature
 from opt3dgs_optim.parts.fading import Fading
@@ -14,7 +15,6 @@ from opt3dgs_optim.parts.histogram import EnergyHistogram
 from opt3dgs_optim.parts.last_phase import FreshMoments, SquaredLoss
 from opt3dgs_optim.parts.noise import IsotropicNoise, PositionNoise
 from opt3dgs_optim.parts.out_of_view import OutOfView
-from opt3dgs_optim.parts.pooling import Pooling
 from opt3dgs_optim.phases import PhaseScheduler
 from opt3dgs_optim.presets import DEFAULTS, DEFAULTS_ADC, paper_parts
 from opt3dgs_optim.runs import RunLog
@@ -26,6 +26,7 @@ __all__ = [
     "DEFAULTS",
     "DEFAULTS_ADC",
     "Annealing",
+    "Averaging",
     "ConstantMultiplier",
     "Course",
     "Curvature",
@@ -38,7 +39,6 @@ __all__ = [
     "Part",
     "Phase",
     "PhaseScheduler",
-    "Pooling",
     "PositionNoise",
     "RunLog",
     "SquaredLoss",

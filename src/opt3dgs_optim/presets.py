@@ -2,6 +2,7 @@
 
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.parts.annealing import Annealing
+from opt3dgs_optim.parts.averaging import Averaging
 from opt3dgs_optim.parts.curvature import Curvature
 from opt3dgs_optim.parts.fading import Fading
 from opt3dgs_optim.parts.histogram import EnergyHistogram
@@ -11,12 +12,14 @@ from opt3dgs_optim.parts.out_of_view import OutOfView
 PAPER_STEPS = 30_000
 PAPER_SWITCH = 29_000 / PAPER_STEPS
 PAPER_WARMUP = 2_500 / PAPER_STEPS
-DEFAULTS: tuple[Part, ...] = (Annealing(), Fading(), OutOfView())  # what paid: docs/evidence.md
+# What paid: docs/evidence.md.
+DEFAULTS: tuple[Part, ...] = (Annealing(), Fading(), OutOfView(), Averaging())
 # For clone, split and prune: longer steps let scales grow until they are pruned as too big.
 DEFAULTS_ADC: tuple[Part, ...] = (
     Annealing(names=("quats", "opacities", "sh0", "shN")),
     Fading(names=("means", "quats", "opacities", "sh0", "shN")),
     OutOfView(),
+    Averaging(),
 )
 
 

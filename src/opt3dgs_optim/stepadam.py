@@ -124,7 +124,7 @@ class StepAdam(Adam):
                     if param.grad is None or param.grad.is_sparse:
                         continue
                     self._told |= guard(param.grad, course, self._told)
-                    if own is not None or befores or back:
+                    if own is not None or befores or back or course.keys:
                         self._lend_gradient(group, param, befores, lent, own, back)
                     moved.append((group, param, afters))
                 said = [part.factor(group, course) for part in factors]

@@ -13,11 +13,11 @@ from trainers import everything
 from opt3dgs_optim import (
     AWSGLD,
     Annealing,
+    Averaging,
     Curvature,
     EnergyHistogram,
     Fading,
     LQNAdam,
-    Pooling,
     PositionNoise,
     backend_info,
 )
@@ -192,7 +192,12 @@ def test_phase_scheduler_steps_without_synchronisation() -> None:
         name: torch.optim.Adam([{"params": [p], "lr": 1e-3, "name": name}], fused=True)
         for name, p in splats.items()
     }
-    others = Annealing(names=GAUSSIAN), Fading(events=10), Pooling(), PositionNoise(splats, 1.0)
+    others = (
+        Annealing(names=GAUSSIAN),
+        Fading(events=10),
+        Averaging(1.0),
+        PositionNoise(splats, 1.0),
+    )
     phases = everything(40, 20, *others, curvature=Curvature(backend="cuda"))
     optimizers = phases.upgrade(adams)
     loss = torch.tensor(0.1, device="cuda")

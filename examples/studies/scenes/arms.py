@@ -17,6 +17,7 @@ from torch import Tensor
 
 from opt3dgs_optim import (
     Annealing,
+    Averaging,
     ConstantMultiplier,
     Curvature,
     Fading,
@@ -25,7 +26,6 @@ from opt3dgs_optim import (
     Part,
     Phase,
     PhaseScheduler,
-    Pooling,
     SquaredLoss,
     paper_parts,
 )
@@ -33,11 +33,14 @@ from opt3dgs_optim.names import GAUSSIAN
 from opt3dgs_optim.presets import PAPER_WARMUP
 from studies.scenes.parts.exploring import NuOfNoise, NuPerPoint, RestartedHistogram, ViewHistogram
 from studies.scenes.parts.own_step import OwnStep
+from studies.scenes.parts.pooling import Pooling
 from studies.scenes.parts.share_kept import ShareKept
 
 BASELINE = "mcmc"
 FADED = "faded"  # fading alone
-DEFAULTS = "annealed-all-but-means+faded"  # what `PhaseScheduler(total_steps)` is
+DEFAULTS = "annealed-all-but-means+faded"  # what `PhaseScheduler(total_steps)` was before:
+AVERAGED = f"{DEFAULTS}+averaged"  # what it is, branched off that one
+STOCK_AVERAGED = "averaged@1/30"
 EARLY = (f"{FADED}-to-1/4", f"{DEFAULTS}-to-1/4")  # fading ends after that share of the run
 ANNEALED = "annealed-4-opacities-1+faded"  # the defaults until the views rotated
 SHORT_LABEL = "annealed+faded"
@@ -172,6 +175,27 @@ def adaptive() -> list[StudyArm]:
     ]
 
 
+def averaged() -> list[StudyArm]:
+    """The mean of the last iterates; each branches off the same without it."""
+    trunks = {
+        STOCK_AVERAGED: (BASELINE, ()),
+        AVERAGED: (DEFAULTS, (ANNEALING, FADING, OutOfView())),
+        "adc+averaged": ("adc", ()),
+        "adc+defaults-but-scales+averaged": ("adc+defaults-but-scales", BUT_SCALES),
+    }
+    return [
+        StudyArm(
+            name,
+            parts=of(*parts, Averaging(1 / 30)),
+            mcmc=not name.startswith("adc"),
+            adaptive=name.startswith("adc"),
+            switch=29 / 30,
+            trunk=trunk,
+        )
+        for name, (trunk, parts) in trunks.items()
+    ]
+
+
 def groups() -> dict[str, list[StudyArm]]:
     """All arms as `arms.csv` has them, in its order."""
     paper = StudyArm("paper", parts=lambda iterations, _nu: paper_parts(iterations), switch=29 / 30)
@@ -181,6 +205,7 @@ def groups() -> dict[str, list[StudyArm]]:
         *(StudyArm(f"{n}-constant", parts=constant, needs=n) for n in (STABLE, paper.name)),
         *last_phases(),
         *adaptive(),
+        *averaged(),
     ]
     trained = {arm.name: arm for arm in coded}
     made: dict[str, list[StudyArm]] = {}

@@ -10,6 +10,7 @@ from typing import Any
 
 from studies.scenes.arms import (
     ANNEALED,
+    AVERAGED,
     DEFAULTS,
     DEFAULTS_POOLED,
     EARLY,
@@ -22,6 +23,7 @@ from studies.scenes.arms import (
     SELDOM_FADED,
     SHARE_KEPT,
     STABLE,
+    STOCK_AVERAGED,
     STUDY_ARMS,
     UNFADED,
     UNHELD,
@@ -35,12 +37,13 @@ ROTATED_ARMS = (
     *("mcmc", FADED, DEFAULTS, ANNEALED, "paper", "paper-constant"),
     *(SELDOM_FADED, *UNFADED.values(), "rates-x2", DEFAULTS_POOLED, "own-step"),
     *(STABLE, f"{STABLE}-constant"),
+    *(AVERAGED, STOCK_AVERAGED),
     *("l2@1/30", "l1+reset@1/30", "l2+reset@1/30", "l2+reset+lqn@1/30"),
     *(f"l1+reset{x}@1/{k}" for k in (4, 2) for x in ("", "+lqn", "+lqn-all")),
 )
 BRIEF_ARMS = ("mcmc", FADED, DEFAULTS, ANNEALED, *EARLY)
 HALF_ARMS = (  # with 50,000 Gaussians
-    *("mcmc", DEFAULTS, SHARE_KEPT, SELDOM_FADED, *UNFADED.values()),
+    *("mcmc", DEFAULTS, AVERAGED, STOCK_AVERAGED, SHARE_KEPT, SELDOM_FADED, *UNFADED.values()),
     *("paper", "paper-constant"),
 )
 RATES_ARMS = ("mcmc", OWN_STEP, DEFAULTS)

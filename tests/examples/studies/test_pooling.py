@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from studies.scenes.parts.pooling import Pooling
 from torch import Tensor
 from trainers import (
     gsplat_optimizers,
@@ -18,7 +19,7 @@ from trainers import (
     upgraded,
 )
 
-from opt3dgs_optim import Course, Pooling
+from opt3dgs_optim import Course
 
 TOTAL = 60
 GEOMETRY = ("means", "scales", "quats")

@@ -5,9 +5,9 @@ from typing import Any
 
 from torch import Tensor
 
-from opt3dgs_optim.course import Course
+from opt3dgs_optim import Course, Part
 from opt3dgs_optim.names import check_names
-from opt3dgs_optim.part import Group, Part
+from opt3dgs_optim.part import Group
 
 
 @dataclass(frozen=True, repr=False)

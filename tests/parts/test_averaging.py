@@ -1,0 +1,149 @@
+"""The mean of the last iterates: what it is, when it takes their place, and what it survives."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+from trainers import (
+    assert_same,
+    edit_rows,
+    every_one,
+    gsplat_optimizers,
+    inria_optimizer,
+    make_splats,
+    only,
+    state_of,
+    train,
+    trained_by_adam,
+    upgraded,
+    values_of,
+)
+
+from opt3dgs_optim import Averaging
+
+TOTAL, SHARE = 60, 0.25
+FIRST = 45  # the first iteration of the last quarter: from the next one on iterates are averaged
+MAKERS = pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
+
+
+@MAKERS
+def test_a_run_ends_at_the_mean_of_its_last_iterates(make: Any) -> None:
+    splats, phases, optimizers = upgraded(TOTAL, Averaging(SHARE), make=make)
+    iterates = []
+    for i in range(TOTAL - 2):
+        train(splats, optimizers, phases, i, i + 1)
+        iterates.append(values_of(splats))
+    assert_same(trained_by_adam(TOTAL - 2), splats)  # until then it changes nothing
+    # INRIA's trainer saves before its last iteration and makes no step in it.
+    train(splats, optimizers, phases, TOTAL - 2, TOTAL - 1)
+    last = trained_by_adam(TOTAL - 1)
+    for name, param in splats.items():
+        averaged = [*(each[name] for each in iterates[FIRST + 1 :]), last[name]]
+        expected = torch.stack([each.detach().double() for each in averaged]).mean(0)
+        assert len(averaged) == TOTAL - FIRST - 2
+        torch.testing.assert_close(param.double(), expected, rtol=1e-5, atol=1e-7)
+    # gsplat's saves before its last step, and evaluates after it: that step stays at the mean.
+    mean = values_of(splats)
+    train(splats, optimizers, phases, TOTAL - 1, TOTAL)
+    for name, param in splats.items():
+        off = (param - mean[name]).norm()
+        assert off <= 0.1 * (last[name] - mean[name]).norm(), name
+        assert torch.equal(param, state_of(optimizers, param)["mean_iterate"])
+
+
+def test_a_run_that_goes_on_is_let_go() -> None:
+    splats, phases, optimizers = upgraded(TOTAL, Averaging(SHARE))
+    train(splats, optimizers, phases, 0, TOTAL)
+    mean = values_of(splats)
+    train(splats, optimizers, phases, TOTAL, TOTAL + 1)
+    assert all(not torch.equal(param, mean[name]) for name, param in splats.items())
+
+
+def test_it_ends_nearer_to_where_noise_leads_it_around() -> None:
+    """Adam at a constant rate about the minimum of a bowl, its gradients noisy."""
+    ends = []
+    for parts in ([], [Averaging(0.5)]):
+        x = Parameter(torch.ones(500, 3))
+        phases = only(3_000, *parts)
+        (adam,) = phases.upgrade({"means": torch.optim.Adam([x], lr=0.01)}).values()
+        generator = torch.Generator().manual_seed(0)
+        for _ in range(3_000):
+            x.grad = x.detach() + torch.randn(500, 3, generator=generator)
+            phases.observe(0.1)
+            adam.step()
+        ends.append(float(x.detach().square().mean()))
+    assert ends[1] < 0.25 * ends[0]
+
+
+@pytest.mark.parametrize("parts", [[Averaging(1.0)]], ids=["alone"])
+def test_rows_that_density_control_edits_begin_anew(parts: list[Any]) -> None:
+    """Alone, too: no other part asks whose rows they are."""
+    splats, phases, optimizers = upgraded(TOTAL, *parts)
+    train(splats, optimizers, phases, 0, 50)
+    edit_rows(splats, optimizers, torch.arange(11, -1, -2), 3)
+    iterates: list[dict[str, Tensor]] = []
+    for i in range(50, TOTAL - 2):
+        train(splats, optimizers, phases, i, i + 1)
+        iterates.append(values_of(splats))
+    for name, param in splats.items():
+        state = state_of(optimizers, param)
+        assert state["num_averaged"].tolist() == [7.0] * 9
+        expected = torch.stack([each[name] for each in iterates[1:]]).mean(0)
+        torch.testing.assert_close(state["mean_iterate"], expected)
+
+
+def test_rows_that_are_edited_in_the_last_moment_are_left_where_they_are() -> None:
+    splats, phases, optimizers = upgraded(TOTAL, Averaging(1.0))
+    train(splats, optimizers, phases, 0, TOTAL - 2)
+    edit_rows(splats, optimizers, torch.arange(12), 0)
+    before = values_of(splats)
+    train(splats, optimizers, phases, TOTAL - 2, TOTAL)
+    for name, param in splats.items():
+        assert bool((param != 0).all())
+        torch.testing.assert_close(param.detach(), before[name], rtol=0, atol=0.2)
+
+
+def test_with_masks_every_row_has_the_mean_of_its_own_iterates() -> None:
+    splats, phases, optimizers = upgraded(TOTAL, Averaging(SHARE), make=inria_optimizer)
+    train(splats, optimizers, phases, 0, FIRST + 1)
+    generator, seen = torch.Generator().manual_seed(0), torch.zeros(12)
+    sums = {name: torch.zeros_like(param) for name, param in splats.items()}
+    for _ in range(FIRST + 1, TOTAL - 2):
+        mask = torch.rand(12, generator=generator) < 0.6
+        for param in splats.values():
+            param.grad = torch.randn(param.shape, generator=generator)
+        phases.observe(0.1)
+        optimizers.step(mask, 12)
+        seen += mask
+        for name, param in splats.items():
+            sums[name][mask] += param.detach()[mask]
+    assert 0 < seen.min() < seen.max()
+    for name, param in splats.items():
+        state = state_of(optimizers, param)
+        assert torch.equal(state["num_averaged"], seen)
+        expected = sums[name] / seen.reshape(-1, *[1] * (param.dim() - 1))
+        torch.testing.assert_close(state["mean_iterate"], expected)
+
+
+def test_half_precision_is_averaged_in_single() -> None:
+    x = Parameter(torch.full((4, 3), 100.0, dtype=torch.bfloat16))
+    phases = only(400, Averaging(1.0))
+    (adam,) = phases.upgrade({"means": torch.optim.Adam([x], lr=0.0)}).values()
+    for _ in range(400):
+        x.grad = torch.ones_like(x)
+        phases.observe(0.1)
+        adam.step()
+    assert adam.state[x]["mean_iterate"].dtype == torch.float32
+    assert bool((x == 100).all())
+
+
+def test_it_takes_its_memory_only_in_the_end() -> None:
+    splats, phases, optimizers = upgraded(30_000, Averaging(), make=gsplat_optimizers)
+    train(splats, optimizers, phases, 0, 5)
+    state = [set(each.state[p]) for each in every_one(optimizers) for p in each.state]
+    assert all(keys == {"step", "exp_avg", "exp_avg_sq"} for keys in state)
+    assert len(state) == len(make_splats())
