@@ -14,6 +14,7 @@ from torch.nn import Parameter
 from torch.optim import Adam
 from torch.optim.lr_scheduler import ExponentialLR
 from trainers import (
+    AveragedThroughout,
     assert_same,
     every_one,
     everything,
@@ -30,7 +31,6 @@ from trainers import (
 from opt3dgs_optim import (
     AWSGLD,
     Annealing,
-    Averaging,
     ConstantMultiplier,
     EnergyHistogram,
     Fading,
@@ -168,7 +168,7 @@ def test_invisible_rows_stand_still_in_both_phases(kind: Any, exploiting: bool, 
     others = (
         Annealing(names=GAUSSIAN),
         Fading(1.0, events=40, start=0.0, stop=1.0),
-        Averaging(1.0),
+        AveragedThroughout(),
     )
     noise = PositionNoise(splats, scale=1.0)
     phases = everything(40, 10, *others, noise, nu=EnergyHistogram(warmup=4), settling=0)
@@ -266,7 +266,9 @@ def pulled(splats: dict[str, Parameter], *left_out: str) -> None:
 @MAKERS
 def test_a_stale_mask_with_nothing_to_step_is_nothing(make: Any) -> None:
     """INRIA after an edit: the mask has the old rows, the new Parameters no gradient yet."""
-    splats, phases, optimizer = upgraded(40, Annealing(names=GAUSSIAN), Averaging(1.0), make=make)
+    splats, phases, optimizer = upgraded(
+        40, Annealing(names=GAUSSIAN), AveragedThroughout(), make=make
+    )
     pulled(splats)
     phases.observe(0.1)
     optimizer.step(EVERY, 12)
@@ -295,7 +297,7 @@ def test_other_groups_ride_along_without_the_mask() -> None:
     splats, exposure = make_splats(), Parameter(torch.ones(3, 4))
     optimizer = inria_optimizer(splats)
     optimizer.add_param_group({"params": [exposure], "lr": 0.1, "name": "exposure"})
-    phases = only(10, Annealing(names=GAUSSIAN), Averaging(1.0))
+    phases = only(10, Annealing(names=GAUSSIAN), AveragedThroughout())
     whole: Any = phases.upgrade(optimizer)
     twin = Parameter(torch.ones(3, 4))
     plain = Adam([twin], lr=0.1, eps=1e-15)

@@ -91,6 +91,7 @@ TABLE: dict[str, tuple[Callable[..., Any], type, dict[str, Any]]] = {
     "LQNAdam": (lqnadam, LQNAdam, {**ADAM, **CURVATURE}),
     "Curvature": (Curvature, Curvature, {**CURVATURE, "names": NOT_NAMES}),
     "FreshMoments": (FreshMoments, FreshMoments, {"settling": COUNTS}),
+    "Averaging": (Averaging, Averaging, {}),
     "OutOfView": (OutOfView, OutOfView, {}),
     "SquaredLoss": (SquaredLoss, SquaredLoss, {}),
     "PhaseScheduler": (
@@ -115,7 +116,6 @@ TABLE: dict[str, tuple[Callable[..., Any], type, dict[str, Any]]] = {
             "names": NOT_NAMES,
         },
     ),
-    "Averaging": (Averaging, Averaging, {"share": [*NOT_NUMBERS, 0.0, 1.1]}),
     "Fading": (
         Fading,
         Fading,

@@ -245,18 +245,18 @@ def test_a_hook_that_is_not_overridden_is_never_called() -> None:
         assert phases.hooks[hook] == []
 
 
-# -- pooling: one short file, and nobody knows its name ------------------------------------------
+# -- a part is one short file, whose name the presets alone know ---------------------------------
 
 
-def test_pooling_is_one_short_file_that_nobody_else_knows() -> None:
-    pooling = SOURCE / "parts" / "pooling.py"
-    assert len(pooling.read_text().splitlines()) <= 60
+def test_a_part_is_one_short_file_that_only_the_presets_know() -> None:
+    averaging = SOURCE / "parts" / "averaging.py"
+    assert len(averaging.read_text().splitlines()) <= 60
     knows = {
         path.relative_to(SOURCE).as_posix()
         for path in SOURCE.rglob("*.py")
-        if re.search(r"\bpooling\b", path.read_text(), re.IGNORECASE)
+        if re.search(r"\bAveraging\b", path.read_text())
     }
-    assert knows == {"__init__.py", "parts/pooling.py"}
+    assert knows == {"__init__.py", "presets.py", "parts/averaging.py"}
 
 
 def test_the_core_knows_no_part() -> None:

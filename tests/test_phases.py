@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 from trainers import (
+    AveragedThroughout,
     assert_same,
     begun,
     edit_rows,
@@ -159,7 +160,7 @@ def test_resume_is_bit_exact(make: Any, at: int, order: str) -> None:
     """Before, at and after the switch; loaded into our optimizer or into the trainer's Adam."""
 
     def every_part() -> PhaseScheduler:
-        return scheduler(Annealing(), Fading(share=0.5, events=20), Averaging(0.9))
+        return scheduler(Annealing(), Fading(share=0.5, events=20), AveragedThroughout())
 
     whole, optimizers = begun(phases := every_part(), make)
     train(whole, optimizers, phases, 0, TOTAL)
@@ -186,7 +187,7 @@ def test_resume_is_bit_exact(make: Any, at: int, order: str) -> None:
 
 def test_density_control_between_steps_is_survived_in_both_phases() -> None:
     fading = Fading(share=1.0, events=60, start=0.0, stop=1.0)
-    splats, optimizers = begun(phases := scheduler(Annealing(), fading, Averaging(1.0)))
+    splats, optimizers = begun(phases := scheduler(Annealing(), fading, AveragedThroughout()))
     generator = torch.Generator().manual_seed(0)
     for iteration in range(TOTAL):
         train(splats, optimizers, phases, iteration, iteration + 1)
@@ -402,7 +403,7 @@ def test_an_energy_that_stops_coming() -> None:
 
 
 def test_steps_before_the_first_energy_are_plain_adams() -> None:
-    splats, _, optimizers = upgraded(500, Annealing(names=GAUSSIAN), Averaging(1.0))
+    splats, _, optimizers = upgraded(500, Annealing(names=GAUSSIAN), AveragedThroughout())
     train(splats, optimizers, None, 0, 15)
     assert_same(splats, trained_by_adam(15))
 
@@ -470,7 +471,7 @@ def test_an_iteration_that_is_none(iteration: Any) -> None:
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
 def test_copies_go_on_alike(copied: Any) -> None:
     splats, optimizers = begun(
-        phases := scheduler(Annealing(names=GAUSSIAN), Fading(), Averaging(1.0))
+        phases := scheduler(Annealing(names=GAUSSIAN), Fading(), AveragedThroughout())
     )
     train(splats, optimizers, phases, 0, SWITCH + 4)
     twins, other, adams = copied((splats, phases, optimizers))

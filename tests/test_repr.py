@@ -87,11 +87,11 @@ def test_the_phases_of_a_training() -> None:
 
 
 def test_a_part_says_its_options() -> None:
-    parts = [Annealing(peak=3.0), Fading(seed=2), Averaging(0.1)]
+    parts = [Annealing(peak=3.0), Fading(seed=2), Averaging()]
     said = repr(only(100, *parts))
     assert "Annealing(peak=3.0, final=0.4, opacity_peak=1.0)" in said
     assert "seed=2)" in said  # the names of all Gaussian parameters are left out
-    assert "Averaging(share=0.1)" in said
+    assert "\n  Averaging()\n" in said
 
 
 @pytest.mark.parametrize("steps", [0, 3, 11])

@@ -12,6 +12,7 @@ from devices import on_a_device
 from torch import Tensor
 from torch.nn import Parameter
 from trainers import (
+    AveragedThroughout,
     assert_same,
     begun,
     everything,
@@ -30,7 +31,6 @@ from trainers import (
 from opt3dgs_optim import (
     AWSGLD,
     Annealing,
-    Averaging,
     ConstantMultiplier,
     EnergyHistogram,
     Fading,
@@ -176,7 +176,7 @@ def test_what_is_lent_is_taken_back_after_an_exception(
 
 def test_a_parameter_without_gradient_is_left_alone() -> None:
     splats, phases, optimizers = upgraded(
-        TOTAL, Annealing(names=GAUSSIAN), Fading(), Averaging(1.0)
+        TOTAL, Annealing(names=GAUSSIAN), Fading(), AveragedThroughout()
     )
     before = splats["means"].detach().clone()
     for _ in range(3):
@@ -214,7 +214,7 @@ def test_numbers_that_are_not_finite_are_zero_and_nobody_else_notices(
     def optimizer(x: Parameter) -> tuple[Any, Any]:
         if make != "phases":
             return make([x], lr=0.01, **path), None
-        phases = only(TOTAL, Annealing(names=GAUSSIAN), Averaging(1.0))
+        phases = only(TOTAL, Annealing(names=GAUSSIAN), AveragedThroughout())
         adam = torch.optim.Adam([x], lr=0.01, **path)
         return phases.upgrade({"means": adam})["means"], phases
 
@@ -284,7 +284,7 @@ def test_a_broken_loss_skips_the_step(make: Any, bad: float) -> None:
     ends, histograms = [], []
     for hostile in (False, True):
         histogram = EnergyHistogram(warmup=10)
-        others = Annealing(names=GAUSSIAN), Fading(), Averaging(1.0)
+        others = Annealing(names=GAUSSIAN), Fading(), AveragedThroughout()
         phases = everything(60, 40, *others, nu=histogram, settling=0)
         splats, optimizers = begun(phases, make)
         for iteration in range(60):
@@ -318,7 +318,7 @@ def test_a_broken_loss_is_dropped_on_a_device_too(
         20,
         Annealing(names=GAUSSIAN),
         fading,
-        Averaging(1.0),
+        AveragedThroughout(),
         noise,
         nu=ConstantMultiplier(2.0),
     )
@@ -349,7 +349,7 @@ def test_a_finite_loss_on_a_device_is_the_step_on_a_host(
     for device in (False, True):
         if device:
             on_a_device(monkeypatch)
-        others = Annealing(names=GAUSSIAN), Fading(), Averaging(1.0)
+        others = Annealing(names=GAUSSIAN), Fading(), AveragedThroughout()
         phases = everything(TOTAL, 20, *others, nu=ConstantMultiplier(2.0))
         splats, optimizers = begun(phases, **path)
         train(splats, optimizers, phases, 0, TOTAL)
@@ -362,7 +362,9 @@ def test_a_masked_step_with_a_broken_loss_on_a_device(
     path: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     on_a_device(monkeypatch)
-    splats, phases, optimizers = upgraded(TOTAL, Annealing(names=GAUSSIAN), Averaging(1.0), **path)
+    splats, phases, optimizers = upgraded(
+        TOTAL, Annealing(names=GAUSSIAN), AveragedThroughout(), **path
+    )
     train(splats, optimizers, phases, 0, 5)
     before = splats["means"].detach().clone()
     phases.observe(torch.tensor(math.inf))

@@ -67,7 +67,7 @@ class SignAgreement(Part):
         return torch.where(grad * state["exp_avg"] < 0, 0.0, grad)
 
 
-parts: list[Part] = [*DEFAULTS, Averaging(0.1), SignAgreement(), ConstantMultiplier(1.5)]
+parts: list[Part] = [*DEFAULTS, Averaging(), SignAgreement(), ConstantMultiplier(1.5)]
 phases = PhaseScheduler(30_000, 0.9, parts, adaptive=True)
 phases = PhaseScheduler(30_000, 29_000, [Annealing(4.0, names=("means",)), Fading(seed=3)])
 phases = PhaseScheduler(300, parts=[FreshMoments(), SquaredLoss(), Curvature(history_size=3)])

@@ -46,7 +46,7 @@ class PhaseScheduler(Course):
     optimizer. The state travels inside `param_groups[0]` of every upgraded optimizer's
     `state_dict()`, so that a trainer which saves its optimizers resumes bit for bit.
 
-    Memory: Adam's; with curvature 32 bytes per point and pair more, from the switch on.
+    Memory: Adam's; in the end the parameters' again; with curvature 32 bytes per point and pair.
 
     Examples:
         >>> import torch

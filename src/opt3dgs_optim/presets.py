@@ -12,14 +12,12 @@ from opt3dgs_optim.parts.out_of_view import OutOfView
 PAPER_STEPS = 30_000
 PAPER_SWITCH = 29_000 / PAPER_STEPS
 PAPER_WARMUP = 2_500 / PAPER_STEPS
-# What paid: docs/evidence.md.
-DEFAULTS: tuple[Part, ...] = (Annealing(), Fading(), OutOfView(), Averaging())
+DEFAULTS: tuple[Part, ...] = (Annealing(), Fading(), OutOfView(), Averaging())  # docs/evidence.md
 # For clone, split and prune: longer steps let scales grow until they are pruned as too big.
 DEFAULTS_ADC: tuple[Part, ...] = (
     Annealing(names=("quats", "opacities", "sh0", "shN")),
     Fading(names=("means", "quats", "opacities", "sh0", "shN")),
-    OutOfView(),
-    Averaging(),
+    *DEFAULTS[2:],
 )
 
 

@@ -8,12 +8,11 @@ import pytest
 import torch
 from kernel_host import OPTIONS, Problem, free_run, relative_difference
 from torch import Tensor
-from trainers import everything
+from trainers import AveragedThroughout, everything
 
 from opt3dgs_optim import (
     AWSGLD,
     Annealing,
-    Averaging,
     Curvature,
     EnergyHistogram,
     Fading,
@@ -195,7 +194,7 @@ def test_phase_scheduler_steps_without_synchronisation() -> None:
     others = (
         Annealing(names=GAUSSIAN),
         Fading(events=10),
-        Averaging(1.0),
+        AveragedThroughout(),
         PositionNoise(splats, 1.0),
     )
     phases = everything(40, 20, *others, curvature=Curvature(backend="cuda"))

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 from trainers import (
+    AveragedThroughout,
     assert_same,
     edit_rows,
     every_one,
@@ -25,14 +26,24 @@ from trainers import (
 
 from opt3dgs_optim import Averaging
 
-TOTAL, SHARE = 60, 0.25
+TOTAL = 60
 FIRST = 45  # the first iteration of the last quarter: from the next one on iterates are averaged
+
+
+class LastQuarter(Averaging):
+    share = 0.25
+
+
+class LastHalf(Averaging):
+    share = 0.5
+
+
 MAKERS = pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
 
 
 @MAKERS
 def test_a_run_ends_at_the_mean_of_its_last_iterates(make: Any) -> None:
-    splats, phases, optimizers = upgraded(TOTAL, Averaging(SHARE), make=make)
+    splats, phases, optimizers = upgraded(TOTAL, LastQuarter(), make=make)
     iterates = []
     for i in range(TOTAL - 2):
         train(splats, optimizers, phases, i, i + 1)
@@ -56,7 +67,7 @@ def test_a_run_ends_at_the_mean_of_its_last_iterates(make: Any) -> None:
 
 
 def test_a_run_that_goes_on_is_let_go() -> None:
-    splats, phases, optimizers = upgraded(TOTAL, Averaging(SHARE))
+    splats, phases, optimizers = upgraded(TOTAL, LastQuarter())
     train(splats, optimizers, phases, 0, TOTAL)
     mean = values_of(splats)
     train(splats, optimizers, phases, TOTAL, TOTAL + 1)
@@ -66,7 +77,7 @@ def test_a_run_that_goes_on_is_let_go() -> None:
 def test_it_ends_nearer_to_where_noise_leads_it_around() -> None:
     """Adam at a constant rate about the minimum of a bowl, its gradients noisy."""
     ends = []
-    for parts in ([], [Averaging(0.5)]):
+    for parts in ([], [LastHalf()]):
         x = Parameter(torch.ones(500, 3))
         phases = only(3_000, *parts)
         (adam,) = phases.upgrade({"means": torch.optim.Adam([x], lr=0.01)}).values()
@@ -79,7 +90,7 @@ def test_it_ends_nearer_to_where_noise_leads_it_around() -> None:
     assert ends[1] < 0.25 * ends[0]
 
 
-@pytest.mark.parametrize("parts", [[Averaging(1.0)]], ids=["alone"])
+@pytest.mark.parametrize("parts", [[AveragedThroughout()]], ids=["alone"])
 def test_rows_that_density_control_edits_begin_anew(parts: list[Any]) -> None:
     """Alone, too: no other part asks whose rows they are."""
     splats, phases, optimizers = upgraded(TOTAL, *parts)
@@ -97,7 +108,7 @@ def test_rows_that_density_control_edits_begin_anew(parts: list[Any]) -> None:
 
 
 def test_rows_that_are_edited_in_the_last_moment_are_left_where_they_are() -> None:
-    splats, phases, optimizers = upgraded(TOTAL, Averaging(1.0))
+    splats, phases, optimizers = upgraded(TOTAL, AveragedThroughout())
     train(splats, optimizers, phases, 0, TOTAL - 2)
     edit_rows(splats, optimizers, torch.arange(12), 0)
     before = values_of(splats)
@@ -108,7 +119,7 @@ def test_rows_that_are_edited_in_the_last_moment_are_left_where_they_are() -> No
 
 
 def test_with_masks_every_row_has_the_mean_of_its_own_iterates() -> None:
-    splats, phases, optimizers = upgraded(TOTAL, Averaging(SHARE), make=inria_optimizer)
+    splats, phases, optimizers = upgraded(TOTAL, LastQuarter(), make=inria_optimizer)
     train(splats, optimizers, phases, 0, FIRST + 1)
     generator, seen = torch.Generator().manual_seed(0), torch.zeros(12)
     sums = {name: torch.zeros_like(param) for name, param in splats.items()}
@@ -131,7 +142,7 @@ def test_with_masks_every_row_has_the_mean_of_its_own_iterates() -> None:
 
 def test_half_precision_is_averaged_in_single() -> None:
     x = Parameter(torch.full((4, 3), 100.0, dtype=torch.bfloat16))
-    phases = only(400, Averaging(1.0))
+    phases = only(400, AveragedThroughout())
     (adam,) = phases.upgrade({"means": torch.optim.Adam([x], lr=0.0)}).values()
     for _ in range(400):
         x.grad = torch.ones_like(x)

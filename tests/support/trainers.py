@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from opt3dgs_optim import (
+    Averaging,
     Curvature,
     EnergyHistogram,
     FreshMoments,
@@ -44,6 +45,12 @@ INRIA_NAMES = {
     "scales": "scaling",
     "quats": "rotation",
 }
+
+
+class AveragedThroughout(Averaging):
+    """`Averaging` of all iterates, for short runs."""
+
+    share = 1.0
 
 
 def everything(

@@ -41,6 +41,7 @@ FADED = "faded"  # fading alone
 DEFAULTS = "annealed-all-but-means+faded"  # what `PhaseScheduler(total_steps)` was before:
 AVERAGED = f"{DEFAULTS}+averaged"  # what it is, branched off that one
 STOCK_AVERAGED = "averaged@1/30"
+FADED_AVERAGED = f"{FADED}+averaged"
 EARLY = (f"{FADED}-to-1/4", f"{DEFAULTS}-to-1/4")  # fading ends after that share of the run
 ANNEALED = "annealed-4-opacities-1+faded"  # the defaults until the views rotated
 SHORT_LABEL = "annealed+faded"
@@ -179,6 +180,7 @@ def averaged() -> list[StudyArm]:
     """The mean of the last iterates; each branches off the same without it."""
     trunks = {
         STOCK_AVERAGED: (BASELINE, ()),
+        FADED_AVERAGED: (FADED, (FADING,)),
         AVERAGED: (DEFAULTS, (ANNEALING, FADING, OutOfView())),
         "adc+averaged": ("adc", ()),
         "adc+defaults-but-scales+averaged": ("adc+defaults-but-scales", BUT_SCALES),
@@ -186,7 +188,7 @@ def averaged() -> list[StudyArm]:
     return [
         StudyArm(
             name,
-            parts=of(*parts, Averaging(1 / 30)),
+            parts=of(*parts, Averaging()),
             mcmc=not name.startswith("adc"),
             adaptive=name.startswith("adc"),
             switch=29 / 30,

@@ -5,7 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from studies.scenes.analysis import Study
-from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, DEFAULTS_POOLED, FADED, STABLE, UNHELD
+from studies.scenes.arms import (
+    ANNEALED,
+    AVERAGED,
+    BASELINE,
+    DEFAULTS,
+    DEFAULTS_POOLED,
+    FADED,
+    STABLE,
+    UNHELD,
+)
 from studies.scenes.long_tables import Difference, difference
 from studies.scenes.records import Setting
 
@@ -20,6 +29,7 @@ COMPARISONS = {
     "Fading": (FADED, BASELINE),
     "Annealing": (DEFAULTS, FADED),
     "Annealing of the positions": (ANNEALED, DEFAULTS),
+    "Averaging": (AVERAGED, DEFAULTS),
     "Pooling": (DEFAULTS_POOLED, DEFAULTS),
     "EnergyHistogram": (STABLE, f"{STABLE}-constant"),
     "SquaredLoss": ("l2@1/30", BASELINE),

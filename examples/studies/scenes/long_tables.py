@@ -9,7 +9,7 @@ from statistics import fmean, stdev
 
 from studies.pages import table
 from studies.scenes.analysis import Study, falls
-from studies.scenes.arms import BASELINE, DEFAULTS, STUDY_ARMS, label
+from studies.scenes.arms import AVERAGED, BASELINE, STUDY_ARMS, label
 from studies.scenes.records import Record, Setting
 
 METRICS = {"psnr": (1.0, 2), "ssim": (1.0, 4), "lpips": (-1.0, 4)}  # sign of better, digits
@@ -149,24 +149,34 @@ def headline_table(study: Study, long: Sequence[Setting], short: int) -> str:
     rows = []
     for count in (long[0].iterations, short) if long else ():
         settings = [replace(setting, iterations=count) for setting in long]
-        pairs = difference(study, settings, DEFAULTS, BASELINE).pairs
+        pairs = difference(study, settings, AVERAGED, BASELINE).pairs
         for what, ours in (("stock", False), ("**defaults**", True)):
             found = [[a if ours else b for a, b, _ in pairs.get(s.scene, [])] for s in settings]
             rows.append((f"{what}, {count:,}", *(_cell(records, seeds=False) for records in found)))
     return table(["iterations", *(setting.scene for setting in long)], "l", rows)
 
 
-def scenes_gain_table(study: Study, settings: Sequence[Setting], arm: str, control: str) -> str:
-    """One line per scene and size: the arm and its control at their ends, and the gain."""
+def scenes_gain_table(
+    study: Study, settings: Sequence[Setting], arm: str, control: str, branch: str
+) -> str:
+    """One line per scene and size: the arm and its control at their ends, and the gain.
+
+    Beside it what a branch adds, which differs from the arm in its last iterations alone.
+    """
     rows = []
     for setting in settings:
         found = difference(study, [setting], arm, control)
         if found.count:
             ours, theirs, _ = zip(*found.pairs[setting.scene], strict=True)
             ends = _cell(theirs), _cell(ours, seeds=False)
-            rows.append((setting.scene, _crowd(setting), *ends, cells_of(found)[0]))
-    heads = ("scene", "Gaussians, images", f"`{label(control)}`", f"`{label(arm)}`", "gain, dB")
-    return table(heads, "llllr", rows)
+            added = difference(study, [setting], branch, arm)
+            more = " / ".join(cells_of(added)) if added.count else "-"
+            rows.append((setting.scene, _crowd(setting), *ends, cells_of(found)[0], more))
+    heads = (
+        *("scene", "Gaussians, images", f"`{label(control)}`", f"`{label(arm)}`", "gain, dB"),
+        f"`{label(branch)}` adds",
+    )
+    return table(heads, "llllrr", rows)
 
 
 def sizes_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) -> str:

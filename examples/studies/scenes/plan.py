@@ -15,6 +15,7 @@ from studies.scenes.arms import (
     DEFAULTS_POOLED,
     EARLY,
     FADED,
+    FADED_AVERAGED,
     GROUPS,
     MORE_AT_ONCE,
     OFTEN_FADED,
@@ -37,7 +38,7 @@ ROTATED_ARMS = (
     *("mcmc", FADED, DEFAULTS, ANNEALED, "paper", "paper-constant"),
     *(SELDOM_FADED, *UNFADED.values(), "rates-x2", DEFAULTS_POOLED, "own-step"),
     *(STABLE, f"{STABLE}-constant"),
-    *(AVERAGED, STOCK_AVERAGED),
+    *(AVERAGED, FADED_AVERAGED, STOCK_AVERAGED),
     *("l2@1/30", "l1+reset@1/30", "l2+reset@1/30", "l2+reset+lqn@1/30"),
     *(f"l1+reset{x}@1/{k}" for k in (4, 2) for x in ("", "+lqn", "+lqn-all")),
 )

@@ -24,6 +24,7 @@ from studies.pages import filled, table
 from studies.scenes.analysis import Study
 from studies.scenes.arms import (
     ANNEALED,
+    AVERAGED,
     BASELINE,
     DEFAULTS,
     FADED,
@@ -147,7 +148,7 @@ def rotated_tables(study: Study) -> dict[str, str]:
     every = every_scene(study, LONG)
     quarter = [setting for setting in every if setting.size == QUARTER]
     degrees = [*every, *every_scene(study, LONG, sh_degree=3)]
-    made["every-scene"] = scenes_gain_table(study, degrees, DEFAULTS, BASELINE)
+    made["every-scene"] = scenes_gain_table(study, degrees, DEFAULTS, BASELINE, AVERAGED)
     made["headline"] = headline_table(study, long, BRIEF)
     made["reach"] = reach_table(study, long, REACH_ARMS, SHORTER)
     made["paper"] = paper_table(study, quarter)

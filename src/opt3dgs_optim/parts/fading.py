@@ -79,8 +79,7 @@ class Fading(Part):
         # A CPU's generator reads 32 bits; consecutive seeds are far apart in them.
         seed = (event + self.seed * 0x9E3779B1) % 2**32
         generator = torch.Generator(device).manual_seed(seed)
-        drawn = torch.rand(num_points, generator=generator, device=device)
-        return drawn < self.share
+        return torch.rand(num_points, generator=generator, device=device) < self.share
 
     def before(
         self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course

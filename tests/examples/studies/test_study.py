@@ -20,6 +20,7 @@ from studies.pages import filled
 from studies.scenes import report, steps
 from studies.scenes.analysis import Study
 from studies.scenes.arms import (
+    AVERAGED,
     BASELINE,
     STUDY_ARMS,
     UNHELD,
@@ -84,10 +85,10 @@ def test_every_rotated_training_is_of_a_stage() -> None:
 
 
 def test_the_defaults_are_the_measured_arm() -> None:
-    measured = find_study_arm(DEFAULT_ARM).parts
+    measured = find_study_arm(AVERAGED).parts
     assert measured is not None
     assert measured(300, None) == list(DEFAULTS)
-    cloning = find_study_arm("adc+defaults-but-scales").parts
+    cloning = find_study_arm("adc+defaults-but-scales+averaged").parts
     assert cloning is not None
     assert cloning(300, None) == list(DEFAULTS_ADC)
 
@@ -185,11 +186,13 @@ def test_every_scene_and_size_has_its_line() -> None:
     quarter = [rotated_record(arm, "banana", 0, psnr=psnr) for arm, psnr in arms]
     half = [replace(r, setting=replace(r.setting, size="images_2", points=5_000)) for r in quarter]
     other = rotated_record(BASELINE, "plush", 0)  # has no pair
-    study = Study([*quarter, *half, other])
-    table = scenes_gain_table(study, every_scene(study, 7_500), DEFAULT_ARM, BASELINE)
+    branch = replace(half[0], arm=AVERAGED, curve=rotated_record(AVERAGED, "a", 0, psnr=20.6).curve)
+    study = Study([*quarter, *half, other, branch])
+    table = scenes_gain_table(study, every_scene(study, 7_500), DEFAULT_ARM, BASELINE, AVERAGED)
+    ends = "20.00 / 0.700 / 0.200 | 20.50 / 0.700 / 0.200 | +0.50"
     assert table.splitlines()[2:] == [
-        "| banana | 4,000, quarter | 20.00 / 0.700 / 0.200 | 20.50 / 0.700 / 0.200 | +0.50 |",
-        "| banana | 5,000, half | 20.00 / 0.700 / 0.200 | 20.50 / 0.700 / 0.200 | +0.50 |",
+        f"| banana | 4,000, quarter | {ends} | - |",
+        f"| banana | 5,000, half | {ends} | +0.10 / +0.0000 / +0.0000 |",
     ]
 
 
@@ -215,7 +218,9 @@ def test_when_stocks_quality_is_reached_over_the_seeds_of_both() -> None:
     both = Study([*study.records(), shorter], costs)
     said = reach_table(both, study.all_settings(), [DEFAULT_ARM], [3_000, 5_000])
     assert "| `defaults` | x0.50 of its seconds | - | +1.00 dB in x0.80 |" in said
-    first = headline_table(study, study.all_settings(), 3_000).splitlines()[2:4]
+    defaults = replace(study.runs(study.all_settings()[0], DEFAULT_ARM)[0], arm=AVERAGED)
+    averaged = Study([*study.records(), defaults])
+    first = headline_table(averaged, study.all_settings(), 3_000).splitlines()[2:4]
     assert first == [
         "| stock, 7,500 | 20.00 / 0.700 / 0.200 |",
         "| **defaults**, 7,500 | 30.00 / 0.700 / 0.200 |",
