@@ -43,7 +43,7 @@ ENERGY = ["test_partitions.py", "parts/test_histogram.py", "parts/test_histogram
 CURVATURE = [
     f"lbfgs/test_{name}.py" for name in ("history", "two_loop", "lqn_direction", "foresight")
 ]
-DEFAULTS = ("annealing", "fading", "out_of_view")
+DEFAULTS = ("annealing", "averaging", "fading", "out_of_view")
 # Of these tests: those that compile C++, a law that the loop oracle sees sooner, other classes.
 LEFT_OUT = "not sanitizers and not mutants and not kernel and not compiles and not power_four"
 OPTIONS_OF = ("EnergyHistogram", "IsotropicNoise", "PositionNoise", "Annealing", "Fading")

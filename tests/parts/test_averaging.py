@@ -24,7 +24,7 @@ from trainers import (
     values_of,
 )
 
-from opt3dgs_optim import Averaging
+from opt3dgs_optim import Averaging, Course
 
 TOTAL = 60
 FIRST = 45  # the first iteration of the last quarter: from the next one on iterates are averaged
@@ -71,7 +71,33 @@ def test_a_run_that_goes_on_is_let_go() -> None:
     train(splats, optimizers, phases, 0, TOTAL)
     mean = values_of(splats)
     train(splats, optimizers, phases, TOTAL, TOTAL + 1)
-    assert all(not torch.equal(param, mean[name]) for name, param in splats.items())
+    for name, param in splats.items():
+        assert not torch.equal(param, mean[name])
+        assert not torch.equal(param, state_of(optimizers, param)["mean_iterate"])
+
+
+def test_it_is_the_mean_of_the_last_thirtieth() -> None:
+    splats, phases, optimizers = upgraded(300, Averaging())
+    train(splats, optimizers, phases, 0, 300)
+    for param in splats.values():  # the first of the ten only makes room
+        assert state_of(optimizers, param)["num_averaged"].tolist() == [9.0] * 12
+
+
+def test_steps_that_a_device_drops_count_for_nothing() -> None:
+    """Whether a loss was finite is a tensor there, and the parts' doing is not asked."""
+    part, state = AveragedThroughout(), {}
+    course = Course([part], total_steps=4)
+    for current, valid, value in ((0, True, 9.0), (1, False, 8.0), (2, False, 7.0), (3, True, 6.0)):
+        course.current, course.valid = current, torch.tensor(valid)
+        param = torch.full((2, 3), value)
+        part.after({}, param, state, course)
+        assert bool((param == value).all())
+        mean = 6.0 if current == 3 else 0.0
+        assert bool((state["mean_iterate"] == mean).all())
+        assert state["num_averaged"].tolist() == [float(current == 3)] * 2
+    course.current, course.valid = 2, torch.tensor(False)
+    part.after({}, param := torch.full((2, 3), 5.0), state, course)
+    assert bool((param == 5.0).all())
 
 
 def test_it_ends_nearer_to_where_noise_leads_it_around() -> None:
