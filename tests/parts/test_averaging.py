@@ -116,19 +116,18 @@ def test_it_ends_nearer_to_where_noise_leads_it_around() -> None:
     assert ends[1] < 0.25 * ends[0]
 
 
-@pytest.mark.parametrize("parts", [[AveragedThroughout()]], ids=["alone"])
-def test_rows_that_density_control_edits_begin_anew(parts: list[Any]) -> None:
+def test_rows_that_density_control_edits_begin_anew() -> None:
     """Alone, too: no other part asks whose rows they are."""
-    splats, phases, optimizers = upgraded(TOTAL, *parts)
-    train(splats, optimizers, phases, 0, 50)
+    splats, phases, optimizers = upgraded(TOTAL, AveragedThroughout())
+    train(splats, optimizers, phases, 0, 40)
     edit_rows(splats, optimizers, torch.arange(11, -1, -2), 3)
     iterates: list[dict[str, Tensor]] = []
-    for i in range(50, TOTAL - 2):
+    for i in range(40, 50):
         train(splats, optimizers, phases, i, i + 1)
         iterates.append(values_of(splats))
     for name, param in splats.items():
         state = state_of(optimizers, param)
-        assert state["num_averaged"].tolist() == [7.0] * 9
+        assert state["num_averaged"].tolist() == [9.0] * 9
         expected = torch.stack([each[name] for each in iterates[1:]]).mean(0)
         torch.testing.assert_close(state["mean_iterate"], expected)
 
@@ -164,6 +163,24 @@ def test_with_masks_every_row_has_the_mean_of_its_own_iterates() -> None:
         assert torch.equal(state["num_averaged"], seen)
         expected = sums[name] / seen.reshape(-1, *[1] * (param.dim() - 1))
         torch.testing.assert_close(state["mean_iterate"], expected)
+
+
+def test_with_masks_rows_take_their_means_as_views_see_them() -> None:
+    """In the last tenth of the steps that are averaged; what no view sees there stays."""
+    splats, phases, optimizers = upgraded(TOTAL, AveragedThroughout(), make=inria_optimizer)
+    train(splats, optimizers, phases, 0, TOTAL - 6)
+    before = values_of(splats)
+    for first in (0, 4):  # of the last six steps two, in which views see eight rows in turns
+        mask = (torch.arange(12) >= first) & (torch.arange(12) < first + 4)
+        for param in splats.values():
+            param.grad = torch.ones_like(param)
+        phases.observe(0.1)
+        optimizers.step(mask, 12)
+    for name, param in splats.items():
+        mean = state_of(optimizers, param)["mean_iterate"]
+        assert torch.equal(param[:8], mean[:8])
+        assert torch.equal(param[8:], before[name][8:])
+        assert not torch.equal(param[8:], mean[8:])
 
 
 def test_half_precision_is_averaged_in_single() -> None:

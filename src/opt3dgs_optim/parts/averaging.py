@@ -19,9 +19,9 @@ class Averaging(Part):
 
     Every step follows one view, so the parameters wander about what fits all of them, the further
     the higher their learning rates; the mean does not (for networks: Izmailov et al., UAI 2018).
-    It is that of the last thirtieth of the run, and takes their place in the last two steps. Where
-    density control edits rows meanwhile, it begins anew; rows that a mask holds back in those two
-    steps stay. Until then nothing is changed. It takes the parameters' memory once more.
+    It is that of the last thirtieth of the run, and takes their place in the last tenth of that,
+    in rows that a mask lets move there. Until then nothing is changed. Where density control edits
+    rows meanwhile, it begins anew. It takes the parameters' memory once more.
     """
 
     share: ClassVar[float] = 1 / 30  # of the run; from 1/150 to 1/10 it ends alike
@@ -31,8 +31,8 @@ class Averaging(Part):
     @torch.no_grad()
     def after(self, group: Group, param: Tensor, state: dict[str, Any], course: Course) -> None:
         """Take the parameter [N, ..] into its mean; in the last steps put that in its place."""
-        left = course.total_steps - course.current
-        if not 0 < left <= self.share * course.total_steps:
+        left, length = course.total_steps - course.current, self.share * course.total_steps
+        if not 0 < left <= length:
             return
         if COUNT not in state:  # from the next step on: this one may yet be taken back
             state[MEAN] = torch.zeros_like(param, dtype=torch.float32)
@@ -40,5 +40,5 @@ class Averaging(Part):
             return
         mean, count = state[MEAN], state[COUNT].add_(course.valid)
         mean += (param - mean) * (course.valid / shaped(count.clamp(min=1.0), mean))
-        if left <= 2:  # trainers save before the last step, or do not make it
+        if left <= max(2, length / 10):  # trainers save before the last step, or do not make it
             param.copy_(torch.where(shaped(count > 0, mean) & course.valid, mean, param))
