@@ -117,9 +117,12 @@ def gsplat_noise_alone(case: Case) -> Callable[[], None]:
 
 
 def upgraded(
-    case: Case, parts: list[Part], *, exploit: bool = False, seen: float = 1.0
+    case: Case, parts: list[Part], *, exploit: bool = False, seen: float = 1.0, at: float = 0.25
 ) -> Callable[[], None]:
-    """Six upgraded optimizers with these parts, and `observe`; views see that share of points."""
+    """Six upgraded optimizers with these parts, and `observe`; views see that share of points.
+
+    At a quarter of the run events of fading are as frequent as they get.
+    """
     splats, steps = case.splats(), 1_000_000
     phases = PhaseScheduler(steps, 0 if exploit else steps, parts)
     optimizers = phases.upgrade(case.adams(splats))
@@ -129,8 +132,7 @@ def upgraded(
         optimizers["means"].param_groups[0][SHARE] = seen
         for grad in grads:
             grad.mul_(torch.rand(case.points, 1, device=case.device) < seen)
-    # Half-way, where events of fading are as frequent as they get; a call is one iteration.
-    count = 0 if exploit else steps // 4
+    count = round(at * steps)  # a call is one iteration
 
     def step() -> None:
         nonlocal count
@@ -191,10 +193,11 @@ SUBJECTS: dict[str, Callable[[Case], Callable[[], Any]]] = {
     "six Adams again": six_adams,  # other tensors, elsewhere in memory: how exact a ratio is
     "defaults": lambda case: upgraded(case, [*DEFAULTS]),
     "defaults, a tenth in view": lambda case: upgraded(case, [*DEFAULTS], seen=0.1),
+    "defaults, last thirtieth": lambda case: upgraded(case, [*DEFAULTS], at=0.975),
     "defaults + histogram": lambda case: upgraded(case, [*DEFAULTS, EnergyHistogram(warmup=4)]),
     "the paper's exploration": lambda case: upgraded(case, [EnergyHistogram.paper(warmup=4)]),
     "the paper's exploitation": lambda case: upgraded(
-        case, [SquaredLoss(), Curvature()], exploit=True
+        case, [SquaredLoss(), Curvature()], exploit=True, at=0.0
     ),
     "position noise alone": noise_alone,
     "gsplat's noise alone": gsplat_noise_alone,
