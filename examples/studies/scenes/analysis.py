@@ -63,7 +63,8 @@ class Study:
         """Seconds of an iteration, as a share of the control's; 1 where not both were measured."""
         where = [getattr(setting, name) for name in COSTED]
         ours, theirs = (
-            1.0 if name == BASELINE else self._costs.get((*where, name)) for name in (arm, control)
+            1.0 if name == BASELINE else self._costs.get((*where, name))
+            for name in (STUDY_ARMS[each].averages or each for each in (arm, control))
         )
         return 1.0 if ours is None or theirs is None else ours / theirs
 

@@ -81,6 +81,11 @@ class StudyArm(Arm):
     adaptive: bool = False  # gsplat's DefaultStrategy in the place of 3DGS-MCMC's
     retired: bool = False  # its code is gone, its records are kept
 
+    @property
+    def averages(self) -> str | None:
+        """The arm whose last iterates this one averages; None: it is another kind of arm."""
+        return self.trunk if self.name.split("@")[0].endswith("averaged") else None
+
     def make(
         self, iterations: int, switch: float, nu: float | None, gaussians: Mapping[str, Tensor]
     ) -> PhaseScheduler:

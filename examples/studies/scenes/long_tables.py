@@ -96,8 +96,24 @@ def difference(
         shared = sorted(ours.keys() & theirs.keys())
         if shared:
             cost = study.cost(setting, arm, control)
-            pairs[setting.scene] = [(ours[seed], theirs[seed], cost) for seed in shared]
+            pairs[setting.scene] = [
+                (_at_any_length(study, ours[seed]), _at_any_length(study, theirs[seed]), cost)
+                for seed in shared
+            ]
     return Difference(arm, control, pairs)
+
+
+def _at_any_length(study: Study, record: Record) -> Record:
+    """Of an arm that averages in the end, the ends of trainings that are a little shorter.
+
+    What the mean adds in the end is taken to be what it would have added there.
+    """
+    trunk = STUDY_ARMS[record.arm].averages
+    without = study.runs(record.setting, trunk).get(record.seed) if trunk else None
+    if without is None:
+        return record
+    ends = {m: without.curve[m] + (record.curve[m][-1] - without.curve[m][-1]) for m in METRICS}
+    return replace(record, curve=record.curve | ends)
 
 
 def differences_table(study: Study, settings: Sequence[Setting], arms: Iterable[str]) -> str:

@@ -30,8 +30,14 @@ from studies.scenes.arms import (
     whole_trainings,
 )
 from studies.scenes.arms import DEFAULTS as DEFAULT_ARM
-from studies.scenes.decisions import MANY_VIEWS_SCENES, decide, every_scene, points_of
-from studies.scenes.long_tables import headline_table, reach_table, scenes_gain_table, sizes_table
+from studies.scenes.decisions import COMPARISONS, MANY_VIEWS_SCENES, decide, every_scene, points_of
+from studies.scenes.long_tables import (
+    difference,
+    headline_table,
+    reach_table,
+    scenes_gain_table,
+    sizes_table,
+)
 from studies.scenes.parts.own_step import OwnStep
 from studies.scenes.parts.step_lengths import StepLengths
 from studies.scenes.plan import plan, stages
@@ -103,6 +109,9 @@ def rotated_record(arm: str, scene: str, seed: int, **metrics: float) -> Record:
     return replace(made, setting=setting)
 
 
+WITH, WITHOUT = COMPARISONS["Fading"]
+
+
 @pytest.mark.parametrize(
     ("better", "verdict"),
     [
@@ -123,10 +132,10 @@ def test_a_part_is_on_if_one_metric_gains_and_none_loses(
     }
     better = {name: value for name, value in better.items() if name != "cost"}
     records = [
-        rotated_record(arm, scene, seed, **(better if arm != BASELINE else {}))
+        rotated_record(arm, scene, seed, **(better if arm == WITH else {}))
         for scene in MANY_VIEWS_SCENES
         for seed in (0, 1)
-        for arm in (BASELINE, "faded")
+        for arm in (WITHOUT, WITH)
     ]
     decision = decide(Study(records, costs))["Fading"]
     assert (decision.iterations, decision.verdict) == (7_500, verdict)
@@ -167,15 +176,27 @@ def test_a_cost_that_was_not_measured_is_the_controls() -> None:
     assert study.cost(setting, DEFAULT_ARM) == 1.0
 
 
+def test_what_averaging_adds_in_the_end_counts_at_equal_seconds() -> None:
+    """At 4/5 of the iterations, where its own curve is that of the iterates yet."""
+    arms = {"faded": 22.0, WITH: 22.4, BASELINE: 20.0, WITHOUT: 20.1}
+    records = [rotated_record(arm, "plush", 0, psnr=psnr) for arm, psnr in arms.items()]
+    setting = records[0].setting
+    study = Study(records, {("plush", "images_4", 7_500, 0, 0, "faded"): 1.25})
+    found = difference(study, [setting], WITH, WITHOUT)
+    assert found.cost == 1.25
+    assert found.of("psnr")[0] == pytest.approx(0.2 * 10.0 + 0.8 * 22.0 + 0.4 - 20.1)
+    assert difference(study, [setting], WITH, "faded").of("psnr")[0] == pytest.approx(0.4)
+
+
 def test_the_longest_trainings_decide() -> None:
     records = [
-        rotated_record(arm, scene, 0, psnr=20.0 + (arm != BASELINE))
+        rotated_record(arm, scene, 0, psnr=20.0 + (arm == WITH))
         for scene in MANY_VIEWS_SCENES
-        for arm in (BASELINE, "faded")
+        for arm in (WITHOUT, WITH)
     ]
     longer = [
         replace(r, setting=replace(r.setting, iterations=30_000), arm=arm)
-        for r, arm in zip(records, 3 * ["faded", BASELINE], strict=True)
+        for r, arm in zip(records, 3 * [WITH, WITHOUT], strict=True)
     ]
     decision = decide(Study([*records, *longer]))["Fading"]
     assert (decision.iterations, decision.verdict) == (30_000, "loses PSNR")
