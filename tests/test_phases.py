@@ -219,7 +219,9 @@ def test_presets() -> None:
     assert warmup is not None
     assert (short.switch_step, warmup.warmup) == (2_900, 250)
     assert (
-        PhaseScheduler(10).parts == [*DEFAULTS] == [Annealing(), Fading(), OutOfView(), Averaging()]
+        PhaseScheduler(10).parts
+        == [*DEFAULTS]
+        == [Annealing(longest=15_000), Fading(), OutOfView(), Averaging()]
     )
     assert PhaseScheduler(10, parts=[]).parts == []
     assert PhaseScheduler(10, parts=[*DEFAULTS, ConstantMultiplier(2.0)]).parts[-1].value == 2.0

@@ -38,25 +38,25 @@ from studies.scenes.parts.share_kept import ShareKept
 
 BASELINE = "mcmc"
 FADED = "faded"  # fading alone
-DEFAULTS = "annealed-all-but-means+faded"  # what `PhaseScheduler(total_steps)` was before:
-AVERAGED = f"{DEFAULTS}+averaged"  # what it is, branched off that one
+BOTH = "annealed-all-but-means+faded"  # the defaults until iterates were averaged
+# What `PhaseScheduler(total_steps)` is: of up to 15,000 iterations, and of more.
+SHORT_DEFAULTS, LONG_DEFAULTS = f"{BOTH}+averaged", f"{FADED}+averaged"
 STOCK_AVERAGED = "averaged@1/30"
-FADED_AVERAGED = f"{FADED}+averaged"
-EARLY = (f"{FADED}-to-1/4", f"{DEFAULTS}-to-1/4")  # fading ends after that share of the run
+EARLY = (f"{FADED}-to-1/4", f"{BOTH}-to-1/4")  # fading ends after that share of the run
 ANNEALED = "annealed-4-opacities-1+faded"  # the defaults until the views rotated
-SHORT_LABEL = "annealed+faded"
-DEFAULTS_POOLED = f"{DEFAULTS}+pooled"
-UNHELD = f"{DEFAULTS}-without-out-of-view"
+SHORT_LABEL = "annealed-all"
+BOTH_POOLED = f"{BOTH}+pooled"
+UNHELD = f"{BOTH}-without-out-of-view"
 STABLE = "awsgld-stable"  # its histogram follows the energy; that of the arms before it did not
 # Where points are many, fading kills a great part of them again and again: what may spare them.
-UNFADED = {name: f"{DEFAULTS}-{name}-unfaded" for name in ("means", "opacities")}
-SHARE_KEPT = f"{DEFAULTS}-share-kept"  # the defaults before Fading counted the points
-SMALLER_SHARE = f"{DEFAULTS}-smaller-share"  # retired: how it counted them first
-SCALES_ALONE = f"{DEFAULTS}-scales-alone"
+UNFADED = {name: f"{BOTH}-{name}-unfaded" for name in ("means", "opacities")}
+SHARE_KEPT = f"{BOTH}-share-kept"  # the defaults before Fading counted the points
+SMALLER_SHARE = f"{BOTH}-smaller-share"  # retired: how it counted them first
+SCALES_ALONE = f"{BOTH}-scales-alone"
 OWN_STEP = "own-step+faded"
-SELDOM_FADED = f"{DEFAULTS}-100-events"
-MORE_AT_ONCE = f"{DEFAULTS}-150-events-of-two-fifths"
-OFTEN_FADED = f"{DEFAULTS}-600-events"
+SELDOM_FADED = f"{BOTH}-100-events"
+MORE_AT_ONCE = f"{BOTH}-150-events-of-two-fifths"
+OFTEN_FADED = f"{BOTH}-600-events"
 
 # As measured, so that a change of the package's defaults does not change what an arm was.
 ANNEALING = Annealing(4.0, 0.4, 1.0, names=("scales", "quats", "opacities", "sh0", "shN"))
@@ -116,9 +116,9 @@ def whole_trainings() -> dict[str, MakeParts | None]:
         "annealed-8-0.4": of(Annealing(8.0, 0.4, 8.0, GAUSSIAN)),
         FADED: of(FADING),
         ANNEALED: of(ANNEALING_OF_ALL, FADING),
-        DEFAULTS: with_fading(FADING),
+        BOTH: with_fading(FADING),
         UNHELD: of(ANNEALING, FADING),
-        DEFAULTS_POOLED: with_fading(FADING, Pooling()),
+        BOTH_POOLED: with_fading(FADING, Pooling()),
         EARLY[0]: of(FADING_EARLY),
         EARLY[1]: with_fading(FADING_EARLY),
         **{name: with_fading(fading) for name, fading in faded_but.items()},
@@ -185,8 +185,9 @@ def averaged() -> list[StudyArm]:
     """The mean of the last iterates; each branches off the same without it."""
     trunks = {
         STOCK_AVERAGED: (BASELINE, ()),
-        FADED_AVERAGED: (FADED, (FADING,)),
-        AVERAGED: (DEFAULTS, (ANNEALING, FADING, OutOfView())),
+        # As was trained without `OutOfView`, which changes no bit of whole views.
+        LONG_DEFAULTS: (FADED, (FADING, OutOfView())),
+        SHORT_DEFAULTS: (BOTH, (ANNEALING, FADING, OutOfView())),
         "adc+averaged": ("adc", ()),
         "adc+defaults-but-scales+averaged": ("adc+defaults-but-scales", BUT_SCALES),
     }
@@ -240,6 +241,8 @@ def find_study_arm(name: str) -> StudyArm:
 
 def label(arm: str) -> str:
     """An arm's name in tables and plots, where the one in the records is long or out of date."""
-    if arm.startswith(DEFAULTS):
-        return "defaults" + arm.removeprefix(DEFAULTS)
+    if arm.startswith(BOTH):
+        return "annealed" + arm.removeprefix(BOTH)
+    arm = arm.replace("adc+defaults", "adc+annealed+faded")
+    arm = arm.replace("1.5.3+defaults", "1.5.3+annealed+faded")
     return re.sub("^defaults", SHORT_LABEL, arm.replace(ANNEALED, SHORT_LABEL))

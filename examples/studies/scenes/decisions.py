@@ -7,37 +7,39 @@ from dataclasses import dataclass, replace
 from studies.scenes.analysis import Study
 from studies.scenes.arms import (
     ANNEALED,
-    AVERAGED,
     BASELINE,
-    DEFAULTS,
-    DEFAULTS_POOLED,
-    FADED_AVERAGED,
+    BOTH,
+    BOTH_POOLED,
+    FADED,
+    LONG_DEFAULTS,
+    SHORT_DEFAULTS,
     STABLE,
-    STOCK_AVERAGED,
     UNHELD,
 )
 from studies.scenes.long_tables import Difference, difference
 from studies.scenes.records import Setting
 
 LENGTHS = (30_000, 7_500)
-QUARTER = "images_4"
+QUARTER, HALF = "images_4", "images_2"
 POINTS = 4_000
 NUM_POINTS = {"embedded": 2_000, "bonsai": 10_000, "lego": 10_000}
 MANY_VIEWS_SCENES = ("bonsai", "lego", "plush")  # forty training views or more
 MIN_SCENES, MIN_SEEDS = 3, 2
 # part -> (the arm with it, the arm without it)
 COMPARISONS = {
-    "Fading": (FADED_AVERAGED, STOCK_AVERAGED),
-    "Annealing": (AVERAGED, FADED_AVERAGED),
-    "Annealing of the positions": (ANNEALED, DEFAULTS),
-    "Averaging": (AVERAGED, DEFAULTS),
-    "Pooling": (DEFAULTS_POOLED, DEFAULTS),
+    "Fading": (FADED, BASELINE),
+    "Averaging": (LONG_DEFAULTS, FADED),
+    "Annealing": (SHORT_DEFAULTS, LONG_DEFAULTS),
+    "Annealing in short runs": (SHORT_DEFAULTS, LONG_DEFAULTS),
+    "Annealing of the positions": (ANNEALED, BOTH),
+    "Pooling": (BOTH_POOLED, BOTH),
     "EnergyHistogram": (STABLE, f"{STABLE}-constant"),
     "SquaredLoss": ("l2@1/30", BASELINE),
     "FreshMoments": ("l1+reset@1/30", BASELINE),
     "Curvature": ("l2+reset+lqn@1/30", "l2+reset@1/30"),
-    "OutOfView": (DEFAULTS, UNHELD),
+    "OutOfView": (BOTH, UNHELD),
 }
+AT = {"Annealing in short runs": (7_500,)}  # other lengths than the longest that there is
 # Parts that change no bit of an ordinary training, only where it would be ruined, and how many
 # pieces of every view make it one that they are for: on unless they lose.
 GUARDS = {"OutOfView": 9}
@@ -104,7 +106,7 @@ def decide(study: Study) -> dict[str, Decision]:
     made = {}
     for part, (arm, control) in COMPARISONS.items():
         made[part] = Decision(arm, control, None, None, guard=part in GUARDS)
-        for iterations in LENGTHS:
+        for iterations in AT.get(part, LENGTHS):
             settings = settings_of(study, iterations, GUARDS.get(part, 0))
             found = difference(study, settings, arm, control)
             if len(found.pairs) >= MIN_SCENES:

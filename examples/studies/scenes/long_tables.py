@@ -9,7 +9,7 @@ from statistics import fmean, stdev
 
 from studies.pages import table
 from studies.scenes.analysis import Study, falls
-from studies.scenes.arms import AVERAGED, BASELINE, STUDY_ARMS, label
+from studies.scenes.arms import BASELINE, LONG_DEFAULTS, SHORT_DEFAULTS, STUDY_ARMS, label
 from studies.scenes.records import Record, Setting
 
 METRICS = {"psnr": (1.0, 2), "ssim": (1.0, 4), "lpips": (-1.0, 4)}  # sign of better, digits
@@ -163,9 +163,10 @@ def headline_table(study: Study, long: Sequence[Setting], short: int) -> str:
     Means over the seeds that both have, since a seed has held-out views of its own.
     """
     rows = []
-    for count in (long[0].iterations, short) if long else ():
+    lengths = ((long[0].iterations, LONG_DEFAULTS), (short, SHORT_DEFAULTS)) if long else ()
+    for count, arm in lengths:
         settings = [replace(setting, iterations=count) for setting in long]
-        pairs = difference(study, settings, AVERAGED, BASELINE).pairs
+        pairs = difference(study, settings, arm, BASELINE).pairs
         for what, ours in (("stock", False), ("**defaults**", True)):
             found = [[a if ours else b for a, b, _ in pairs.get(s.scene, [])] for s in settings]
             rows.append((f"{what}, {count:,}", *(_cell(records, seeds=False) for records in found)))
@@ -173,26 +174,28 @@ def headline_table(study: Study, long: Sequence[Setting], short: int) -> str:
 
 
 def scenes_gain_table(
-    study: Study, settings: Sequence[Setting], arm: str, control: str, branch: str
+    study: Study, settings: Sequence[Setting], arms: Sequence[str], control: str
 ) -> str:
-    """One line per scene and size: the arm and its control at their ends, and the gain.
+    """One line per scene and size: the control and every arm at their ends, and the gains.
 
-    Beside it what a branch adds, which differs from the arm in its last iterations alone.
+    The arms may have other seeds, but a gain is over those that both of its trainings have.
     """
     rows = []
     for setting in settings:
-        found = difference(study, [setting], arm, control)
-        if found.count:
-            ours, theirs, _ = zip(*found.pairs[setting.scene], strict=True)
-            ends = _cell(theirs), _cell(ours, seeds=False)
-            added = difference(study, [setting], branch, arm)
-            more = " / ".join(cells_of(added)) if added.count else "-"
-            rows.append((setting.scene, _crowd(setting), *ends, cells_of(found)[0], more))
-    heads = (
-        *("scene", "Gaussians, images", f"`{label(control)}`", f"`{label(arm)}`", "gain, dB"),
-        f"`{label(branch)}` adds",
+        every = [difference(study, [setting], arm, control) for arm in arms]
+        pairs = [found.pairs.get(setting.scene, []) for found in every]
+        if any(pairs):
+            stock = _cell([theirs for _, theirs, _ in max(pairs, key=len)])
+            beside = []
+            for found, of in zip(every, pairs, strict=True):
+                beside += [_cell([ours for ours, _, _ in of]), cells_of(found)[0] if of else "-"]
+            rows.append((setting.scene, _crowd(setting), stock, *beside))
+    heads = [each for arm in arms for each in (f"`{label(arm)}`", "gain, dB")]
+    return table(
+        ("scene", "Gaussians, images", f"`{label(control)}`", *heads),
+        "lll" + "lr" * len(arms),
+        rows,
     )
-    return table(heads, "llllrr", rows)
 
 
 def sizes_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) -> str:

@@ -10,19 +10,19 @@ from typing import Any
 
 from studies.scenes.arms import (
     ANNEALED,
-    AVERAGED,
-    DEFAULTS,
-    DEFAULTS_POOLED,
+    BOTH,
+    BOTH_POOLED,
     EARLY,
     FADED,
-    FADED_AVERAGED,
     GROUPS,
+    LONG_DEFAULTS,
     MORE_AT_ONCE,
     OFTEN_FADED,
     OWN_STEP,
     SCALES_ALONE,
     SELDOM_FADED,
     SHARE_KEPT,
+    SHORT_DEFAULTS,
     STABLE,
     STOCK_AVERAGED,
     STUDY_ARMS,
@@ -35,22 +35,22 @@ from studies.scenes.training import Spec
 SCENES = ("plush", "banana", "lund_door", "brighton_beach", "embedded")
 FEW_VIEWS_SCENES = ("embedded", "banana", "lund_door", "brighton_beach")
 ROTATED_ARMS = (
-    *("mcmc", FADED, DEFAULTS, ANNEALED, "paper", "paper-constant"),
-    *(SELDOM_FADED, *UNFADED.values(), "rates-x2", DEFAULTS_POOLED, "own-step"),
+    *("mcmc", FADED, BOTH, ANNEALED, "paper", "paper-constant"),
+    *(SELDOM_FADED, *UNFADED.values(), "rates-x2", BOTH_POOLED, "own-step"),
     *(STABLE, f"{STABLE}-constant"),
-    *(AVERAGED, FADED_AVERAGED, STOCK_AVERAGED),
+    *(SHORT_DEFAULTS, LONG_DEFAULTS, STOCK_AVERAGED),
     *("l2@1/30", "l1+reset@1/30", "l2+reset@1/30", "l2+reset+lqn@1/30"),
     *(f"l1+reset{x}@1/{k}" for k in (4, 2) for x in ("", "+lqn", "+lqn-all")),
 )
-BRIEF_ARMS = ("mcmc", FADED, DEFAULTS, ANNEALED, *EARLY)
+BRIEF_ARMS = ("mcmc", FADED, BOTH, ANNEALED, *EARLY)
 HALF_ARMS = (  # with 50,000 Gaussians
-    *("mcmc", DEFAULTS, AVERAGED, STOCK_AVERAGED, SHARE_KEPT, SELDOM_FADED, *UNFADED.values()),
+    *("mcmc", BOTH, SHORT_DEFAULTS, STOCK_AVERAGED, SHARE_KEPT, SELDOM_FADED, *UNFADED.values()),
     *("paper", "paper-constant"),
 )
-RATES_ARMS = ("mcmc", OWN_STEP, DEFAULTS)
-UNSEEN_ARMS = ("mcmc", "out-of-view", UNHELD, DEFAULTS)
-UNSEEN_LONG_ARMS = ("mcmc", UNHELD, DEFAULTS)
-CROWDED_ARMS = ("mcmc", DEFAULTS, SHARE_KEPT, UNFADED["means"])
+RATES_ARMS = ("mcmc", OWN_STEP, BOTH)
+UNSEEN_ARMS = ("mcmc", "out-of-view", UNHELD, BOTH)
+UNSEEN_LONG_ARMS = ("mcmc", UNHELD, BOTH)
+CROWDED_ARMS = ("mcmc", BOTH, SHARE_KEPT, UNFADED["means"])
 
 
 @dataclass(frozen=True)
@@ -99,8 +99,9 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         ],
         "rotated-brief": [
             *rotated(MANY_VIEWS_SCENES, BRIEF_ARMS, seeds, 7_500),
+            *rotated(MANY_VIEWS_SCENES, [SHORT_DEFAULTS, LONG_DEFAULTS], seeds, 7_500),
             *rotated(("bonsai",), [SELDOM_FADED], 1, 7_500),
-            *rotated(MANY_VIEWS_SCENES, [DEFAULTS], 2, 10_000),
+            *rotated(MANY_VIEWS_SCENES, [BOTH], 2, 10_000),
         ],
         "crowded": [  # 40,000 Gaussians on images of a quarter of their size
             *rotated(("bonsai",), CROWDED_ARMS, 1, 7_500, 4),
@@ -110,16 +111,16 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
             *half_size(scenes=("bonsai", "lego"), share=5),
             *half_size(scenes=("plush",), share=12.5),
         ],
-        "sh3": rotated(MANY_VIEWS_SCENES, ("mcmc", DEFAULTS), 1, 30_000, sh_degree=3),
+        "sh3": rotated(MANY_VIEWS_SCENES, ("mcmc", BOTH), 1, 30_000, sh_degree=3),
         "adaptive": rotated(MANY_VIEWS_SCENES, arms["adaptive"], 1, 30_000),
         "sizes": [  # fewer Gaussians, iterations and views
-            *rotated(("bonsai",), ("mcmc", DEFAULTS), 1, 7_500, 0.1),
-            *rotated(("bonsai",), ("mcmc", DEFAULTS), 1, 7_500, 0.4),
-            *rotated(("bonsai",), ("mcmc", DEFAULTS), 1, 3_000),
+            *rotated(("bonsai",), ("mcmc", BOTH), 1, 7_500, 0.1),
+            *rotated(("bonsai",), ("mcmc", BOTH), 1, 7_500, 0.4),
+            *rotated(("bonsai",), ("mcmc", BOTH), 1, 3_000),
             *(
                 spec
                 for views in (14, 28, 55, 110)
-                for spec in rotated(("bonsai",), ("mcmc", DEFAULTS), 1, 7_500, views=views)
+                for spec in rotated(("bonsai",), ("mcmc", BOTH), 1, 7_500, views=views)
             ),
         ],
         "rates": [  # the trainer's own, all of them times a factor

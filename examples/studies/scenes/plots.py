@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from studies.scenes.analysis import Gain, Study
-from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, FADED, label
+from studies.scenes.arms import ANNEALED, BASELINE, BOTH, FADED, label
 from studies.scenes.decisions import points_of
 from studies.scenes.long_tables import difference
 from studies.scenes.records import Record, Setting
@@ -25,7 +25,7 @@ COLOURS = {
     "rates-x2": "#f0e442",
     "annealed-8-0.4": "#999999",
     ANNEALED: "#56b4e9",
-    DEFAULTS: "#0072b2",
+    BOTH: "#0072b2",
     FADED: "#cc79a7",
     f"{ANNEALED}+pooled": "#009e73",
 }
@@ -119,7 +119,7 @@ def plot_sizes(study: Study, path: Path) -> None:
     """
     lines: dict[str, dict[str, dict[float, Sequence[float]]]] = {name: {} for name in SIZE_AXES}
     for setting in study.all_settings():
-        found = difference(study, [setting], DEFAULTS, BASELINE)
+        found = difference(study, [setting], BOTH, BASELINE)
         for axis, place in _places(setting).items() if found.count else ():
             pairs = found.pairs[setting.scene]
             gains = [

@@ -24,11 +24,11 @@ from studies.pages import filled, table
 from studies.scenes.analysis import Study
 from studies.scenes.arms import (
     ANNEALED,
-    AVERAGED,
     BASELINE,
-    DEFAULTS,
+    BOTH,
     FADED,
     GROUPS,
+    LONG_DEFAULTS,
     MORE_AT_ONCE,
     OFTEN_FADED,
     SELDOM_FADED,
@@ -39,7 +39,7 @@ from studies.scenes.arms import (
     UNFADED,
     label,
 )
-from studies.scenes.decisions import QUARTER, decide, every_scene, settings_of
+from studies.scenes.decisions import HALF, QUARTER, decide, every_scene, settings_of
 from studies.scenes.long_tables import (
     cells_of,
     difference,
@@ -103,9 +103,9 @@ ASIDE = ("explorations", "unseen", "adaptive", "never-reset")  # groups with a t
 NU_ARMS = (BASELINE, STABLE, f"{STABLE}-constant", "paper", "paper-constant")
 OFTEN_ARMS = (
     *(BASELINE, SHARE_KEPT, SMALLER_SHARE, SELDOM_FADED, OFTEN_FADED, MORE_AT_ONCE),
-    *(*UNFADED.values(), DEFAULTS),
+    *(*UNFADED.values(), BOTH),
 )
-REACH_ARMS = (FADED, DEFAULTS)
+REACH_ARMS = (FADED, BOTH)
 
 
 def tables(study: Study) -> dict[str, str]:
@@ -148,11 +148,16 @@ def rotated_tables(study: Study) -> dict[str, str]:
     every = every_scene(study, LONG)
     quarter = [setting for setting in every if setting.size == QUARTER]
     degrees = [*every, *every_scene(study, LONG, sh_degree=3)]
-    made["every-scene"] = scenes_gain_table(study, degrees, DEFAULTS, BASELINE, AVERAGED)
+    made["every-scene"] = scenes_gain_table(study, degrees, (BOTH, LONG_DEFAULTS), BASELINE)
     made["headline"] = headline_table(study, long, BRIEF)
     made["reach"] = reach_table(study, long, REACH_ARMS, SHORTER)
     made["paper"] = paper_table(study, quarter)
     made["paper-brief"] = paper_table(study, quarter, brief=True)
+    half = [setting for setting in every if setting.size == HALF]
+    averaged = [arm for arm, each in STUDY_ARMS.items() if each.averages]
+    ends = [*every_scene(study, BRIEF), *every]
+    made["averaging"] = averaging_table(study, ends, averaged)
+    made["paper-half"] = metrics_table(study, half, (BASELINE, "paper", "paper-constant", BOTH))
     aside = {arm for kind in ASIDE for arm in names(kind)}
     shown = [arm for arm in STUDY_ARMS if arm not in aside]
     for count, settings in ((LONG, long), (BRIEF, brief)):
@@ -171,11 +176,26 @@ def rotated_tables(study: Study) -> dict[str, str]:
     views = of_kind(study, Setting("bonsai", 10_000, BRIEF, "sfm", rotated=True), "views")
     views.sort(key=lambda s: s.views or VIEWS[s.scene])
     made["views"] = metrics_table(
-        study, views, (BASELINE, DEFAULTS), head=lambda s: str(s.views or VIEWS[s.scene])
+        study, views, (BASELINE, BOTH), head=lambda s: str(s.views or VIEWS[s.scene])
     )
     tiled = [s for s in study.all_settings() if s.tiled]
     made["unseen"] = metrics_table(study, tiled, (*UNSEEN_ARMS, "kept"), head=pieces)
     return made
+
+
+def averaging_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) -> str:
+    """What the mean of the last iterates adds to the last one of the same trainings."""
+    rows = []
+    for setting in settings:
+        for arm in arms:
+            found = difference(study, [setting], arm, STUDY_ARMS[arm].averages)
+            if found.count:
+                what = f"{setting.points:,}, {setting.size}, {setting.iterations:,}"
+                what = what.replace("images_4", "quarter").replace("images_2", "half")
+                trunk = f"`{label(STUDY_ARMS[arm].averages or arm)}`"
+                rows.append((setting.scene, what, trunk, str(found.count), *cells_of(found)))
+    heads = ("scene", "Gaussians, images, iterations", "on", "seeds", "PSNR", "SSIM", "LPIPS")
+    return table(heads, "lllrrrr", rows)
 
 
 def pieces(setting: Setting) -> str:
@@ -260,7 +280,7 @@ def plots(study: Study, rotating: Study) -> list[Path]:
         title = f"{', '.join(scenes)}\n{SHORT:,} iterations; {BASELINE} {fmean(ends):.2f} dB"
         plot_gains(gains, FOLDER / name, title)
         drawn.append(FOLDER / name)
-    arms = (BASELINE, FADED, DEFAULTS)
+    arms = (BASELINE, FADED, BOTH)
     plot_metrics(rotating, settings_of(rotating, LONG), arms, FOLDER / "rotated.png")
     plot_sizes(rotating, FOLDER / "sizes.png")
     return [*drawn, FOLDER / "rotated.png", FOLDER / "sizes.png"]

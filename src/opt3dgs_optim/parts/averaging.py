@@ -24,7 +24,7 @@ class Averaging(Part):
     rows meanwhile, it begins anew. It takes the parameters' memory once more.
     """
 
-    share: ClassVar[float] = 1 / 30  # of the run; from 1/150 to 1/10 it ends alike
+    share: ClassVar[float] = 1 / 30  # of the run
 
     keys = (MEAN, COUNT)
 

@@ -20,8 +20,10 @@ from studies.pages import filled
 from studies.scenes import report, steps
 from studies.scenes.analysis import Study
 from studies.scenes.arms import (
-    AVERAGED,
     BASELINE,
+    LONG_DEFAULTS,
+    SHORT_DEFAULTS,
+    STOCK_AVERAGED,
     STUDY_ARMS,
     UNHELD,
     adaptive,
@@ -29,7 +31,7 @@ from studies.scenes.arms import (
     last_phases,
     whole_trainings,
 )
-from studies.scenes.arms import DEFAULTS as DEFAULT_ARM
+from studies.scenes.arms import BOTH as DEFAULT_ARM
 from studies.scenes.decisions import COMPARISONS, MANY_VIEWS_SCENES, decide, every_scene, points_of
 from studies.scenes.long_tables import (
     difference,
@@ -75,9 +77,11 @@ def test_the_defaults_are_what_the_page_concludes() -> None:
     decided = {part: decision.on for part, decision in decide(report.rotating_study()).items()}
     committed = json.loads((report.FOLDER / "decisions.json").read_text(encoding="utf-8"))
     assert committed == decided
-    assert {type(part).__name__ for part in DEFAULTS} == {
-        part for part, on in decided.items() if on
-    }
+    short = " in short runs"  # of a part that acts in those alone
+    assert {
+        type(part).__name__ + short * (getattr(part, "longest", None) is not None)
+        for part in DEFAULTS
+    } == {part for part, on in decided.items() if on}
 
 
 def test_every_rotated_training_is_of_a_stage() -> None:
@@ -91,9 +95,13 @@ def test_every_rotated_training_is_of_a_stage() -> None:
 
 
 def test_the_defaults_are_the_measured_arm() -> None:
-    measured = find_study_arm(AVERAGED).parts
+    measured = find_study_arm(SHORT_DEFAULTS).parts
+    long = find_study_arm(LONG_DEFAULTS).parts
     assert measured is not None
-    assert measured(300, None) == list(DEFAULTS)
+    assert long is not None
+    annealing, *others = DEFAULTS
+    assert measured(300, None) == [replace(annealing, longest=None), *others]
+    assert long(300, None) == others
     cloning = find_study_arm("adc+defaults-but-scales+averaged").parts
     assert cloning is not None
     assert cloning(300, None) == list(DEFAULTS_ADC)
@@ -178,14 +186,15 @@ def test_a_cost_that_was_not_measured_is_the_controls() -> None:
 
 def test_what_averaging_adds_in_the_end_counts_at_equal_seconds() -> None:
     """At 4/5 of the iterations, where its own curve is that of the iterates yet."""
-    arms = {"faded": 22.0, WITH: 22.4, BASELINE: 20.0, WITHOUT: 20.1}
+    arms = {"faded": 22.0, LONG_DEFAULTS: 22.4, BASELINE: 20.0, STOCK_AVERAGED: 20.1}
     records = [rotated_record(arm, "plush", 0, psnr=psnr) for arm, psnr in arms.items()]
     setting = records[0].setting
     study = Study(records, {("plush", "images_4", 7_500, 0, 0, "faded"): 1.25})
-    found = difference(study, [setting], WITH, WITHOUT)
+    found = difference(study, [setting], LONG_DEFAULTS, STOCK_AVERAGED)
     assert found.cost == 1.25
     assert found.of("psnr")[0] == pytest.approx(0.2 * 10.0 + 0.8 * 22.0 + 0.4 - 20.1)
-    assert difference(study, [setting], WITH, "faded").of("psnr")[0] == pytest.approx(0.4)
+    found = difference(study, [setting], LONG_DEFAULTS, "faded")
+    assert found.of("psnr")[0] == pytest.approx(0.4)
 
 
 def test_the_longest_trainings_decide() -> None:
@@ -207,13 +216,14 @@ def test_every_scene_and_size_has_its_line() -> None:
     quarter = [rotated_record(arm, "banana", 0, psnr=psnr) for arm, psnr in arms]
     half = [replace(r, setting=replace(r.setting, size="images_2", points=5_000)) for r in quarter]
     other = rotated_record(BASELINE, "plush", 0)  # has no pair
-    branch = replace(half[0], arm=AVERAGED, curve=rotated_record(AVERAGED, "a", 0, psnr=20.6).curve)
-    study = Study([*quarter, *half, other, branch])
-    table = scenes_gain_table(study, every_scene(study, 7_500), DEFAULT_ARM, BASELINE, AVERAGED)
+    ended = rotated_record(LONG_DEFAULTS, "a", 0, psnr=20.6)
+    study = Study([*quarter, *half, other, replace(ended, setting=half[0].setting)])
+    arms = (DEFAULT_ARM, LONG_DEFAULTS)
+    table = scenes_gain_table(study, every_scene(study, 7_500), arms, BASELINE)
     ends = "20.00 / 0.700 / 0.200 | 20.50 / 0.700 / 0.200 | +0.50"
     assert table.splitlines()[2:] == [
-        f"| banana | 4,000, quarter | {ends} | - |",
-        f"| banana | 5,000, half | {ends} | +0.10 / +0.0000 / +0.0000 |",
+        f"| banana | 4,000, quarter | {ends} | - | - |",
+        f"| banana | 5,000, half | {ends} | 20.60 / 0.700 / 0.200 | +0.60 |",
     ]
 
 
@@ -232,14 +242,14 @@ def test_when_stocks_quality_is_reached_over_the_seeds_of_both() -> None:
     runs = (BASELINE, 0, 20.0), (DEFAULT_ARM, 0, 30.0), (BASELINE, 1, 28.0)
     study = Study([rotated_record(arm, "a", seed, psnr=psnr) for arm, seed, psnr in runs])
     said = reach_table(study, study.all_settings(), [BASELINE, DEFAULT_ARM], [3_000, 5_000])
-    assert "| 20.00 dB (1) | `defaults` | x0.50 of its seconds | - | - |" in said
+    assert "| 20.00 dB (1) | `annealed` | x0.50 of its seconds | - | - |" in said
     shorter = rotated_record(DEFAULT_ARM, "a", 0, psnr=21.0)
     shorter = replace(shorter, setting=replace(shorter.setting, iterations=5_000))
     costs = {("a", "images_4", 3_000, 0, 0, DEFAULT_ARM): 1.2}
     both = Study([*study.records(), shorter], costs)
     said = reach_table(both, study.all_settings(), [DEFAULT_ARM], [3_000, 5_000])
-    assert "| `defaults` | x0.50 of its seconds | - | +1.00 dB in x0.80 |" in said
-    defaults = replace(study.runs(study.all_settings()[0], DEFAULT_ARM)[0], arm=AVERAGED)
+    assert "| `annealed` | x0.50 of its seconds | - | +1.00 dB in x0.80 |" in said
+    defaults = replace(study.runs(study.all_settings()[0], DEFAULT_ARM)[0], arm=LONG_DEFAULTS)
     averaged = Study([*study.records(), defaults])
     first = headline_table(averaged, study.all_settings(), 3_000).splitlines()[2:4]
     assert first == [
