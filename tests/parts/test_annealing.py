@@ -103,7 +103,7 @@ def test_the_log_gets_the_factor() -> None:
         assert phases.numbers() == {"annealing": pytest.approx(factor)}
 
 
-@pytest.mark.parametrize(("longest", "factor"), [(None, 2.0), (TOTAL, 2.0), (TOTAL - 1, 1.0)])
+@pytest.mark.parametrize(("longest", "factor"), [(None, 2.0), (TOTAL, 2.0), (TOTAL - 1, 1.0), (1, 1.0)])
 def test_longer_runs_than_it_is_for_are_left_alone(longest: int | None, factor: float) -> None:
     annealing = Annealing(4.0, 1.0, 4.0, longest=longest)
     splats, phases, optimizers = upgraded(TOTAL, annealing)

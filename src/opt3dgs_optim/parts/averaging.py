@@ -39,6 +39,6 @@ class Averaging(Part):
             state[COUNT] = torch.zeros(param.shape[:1], device=param.device)
             return
         mean, count = state[MEAN], state[COUNT].add_(course.valid)
-        mean += (param - mean) * (course.valid / shaped(count.clamp(min=1.0), mean))
+        mean.lerp_(param.float(), course.valid / shaped(count.clamp(min=1.0), mean))
         if left <= max(2, length / 10):  # trainers save before the last step, or do not make it
             param.copy_(torch.where(shaped(count > 0, mean) & course.valid, mean, param))
