@@ -113,7 +113,6 @@ TABLE: dict[str, tuple[Callable[..., Any], type, dict[str, Any]]] = {
             "peak": [*NOT_NUMBERS, 0.0, -1.0],
             "opacity_peak": [*NOT_NUMBERS, 0.0, -1.0],
             "final": [*NOT_NUMBERS, 0.0, -1.0],
-            "longest": [count for count in [*COUNTS, 0] if count is not None],
             "names": NOT_NAMES,
         },
     ),

@@ -218,11 +218,7 @@ def test_presets() -> None:
     warmup = short.part(EnergyHistogram)
     assert warmup is not None
     assert (short.switch_step, warmup.warmup) == (2_900, 250)
-    assert (
-        PhaseScheduler(10).parts
-        == [*DEFAULTS]
-        == [Annealing(longest=15_000), Fading(), OutOfView(), Averaging()]
-    )
+    assert PhaseScheduler(10).parts == [*DEFAULTS] == [Fading(), OutOfView(), Averaging()]
     assert PhaseScheduler(10, parts=[]).parts == []
     assert PhaseScheduler(10, parts=[*DEFAULTS, ConstantMultiplier(2.0)]).parts[-1].value == 2.0
 
@@ -388,7 +384,7 @@ def test_an_energy_that_nobody_steps_after() -> None:
 def test_optimizers_that_step_without_an_energy() -> None:
     splats, optimizers = begun(PhaseScheduler(500))
     train(splats, optimizers, None, 0, 20)
-    with pytest.warns(UserWarning, match=r"20 times without an energy: Annealing, Fad") as told:
+    with pytest.warns(UserWarning, match=r"20 times without an energy: Fading, Out") as told:
         train(splats, optimizers, None, 20, 21)
     (warning,) = told
     assert warning.filename.endswith("trainers.py")  # the user's line, not ours or torch's
@@ -398,9 +394,7 @@ def test_optimizers_that_step_without_an_energy() -> None:
 def test_an_energy_that_stops_coming() -> None:
     splats, optimizers = begun(phases := PhaseScheduler(500))
     train(splats, optimizers, phases, 0, 5)
-    with pytest.warns(
-        UserWarning, match="without an energy: Annealing, Fading, OutOfView, Averaging stand"
-    ):
+    with pytest.warns(UserWarning, match="without an energy: Fading, OutOfView, Averaging stand"):
         train(splats, optimizers, None, 5, 30)
 
 

@@ -6,15 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from trainers import (
-    assert_same,
-    gsplat_optimizers,
-    make_splats,
-    only,
-    train,
-    trained_by_adam,
-    upgraded,
-)
+from trainers import assert_same, gsplat_optimizers, make_splats, only, train, upgraded
 
 from opt3dgs_optim import Annealing, ConstantMultiplier
 
@@ -101,17 +93,6 @@ def test_the_log_gets_the_factor() -> None:
         phases = only(TOTAL, Annealing(4.0, 1.0, names=names))
         phases.observe(0.1, iteration=TOTAL // 2)
         assert phases.numbers() == {"annealing": pytest.approx(factor)}
-
-
-@pytest.mark.parametrize(("longest", "factor"), [(None, 2.0), (TOTAL, 2.0), (TOTAL - 1, 1.0), (1, 1.0)])
-def test_longer_runs_than_it_is_for_are_left_alone(longest: int | None, factor: float) -> None:
-    annealing = Annealing(4.0, 1.0, 4.0, longest=longest)
-    splats, phases, optimizers = upgraded(TOTAL, annealing)
-    train(splats, optimizers, phases, 0, TOTAL // 2 + 1)
-    assert phases.numbers() == {"annealing": pytest.approx(factor)}
-    stock = trained_by_adam(TOTAL // 2 + 1)
-    same = [torch.equal(param, stock[name]) for name, param in splats.items()]
-    assert same == [factor == 1.0 or name == "means" for name in splats]
 
 
 def test_the_defaults_are_those_that_were_measured() -> None:

@@ -39,8 +39,8 @@ from studies.scenes.parts.share_kept import ShareKept
 BASELINE = "mcmc"
 FADED = "faded"  # fading alone
 BOTH = "annealed-all-but-means+faded"  # the defaults until iterates were averaged
-# What `PhaseScheduler(total_steps)` is: of up to 15,000 iterations, and of more.
-SHORT_DEFAULTS, LONG_DEFAULTS = f"{BOTH}+averaged", f"{FADED}+averaged"
+BOTH_AVERAGED = f"{BOTH}+averaged"
+DEFAULTS = f"{FADED}+averaged"  # what `PhaseScheduler(total_steps)` is
 STOCK_AVERAGED = "averaged@1/30"
 EARLY = (f"{FADED}-to-1/4", f"{BOTH}-to-1/4")  # fading ends after that share of the run
 ANNEALED = "annealed-4-opacities-1+faded"  # the defaults until the views rotated
@@ -186,8 +186,8 @@ def averaged() -> list[StudyArm]:
     trunks = {
         STOCK_AVERAGED: (BASELINE, ()),
         # As was trained without `OutOfView`, which changes no bit of whole views.
-        LONG_DEFAULTS: (FADED, (FADING, OutOfView())),
-        SHORT_DEFAULTS: (BOTH, (ANNEALING, FADING, OutOfView())),
+        DEFAULTS: (FADED, (FADING, OutOfView())),
+        BOTH_AVERAGED: (BOTH, (ANNEALING, FADING, OutOfView())),
         "adc+averaged": ("adc", ()),
         "adc+defaults-but-scales+averaged": ("adc+defaults-but-scales", BUT_SCALES),
     }

@@ -9,10 +9,10 @@ from studies.scenes.arms import (
     ANNEALED,
     BASELINE,
     BOTH,
+    BOTH_AVERAGED,
     BOTH_POOLED,
+    DEFAULTS,
     FADED,
-    LONG_DEFAULTS,
-    SHORT_DEFAULTS,
     STABLE,
     UNHELD,
 )
@@ -28,9 +28,8 @@ MIN_SCENES, MIN_SEEDS = 3, 2
 # part -> (the arm with it, the arm without it)
 COMPARISONS = {
     "Fading": (FADED, BASELINE),
-    "Averaging": (LONG_DEFAULTS, FADED),
-    "Annealing": (SHORT_DEFAULTS, LONG_DEFAULTS),
-    "Annealing in short runs": (SHORT_DEFAULTS, LONG_DEFAULTS),
+    "Averaging": (DEFAULTS, FADED),
+    "Annealing": (BOTH_AVERAGED, DEFAULTS),
     "Annealing of the positions": (ANNEALED, BOTH),
     "Pooling": (BOTH_POOLED, BOTH),
     "EnergyHistogram": (STABLE, f"{STABLE}-constant"),
@@ -39,7 +38,6 @@ COMPARISONS = {
     "Curvature": ("l2+reset+lqn@1/30", "l2+reset@1/30"),
     "OutOfView": (BOTH, UNHELD),
 }
-AT = {"Annealing in short runs": (7_500,)}  # other lengths than the longest that there is
 # Parts that change no bit of an ordinary training, only where it would be ruined, and how many
 # pieces of every view make it one that they are for: on unless they lose.
 GUARDS = {"OutOfView": 9}
@@ -106,7 +104,7 @@ def decide(study: Study) -> dict[str, Decision]:
     made = {}
     for part, (arm, control) in COMPARISONS.items():
         made[part] = Decision(arm, control, None, None, guard=part in GUARDS)
-        for iterations in AT.get(part, LENGTHS):
+        for iterations in LENGTHS:
             settings = settings_of(study, iterations, GUARDS.get(part, 0))
             found = difference(study, settings, arm, control)
             if len(found.pairs) >= MIN_SCENES:

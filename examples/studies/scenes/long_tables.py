@@ -9,7 +9,7 @@ from statistics import fmean, stdev
 
 from studies.pages import table
 from studies.scenes.analysis import Study, falls
-from studies.scenes.arms import BASELINE, LONG_DEFAULTS, SHORT_DEFAULTS, STUDY_ARMS, label
+from studies.scenes.arms import BASELINE, DEFAULTS, STUDY_ARMS, label
 from studies.scenes.records import Record, Setting
 
 METRICS = {"psnr": (1.0, 2), "ssim": (1.0, 4), "lpips": (-1.0, 4)}  # sign of better, digits
@@ -163,10 +163,9 @@ def headline_table(study: Study, long: Sequence[Setting], short: int) -> str:
     Means over the seeds that both have, since a seed has held-out views of its own.
     """
     rows = []
-    lengths = ((long[0].iterations, LONG_DEFAULTS), (short, SHORT_DEFAULTS)) if long else ()
-    for count, arm in lengths:
+    for count in (long[0].iterations, short) if long else ():
         settings = [replace(setting, iterations=count) for setting in long]
-        pairs = difference(study, settings, arm, BASELINE).pairs
+        pairs = difference(study, settings, DEFAULTS, BASELINE).pairs
         for what, ours in (("stock", False), ("**defaults**", True)):
             found = [[a if ours else b for a, b, _ in pairs.get(s.scene, [])] for s in settings]
             rows.append((f"{what}, {count:,}", *(_cell(records, seeds=False) for records in found)))

@@ -11,18 +11,18 @@ from typing import Any
 from studies.scenes.arms import (
     ANNEALED,
     BOTH,
+    BOTH_AVERAGED,
     BOTH_POOLED,
+    DEFAULTS,
     EARLY,
     FADED,
     GROUPS,
-    LONG_DEFAULTS,
     MORE_AT_ONCE,
     OFTEN_FADED,
     OWN_STEP,
     SCALES_ALONE,
     SELDOM_FADED,
     SHARE_KEPT,
-    SHORT_DEFAULTS,
     STABLE,
     STOCK_AVERAGED,
     STUDY_ARMS,
@@ -38,13 +38,13 @@ ROTATED_ARMS = (
     *("mcmc", FADED, BOTH, ANNEALED, "paper", "paper-constant"),
     *(SELDOM_FADED, *UNFADED.values(), "rates-x2", BOTH_POOLED, "own-step"),
     *(STABLE, f"{STABLE}-constant"),
-    *(SHORT_DEFAULTS, LONG_DEFAULTS, STOCK_AVERAGED),
+    *(BOTH_AVERAGED, DEFAULTS, STOCK_AVERAGED),
     *("l2@1/30", "l1+reset@1/30", "l2+reset@1/30", "l2+reset+lqn@1/30"),
     *(f"l1+reset{x}@1/{k}" for k in (4, 2) for x in ("", "+lqn", "+lqn-all")),
 )
 BRIEF_ARMS = ("mcmc", FADED, BOTH, ANNEALED, *EARLY)
 HALF_ARMS = (  # with 50,000 Gaussians
-    *("mcmc", BOTH, SHORT_DEFAULTS, STOCK_AVERAGED, SHARE_KEPT, SELDOM_FADED, *UNFADED.values()),
+    *("mcmc", BOTH, BOTH_AVERAGED, STOCK_AVERAGED, SHARE_KEPT, SELDOM_FADED, *UNFADED.values()),
     *("paper", "paper-constant"),
 )
 RATES_ARMS = ("mcmc", OWN_STEP, BOTH)
@@ -99,7 +99,7 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         ],
         "rotated-brief": [
             *rotated(MANY_VIEWS_SCENES, BRIEF_ARMS, seeds, 7_500),
-            *rotated(MANY_VIEWS_SCENES, [SHORT_DEFAULTS, LONG_DEFAULTS], seeds, 7_500),
+            *rotated(MANY_VIEWS_SCENES, [BOTH_AVERAGED, DEFAULTS], seeds, 7_500),
             *rotated(("bonsai",), [SELDOM_FADED], 1, 7_500),
             *rotated(MANY_VIEWS_SCENES, [BOTH], 2, 10_000),
         ],

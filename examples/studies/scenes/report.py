@@ -26,9 +26,9 @@ from studies.scenes.arms import (
     ANNEALED,
     BASELINE,
     BOTH,
+    DEFAULTS,
     FADED,
     GROUPS,
-    LONG_DEFAULTS,
     MORE_AT_ONCE,
     OFTEN_FADED,
     SELDOM_FADED,
@@ -39,7 +39,15 @@ from studies.scenes.arms import (
     UNFADED,
     label,
 )
-from studies.scenes.decisions import HALF, QUARTER, decide, every_scene, settings_of
+from studies.scenes.decisions import (
+    GUARDS,
+    HALF,
+    MANY_VIEWS_SCENES,
+    QUARTER,
+    decide,
+    every_scene,
+    settings_of,
+)
 from studies.scenes.long_tables import (
     cells_of,
     difference,
@@ -148,7 +156,7 @@ def rotated_tables(study: Study) -> dict[str, str]:
     every = every_scene(study, LONG)
     quarter = [setting for setting in every if setting.size == QUARTER]
     degrees = [*every, *every_scene(study, LONG, sh_degree=3)]
-    made["every-scene"] = scenes_gain_table(study, degrees, (BOTH, LONG_DEFAULTS), BASELINE)
+    made["every-scene"] = scenes_gain_table(study, degrees, (BOTH, DEFAULTS), BASELINE)
     made["headline"] = headline_table(study, long, BRIEF)
     made["reach"] = reach_table(study, long, REACH_ARMS, SHORTER)
     made["paper"] = paper_table(study, quarter)
@@ -224,7 +232,10 @@ def decisions_table(study: Study) -> str:
             count = f"{len(found.pairs)}, {found.count}"
             shown = [f"{decision.iterations:,}", count, *cells_of(found)]
         on = "on" if decision.on else "off"
-        rows.append((part, by, *shown, f"{on} ({decision.verdict})"))
+        brief = settings_of(study, BRIEF, GUARDS.get(part, 0))
+        beside = difference(study, brief, decision.arm, decision.control)
+        short = cells_of(beside)[0] if len(beside.pairs) == len(MANY_VIEWS_SCENES) else "-"
+        rows.append((part, by, *shown, f"{on} ({decision.verdict})", short))
     heads = (
         "part",
         "decided by",
@@ -234,8 +245,9 @@ def decisions_table(study: Study) -> str:
         "SSIM",
         "LPIPS",
         "default",
+        f"PSNR at {BRIEF:,}",
     )
-    return table(heads, "llrlrrrl", rows)
+    return table(heads, "llrlrrrlr", rows)
 
 
 def paper_table(study: Study, settings: Sequence[Setting], *, brief: bool = False) -> str:

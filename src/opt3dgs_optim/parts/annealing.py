@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from opt3dgs_optim.checks import check_count, check_number
+from opt3dgs_optim.checks import check_number
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import GAUSSIAN, SLOT, canonical_name, check_names
 from opt3dgs_optim.part import Group, Part
@@ -20,16 +20,16 @@ class Annealing(Part):
 
     3DGS keeps all learning rates but the positions' constant: too small to get far in the first
     iterations, too large to settle in the last. The factor comes on top of the trainer's own
-    schedule; the learning rates in `param_groups` stay as they are. The positions are left alone,
-    and the opacities have a peak of their own, since either would lose detail at four times its
-    rate. In long runs `Averaging` buys as much without it (docs/evidence.md). It costs no memory.
+    schedule; the learning rates in `param_groups` stay as they are. It costs no memory.
+
+    The positions are left alone, and the opacities have a peak of their own, since either would
+    lose detail at four times its rate (docs/evidence.md).
 
     Args:
         peak: factor at the first iteration, above 0, of all parameters but the opacities.
         final: factor at the last iteration, above 0.
         opacity_peak: `peak` of the opacities.
         names: the Gaussian parameters, under gsplat's or INRIA's names.
-        longest: `total_steps` of the longest run in which it acts; None: in all.
 
     Raises:
         ValueError: an option is outside what is allowed, or a name is no Gaussian parameter's.
@@ -39,17 +39,19 @@ class Annealing(Part):
     final: float = 0.4
     opacity_peak: float = 1.0
     names: tuple[str, ...] = ANNEALED
-    longest: int | None = None
 
     def __post_init__(self) -> None:
         for option in ("peak", "final", "opacity_peak"):
             check_number(CALL, option, getattr(self, option), 0.0, open_low=True)
         object.__setattr__(self, "names", check_names(CALL, self.names))
-        if self.longest is not None:
-            check_count(CALL, "longest", self.longest, 1)
 
     def at(self, name: str | None, progress: float) -> float:
-        """The factor on the step of the parameter of that name, at a share of the run in 0..1."""
+        """The factor on a parameter's step.
+
+        Args:
+            name: its name, gsplat's or INRIA's; 1 where it is none of those that are annealed.
+            progress: share of the run that is over; taken as 0..1.
+        """
         known = canonical_name(name)
         if known not in self.names:
             return 1.0
@@ -58,9 +60,8 @@ class Annealing(Part):
         return peak ** (1.0 - t) * self.final**t
 
     def factor(self, group: Group, course: Course) -> float:
-        acts = self.longest is None or course.total_steps <= self.longest
-        return self.at(group.get(SLOT), course.progress) if acts else 1.0
+        return self.at(group.get(SLOT), course.progress)
 
     def numbers(self, course: Course) -> Mapping[str, float]:
         """`annealing`: the factor on the steps of the first of its parameters."""
-        return {"annealing": self.factor({SLOT: self.names[0]}, course)}
+        return {"annealing": self.at(self.names[0], course.progress)}

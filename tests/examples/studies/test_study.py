@@ -21,8 +21,7 @@ from studies.scenes import report, steps
 from studies.scenes.analysis import Study
 from studies.scenes.arms import (
     BASELINE,
-    LONG_DEFAULTS,
-    SHORT_DEFAULTS,
+    BOTH,
     STOCK_AVERAGED,
     STUDY_ARMS,
     UNHELD,
@@ -31,7 +30,7 @@ from studies.scenes.arms import (
     last_phases,
     whole_trainings,
 )
-from studies.scenes.arms import BOTH as DEFAULT_ARM
+from studies.scenes.arms import DEFAULTS as DEFAULT_ARM
 from studies.scenes.decisions import COMPARISONS, MANY_VIEWS_SCENES, decide, every_scene, points_of
 from studies.scenes.long_tables import (
     difference,
@@ -77,11 +76,9 @@ def test_the_defaults_are_what_the_page_concludes() -> None:
     decided = {part: decision.on for part, decision in decide(report.rotating_study()).items()}
     committed = json.loads((report.FOLDER / "decisions.json").read_text(encoding="utf-8"))
     assert committed == decided
-    short = " in short runs"  # of a part that acts in those alone
-    assert {
-        type(part).__name__ + short * (getattr(part, "longest", None) is not None)
-        for part in DEFAULTS
-    } == {part for part, on in decided.items() if on}
+    assert {type(part).__name__ for part in DEFAULTS} == {
+        part for part, on in decided.items() if on
+    }
 
 
 def test_every_rotated_training_is_of_a_stage() -> None:
@@ -95,13 +92,9 @@ def test_every_rotated_training_is_of_a_stage() -> None:
 
 
 def test_the_defaults_are_the_measured_arm() -> None:
-    measured = find_study_arm(SHORT_DEFAULTS).parts
-    long = find_study_arm(LONG_DEFAULTS).parts
+    measured = find_study_arm(DEFAULT_ARM).parts
     assert measured is not None
-    assert long is not None
-    annealing, *others = DEFAULTS
-    assert measured(300, None) == [replace(annealing, longest=None), *others]
-    assert long(300, None) == others
+    assert measured(300, None) == list(DEFAULTS)
     cloning = find_study_arm("adc+defaults-but-scales+averaged").parts
     assert cloning is not None
     assert cloning(300, None) == list(DEFAULTS_ADC)
@@ -165,7 +158,7 @@ def test_a_guard_is_on_unless_it_loses(psnr: tuple[float, ...], on: bool) -> Non
     every = []
     for scene, end in zip(MANY_VIEWS_SCENES, psnr, strict=True):
         for seed in (0, 1):
-            with_it = rotated_record(DEFAULT_ARM, scene, seed, psnr=end)
+            with_it = rotated_record(BOTH, scene, seed, psnr=end)
             every += [with_it, rotated_record(UNHELD, scene, seed)]
     cut = [replace(r, setting=replace(r.setting, tiled=9)) for r in every]
     decision = decide(Study(cut))["OutOfView"]
@@ -180,20 +173,20 @@ def test_a_cost_that_was_not_measured_is_the_controls() -> None:
     study = Study([], {("plush", "images_4", 7_500, 0, 0, "faded"): 1.25})
     assert study.cost(setting, "faded") == 1.25
     assert study.cost(replace(setting, sh_degree=3), "faded") == 1.0
-    assert study.cost(setting, DEFAULT_ARM, "faded") == 1.0
-    assert study.cost(setting, DEFAULT_ARM) == 1.0
+    assert study.cost(setting, BOTH, "faded") == 1.0
+    assert study.cost(setting, BOTH) == 1.0
 
 
 def test_what_averaging_adds_in_the_end_counts_at_equal_seconds() -> None:
     """At 4/5 of the iterations, where its own curve is that of the iterates yet."""
-    arms = {"faded": 22.0, LONG_DEFAULTS: 22.4, BASELINE: 20.0, STOCK_AVERAGED: 20.1}
+    arms = {"faded": 22.0, DEFAULT_ARM: 22.4, BASELINE: 20.0, STOCK_AVERAGED: 20.1}
     records = [rotated_record(arm, "plush", 0, psnr=psnr) for arm, psnr in arms.items()]
     setting = records[0].setting
     study = Study(records, {("plush", "images_4", 7_500, 0, 0, "faded"): 1.25})
-    found = difference(study, [setting], LONG_DEFAULTS, STOCK_AVERAGED)
+    found = difference(study, [setting], DEFAULT_ARM, STOCK_AVERAGED)
     assert found.cost == 1.25
     assert found.of("psnr")[0] == pytest.approx(0.2 * 10.0 + 0.8 * 22.0 + 0.4 - 20.1)
-    found = difference(study, [setting], LONG_DEFAULTS, "faded")
+    found = difference(study, [setting], DEFAULT_ARM, "faded")
     assert found.of("psnr")[0] == pytest.approx(0.4)
 
 
@@ -212,13 +205,13 @@ def test_the_longest_trainings_decide() -> None:
 
 
 def test_every_scene_and_size_has_its_line() -> None:
-    arms = ((BASELINE, 20.0), (DEFAULT_ARM, 20.5))
+    arms = ((BASELINE, 20.0), (BOTH, 20.5))
     quarter = [rotated_record(arm, "banana", 0, psnr=psnr) for arm, psnr in arms]
     half = [replace(r, setting=replace(r.setting, size="images_2", points=5_000)) for r in quarter]
     other = rotated_record(BASELINE, "plush", 0)  # has no pair
-    ended = rotated_record(LONG_DEFAULTS, "a", 0, psnr=20.6)
+    ended = rotated_record(DEFAULT_ARM, "a", 0, psnr=20.6)
     study = Study([*quarter, *half, other, replace(ended, setting=half[0].setting)])
-    arms = (DEFAULT_ARM, LONG_DEFAULTS)
+    arms = (BOTH, DEFAULT_ARM)
     table = scenes_gain_table(study, every_scene(study, 7_500), arms, BASELINE)
     ends = "20.00 / 0.700 / 0.200 | 20.50 / 0.700 / 0.200 | +0.50"
     assert table.splitlines()[2:] == [
@@ -228,7 +221,7 @@ def test_every_scene_and_size_has_its_line() -> None:
 
 
 def test_a_line_compares_arms_of_one_seed() -> None:
-    arms = (BASELINE, "faded", DEFAULT_ARM)
+    arms = (BASELINE, "faded", BOTH)
     records = [rotated_record(arm, "banana", seed) for arm in arms for seed in (0, 1)]
     others = [rotated_record(arm, "plush", 0) for arm in arms[:2]]
     study = Study([*records, *others])
@@ -239,17 +232,17 @@ def test_a_line_compares_arms_of_one_seed() -> None:
 
 
 def test_when_stocks_quality_is_reached_over_the_seeds_of_both() -> None:
-    runs = (BASELINE, 0, 20.0), (DEFAULT_ARM, 0, 30.0), (BASELINE, 1, 28.0)
+    runs = (BASELINE, 0, 20.0), (BOTH, 0, 30.0), (BASELINE, 1, 28.0)
     study = Study([rotated_record(arm, "a", seed, psnr=psnr) for arm, seed, psnr in runs])
-    said = reach_table(study, study.all_settings(), [BASELINE, DEFAULT_ARM], [3_000, 5_000])
+    said = reach_table(study, study.all_settings(), [BASELINE, BOTH], [3_000, 5_000])
     assert "| 20.00 dB (1) | `annealed` | x0.50 of its seconds | - | - |" in said
-    shorter = rotated_record(DEFAULT_ARM, "a", 0, psnr=21.0)
+    shorter = rotated_record(BOTH, "a", 0, psnr=21.0)
     shorter = replace(shorter, setting=replace(shorter.setting, iterations=5_000))
-    costs = {("a", "images_4", 3_000, 0, 0, DEFAULT_ARM): 1.2}
+    costs = {("a", "images_4", 3_000, 0, 0, BOTH): 1.2}
     both = Study([*study.records(), shorter], costs)
-    said = reach_table(both, study.all_settings(), [DEFAULT_ARM], [3_000, 5_000])
+    said = reach_table(both, study.all_settings(), [BOTH], [3_000, 5_000])
     assert "| `annealed` | x0.50 of its seconds | - | +1.00 dB in x0.80 |" in said
-    defaults = replace(study.runs(study.all_settings()[0], DEFAULT_ARM)[0], arm=LONG_DEFAULTS)
+    defaults = replace(study.runs(study.all_settings()[0], BOTH)[0], arm=DEFAULT_ARM)
     averaged = Study([*study.records(), defaults])
     first = headline_table(averaged, study.all_settings(), 3_000).splitlines()[2:4]
     assert first == [
