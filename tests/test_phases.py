@@ -220,7 +220,8 @@ def test_presets() -> None:
     assert (short.switch_step, warmup.warmup) == (2_900, 250)
     assert PhaseScheduler(10).parts == [*DEFAULTS] == [Fading(), OutOfView(), Averaging()]
     assert PhaseScheduler(10, parts=[]).parts == []
-    assert PhaseScheduler(10, parts=[*DEFAULTS, ConstantMultiplier(2.0)]).parts[-1].value == 2.0
+    more = ConstantMultiplier(2.0)
+    assert PhaseScheduler(10, parts=[*DEFAULTS, more]).parts[-1] == more
 
 
 def test_optimizers_that_cannot_be_upgraded_are_named() -> None:
