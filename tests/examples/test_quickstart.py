@@ -11,7 +11,7 @@ import quickstart
 def test_it_fits_prints_and_draws(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(quickstart, "ITERATIONS", 200)
+    monkeypatch.setattr(quickstart, "ITERATIONS", 400)
     picture = tmp_path / "new" / "quick"  # no suffix: written as named
     assert quickstart.main(["-o", str(picture)]) == 0
     stock, ours, written = capsys.readouterr().out.splitlines()
