@@ -101,7 +101,7 @@ _ARMS = (
     Arm("opt3dgs", "every part of the paper, settings measured on the run", opt3dgs),
     Arm(
         DEFAULT_ARM,
-        "the package's: all but the positions annealed, moments faded",
+        "the package's: moments faded, the last iterates averaged",
         lambda _iterations, _nu: [*DEFAULTS],
     ),
 )

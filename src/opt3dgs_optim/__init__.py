@@ -1,4 +1,4 @@
-"""Optimizers for 3D Gaussian Splatting trainers: Opt3DGS (AAAI 2026), fading, annealing."""
+"""Optimizers for 3D Gaussian Splatting trainers: Opt3DGS (AAAI 2026), fading, averaging."""
 
 from opt3dgs_optim.awsgld import AWSGLD
 from opt3dgs_optim.backend import backend_info
