@@ -63,10 +63,13 @@ ANNEALING = Annealing(4.0, 0.4, 1.0, names=("scales", "quats", "opacities", "sh0
 ANNEALING_BUT_OPACITIES = Annealing(4.0, 0.4, 1.0, names=("scales", "quats", "sh0", "shN"))
 ANNEALING_OF_ALL = Annealing(4.0, 0.4, 1.0, GAUSSIAN)
 FADING = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=300)
-BUT_SCALES = (
-    Annealing(4.0, 0.4, 1.0, names=("quats", "opacities", "sh0", "shN")),
+FADED_BUT_SCALES = (
     replace(FADING, names=("means", "quats", "opacities", "sh0", "shN")),
     OutOfView(),
+)
+BUT_SCALES = (
+    Annealing(4.0, 0.4, 1.0, names=("quats", "opacities", "sh0", "shN")),
+    *FADED_BUT_SCALES,
 )
 FADING_EARLY = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=140, stop=0.25)
 
@@ -170,6 +173,7 @@ def adaptive() -> list[StudyArm]:
     kinds = {
         "": None,
         "+faded": of(FADING),
+        "+faded-but-scales": of(*FADED_BUT_SCALES),
         "+annealed": of(ANNEALING),
         "+annealed-but-opacities": of(ANNEALING_BUT_OPACITIES),
         "+defaults": with_fading(FADING),
@@ -189,6 +193,7 @@ def averaged() -> list[StudyArm]:
         DEFAULTS: (FADED, (FADING, OutOfView())),
         BOTH_AVERAGED: (BOTH, (ANNEALING, FADING, OutOfView())),
         "adc+averaged": ("adc", ()),
+        "adc+faded-but-scales+averaged": ("adc+faded-but-scales", FADED_BUT_SCALES),
         "adc+defaults-but-scales+averaged": ("adc+defaults-but-scales", BUT_SCALES),
     }
     return [
