@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import torch
 from hosts.trials import ITERATIONS, TRIALS, Done, Nerfstudio, Outcome, Trial
 
-from opt3dgs_optim import DEFAULTS, __version__
+from opt3dgs_optim import __version__
 from opt3dgs_optim.hosts import diff
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "hosts" / "survey.md"
@@ -37,6 +37,8 @@ OTHERS = re.compile(
 MORE = ("sugar_trainers/*.py", "nerfstudio/engine/trainer.py", "internal/gaussian_splatting.py")
 GROUPS = re.compile(r" \(all: [^)]*\)")  # the names of an optimizer's groups: long
 STOPS = re.compile(r"(?<=stops: )(\w+):.*")  # what an exception says after its name
+SAYS_PARTS = re.compile(r"opt3dgs_optim .*, parts (.*), in the steps of ")
+PART = re.compile(r"(\w+)\(")
 PAGE_TEXT = """# Which trainers were tried
 
 `python examples/hosts/survey.py --trainers DIR --write` makes this page \
@@ -126,7 +128,8 @@ def keep(trial: Trial, trainers: Path, scene: str, got: Outcome) -> None:
     row: dict[str, Any] = {"name": trial.name, "commit": commit_of(trainers / trial.trainer)}
     row |= {"date": datetime.date.today().isoformat(), "torch": torch.__version__}
     row |= {"stock": _shown(got.stock), "ours": _shown(got.ours)}
-    row["parts"] = ", ".join(type(part).__name__ for part in DEFAULTS)
+    said = SAYS_PARTS.search(got.ours.output)
+    row["parts"] = ", ".join(PART.findall(said[1])) if said else "-"
     row |= {"checkpoint": "yes" if got.checkpoint else "-", "resume": "-"}
     if got.own and got.theirs:
         row["resume"] = f"own: {_shown(got.own)}; stock's: {_shown(got.theirs)}"
@@ -179,7 +182,8 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
         version=__version__,
         today=datetime.date.today().isoformat(),
         **{key: trials[key] for key in ("iterations", "scene", "machine")},
-        **{key: _span(trials, key) for key in ("parts", "date", "torch")},
+        **{key: _span(trials, key) for key in ("date", "torch")},
+        parts="; ".join(sorted({row["parts"] for row in trials["rows"]} - {"-"})),
         ran="".join(ran),
         counts=(len(trials["rows"]), len(TRIALS), saved, len(rows), len(names), len(edited)),
         diffs="".join(diffs),
