@@ -160,15 +160,22 @@ def metrics_table(
 def headline_table(study: Study, long: Sequence[Setting], short: int) -> str:
     """Stock beside the defaults at both lengths: what a reader sees first.
 
-    Means over the seeds that both have, since a seed has held-out views of its own.
+    Means over the seeds that all of a scene's trainings have, since a seed has held-out views of
+    its own.
     """
-    rows = []
-    for count in (long[0].iterations, short) if long else ():
-        settings = [replace(setting, iterations=count) for setting in long]
-        pairs = difference(study, settings, DEFAULTS, BASELINE).pairs
-        for what, ours in (("stock", False), ("**defaults**", True)):
-            found = [[a if ours else b for a, b, _ in pairs.get(s.scene, [])] for s in settings]
-            rows.append((f"{what}, {count:,}", *(_cell(records, seeds=False) for records in found)))
+    lengths = (long[0].iterations, short) if long else ()
+    whats = {"stock": BASELINE, "**defaults**": DEFAULTS}
+    columns: list[list[str]] = []
+    for setting in long:
+        of = [
+            study.runs(replace(setting, iterations=count), arm)
+            for count in lengths
+            for arm in whats.values()
+        ]
+        shared = set.intersection(*map(set, of))
+        columns.append([_cell([runs[seed] for seed in sorted(shared)]) for runs in of])
+    heads = [f"{what}, {count:,}" for count in lengths for what in whats]
+    rows = list(zip(heads, *columns, strict=True))
     return table(["iterations", *(setting.scene for setting in long)], "l", rows)
 
 
@@ -239,7 +246,8 @@ def reach_table(
             pairs = found.pairs.get(setting.scene, [])
             if not pairs:
                 continue
-            reached = [ours.reached(theirs.final) for ours, theirs, _ in pairs]
+            runs = study.runs(setting, arm)  # the iterates, of an arm that ends at their mean
+            reached = [runs[ours.seed].reached(theirs.final) for ours, theirs, _ in pairs]
             known = [iteration for iteration in reached if iteration is not None]
             said, beside = "never", []
             if len(known) == len(reached):
@@ -256,12 +264,12 @@ def reach_table(
     return table([*heads, *(f"trained for {n:,} iterations only" for n in shorter)], "l", rows)
 
 
-def _cell(records: Sequence[Record], *, gaussians: bool = False, seeds: bool = True) -> str:
+def _cell(records: Sequence[Record], *, gaussians: bool = False) -> str:
     if not records:
         return "-"
     values = [fmean(float(r.curve[m][-1]) for r in records) for m in METRICS]
     psnr, ssim, lpips = values
-    of = f" ({len(records)} seeds)" if seeds and len(records) > 1 else ""
+    of = f" ({len(records)} seeds)" if len(records) > 1 else ""
     count = fmean(float(r.curve["num_points"][-1]) for r in records)
     beside = f", {count:,.0f} Gaussians" if gaussians else ""
     return f"{psnr:.2f} / {ssim:.3f} / {lpips:.3f}{beside}{of}"

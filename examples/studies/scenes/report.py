@@ -113,7 +113,7 @@ OFTEN_ARMS = (
     *(BASELINE, SHARE_KEPT, SMALLER_SHARE, SELDOM_FADED, OFTEN_FADED, MORE_AT_ONCE),
     *(*UNFADED.values(), BOTH),
 )
-REACH_ARMS = (FADED, BOTH)
+REACH_ARMS = (DEFAULTS, BOTH)
 
 
 def tables(study: Study) -> dict[str, str]:

@@ -242,12 +242,19 @@ def test_when_stocks_quality_is_reached_over_the_seeds_of_both() -> None:
     both = Study([*study.records(), shorter], costs)
     said = reach_table(both, study.all_settings(), [BOTH], [3_000, 5_000])
     assert "| `annealed` | x0.50 of its seconds | - | +1.00 dB in x0.80 |" in said
-    defaults = replace(study.runs(study.all_settings()[0], BOTH)[0], arm=DEFAULT_ARM)
-    averaged = Study([*study.records(), defaults])
-    first = headline_table(averaged, study.all_settings(), 3_000).splitlines()[2:4]
-    assert first == [
-        "| stock, 7,500 | 20.00 / 0.700 / 0.200 |",
-        "| **defaults**, 7,500 | 30.00 / 0.700 / 0.200 |",
+
+
+def test_the_headline_is_of_the_seeds_that_every_line_has() -> None:
+    runs = (BASELINE, 0, 20.0), (BASELINE, 1, 28.0), (DEFAULT_ARM, 0, 30.0), (DEFAULT_ARM, 1, 31.0)
+    long = [rotated_record(arm, "a", seed, psnr=psnr) for arm, seed, psnr in runs]
+    setting = replace(long[0].setting, iterations=3_000)
+    short = [replace(r, setting=setting) for r in long if (r.arm, r.seed) != (BASELINE, 1)]
+    rest = " / 0.700 / 0.200 |"
+    assert headline_table(Study([*long, *short]), [long[0].setting], 3_000).splitlines()[2:] == [
+        f"| stock, 7,500 | 20.00{rest}",
+        f"| **defaults**, 7,500 | 30.00{rest}",
+        f"| stock, 3,000 | 20.00{rest}",
+        f"| **defaults**, 3,000 | 30.00{rest}",
     ]
 
 
