@@ -183,6 +183,21 @@ def test_with_masks_rows_take_their_means_as_views_see_them() -> None:
         assert not torch.equal(param[8:], mean[8:])
 
 
+def test_what_is_infinite_stays() -> None:
+    """gsplat's `--app_opt` takes the logit of the points' colours, and some are 0 or 1."""
+    x = Parameter(torch.tensor([[0.0, float("inf"), -float("inf")], [1.0, 2.0, 3.0]]))
+    phases = only(TOTAL, LastHalf())
+    (adam,) = phases.upgrade({"sh0": torch.optim.Adam([x], lr=0.1)}).values()
+    for _ in range(TOTAL):
+        x.grad = torch.where(x.detach().isinf(), 0.0, 1.0)
+        phases.observe(0.1)
+        adam.step()
+    assert x[0, 1:].tolist() == [float("inf"), -float("inf")]
+    finite, mean = x.isfinite(), adam.state[x]["mean_iterate"]
+    assert int(finite.sum()) == 4
+    assert torch.equal(x[finite], mean[finite])
+
+
 def test_half_precision_is_averaged_in_single() -> None:
     x = Parameter(torch.full((4, 3), 100.0, dtype=torch.bfloat16))
     phases = only(400, AveragedThroughout())

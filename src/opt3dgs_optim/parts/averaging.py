@@ -18,10 +18,10 @@ class Averaging(Part):
     """Put the mean of the last iterates in the place of the last one (Polyak and Juditsky 1992).
 
     Every step follows one view, so the parameters wander about what fits all of them, the further
-    the higher their learning rates; the mean does not (for networks: Izmailov et al., UAI 2018).
-    It is that of the last thirtieth of the run, and takes their place in the last tenth of that,
-    in rows that a mask lets move there. Until then nothing is changed. Where density control edits
-    rows meanwhile, it begins anew. It takes the parameters' memory once more.
+    the higher their learning rates; the mean does not. That of the last thirtieth of the run takes
+    their place in the last tenth of it, in rows that a mask lets move; what is infinite, as colours
+    of gsplat's `--app_opt`, stays, and edited rows begin anew. Until then nothing is changed. It
+    takes the parameters' memory once more.
     """
 
     share: ClassVar[float] = 1 / 30  # of the run
@@ -38,7 +38,7 @@ class Averaging(Part):
             state[MEAN] = torch.zeros_like(param, dtype=torch.float32)
             state[COUNT] = torch.zeros(param.shape[:1], device=param.device)
             return
-        mean, count = state[MEAN], state[COUNT].add_(course.valid)
-        mean.lerp_(param.float(), course.valid / shaped(count.clamp(min=1.0), mean))
+        mean, count = state[MEAN], shaped(state[COUNT].add_(course.valid), param)
+        mean.lerp_(param.float(), course.valid / count.clamp(min=1.0))
         if left <= max(2, length / 10):  # trainers save before the last step, or do not make it
-            param.copy_(torch.where(shaped(count > 0, mean) & course.valid, mean, param))
+            param.copy_(torch.where(mean.isfinite() & course.valid, mean, param))
