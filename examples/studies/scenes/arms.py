@@ -47,6 +47,7 @@ ANNEALED = "annealed-4-opacities-1+faded"  # the defaults until the views rotate
 SHORT_LABEL = "annealed-all"
 BOTH_POOLED = f"{BOTH}+pooled"
 UNHELD = f"{BOTH}-without-out-of-view"
+HELD = f"{FADED}+out-of-view"  # where views see little; elsewhere it is `FADED`, bit for bit
 STABLE = "awsgld-stable"  # its histogram follows the energy; that of the arms before it did not
 # Where points are many, fading kills a great part of them again and again: what may spare them.
 UNFADED = {name: f"{BOTH}-{name}-unfaded" for name in ("means", "opacities")}
@@ -133,6 +134,7 @@ def whole_trainings() -> dict[str, MakeParts | None]:
         "own-step": fixed(OwnStep),
         OWN_STEP: lambda _iterations, _nu: [OwnStep(), FADING],
         "out-of-view": of(OutOfView()),
+        HELD: of(FADING, OutOfView()),
         "nu-per-view": lambda iterations, _nu: [ViewHistogram(_warmup(iterations))],
         "nu-per-point": fixed(NuPerPoint),
         "nu-restarted": lambda iterations, _nu: [RestartedHistogram(_warmup(iterations))],
@@ -191,6 +193,7 @@ def averaged() -> list[StudyArm]:
         STOCK_AVERAGED: (BASELINE, ()),
         # As was trained without `OutOfView`, which changes no bit of whole views.
         DEFAULTS: (FADED, (FADING, OutOfView())),
+        f"{HELD}+averaged": (HELD, (FADING, OutOfView())),
         BOTH_AVERAGED: (BOTH, (ANNEALING, FADING, OutOfView())),
         "adc+averaged": ("adc", ()),
         "adc+faded-but-scales+averaged": ("adc+faded-but-scales", FADED_BUT_SCALES),
