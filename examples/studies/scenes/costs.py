@@ -109,7 +109,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not made:
         raise ValueError(f"--runs {args.runs}: holds no scene with {BASELINE} and another arm")
     old = json.loads(COSTS.read_text(encoding="utf-8")) if COSTS.exists() else []
-    entries = {costed(entry): entry for entry in (*old, *made)}  # the new take their place
+    entries = {costed(entry): entry for entry in old}
+    for entry in made:  # what other arms cost stays
+        known = entries.get(costed(entry), {}).get("shares", {})
+        entries[costed(entry)] = {
+            **entry,
+            "shares": dict(sorted({**known, **entry["shares"]}.items())),
+        }
     text = json.dumps([entries[key] for key in sorted(entries)], indent=1)
     COSTS.write_text(text + "\n", encoding="utf-8")
     print(COSTS)
