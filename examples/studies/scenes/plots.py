@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from studies.scenes.analysis import Gain, Study
-from studies.scenes.arms import ANNEALED, BASELINE, BOTH, FADED, label
+from studies.scenes.arms import ANNEALED, BASELINE, BOTH, DEFAULTS, FADED, label
 from studies.scenes.decisions import points_of
 from studies.scenes.long_tables import difference
 from studies.scenes.records import Record, Setting
@@ -25,7 +25,8 @@ COLOURS = {
     "rates-x2": "#f0e442",
     "annealed-8-0.4": "#999999",
     ANNEALED: "#56b4e9",
-    BOTH: "#0072b2",
+    DEFAULTS: "#0072b2",
+    "paper": "#d55e00",
     FADED: "#cc79a7",
     f"{ANNEALED}+pooled": "#009e73",
 }
@@ -85,11 +86,19 @@ def plot_curves(study: Study, settings: Sequence[Setting], arms: Sequence[str], 
 
 
 def plot_metrics(
-    study: Study, settings: Sequence[Setting], arms: Sequence[str], path: Path
+    study: Study,
+    settings: Sequence[Setting],
+    arms: Sequence[str],
+    path: Path,
+    shorter: Sequence[int] = (),
 ) -> None:
     """PSNR and LPIPS of the held-out views over stock's seconds, a column per scene.
 
     Means over the seeds that all of a scene's arms have: a seed has held-out views of its own.
+
+    Args:
+        shorter: lengths of trainings of the last arm that were that long from their start: dots at
+            their ends, at the cost of an iteration of the first of them.
     """
     figure, axes = plt.subplots(
         2, len(settings), figsize=(3.6 * len(settings), 5.0), squeeze=False, layout="constrained"
@@ -105,6 +114,14 @@ def plot_metrics(
                 # The first looks are off the scale of what is compared.
                 axis.plot(shares[2:], mean[2:], color=COLOURS[arm], label=label(arm))
                 axis.grid(alpha=0.3)
+        for count in shorter if shared else ():
+            found = study.runs(replace(setting, iterations=count), arms[-1])
+            cost = study.cost(replace(setting, iterations=shorter[0]), arms[-1])
+            for axis, metric in zip(column, ("psnr", "lpips"), strict=True):
+                ends = [found[seed].curve[metric][-1] for seed in shared if seed in found]
+                if len(ends) == len(shared):
+                    place = count / setting.iterations * cost
+                    axis.plot(place, np.mean(ends), "o", color=COLOURS[arms[-1]])
         column[0].set_title(f"{setting.scene}, {setting.points:,} points", fontsize=10)
         column[1].set_xlabel("seconds, as a share of stock's")
     axes[0, 0].set_ylabel("test PSNR (dB)")

@@ -27,7 +27,6 @@ from studies.scenes.arms import (
     BASELINE,
     BOTH,
     DEFAULTS,
-    FADED,
     GROUPS,
     MORE_AT_ONCE,
     OFTEN_FADED,
@@ -113,7 +112,7 @@ OFTEN_ARMS = (
     *(BASELINE, SHARE_KEPT, SMALLER_SHARE, SELDOM_FADED, OFTEN_FADED, MORE_AT_ONCE),
     *(*UNFADED.values(), BOTH),
 )
-REACH_ARMS = (DEFAULTS, BOTH)
+REACH_ARMS = (DEFAULTS,)
 
 
 def tables(study: Study) -> dict[str, str]:
@@ -292,8 +291,8 @@ def plots(study: Study, rotating: Study) -> list[Path]:
         title = f"{', '.join(scenes)}\n{SHORT:,} iterations; {BASELINE} {fmean(ends):.2f} dB"
         plot_gains(gains, FOLDER / name, title)
         drawn.append(FOLDER / name)
-    arms = (BASELINE, FADED, BOTH)
-    plot_metrics(rotating, settings_of(rotating, LONG), arms, FOLDER / "rotated.png")
+    arms = (BASELINE, "paper", DEFAULTS)
+    plot_metrics(rotating, settings_of(rotating, LONG), arms, FOLDER / "rotated.png", SHORTER)
     plot_sizes(rotating, FOLDER / "sizes.png")
     return [*drawn, FOLDER / "rotated.png", FOLDER / "sizes.png"]
 

@@ -9,6 +9,7 @@ import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,11 +18,12 @@ from splatting.arms import Arm
 from splatting.fit import Fit, FitOptions
 from splatting.scenes import load_scene
 from studies.pages import filled
-from studies.scenes import report, steps
+from studies.scenes import plots, report, steps
 from studies.scenes.analysis import Study
 from studies.scenes.arms import (
     BASELINE,
     BOTH,
+    FADED,
     STOCK_AVERAGED,
     STUDY_ARMS,
     UNHELD,
@@ -256,6 +258,27 @@ def test_the_headline_is_of_the_seeds_that_every_line_has() -> None:
         f"| stock, 3,000 | 20.00{rest}",
         f"| **defaults**, 3,000 | 30.00{rest}",
     ]
+
+
+def test_dots_are_the_ends_of_shorter_trainings_of_every_seed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    long = [rotated_record(arm, "a", seed) for arm in (BASELINE, DEFAULT_ARM) for seed in (0, 1)]
+    short = replace(long[0].setting, iterations=3_000)
+    others = [
+        replace(rotated_record(DEFAULT_ARM, "a", s, psnr=20 + s), setting=short) for s in (0, 1)
+    ]
+    panels: list[Any] = []
+    monkeypatch.setattr(plots, "_finish", lambda _figure, axis, _path: panels.append(axis))
+    costs = {("a", "images_4", 3_000, 0, 0, FADED): 1.5}
+    for known in (others, others[:1]):  # the second without one of the seeds
+        study = Study([*long, *known], costs)
+        plots.plot_metrics(study, [long[0].setting], (BASELINE, DEFAULT_ARM), tmp_path, [3_000])
+    dots = [
+        [line.get_xydata() for line in panel.lines if line.get_marker() == "o"] for panel in panels
+    ]
+    assert np.array(dots[0]).tolist() == [[[0.4 * 1.5, 20.5]]]
+    assert dots[1] == []
 
 
 def test_gain_at_equal_seconds_and_its_spread() -> None:
