@@ -17,6 +17,7 @@ from studies.scenes.arms import (
     EARLY,
     FADED,
     GROUPS,
+    HELD,
     MORE_AT_ONCE,
     OFTEN_FADED,
     OWN_STEP,
@@ -45,11 +46,12 @@ ROTATED_ARMS = (
 BRIEF_ARMS = ("mcmc", FADED, BOTH, ANNEALED, *EARLY)
 HALF_ARMS = (  # with 50,000 Gaussians
     *("mcmc", BOTH, BOTH_AVERAGED, STOCK_AVERAGED, SHARE_KEPT, SELDOM_FADED, *UNFADED.values()),
-    *("paper", "paper-constant"),
+    *(FADED, DEFAULTS, "paper", "paper-constant"),
 )
-RATES_ARMS = ("mcmc", OWN_STEP, BOTH)
+SIZE_ARMS = ("mcmc", BOTH, FADED, DEFAULTS)
+RATES_ARMS = ("mcmc", OWN_STEP, BOTH, FADED, DEFAULTS)
 UNSEEN_ARMS = ("mcmc", "out-of-view", UNHELD, BOTH)
-UNSEEN_LONG_ARMS = ("mcmc", UNHELD, BOTH)
+UNSEEN_LONG_ARMS = ("mcmc", UNHELD, BOTH, FADED, HELD, f"{HELD}+averaged")
 CROWDED_ARMS = ("mcmc", BOTH, SHARE_KEPT, UNFADED["means"])
 
 
@@ -101,7 +103,7 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
             *rotated(MANY_VIEWS_SCENES, BRIEF_ARMS, seeds, 7_500),
             *rotated(MANY_VIEWS_SCENES, [BOTH_AVERAGED, DEFAULTS], seeds, 7_500),
             *rotated(("bonsai",), [SELDOM_FADED], 1, 7_500),
-            *rotated(MANY_VIEWS_SCENES, [BOTH], 2, 10_000),
+            *rotated(MANY_VIEWS_SCENES, [BOTH, FADED, DEFAULTS], seeds, 10_000),
         ],
         "crowded": [  # 40,000 Gaussians on images of a quarter of their size
             *rotated(("bonsai",), CROWDED_ARMS, 1, 7_500, 4),
@@ -111,16 +113,16 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
             *half_size(scenes=("bonsai", "lego"), share=5),
             *half_size(scenes=("plush",), share=12.5),
         ],
-        "sh3": rotated(MANY_VIEWS_SCENES, ("mcmc", BOTH), 1, 30_000, sh_degree=3),
+        "sh3": rotated(MANY_VIEWS_SCENES, SIZE_ARMS, 1, 30_000, sh_degree=3),
         "adaptive": rotated(MANY_VIEWS_SCENES, arms["adaptive"], 1, 30_000),
         "sizes": [  # fewer Gaussians, iterations and views
-            *rotated(("bonsai",), ("mcmc", BOTH), 1, 7_500, 0.1),
-            *rotated(("bonsai",), ("mcmc", BOTH), 1, 7_500, 0.4),
-            *rotated(("bonsai",), ("mcmc", BOTH), 1, 3_000),
+            *rotated(("bonsai",), SIZE_ARMS, 1, 7_500, 0.1),
+            *rotated(("bonsai",), SIZE_ARMS, 1, 7_500, 0.4),
+            *rotated(("bonsai",), SIZE_ARMS, 1, 3_000),
             *(
                 spec
                 for views in (14, 28, 55, 110)
-                for spec in rotated(("bonsai",), ("mcmc", BOTH), 1, 7_500, views=views)
+                for spec in rotated(("bonsai",), SIZE_ARMS, 1, 7_500, views=views)
             ),
         ],
         "rates": [  # the trainer's own, all of them times a factor
