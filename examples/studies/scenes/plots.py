@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -97,8 +98,8 @@ def plot_metrics(
     Means over the seeds that all of a scene's arms have: a seed has held-out views of its own.
 
     Args:
-        shorter: lengths of trainings of the last arm that were that long from their start: dots at
-            their ends, at the cost of an iteration of the first of them.
+        shorter: lengths of trainings that were that long from their start: dots at their ends, at
+            the first length's cost of an iteration.
     """
     figure, axes = plt.subplots(
         2, len(settings), figsize=(3.6 * len(settings), 5.0), squeeze=False, layout="constrained"
@@ -114,14 +115,14 @@ def plot_metrics(
                 # The first looks are off the scale of what is compared.
                 axis.plot(shares[2:], mean[2:], color=COLOURS[arm], label=label(arm))
                 axis.grid(alpha=0.3)
-        for count in shorter if shared else ():
-            found = study.runs(replace(setting, iterations=count), arms[-1])
-            cost = study.cost(replace(setting, iterations=shorter[0]), arms[-1])
-            for axis, metric in zip(column, ("psnr", "lpips"), strict=True):
-                ends = [found[seed].curve[metric][-1] for seed in shared if seed in found]
-                if len(ends) == len(shared):
-                    place = count / setting.iterations * cost
-                    axis.plot(place, np.mean(ends), "o", color=COLOURS[arms[-1]])
+        for arm, count in itertools.product(arms if shared else (), shorter):
+            found = study.runs(replace(setting, iterations=count), arm)
+            if set(shared) <= found.keys():
+                cost = study.cost(replace(setting, iterations=shorter[0]), arm)
+                place = count / setting.iterations * cost
+                for axis, metric in zip(column, ("psnr", "lpips"), strict=True):
+                    end = np.mean([found[seed].curve[metric][-1] for seed in shared])
+                    axis.plot(place, end, "o", color=COLOURS[arm])
         column[0].set_title(f"{setting.scene}, {setting.points:,} points", fontsize=10)
         column[1].set_xlabel("seconds, as a share of stock's")
     axes[0, 0].set_ylabel("test PSNR (dB)")
