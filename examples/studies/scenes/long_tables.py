@@ -173,7 +173,7 @@ def headline_table(study: Study, long: Sequence[Setting], short: int) -> str:
             for arm in whats.values()
         ]
         shared = set.intersection(*map(set, of))
-        columns.append([_cell([runs[seed] for seed in sorted(shared)]) for runs in of])
+        columns.append([_cell([runs[seed] for seed in shared], seeds=False) for runs in of])
     heads = [f"{what}, {count:,}" for count in lengths for what in whats]
     rows = list(zip(heads, *columns, strict=True))
     return table(["iterations", *(setting.scene for setting in long)], "l", rows)
@@ -264,12 +264,12 @@ def reach_table(
     return table([*heads, *(f"trained for {n:,} iterations only" for n in shorter)], "l", rows)
 
 
-def _cell(records: Sequence[Record], *, gaussians: bool = False) -> str:
+def _cell(records: Sequence[Record], *, gaussians: bool = False, seeds: bool = True) -> str:
     if not records:
         return "-"
     values = [fmean(float(r.curve[m][-1]) for r in records) for m in METRICS]
     psnr, ssim, lpips = values
-    of = f" ({len(records)} seeds)" if len(records) > 1 else ""
+    of = f" ({len(records)} seeds)" if seeds and len(records) > 1 else ""
     count = fmean(float(r.curve["num_points"][-1]) for r in records)
     beside = f", {count:,.0f} Gaussians" if gaussians else ""
     return f"{psnr:.2f} / {ssim:.3f} / {lpips:.3f}{beside}{of}"
