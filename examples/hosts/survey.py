@@ -55,8 +55,8 @@ Parts of these runs: {parts}. {date}, torch {torch}, {machine}.
 {counts[0]} of the {counts[1]} trials in `examples/hosts/trials.py` have \
 been run for this table; {counts[2]} of them left a checkpoint. Resume: from the edited \
 trainer's own, and from the stock one's; gsplat's scripts evaluate a checkpoint and do \
-not go on from one. Where a stock run is taken over at half, annealing halves the steps \
-of the opacities, and the 30 iterations from their reset to the end are too few.
+not go on from one. With clone and split annealing slows the opacities towards the end: in so \
+few iterations after a reset, or after taking a stock run over, they stay behind stock's.
 
 ## `hosts diff` over public trainers
 
