@@ -58,7 +58,7 @@ from studies.scenes.long_tables import (
     scenes_gain_table,
     sizes_table,
 )
-from studies.scenes.plan import RATES_ARMS, UNSEEN_ARMS
+from studies.scenes.plan import RATES_ARMS, SIZE_ARMS, UNSEEN_ARMS, UNSEEN_LONG_ARMS
 from studies.scenes.plots import VIEWS, plot_curves, plot_gains, plot_metrics, plot_sizes
 from studies.scenes.records import COSTS, FOLDER, Setting, gather, merge, read, read_costs, write
 from studies.scenes.tables import (
@@ -183,10 +183,11 @@ def rotated_tables(study: Study) -> dict[str, str]:
     views = of_kind(study, Setting("bonsai", 10_000, BRIEF, "sfm", rotated=True), "views")
     views.sort(key=lambda s: s.views or VIEWS[s.scene])
     made["views"] = metrics_table(
-        study, views, (BASELINE, BOTH), head=lambda s: str(s.views or VIEWS[s.scene])
+        study, views, SIZE_ARMS, head=lambda s: str(s.views or VIEWS[s.scene])
     )
     tiled = [s for s in study.all_settings() if s.tiled]
-    made["unseen"] = metrics_table(study, tiled, (*UNSEEN_ARMS, "kept"), head=pieces)
+    cut = dict.fromkeys((*UNSEEN_ARMS, *UNSEEN_LONG_ARMS, "kept"))
+    made["unseen"] = metrics_table(study, tiled, cut, head=pieces)
     return made
 
 

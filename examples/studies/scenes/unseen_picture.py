@@ -18,13 +18,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 from splatting.stopping import command
 
-from studies.scenes.arms import BASELINE, label
-from studies.scenes.plan import UNSEEN_LONG_ARMS, folder_of
+from studies.scenes.arms import BASELINE, FADED, HELD, label
+from studies.scenes.plan import folder_of
 from studies.scenes.records import FOLDER
 from studies.scenes.training import Spec, scene_of
 
 SCENES = {"bonsai": 10_000, "plush": 4_000}  # and their Gaussians
-PIECES, SEED, VIEW = 9, 1, 4
+ARMS = (BASELINE, FADED, f"{HELD}+averaged")
+PIECES, SEED, VIEW = 9, 0, 4
 DPI = 150
 
 
@@ -37,14 +38,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     figure, axes = plt.subplots(
         len(SCENES),
-        1 + len(UNSEEN_LONG_ARMS),
+        1 + len(ARMS),
         figsize=(9, 3.3),
         squeeze=False,
         layout="constrained",
     )
     for row, (scene, points) in zip(axes, SCENES.items(), strict=True):
         like = Spec(scene, BASELINE, SEED, 30_000, points, rotated=True, tiled=PIECES)
-        for axis, arm in zip(row[1:], UNSEEN_LONG_ARMS, strict=True):
+        for axis, arm in zip(row[1:], ARMS, strict=True):
             folder = folder_of(replace(like, arm=arm), args.runs)
             found = json.loads((folder / "record.json").read_text(encoding="utf-8"))
             images = np.load(folder / "renders.npz")
