@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from studies.scenes.analysis import Gain, Study
-from studies.scenes.arms import ANNEALED, BASELINE, BOTH, DEFAULTS, FADED, label
+from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, FADED, label
 from studies.scenes.decisions import points_of
 from studies.scenes.long_tables import difference
 from studies.scenes.records import Record, Setting
@@ -137,7 +137,7 @@ def plot_sizes(study: Study, path: Path) -> None:
     """
     lines: dict[str, dict[str, dict[float, Sequence[float]]]] = {name: {} for name in SIZE_AXES}
     for setting in study.all_settings():
-        found = difference(study, [setting], BOTH, BASELINE)
+        found = difference(study, [setting], DEFAULTS, BASELINE)
         for axis, place in _places(setting).items() if found.count else ():
             pairs = found.pairs[setting.scene]
             gains = [
