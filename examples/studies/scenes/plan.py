@@ -52,7 +52,7 @@ SIZE_ARMS = ("mcmc", BOTH, FADED, DEFAULTS)
 RATES_ARMS = ("mcmc", OWN_STEP, BOTH, FADED, DEFAULTS)
 UNSEEN_ARMS = ("mcmc", "out-of-view", UNHELD, BOTH)
 UNSEEN_LONG_ARMS = ("mcmc", UNHELD, BOTH, FADED, HELD, f"{HELD}+averaged")
-CROWDED_ARMS = ("mcmc", BOTH, SHARE_KEPT, UNFADED["means"])
+CROWDED_ARMS = (*SIZE_ARMS, SHARE_KEPT, UNFADED["means"])
 
 
 @dataclass(frozen=True)
