@@ -217,6 +217,21 @@ def sizes_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) 
     return table(heads, "l", rows)
 
 
+def averaging_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) -> str:
+    """What the mean of the last iterates adds to the last one of the same trainings."""
+    rows = []
+    for setting in settings:
+        for arm in arms:
+            trunk = STUDY_ARMS[arm].averages or arm
+            found = difference(study, [setting], arm, trunk)
+            if found.count:
+                what = f"{_crowd(setting)}, {setting.iterations:,}"
+                counts = f"`{label(trunk)}`", str(found.count)
+                rows.append((setting.scene, what, *counts, *cells_of(found)))
+    heads = ("scene", "Gaussians, images, iterations", "on", "seeds", "PSNR", "SSIM", "LPIPS")
+    return table(heads, "lllrrrr", rows)
+
+
 def falls_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) -> str:
     """How far the training PSNR was below its best before, at most, over evaluations and seeds."""
     rows = []
