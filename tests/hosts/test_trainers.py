@@ -33,8 +33,9 @@ NEEDED = {
     "nerfstudio": "torchmetrics tyro cv2 sklearn yaml imageio nerfacc pytorch_msssim rawpy mediapy",
 }
 GAUSSIANS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
-# dB that a run which takes a stock one over at half may be worse: opacities that annealing slows do
-# not recover from a reset.
+OURS = 1.5  # dB that an edited run of 100 iterations may be worse than the stock one
+# Likewise one that takes a stock run over at half: opacities that annealing slows do not recover
+# from a reset.
 TAKEN_OVER = 2.5
 
 pytestmark = pytest.mark.hosts
@@ -75,10 +76,10 @@ def test_stock_edited_and_resumed(trial: Trial, scene: Path, tmp_path: Path) -> 
     assert got.ours.code == 0, got.ours.output[-3000:]
     assert f"total_steps={ITERATIONS}," in got.ours.output  # the sign of life
     assert got.checkpoint is not None
-    no_worse(got.ours, got.stock, trial.worse)
+    no_worse(got.ours, got.stock, OURS)
     if trial.gsplat:
         return
-    again = (got.own, got.ours, trial.worse), (got.theirs, got.stock, TAKEN_OVER)
+    again = (got.own, got.ours, OURS), (got.theirs, got.stock, TAKEN_OVER)
     for done, begun, allowed in again:
         assert done is not None
         assert done.code == 0, done.output[-3000:]
