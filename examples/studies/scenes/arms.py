@@ -45,7 +45,9 @@ STOCK_AVERAGED = "averaged@1/30"
 EARLY = (f"{FADED}-to-1/4", f"{BOTH}-to-1/4")  # fading ends after that share of the run
 ANNEALED = "annealed-4-opacities-1+faded"  # the defaults until the views rotated
 SHORT_LABEL = "annealed-all"
-BOTH_POOLED = f"{BOTH}+pooled"
+BOTH_POOLED = f"{BOTH}+pooled"  # retired
+POOLED = f"{FADED}+pooled"
+POOLED_AVERAGED = f"{POOLED}+averaged"  # the defaults, pooled
 UNHELD = f"{BOTH}-without-out-of-view"
 HELD = f"{FADED}+out-of-view"  # where views see little; elsewhere it is `FADED`, bit for bit
 STABLE = "awsgld-stable"  # its histogram follows the energy; that of the arms before it did not
@@ -122,7 +124,7 @@ def whole_trainings() -> dict[str, MakeParts | None]:
         ANNEALED: of(ANNEALING_OF_ALL, FADING),
         BOTH: with_fading(FADING),
         UNHELD: of(ANNEALING, FADING),
-        BOTH_POOLED: with_fading(FADING, Pooling()),
+        POOLED: of(FADING, OutOfView(), Pooling()),
         EARLY[0]: of(FADING_EARLY),
         EARLY[1]: with_fading(FADING_EARLY),
         **{name: with_fading(fading) for name, fading in faded_but.items()},
@@ -195,6 +197,7 @@ def averaged() -> list[StudyArm]:
         DEFAULTS: (FADED, (FADING, OutOfView())),
         f"{HELD}+averaged": (HELD, (FADING, OutOfView())),
         BOTH_AVERAGED: (BOTH, (ANNEALING, FADING, OutOfView())),
+        POOLED_AVERAGED: (POOLED, (FADING, OutOfView(), Pooling())),
         "adc+averaged": ("adc", ()),
         "adc+faded-but-scales+averaged": ("adc+faded-but-scales", FADED_BUT_SCALES),
         "adc+defaults-but-scales+averaged": ("adc+defaults-but-scales", BUT_SCALES),

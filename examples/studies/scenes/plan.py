@@ -12,7 +12,6 @@ from studies.scenes.arms import (
     ANNEALED,
     BOTH,
     BOTH_AVERAGED,
-    BOTH_POOLED,
     DEFAULTS,
     EARLY,
     FADED,
@@ -21,6 +20,7 @@ from studies.scenes.arms import (
     MORE_AT_ONCE,
     OFTEN_FADED,
     OWN_STEP,
+    POOLED_AVERAGED,
     SCALES_ALONE,
     SELDOM_FADED,
     SHARE_KEPT,
@@ -37,9 +37,9 @@ SCENES = ("plush", "banana", "lund_door", "brighton_beach", "embedded")
 FEW_VIEWS_SCENES = ("embedded", "banana", "lund_door", "brighton_beach")
 ROTATED_ARMS = (
     *("mcmc", FADED, BOTH, ANNEALED, "paper", "paper-constant"),
-    *(SELDOM_FADED, *UNFADED.values(), "rates-x2", BOTH_POOLED, "own-step"),
+    *(SELDOM_FADED, *UNFADED.values(), "rates-x2", "own-step"),
     *(STABLE, f"{STABLE}-constant"),
-    *(BOTH_AVERAGED, DEFAULTS, STOCK_AVERAGED),
+    *(BOTH_AVERAGED, DEFAULTS, STOCK_AVERAGED, POOLED_AVERAGED),
     *("l2@1/30", "l1+reset@1/30", "l2+reset@1/30", "l2+reset+lqn@1/30"),
     *(f"l1+reset{x}@1/{k}" for k in (4, 2) for x in ("", "+lqn", "+lqn-all")),
 )
