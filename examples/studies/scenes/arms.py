@@ -45,7 +45,6 @@ STOCK_AVERAGED = "averaged@1/30"
 EARLY = (f"{FADED}-to-1/4", f"{BOTH}-to-1/4")  # fading ends after that share of the run
 ANNEALED = "annealed-4-opacities-1+faded"  # the defaults until the views rotated
 SHORT_LABEL = "annealed-all"
-BOTH_POOLED = f"{BOTH}+pooled"  # retired
 POOLED = f"{FADED}+pooled"
 POOLED_AVERAGED = f"{POOLED}+averaged"  # the defaults, pooled
 UNHELD = f"{BOTH}-without-out-of-view"

@@ -10,11 +10,11 @@ from studies.scenes.arms import (
     BASELINE,
     BOTH,
     BOTH_AVERAGED,
-    BOTH_POOLED,
     DEFAULTS,
     FADED,
+    HELD,
+    POOLED_AVERAGED,
     STABLE,
-    UNHELD,
 )
 from studies.scenes.long_tables import Difference, difference
 from studies.scenes.records import Setting
@@ -31,16 +31,16 @@ COMPARISONS = {
     "Averaging": (DEFAULTS, FADED),
     "Annealing": (BOTH_AVERAGED, DEFAULTS),
     "Annealing of the positions": (ANNEALED, BOTH),
-    "Pooling": (BOTH_POOLED, BOTH),
+    "Pooling": (POOLED_AVERAGED, DEFAULTS),
     "EnergyHistogram": (STABLE, f"{STABLE}-constant"),
     "SquaredLoss": ("l2@1/30", BASELINE),
     "FreshMoments": ("l1+reset@1/30", BASELINE),
     "Curvature": ("l2+reset+lqn@1/30", "l2+reset@1/30"),
-    "OutOfView": (BOTH, UNHELD),
+    "OutOfView": (HELD, FADED),
 }
-# Parts that change no bit of an ordinary training, only where it would be ruined, and how many
-# pieces of every view make it one that they are for: on unless they lose.
-GUARDS = {"OutOfView": 9}
+# Parts that change no bit of an ordinary training are judged where they act: with every view cut
+# into so many.
+PIECES = {"OutOfView": 9}
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,6 @@ class Decision:
     control: str
     iterations: int | None  # None: not measured on enough scenes
     found: Difference | None
-    guard: bool = False
 
     @property
     def verdict(self) -> str:
@@ -59,15 +58,12 @@ class Decision:
         if self.found is None:
             return "too few"
         verdict, seeds = self.found.verdict, min(map(len, self.found.pairs.values()))
-        if self.guard and verdict == "no difference":
-            verdict = "loses nothing"
-        passed = verdict in ("pays", "loses nothing")
-        return f"{verdict}, one seed" if passed and seeds < MIN_SEEDS else verdict
+        return f"{verdict}, one seed" if verdict == "pays" and seeds < MIN_SEEDS else verdict
 
     @property
     def on(self) -> bool:
-        """A part that was not shown to pay is off; a guard that loses."""
-        return self.verdict in ("pays", "loses nothing")
+        """A part that was not shown to pay is off."""
+        return self.verdict == "pays"
 
 
 def points_of(scene: str) -> int:
@@ -98,14 +94,14 @@ def decide(study: Study) -> dict[str, Decision]:
     """The decision on every part, at the longest trainings that three scenes have.
 
     Each part is judged against the same training without it: the multiplier against a constant of
-    its mean, curvature against the same phase without it, annealing on top of fading, a guard
-    where it acts, on views that were cut up.
+    its mean, curvature against the same phase without it, annealing and pooling on top of the
+    defaults.
     """
     made = {}
     for part, (arm, control) in COMPARISONS.items():
-        made[part] = Decision(arm, control, None, None, guard=part in GUARDS)
+        made[part] = Decision(arm, control, None, None)
         for iterations in LENGTHS:
-            settings = settings_of(study, iterations, GUARDS.get(part, 0))
+            settings = settings_of(study, iterations, PIECES.get(part, 0))
             found = difference(study, settings, arm, control)
             if len(found.pairs) >= MIN_SCENES:
                 made[part] = replace(made[part], iterations=iterations, found=found)

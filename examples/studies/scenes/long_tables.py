@@ -179,29 +179,19 @@ def headline_table(study: Study, long: Sequence[Setting], short: int) -> str:
     return table(["iterations", *(setting.scene for setting in long)], "l", rows)
 
 
-def scenes_gain_table(
-    study: Study, settings: Sequence[Setting], arms: Sequence[str], control: str
-) -> str:
-    """One line per scene and size: the control and every arm at their ends, and the gains.
+def scenes_gain_table(study: Study, settings: Sequence[Setting], arm: str, control: str) -> str:
+    """One line per scene and size: control and arm at their ends, and the gain at equal seconds.
 
-    The arms may have other seeds, but a gain is over those that both of its trainings have.
+    All over the seeds that both have.
     """
     rows = []
     for setting in settings:
-        every = [difference(study, [setting], arm, control) for arm in arms]
-        pairs = [found.pairs.get(setting.scene, []) for found in every]
-        if any(pairs):
-            stock = _cell([theirs for _, theirs, _ in max(pairs, key=len)])
-            beside = []
-            for found, of in zip(every, pairs, strict=True):
-                beside += [_cell([ours for ours, _, _ in of]), cells_of(found)[0] if of else "-"]
-            rows.append((setting.scene, _crowd(setting), stock, *beside))
-    heads = [each for arm in arms for each in (f"`{label(arm)}`", "gain, dB")]
-    return table(
-        ("scene", "Gaussians, images", f"`{label(control)}`", *heads),
-        "lll" + "lr" * len(arms),
-        rows,
-    )
+        found = difference(study, [setting], arm, control)
+        for pairs in found.pairs.values():
+            ends = [_cell([pair[i] for pair in pairs]) for i in (1, 0)]
+            rows.append((setting.scene, _crowd(setting), *ends, cells_of(found)[0]))
+    names = f"`{label(control)}`", f"`{label(arm)}`"
+    return table(("scene", "Gaussians, images", *names, "gain, dB"), "llllr", rows)
 
 
 def sizes_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) -> str:
@@ -244,9 +234,7 @@ def falls_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) 
     return table(["scene", *(f"`{label(arm)}`" for arm in arms)], "lr", rows)
 
 
-def reach_table(
-    study: Study, long: Sequence[Setting], arms: Sequence[str], shorter: Sequence[int]
-) -> str:
+def reach_table(study: Study, long: Sequence[Setting], arm: str, shorter: Sequence[int]) -> str:
     """When an arm has the PSNR that stock has after its last iteration, as a share of its seconds.
 
     Args:
@@ -255,13 +243,10 @@ def reach_table(
     """
     total, rows = long[0].iterations if long else 0, []
     for setting in long:
-        stock = study.runs(setting, BASELINE)
-        for arm in arms:
-            found = difference(study, [setting], arm, BASELINE)
-            pairs = found.pairs.get(setting.scene, [])
-            if not pairs:
-                continue
-            runs = study.runs(setting, arm)  # the iterates, of an arm that ends at their mean
+        stock, runs = study.runs(setting, BASELINE), study.runs(setting, arm)
+        found = difference(study, [setting], arm, BASELINE)
+        for pairs in found.pairs.values():
+            # The iterates, of an arm that ends at their mean.
             reached = [runs[ours.seed].reached(theirs.final) for ours, theirs, _ in pairs]
             known = [iteration for iteration in reached if iteration is not None]
             said, beside = "never", []
@@ -274,8 +259,8 @@ def reach_table(
                 share = count / total * cost
                 beside.append(f"{fmean(gains):+.2f} dB in x{share:.2f}" if gains else "-")
             ends = f"{fmean(theirs.final for _, theirs, _ in pairs):.2f} dB ({len(pairs)})"
-            rows.append((setting.scene, ends, f"`{label(arm)}`", said, *beside))
-    heads = ["scene", f"stock, {total:,} iterations", "arm", "reaches stock's PSNR after"]
+            rows.append((setting.scene, ends, said, *beside))
+    heads = ["scene", f"stock, {total:,} iterations", f"`{label(arm)}` has that PSNR after"]
     return table([*heads, *(f"trained for {n:,} iterations only" for n in shorter)], "l", rows)
 
 

@@ -20,6 +20,7 @@ from studies.scenes.arms import (
     MORE_AT_ONCE,
     OFTEN_FADED,
     OWN_STEP,
+    POOLED,
     POOLED_AVERAGED,
     SCALES_ALONE,
     SELDOM_FADED,
@@ -39,7 +40,7 @@ ROTATED_ARMS = (
     *("mcmc", FADED, BOTH, ANNEALED, "paper", "paper-constant"),
     *(SELDOM_FADED, *UNFADED.values(), "rates-x2", "own-step"),
     *(STABLE, f"{STABLE}-constant"),
-    *(BOTH_AVERAGED, DEFAULTS, STOCK_AVERAGED, POOLED_AVERAGED),
+    *(BOTH_AVERAGED, DEFAULTS, STOCK_AVERAGED, POOLED, POOLED_AVERAGED),
     *("l2@1/30", "l1+reset@1/30", "l2+reset@1/30", "l2+reset+lqn@1/30"),
     *(f"l1+reset{x}@1/{k}" for k in (4, 2) for x in ("", "+lqn", "+lqn-all")),
 )

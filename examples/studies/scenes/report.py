@@ -27,7 +27,9 @@ from studies.scenes.arms import (
     BASELINE,
     BOTH,
     DEFAULTS,
+    FADED,
     GROUPS,
+    HELD,
     MORE_AT_ONCE,
     OFTEN_FADED,
     SELDOM_FADED,
@@ -39,9 +41,9 @@ from studies.scenes.arms import (
     label,
 )
 from studies.scenes.decisions import (
-    GUARDS,
     HALF,
     MANY_VIEWS_SCENES,
+    PIECES,
     QUARTER,
     decide,
     every_scene,
@@ -113,7 +115,7 @@ OFTEN_ARMS = (
     *(BASELINE, SHARE_KEPT, SMALLER_SHARE, SELDOM_FADED, OFTEN_FADED, MORE_AT_ONCE),
     *(*UNFADED.values(), BOTH),
 )
-REACH_ARMS = (DEFAULTS,)
+ADAPTIVE_ARMS = ("adc", "adc+defaults", "adc+defaults-but-scales+averaged")
 
 
 def tables(study: Study) -> dict[str, str]:
@@ -156,9 +158,9 @@ def rotated_tables(study: Study) -> dict[str, str]:
     every = every_scene(study, LONG)
     quarter = [setting for setting in every if setting.size == QUARTER]
     degrees = [*every, *every_scene(study, LONG, sh_degree=3)]
-    made["every-scene"] = scenes_gain_table(study, degrees, (BOTH, DEFAULTS), BASELINE)
+    made["every-scene"] = scenes_gain_table(study, degrees, DEFAULTS, BASELINE)
     made["headline"] = headline_table(study, long, BRIEF)
-    made["reach"] = reach_table(study, long, REACH_ARMS, SHORTER)
+    made["reach"] = reach_table(study, long, DEFAULTS, SHORTER)
     made["paper"] = paper_table(study, quarter)
     made["paper-brief"] = paper_table(study, quarter, brief=True)
     half = [setting for setting in every if setting.size == HALF]
@@ -177,6 +179,7 @@ def rotated_tables(study: Study) -> dict[str, str]:
     often = [s for s in study.all_settings() if s.rotated and not s.tiled and not s.views]
     made["often"] = sizes_table(study, often, OFTEN_ARMS)
     made["explorations"] = differences_table(study, brief, (STABLE, *names("explorations")))
+    made["adaptive-brief"] = metrics_table(study, long, ADAPTIVE_ARMS, seed=0)
     made["adaptive"] = metrics_table(study, long, names("adaptive"), seed=0)
     made["adaptive-again"] = metrics_table(study, long, names("adaptive"), seed=1)
     made["never-reset"] = metrics_table(study, long, names("never-reset"), seed=0)
@@ -190,6 +193,8 @@ def rotated_tables(study: Study) -> dict[str, str]:
     tiled = [s for s in study.all_settings() if s.tiled]
     cut = dict.fromkeys((*UNSEEN_ARMS, *UNSEEN_LONG_ARMS, "kept"))
     made["unseen"] = metrics_table(study, tiled, cut, head=pieces)
+    nine = [s for s in tiled if s.tiled == PIECES["OutOfView"] and s.iterations == LONG]
+    made["unseen-brief"] = metrics_table(study, nine, (BASELINE, FADED, f"{HELD}+averaged"))
     return made
 
 
@@ -219,7 +224,7 @@ def decisions_table(study: Study) -> str:
             count = f"{len(found.pairs)}, {found.count}"
             shown = [f"{decision.iterations:,}", count, *cells_of(found)]
         on = "on" if decision.on else "off"
-        brief = settings_of(study, BRIEF, GUARDS.get(part, 0))
+        brief = settings_of(study, BRIEF, PIECES.get(part, 0))
         beside = difference(study, brief, decision.arm, decision.control)
         short = cells_of(beside)[0] if len(beside.pairs) == len(MANY_VIEWS_SCENES) else "-"
         rows.append((part, by, *shown, f"{on} ({decision.verdict})", short))
@@ -241,18 +246,18 @@ def paper_table(study: Study, settings: Sequence[Setting], *, brief: bool = Fals
     """One line per part of the paper: what it gains over the same training without it.
 
     Args:
-        brief: the PSNR alone, without the scenes' names, for the README.
+        brief: the PSNR alone, for the README.
     """
     rows = []
     for what, arm, control in PAPER:
         found = difference(study, settings, arm, control)
         if found.count:
             psnr, *others = cells_of(found)
-            names = ", ".join(found.pairs)
-            rows.append((what, psnr) if brief else (what, names, psnr, *others))
+            counts = f"{len(found.pairs)}, {found.count}"
+            rows.append((what, psnr) if brief else (what, counts, psnr, *others))
     if brief:
         return table(("part", "PSNR, dB"), "lr", rows)
-    return table(("part", "scenes", "PSNR, dB", "SSIM", "LPIPS"), "llr", rows)
+    return table(("part", "scenes, trainings", "PSNR, dB", "SSIM", "LPIPS"), "llr", rows)
 
 
 def plots(study: Study, rotating: Study) -> list[Path]:
