@@ -188,8 +188,8 @@ def scenes_gain_table(study: Study, settings: Sequence[Setting], arm: str, contr
     for setting in settings:
         found = difference(study, [setting], arm, control)
         for pairs in found.pairs.values():
-            ends = [_cell([pair[i] for pair in pairs]) for i in (1, 0)]
-            rows.append((setting.scene, _crowd(setting), *ends, cells_of(found)[0]))
+            stock, ours = _cell([b for _, b, _ in pairs]), _cell([a for a, _, _ in pairs])
+            rows.append((setting.scene, _crowd(setting), stock, ours, cells_of(found)[0]))
     names = f"`{label(control)}`", f"`{label(arm)}`"
     return table(("scene", "Gaussians, images", *names, "gain, dB"), "llllr", rows)
 
