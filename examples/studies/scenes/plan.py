@@ -90,7 +90,7 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         group: [arm.name for arm in found if not arm.retired] for group, found in GROUPS.items()
     }
     two, rotated = ["mcmc", ANNEALED], partial(cross, rotated=True)
-    half_size = partial(rotated, arms=HALF_ARMS, seeds=1, iterations=30_000, size="images_2")
+    half_size = partial(rotated, iterations=30_000, size="images_2")
     return {
         "rotated": [
             spec
@@ -111,8 +111,10 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
             *rotated(("plush",), CROWDED_ARMS, 1, 7_500, 10),
         ],
         "half-size": [
-            *half_size(scenes=("bonsai", "lego"), share=5),
-            *half_size(scenes=("plush",), share=12.5),
+            spec
+            for chosen, count in ((HALF_ARMS, 1), (("mcmc", DEFAULTS), seeds))
+            for scenes, share in ((("bonsai", "lego"), 5), (("plush",), 12.5))
+            for spec in half_size(scenes, chosen, count, share=share)
         ],
         "sh3": rotated(MANY_VIEWS_SCENES, SIZE_ARMS, 1, 30_000, sh_degree=3),
         "adaptive": rotated(MANY_VIEWS_SCENES, arms["adaptive"], 1, 30_000),
