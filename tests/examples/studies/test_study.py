@@ -37,6 +37,7 @@ from studies.scenes.long_tables import (
     difference,
     headline_table,
     reach_table,
+    same_start,
     scenes_gain_table,
     sizes_table,
 )
@@ -189,6 +190,20 @@ def test_what_averaging_adds_in_the_end_counts_at_equal_seconds() -> None:
     assert found.of("psnr")[0] == pytest.approx(0.2 * 10.0 + 0.8 * 22.0 + 0.4 - 20.1)
     found = difference(study, [setting], DEFAULT_ARM, "faded")
     assert found.of("psnr")[0] == pytest.approx(0.4)
+
+
+def test_a_branch_is_not_compared_with_a_trunk_that_was_trained_again() -> None:
+    branch, trunk = (rotated_record(arm, "plush", 0) for arm in ("l2@1/30", BASELINE))
+    again = replace(trunk, curve=trunk.curve | {"psnr": trunk.curve["psnr"] + 0.1})
+    assert difference(Study([branch, trunk]), [trunk.setting], branch.arm).count == 1
+    assert difference(Study([branch, again]), [trunk.setting], branch.arm).count == 0
+
+
+def test_means_of_iterates_are_of_the_trunks_in_the_records() -> None:
+    study = report.rotating_study()
+    for ours in study.records():
+        if trunk := STUDY_ARMS[ours.arm].averages:
+            assert same_start(ours, study.runs(ours.setting, trunk)[ours.seed]), ours
 
 
 def test_the_longest_trainings_decide() -> None:
