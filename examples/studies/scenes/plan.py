@@ -112,7 +112,7 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         ],
         "half-size": [
             spec
-            for chosen, count in ((HALF_ARMS, 1), (("mcmc", DEFAULTS), seeds))
+            for chosen, count in ((HALF_ARMS, 1), (("mcmc", STOCK_AVERAGED, DEFAULTS), seeds))
             for scenes, share in ((("bonsai", "lego"), 5), (("plush",), 12.5))
             for spec in half_size(scenes, chosen, count, share=share)
         ],
