@@ -8,8 +8,8 @@ from torch import Tensor
 
 from opt3dgs_optim.checks import check_choice, warn_user
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.lending import AdamOptions
-from opt3dgs_optim.names import SLOT
+from opt3dgs_optim.names import gaussian_of
+from opt3dgs_optim.overrides import AdamOptions
 from opt3dgs_optim.part import Group, Part
 from opt3dgs_optim.parts.histogram import EnergyHistogram
 from opt3dgs_optim.parts.noise import IsotropicNoise, PositionNoise
@@ -88,7 +88,8 @@ class AWSGLD(StepAdam):
     def acts_on(self, part: Part, group: Group) -> bool:
         """All parts on all groups, but the positions' noise on positions."""
         if isinstance(part, PositionNoise):
-            return group[SLOT] == "means" or (len(self.param_groups) == 1 and group[SLOT] is None)
+            name = gaussian_of(group)
+            return name == "means" or (len(self.param_groups) == 1 and name is None)
         return True
 
     def __getstate__(self) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import os
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
+from numbers import Integral, Real
 from typing import Any
 
 import torch
@@ -24,7 +25,7 @@ def check_number(
     open_high: bool = False,
 ) -> float:
     """Return `value` as a float, or raise ValueError if it lies outside the interval."""
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    number = isinstance(value, Real) and not isinstance(value, bool)  # numpy's scalars, too
     outside = not number or not low <= value <= high or not math.isfinite(value)
     if outside or (open_low and value == low) or (open_high and value == high):
         left, right = ("(" if open_low else "["), (")" if open_high else "]")
@@ -36,11 +37,11 @@ def check_number(
 
 def check_count(call: str, name: str, value: Any, low: int, high: int | None = None) -> int:
     """Return `value` as an int, or raise ValueError unless it is an integer in low..high."""
-    whole = isinstance(value, int) and not isinstance(value, bool)
+    whole = isinstance(value, Integral) and not isinstance(value, bool)  # numpy's, too
     if not whole or value < low or (high is not None and value > high):
         allowed = f"at least {low}" if high is None else f"in {low}..{high}"
         raise ValueError(f"{call}: {name}={value!r}, but an integer {allowed} is needed")
-    return value
+    return int(value)
 
 
 def check_choice(call: str, name: str, value: Any, allowed: Sequence[Any] = (True, False)) -> Any:

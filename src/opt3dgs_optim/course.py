@@ -1,20 +1,46 @@
 """The course of a training: its clock, its parts, and the energy observed last."""
 
+from __future__ import annotations
+
 import math
-from collections.abc import Iterable, Mapping
-from typing import Any, TypeVar
+import weakref
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import LOGGER, check_count, check_keys
-from opt3dgs_optim.part import Part, Phase, overrides
+from opt3dgs_optim.checks import LOGGER, check_count, check_keys, check_number
+from opt3dgs_optim.names import gaussian_of, set_of
+from opt3dgs_optim.part import Kept, Part, Phase, Window, overrides
+from opt3dgs_optim.state import ADAM_KEYS, key_of
 
-HOOKS = ("observe", "pixel_loss", "factor", "before", "after", "numbers")
-CHECK_STEPS = 100  # iterations between two looks at the parts' evidence
-FORMAT = 2  # of a checkpoint
+if TYPE_CHECKING:
+    from opt3dgs_optim.stepadam import StepAdam
+
+HOOKS = ("observe", "pixel_loss", "factor", "before", "displacement", "after", "numbers")
+EVIDENCE_INTERVAL = 100  # iterations between two looks at the parts' evidence
+FORMAT = 3  # of a checkpoint
+READABLE_FORMATS = (2, 3)
 STATE_KEY = "opt3dgs"  # in param_groups[0] of an optimizer's state_dict: the course's state
+NEVER = 2**62  # an iteration that no training reaches
+MAX_CACHED_PLACES = 64
 P = TypeVar("P", bound=Part)
+
+
+class Place(NamedTuple):
+    """Where a Gaussian parameter stands: which set of Gaussians, which tensor of its group."""
+
+    set_name: str  # "" where an optimizer holds one set
+    index: int
+
+
+class Change(NamedTuple):
+    """A part that was switched off or on again."""
+
+    event: str  # "switched_off" or "switched_on"
+    part: str
+    reason: str
 
 
 class Course:
@@ -28,6 +54,7 @@ class Course:
 
     Raises:
         TypeError: one of the parts is none.
+        ValueError: a part occurs twice, or declares what it keeps in a way that cannot be.
     """
 
     def __init__(
@@ -38,31 +65,65 @@ class Course:
         switch_step: int | None = None,
         adaptive: bool = False,
     ) -> None:
-        self.parts = list(parts)
-        for part in self.parts:
+        call, self._parts = type(self).__name__, tuple(parts)
+        for part in self._parts:
             if not isinstance(part, Part):
-                raise TypeError(f"{type(self).__name__}: parts has {part!r}, but a Part is needed")
+                raise TypeError(f"{call}: parts has {part!r}, but a Part is needed")
+            if sum(part is other for other in self._parts) > 1:
+                raise ValueError(f"{call}: parts has {part!r} twice, but each acts once per step")
         self.total_steps, self.switch_step = total_steps, switch_step or 0
         self._has_phases = switch_step is not None
-        self.keeps_state = self._has_phases or bool(self.parts)  # for a checkpoint
+        self.keeps_state = self._has_phases or bool(self._parts)  # for a checkpoint
         self.adaptive = adaptive
         self.switched_off: dict[str, str] = {}  # part's name -> why
-        self.current = -1  # the iteration observed last, whose step comes next
+        self._current = -1
         self.num_observed = 0
         self.steps = 0  # of all optimizers
+        self.rewinds = 0  # how often the clock has been set back
         self.valid: Tensor | bool = True  # whether the last energy was finite
-        self.unseen: Any = (-1, None, 1.0)  # `OutOfView`: iteration, points out of view, seen share
+        self.energy_device = torch.device("cpu")
+        self.kept_numbers: dict[str, Tensor] = {}  # what parts keep per training
+        self._published: dict[tuple[str, Place], tuple[int, Any]] = {}
+        self._places: dict[int, tuple[weakref.ref[Tensor], Place]] = {}  # id of a tensor -> where
+        self._followers: list[weakref.ref[StepAdam]] = []
+        self._named = _by_name(self._parts)
+        self.declared = {name: _declared(call, part) for name, part in self._named.items()}
+        self.row_keys = tuple(
+            key_of(name, kept)
+            for name, entries in self.declared.items()
+            for kept in entries.values()
+            if kept.per == "row"
+        )
+        self._windowed = [name for name, entries in self.declared.items() if entries]
         self._plan()
 
     def _plan(self) -> None:
         """Which parts have which hooks in which phase; a hook that nobody has is never called."""
-        on = [part for name, part in self.named().items() if name not in self.switched_off]
+        on = [part for name, part in self._named.items() if name not in self.switched_off]
         self._hooks: dict[Phase | None, dict[str, list[Part]]] = {}
         for phase in (None, *Phase):
             acting = [part for part in on if phase is None or part.during in (None, phase)]
             having = {hook: [part for part in acting if overrides(part, hook)] for hook in HOOKS}
             self._hooks[phase] = having
-        self.keys = tuple({key: None for part in self.parts for key in part.keys})
+        self.current = self._current
+
+    # -- the clock -------------------------------------------------------------------------------
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """What the steps have, in order; chosen when the course is made."""
+        return self._parts
+
+    @property
+    def current(self) -> int:
+        """The iteration observed last, whose step comes next; -1 before any."""
+        return self._current
+
+    @current.setter
+    def current(self, iteration: int) -> None:
+        self._current = iteration
+        # Noted here, so that a compiled loss does not depend on the iteration but at the switch.
+        self.pixel_parts = self._hooks[self.phase_of(iteration + 1)]["pixel_loss"]
 
     @property
     def iteration(self) -> int:
@@ -80,16 +141,35 @@ class Course:
         return self.phase_of(self.current) is Phase.EXPLOITATION
 
     @property
-    def check_steps(self) -> int:
+    def evidence_interval(self) -> int:
         """Iterations between looks at the evidence: a tenth of a short exploitation."""
         left = self.total_steps - self.switch_step
-        return min(CHECK_STEPS, max(left // 10, 10)) if self.exploiting else CHECK_STEPS
+        return min(EVIDENCE_INTERVAL, max(left // 10, 10)) if self.exploiting else EVIDENCE_INTERVAL
 
     def phase_of(self, iteration: int) -> Phase | None:
         """The phase of an iteration; None where there are no phases."""
         if not self._has_phases:
             return None
         return Phase.EXPLOITATION if iteration >= self.switch_step else Phase.EXPLORATION
+
+    def window_of(self, phase: Phase | None) -> Window | None:
+        """The iterations of a phase; None for both phases, or where there are none."""
+        if phase is None or not self._has_phases:
+            return None
+        # Trainers that go on beyond total_steps stay in exploitation.
+        exploring = phase is Phase.EXPLORATION
+        return (0, self.switch_step) if exploring else (self.switch_step, NEVER)
+
+    def open_windows(self) -> dict[str, Window | None]:
+        """The window of each part that keeps something for a time, None while it is closed."""
+        found: dict[str, Window | None] = {}
+        for name in self._windowed:
+            window = self._named[name].window(self)
+            if window is not None:
+                found[name] = window if window[0] <= self.current < window[1] else None
+        return found
+
+    # -- the parts -------------------------------------------------------------------------------
 
     @property
     def hooks(self) -> dict[str, list[Part]]:
@@ -98,20 +178,92 @@ class Course:
 
     def part(self, kind: type[P]) -> P | None:
         """The first part of a class, or None."""
-        return next((part for part in self.parts if isinstance(part, kind)), None)
+        return next((part for part in self._parts if isinstance(part, kind)), None)
 
     def named(self) -> dict[str, Part]:
         """The parts by their classes' names, as in checkpoints; "#2" is the second of a class."""
-        named: dict[str, Part] = {}
-        for part in self.parts:
-            kind = type(part).__name__
-            again = sum(name.split("#")[0] == kind for name in named)
-            named[f"{kind}#{again + 1}" if again else kind] = part
-        return named
+        return dict(self._named)
+
+    def name_of(self, part: Part) -> str:
+        """The name of one of the parts."""
+        return next(name for name, known in self._named.items() if known is part)
+
+    # -- what parts know of each other, and of the Gaussians --------------------------------------
+
+    def register(self, optimizer: StepAdam) -> None:
+        """Know an optimizer whose steps have these parts, for as long as somebody else holds it."""
+        if optimizer not in self.followers():
+            self._followers.append(weakref.ref(optimizer))
+
+    def followers(self) -> list[StepAdam]:
+        """The optimizers whose steps have these parts, the latest last."""
+        return [each for ref in self._followers if (each := ref()) is not None]
+
+    @property
+    def num_lost_followers(self) -> int:
+        """How many optimizers that had these parts do not exist any more."""
+        return sum(ref() is None for ref in self._followers)
+
+    def place_of(self, param: Tensor) -> Place | None:
+        """Where a Gaussian parameter stands; None for any other tensor."""
+        known = self._places.get(id(param))
+        if known is not None and known[0]() is param:
+            return known[1]
+        place = next((place for place, _, each in self._gaussians() if each is param), None)
+        if place is not None:
+            if len(self._places) >= MAX_CACHED_PLACES:  # of tensors that density control replaced
+                self._places.clear()
+            self._places[id(param)] = weakref.ref(param), place
+        return place
+
+    def gaussians_of(self, param: Tensor) -> dict[str, Tensor]:
+        """The present tensors of the set of Gaussians that a parameter belongs to.
+
+        They are looked up in the optimizers' groups, because density control replaces them:
+        `means, scales, quats, opacities, sh0, shN` as far as optimizers of this course hold them,
+        raw, as the trainer keeps them (see `docs/hosts/other.md`). Empty for any other tensor.
+        """
+        place = self.place_of(param)
+        if place is None:
+            return {}
+        return {name: each for where, name, each in self._gaussians() if where == place}
+
+    def _gaussians(self) -> Iterator[tuple[Place, str, Tensor]]:
+        for optimizer in self.followers():
+            for group in optimizer.param_groups:
+                name = gaussian_of(group)
+                if name is not None:
+                    for index, param in enumerate(group["params"]):
+                        yield Place(set_of(group), index), name, param
+
+    def publish(self, name: str, param: Tensor, value: Any) -> None:
+        """Tell other parts something about the set of Gaussians that a parameter belongs to."""
+        place = self.place_of(param)
+        if place is not None:
+            self._published[name, place] = self.current, value
+
+    def published(self, name: str, param: Tensor, *, earlier: bool = False) -> Any:
+        """What a part has published about the Gaussians of `param` in this iteration, or None.
+
+        With `earlier`, also what it has published in an iteration before.
+        """
+        place = self.place_of(param)
+        if place is None:
+            return None
+        iteration, value = self._published.get((name, place), (self.current, None))
+        return value if earlier or iteration == self.current else None
+
+    def last_published(self, name: str) -> Any:
+        """What a part has published last under a name, about whichever Gaussians; or None."""
+        found = [entry for (key, _), entry in self._published.items() if key == name]
+        return max(found, key=lambda entry: entry[0])[1] if found else None
+
+    # -- energies --------------------------------------------------------------------------------
 
     def take(self, energy: Tensor) -> None:
         """Tell the parts that act of the energy of the iteration `current`, 0-d, detached."""
         self.num_observed += 1
+        self.energy_device = energy.device
         is_finite = math.isfinite if energy.device.type == "cpu" else torch.isfinite
         self.valid = is_finite(energy)
         for part in self.hooks["observe"]:
@@ -128,6 +280,15 @@ class Course:
             self.take(torch.as_tensor(closure_value).detach().reshape(()))
         return True
 
+    def valid_on_host(self) -> bool:
+        """Whether the last energy was finite, as the host knows it: one synchronisation an energy.
+
+        For steps that cannot be told on the device that they do not count.
+        """
+        if isinstance(self.valid, Tensor):
+            self.valid = bool(self.valid)
+        return self.valid
+
     def expect(self, steps: int) -> None:
         """Called where Adam's moments come without our state: they have made so many steps."""
 
@@ -138,17 +299,17 @@ class Course:
             columns.update(part.numbers(self))
         return columns
 
-    def judge(self, over_ranks: Any = None) -> list[tuple[str, str, str]]:
+    def judge(self, over_ranks: Any = None) -> list[Change]:
         """Switch parts off and on by their evidence: one transfer from the device.
 
-        `over_ranks` averages a tensor over the ranks, so that all decide alike. Returns (event,
-        part's name, reason) of each change.
+        `over_ranks` averages a tensor over the ranks, so that all decide alike.
         """
-        shown = [(name, part, part.evidence(self)) for name, part in self.named().items()]
+        shown = [(name, part, part.evidence(self)) for name, part in self._named.items()]
         known = [(name, part, seen) for name, part, seen in shown if seen is not None]
         if not known:
             return []
-        device = known[-1][2].device
+        # What a part has not begun to count yet lies on the host, which NCCL does not take.
+        device = self.energy_device
         widest = torch.float32 if device.type == "mps" else torch.float64
         packed = torch.cat([seen.detach().to(device, widest) for _, _, seen in known])
         numbers = (packed if over_ranks is None else over_ranks(packed)).tolist()
@@ -158,14 +319,16 @@ class Course:
             why = part.useless(own, self)
             if why is not None and name not in self.switched_off:
                 self.switched_off[name] = why
-                changes.append(("switched_off", name, why))
+                changes.append(Change("switched_off", name, why))
             elif why is None and self.switched_off.pop(name, None) is not None:
-                changes.append(("switched_on", name, "it is of use again"))
+                changes.append(Change("switched_on", name, "it is of use again"))
         if changes:
             self._plan()
         for event, name, why in changes:
             LOGGER.info("iteration %d: %s %s: %s", self.current, name, event.replace("_", " "), why)
         return changes
+
+    # -- checkpoints -----------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
         """Clock, parts and what is switched off, as plain numbers, strings, lists and dicts."""
@@ -174,17 +337,11 @@ class Course:
             "iteration": self.iteration,
             "num_observed": self.num_observed,
             "switched_off": dict(self.switched_off),
-            "parts": {n: state for n, part in self.named().items() if (state := part.state_dict())},
+            "kept": {key: value.item() for key, value in self.kept_numbers.items()},
+            "parts": {
+                name: state for name, part in self._named.items() if (state := part.state_dict())
+            },
         }
-
-    def take_loaded(self, optimizer: Any) -> None:
-        """Take the state out of an optimizer's groups, where a checkpoint has put it."""
-        shared = optimizer.param_groups[0].pop(STATE_KEY, None)
-        if shared is not None:
-            self.load_state_dict(shared)
-        else:
-            steps = [float(state["step"]) for state in optimizer.state.values() if "step" in state]
-            self.expect(int(max(steps, default=0)))
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore `state_dict()`; parts that it does not know begin anew.
@@ -194,21 +351,67 @@ class Course:
         """
         call = f"{type(self).__name__}.load_state_dict"
         check_keys(call, state, ("iteration", "num_observed", "switched_off", "parts"))
-        if state.get("format") != FORMAT:
-            raise ValueError(f"{call}: format={state.get('format')!r}, but {FORMAT} is needed")
+        if state.get("format") not in READABLE_FORMATS:
+            raise ValueError(
+                f"{call}: format={state.get('format')!r}, but one of {READABLE_FORMATS} is needed"
+            )
         for name in ("iteration", "num_observed"):
             check_count(call, name, state[name], 0)
         for name in ("parts", "switched_off"):
             check_keys(f"{call}: {name}", state[name], ())
-        named = self.named()
-        old = {name: part.state_dict() for name, part in named.items()}
+        kept = state.get("kept", {})
+        check_keys(f"{call}: kept", kept, ())
+        entries = self.number_entries("training")
+        numbers = {
+            key: torch.tensor(check_number(call, key, kept[key]), dtype=entries[key].dtype)
+            for key in entries
+            if key in kept
+        }
+        old = {name: part.state_dict() for name, part in self._named.items()}
         try:
-            for name in [name for name in named if name in state["parts"]]:
-                named[name].load_state_dict(state["parts"][name])
+            for name in [name for name in self._named if name in state["parts"]]:
+                self._named[name].load_state_dict(state["parts"][name])
         except (ValueError, LookupError, TypeError, AttributeError) as error:
-            for name in [name for name in named if old[name]]:
-                named[name].load_state_dict(old[name])
+            for name in [name for name in self._named if old[name]]:
+                self._named[name].load_state_dict(old[name])
             raise ValueError(f"{call}: {error}") from None
         self.current, self.num_observed = state["iteration"] - 1, state["num_observed"]
-        self.switched_off = {k: str(v) for k, v in state["switched_off"].items() if k in named}
+        self.kept_numbers.clear()
+        self.kept_numbers.update(numbers)
+        known = {name: why for name, why in state["switched_off"].items() if name in self._named}
+        self.switched_off = {name: str(why) for name, why in known.items()}
         self._plan()
+
+    def number_entries(self, per: str) -> dict[str, Kept]:
+        """What the parts keep as numbers, `per` "parameter" or "training", by its keys."""
+        return {
+            key_of(name, kept): kept
+            for name, entries in self.declared.items()
+            for kept in entries.values()
+            if kept.per == per
+        }
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Copies of the optimizers make themselves known to the copy of the course.
+        return {**vars(self), "_followers": [], "_places": {}, "_published": {}}
+
+
+def _by_name(parts: Iterable[Part]) -> dict[str, Part]:
+    named: dict[str, Part] = {}
+    for part in parts:
+        kind = type(part).__name__
+        again = sum(name.split("#")[0] == kind for name in named)
+        named[f"{kind}#{again + 1}" if again else kind] = part
+    return named
+
+
+def _declared(call: str, part: Part) -> dict[str, Kept]:
+    """What a part keeps, by name; ValueError where a name occurs twice, or is Adam's."""
+    entries = {kept.name: kept for kept in part.keeps}
+    if len(entries) < len(part.keeps) or any(name in ADAM_KEYS for name in entries):
+        names = [kept.name for kept in part.keeps]
+        raise ValueError(
+            f"{call}: {type(part).__name__} keeps {names}, but different names, none of them "
+            f"Adam's own ({', '.join(ADAM_KEYS)}), are needed"
+        )
+    return entries

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from opt3dgs_optim.backend import Backend
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.lending import AdamOptions
+from opt3dgs_optim.overrides import AdamOptions
 from opt3dgs_optim.parts.curvature import Curvature
 from opt3dgs_optim.stepadam import StepAdam
 

@@ -5,21 +5,66 @@ from typing import Any
 
 # gsplat | INRIA and 3dgs-mcmc | nerfstudio
 GAUSSIAN_NAMES: Mapping[str, tuple[str, ...]] = {
-    "means": ("means", "xyz"),
-    "scales": ("scales", "scaling"),
-    "quats": ("quats", "rotation"),
-    "opacities": ("opacities", "opacity"),
-    "sh0": ("sh0", "f_dc", "features_dc", "colors"),
-    "shN": ("shN", "f_rest", "features_rest", "features"),
+    "means": ("means", "xyz", "positions"),
+    "scales": ("scales", "scaling", "log_scales", "scale"),
+    "quats": ("quats", "rotation", "rotations"),
+    "opacities": ("opacities", "opacity", "logit_opacities", "density"),
+    "sh0": ("sh0", "f_dc", "features_dc", "colors", "shs_dc", "features_albedo"),
+    "shN": ("shN", "f_rest", "features_rest", "features", "shs_rest", "features_specular"),
 }
 GAUSSIAN = tuple(GAUSSIAN_NAMES)
-SLOT = "gaussian"  # of a parameter group: gsplat's name of what it holds, written by `upgrade`
+SLOT = "gaussian"  # of a parameter group: gsplat's name of what it holds
 _CANONICAL = {alias: name for name, aliases in GAUSSIAN_NAMES.items() for alias in aliases}
+
+
+def split_name(name: Any) -> tuple[str, str | None]:
+    """The set of Gaussians and gsplat's name of a group's name, as drivestudio's `Background#xyz`.
+
+    The set is "" where there is none; the second is None for any other group.
+    """
+    if not isinstance(name, str):
+        return "", None
+    prefix, _, last = name.rpartition("#")
+    return prefix, _CANONICAL.get(last)
 
 
 def canonical_name(name: Any) -> str | None:
     """gsplat's name of a Gaussian parameter group, or None for any other group."""
-    return _CANONICAL.get(name) if isinstance(name, str) else None
+    return split_name(name)[1]
+
+
+class NamedGroup(dict[str, Any]):
+    """A parameter group that knows which Gaussian parameter it holds.
+
+    `group["gaussian"]` is gsplat's name of it, or None, but no key of the group: torch's flat
+    distributed checkpoints ask every stored checkpoint for all keys of the present groups, so that
+    one of a stock trainer could not be loaded any more.
+    """
+
+    def __init__(self, group: Mapping[str, Any], set_name: str, gaussian: str | None) -> None:
+        super().__init__(group)
+        self.set_name, self.gaussian = set_name, gaussian
+
+    def __missing__(self, key: str) -> Any:
+        if key == SLOT:
+            return self.gaussian
+        raise KeyError(key)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        return self.gaussian if key == SLOT else super().get(key, default)
+
+    def __reduce__(self) -> Any:
+        return NamedGroup, (dict(self), self.set_name, self.gaussian)
+
+
+def gaussian_of(group: Mapping[str, Any]) -> str | None:
+    """gsplat's name of the Gaussian parameter that a group holds, or None."""
+    return group.get(SLOT)
+
+
+def set_of(group: Mapping[str, Any]) -> str:
+    """The set of Gaussians that a group belongs to, "" where an optimizer holds one."""
+    return getattr(group, "set_name", "")
 
 
 def group_name(index: int, group: Mapping[str, Any]) -> str:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from collections.abc import Callable, Mapping, MutableMapping
+from dataclasses import dataclass, fields, is_dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+import torch
 from torch import Tensor
 
 from opt3dgs_optim.names import GAUSSIAN
@@ -14,7 +15,9 @@ from opt3dgs_optim.names import GAUSSIAN
 if TYPE_CHECKING:
     from opt3dgs_optim.course import Course
 
-Group = dict[str, Any]  # a parameter group of an optimizer
+Group = MutableMapping[str, Any]  # a parameter group of an optimizer
+State = MutableMapping[str, Any]  # what a hook sees of a parameter's state, see `Part`
+Window = tuple[int, int]  # first iteration, and the one after the last
 
 
 class Phase(enum.Enum):
@@ -24,26 +27,79 @@ class Phase(enum.Enum):
     EXPLOITATION = "exploitation"
 
 
+@dataclass(frozen=True)
+class Kept:
+    """One thing that a part keeps from step to step: see `Part.keeps`.
+
+    Args:
+        name: how the part's hooks read and write it, `state[name]`.
+        per: `"row"` keeps a tensor whose first dimension is the parameter's, one row per point;
+            `"parameter"` a number per parameter; `"training"` one number for the whole training.
+        shape: per row, the dimensions after the first, or a function of the parameter that gives
+            them; None: those of the parameter itself.
+        dtype: of what is kept. A floating one is never narrower than the parameter's: what belongs
+            to float64 positions is kept in float64.
+        initial: the value of a number before it is written. Rows begin as zeros, because trainers
+            that add points append zero rows: an all-zero row must mean "nothing yet".
+    """
+
+    name: str
+    per: Literal["row", "parameter", "training"] = "row"
+    shape: tuple[int, ...] | Callable[[Tensor], tuple[int, ...]] | None = None
+    dtype: torch.dtype = torch.float32
+    initial: float = 0.0
+
+    def shape_for(self, param: Tensor) -> tuple[int, ...]:
+        """The whole shape of what is kept of a parameter [N, ..]."""
+        if self.per != "row":
+            return ()
+        if self.shape is None:
+            return tuple(param.shape)
+        rest = self.shape(param) if callable(self.shape) else self.shape
+        return (*param.shape[:1], *rest)
+
+    def dtype_for(self, param: Tensor) -> torch.dtype:
+        """The dtype of what is kept of a parameter."""
+        if self.dtype.is_floating_point and param.dtype == torch.float64:
+            return torch.float64
+        return self.dtype
+
+    def make(self, param: Tensor) -> Tensor:
+        """The initial value for a parameter, on its device."""
+        shape, dtype = self.shape_for(param), self.dtype_for(param)
+        value = 0.0 if self.per == "row" else self.initial
+        return torch.full(shape, value, dtype=dtype, device=param.device)
+
+
 class Part:
     """One thing that a training's steps can have: a factor, another gradient, noise, ...
 
-    A part overrides the hooks that it needs; another is never called. What it keeps per row lives
-    in `optimizer.state[param]` under its `keys`, as float32 tensors with the points first, where an
-    all-zero row means "nothing": density control edits them with the moments. What it keeps per
-    parameter lives in the group, as plain numbers. Both travel in the optimizers' `state_dict()`,
-    and so does `state_dict()` of the part.
+    A part overrides the hooks that it needs, and a hook that is not overridden is never called. It
+    knows nothing of masks, of GradScaler, of `maximize` or of steps that do not count: a hook gets
+    the gradient of what is minimised, unscaled, and zero in rows that a mask holds still.
 
-    Parts know nothing of masks, of GradScaler or of `maximize`: they get the gradient of what is
-    minimised, unscaled, zero in rows that a mask holds back. Examples: docs/write-a-part.md.
+    What a part keeps is declared in `keeps`, and the optimizer does the rest. It makes each entry
+    when a hook first reads it, on the parameter's device and in the declared dtype; it stores it
+    under the part's own name, so that two parts of one class never share; it saves it with the
+    optimizer's `state_dict()`, and checks and restores it; it drops rows that are not those of the
+    parameter any more, and everything once the part's `window` is over or another one begins.
+
+    The hooks' `state` is a mapping. `state["exp_avg"]`, `state["exp_avg_sq"]` and `state["step"]`
+    are Adam's own moments under torch's names, and a declared name is what the part keeps. If a
+    step turns out not to count (its loss is not finite, or a GradScaler skips it), what hooks have
+    written to what they keep, or to the parameter, is undone, and its gradient is zero. A hook
+    that edits Adam's moments in place does so by the clock: such an edit holds in any case.
+
+    `docs/write-a-part.md` has examples.
 
     Attributes:
         during: the phase in which the part acts; None: in both.
         names: the Gaussian parameters that it acts on, gsplat's names; None: every group.
-        keys: what it keeps per row in `optimizer.state[param]`.
+        keeps: what it keeps.
     """
 
     during: ClassVar[Phase | None] = None
-    keys: ClassVar[tuple[str, ...]] = ()
+    keeps: ClassVar[tuple[Kept, ...]] = ()
     names: Any = GAUSSIAN  # tuple[str, ...] | None
 
     def __repr__(self) -> str:
@@ -52,6 +108,14 @@ class Part:
         shown = [f.name for f in options if f.name != "names" or self.names != f.default]
         given = {name: getattr(self, name) for name in shown if getattr(self, name) is not None}
         return f"{type(self).__name__}({', '.join(f'{n}={v!r}' for n, v in given.items())})"
+
+    def window(self, course: Course) -> Window | None:
+        """The iterations for which what the part keeps is valid; None: all.
+
+        What was kept in another window is dropped: in a longer run, after the clock has been set
+        back, or when the window is over. A part that acts in one phase has that phase's window.
+        """
+        return course.window_of(self.during)
 
     def observe(self, energy: Tensor, valid: Tensor | bool, course: Course) -> None:
         """Take the loss of an iteration in which the part acts, 0-d, finite where `valid`.
@@ -67,16 +131,25 @@ class Part:
         """The factor on the group's step, 0-d; None is 1. The factors of all parts multiply."""
 
     def before(
-        self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
+        self, group: Group, param: Tensor, grad: Tensor, state: State, course: Course
     ) -> Tensor:
-        """The gradient that Adam is fed instead of `grad` (of its shape); may edit the moments.
+        """The gradient that Adam is fed instead of `grad`, of its shape; may edit the moments.
 
-        `state` holds Adam's moments already. `course.valid` as a tensor: a step that will be
-        dropped is still prepared, and must leave no trace.
+        Adam's moments are there already, and the parameter has not moved yet.
         """
         raise NotImplementedError
 
-    def after(self, group: Group, param: Tensor, state: dict[str, Any], course: Course) -> None:
+    def displacement(
+        self, group: Group, param: Tensor, step: Tensor, state: State, course: Course
+    ) -> Tensor:
+        """What the parameter moves by instead of Adam's `step`, of its shape.
+
+        Adam's step, learning rate and factors included, is added to the parameter elsewhere; a part
+        with this hook gets it by itself, and the parameter has not moved yet.
+        """
+        raise NotImplementedError
+
+    def after(self, group: Group, param: Tensor, state: State, course: Course) -> None:
         """After the parameter has moved. The group's learning rate is the trainer's own again."""
 
     def numbers(self, course: Course) -> Mapping[str, float | Tensor]:
@@ -84,7 +157,7 @@ class Part:
         return {}
 
     def state_dict(self) -> dict[str, Any]:
-        """What a checkpoint must hold, as plain floats, lists and dicts."""
+        """What a checkpoint must hold besides `keeps`, as plain floats, lists and dicts."""
         return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from numbers import Integral
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import torch
@@ -20,9 +21,10 @@ if TYPE_CHECKING:
     from opt3dgs_optim.runs import RunLog
 
 CALL = "PhaseScheduler"
-SILENCE = 20  # iterations without a step, or steps without an energy, before it is said
-PAUSE = 200  # iterations without a step that some trainers have by design
-Optimizers = TypeVar("Optimizers", bound="Optimizer | Mapping[str, Optimizer]")
+# How long a trainer may do something by design before it is taken for a mistake.
+PATIENCE = 20  # iterations without a step, steps without an energy, or losses that are not finite
+LONG_PATIENCE = 200  # iterations without a step in a training that has stepped
+Optimizers = TypeVar("Optimizers", bound="Optimizer | Mapping[str, Optimizer] | list[Optimizer]")
 
 
 class PhaseScheduler(Course):
@@ -38,7 +40,8 @@ class PhaseScheduler(Course):
             One that learns (`EnergyHistogram`, `Curvature`, `PositionNoise`) serves one run.
         adaptive: whether parts that this training shows no need of are switched off, see
             `switched_off`. Every 100 iterations that is one synchronisation with the GPU.
-        log: a `RunLog` that gets one line per `observe`, with what the parts say of themselves.
+        log: a `RunLog` that gets one line per `observe`, with what the parts say of themselves. A
+            copy, or what comes out of a pickle, has none.
         process_group: a `torch.distributed` process group over whose ranks the energy is averaged;
             every rank must call `observe` as often, and a loss that is not finite skips all steps.
 
@@ -74,8 +77,8 @@ class PhaseScheduler(Course):
         log: RunLog | None = None,
         process_group: Any = None,
     ) -> None:
-        check_count(CALL, "total_steps", total_steps, 1)
-        if isinstance(switch, int) and not isinstance(switch, bool):
+        total_steps = check_count(CALL, "total_steps", total_steps, 1)
+        if isinstance(switch, Integral) and not isinstance(switch, bool):
             switch_step = check_count(CALL, "switch", switch, 0, total_steps)
         else:
             switch_step = round(check_number(CALL, "switch", switch, 0.0, 1.0) * total_steps)
@@ -89,8 +92,10 @@ class PhaseScheduler(Course):
             raise ValueError(f"{CALL}: log={log!r}, but a RunLog or None is needed")
         self.log = log
         self._over_ranks = None if process_group is None else RankMean(CALL, process_group)
-        self._overrun = self._told = False
-        self._silence, self._unheard = 1, 0  # energies without a step, steps without an energy
+        self._reported: set[str] = set()  # kinds of mistakes that were said
+        self._iterations_without_step = 1
+        self._steps_without_energy = 0
+        self._losses_not_finite = 0  # in a row
         self._num_optimizers = 0
         self._adam_steps: int | None = None  # of moments that came without a state of ours
 
@@ -109,7 +114,7 @@ class PhaseScheduler(Course):
         Fixed energy range [0, 0.2] and temperature, warm-up 2,500 of 30,000, switch at 29,000,
         K = 5 consecutive pairs, L2, fresh moments. Single parts: `paper_parts`.
         """
-        check_count(f"{CALL}.paper", "total_steps", total_steps, 1)
+        total_steps = check_count(f"{CALL}.paper", "total_steps", total_steps, 1)
         options = {"adaptive": adaptive, "log": log, "process_group": process_group}
         return cls(total_steps, switch, paper_parts(total_steps), **options)
 
@@ -126,11 +131,13 @@ class PhaseScheduler(Course):
 
         Args:
             optimizers: a dict of `torch.optim.Adam`, one per parameter (gsplat, nerfstudio), whose
-                keys say what they hold, or one Adam with named groups (INRIA, 3dgs-mcmc). What
-                holds no Gaussian parameter (camera poses, exposures) stays as it is.
+                keys say what they hold; one Adam with named groups (INRIA, 3dgs-mcmc); or a list
+                of such (gaussian-splatting-lightning). What holds no Gaussian parameter (camera
+                poses, exposures) stays as it is.
 
         Raises:
-            TypeError: an optimizer of Gaussian parameters is no Adam, or has another owner.
+            TypeError: an optimizer of Gaussian parameters is no Adam, has parts of another
+                scheduler, or is of a class that cannot be kept.
             ValueError: nothing holds a Gaussian parameter, or a name occurs twice.
         """
         self._num_optimizers += upgrade(optimizers, self)
@@ -148,16 +155,19 @@ class PhaseScheduler(Course):
                 calls: in a training that goes on from a checkpoint of the stock trainer, say.
         """
         if iteration is not None:
-            check_count(f"{CALL}.observe", "iteration", iteration, 0)
+            iteration = check_count(f"{CALL}.observe", "iteration", iteration, 0)
+            if iteration < self.current:  # what is kept for a time begins anew
+                self.rewinds += 1
         self.current = self.iteration if iteration is None else iteration
         self._watch_clock()
         value = loss if isinstance(loss, Tensor) else torch.tensor(float(loss))
         value = value.detach().reshape(()) if value.dim() else value.detach()
         self.take(value if self._over_ranks is None else self._over_ranks(value))
+        self._watch_losses()
         if self.log is not None:
             phase = self.phase_of(self.current)
             self.log.step(self.current, phase=phase, energy=value, **self.numbers())
-        if self.adaptive and self.num_observed % self.check_steps == 0:
+        if self.adaptive and self.num_observed % self.evidence_interval == 0:
             for event, part, reason in self.judge(self._over_ranks):
                 if self.log is not None:
                     self.log.event(event, self.current, part=part, reason=reason)
@@ -179,55 +189,98 @@ class PhaseScheduler(Course):
 
     def pixel_part(self) -> Part | None:
         """The part whose photometric term holds for the iteration whose loss comes next."""
-        parts = self._hooks[self.phase]["pixel_loss"]
-        return parts[-1] if parts else None
+        return self.pixel_parts[-1] if self.pixel_parts else None
 
     def stepping(self, closure_value: Any) -> bool:
         """As `Course.stepping`; before the first energy the steps are plain Adam's."""
         self.steps += 1
         if closure_value is not None:
             self.observe(closure_value)
-        self._silence = 0
-        self._unheard += 1
-        if self._unheard > SILENCE * max(self._num_optimizers, 1):
-            self._tell(
-                f"the optimizers have stepped {SILENCE} times without an energy: {{}} stand still; "
-                "call observe(loss) once per iteration, before the steps"
+        self._iterations_without_step = 0
+        self._steps_without_energy += 1
+        if self._steps_without_energy > PATIENCE * max(self._num_optimizers, 1):
+            self._report(
+                "no energy",
+                f"the optimizers have stepped {PATIENCE} times without an energy: {self._names()} "
+                "stand still; call observe(loss) once per iteration, before the steps",
             )
         return self.num_observed > 0
 
-    def _tell(self, mistake: str) -> None:
-        """Say once what keeps the parts from acting."""
-        if self.parts and not self._told:
-            self._told = True
-            warn_user(f"{CALL}: {mistake.format(', '.join(self.named()))}")
+    def _names(self) -> str:
+        return ", ".join(self.named())
+
+    def _report(self, kind: str, mistake: str) -> None:
+        """Say once what keeps the parts from acting as they are meant to."""
+        if self.parts and kind not in self._reported:
+            self._reported.add(kind)
+            warn_user(f"{CALL}: {mistake}")
 
     def _watch_clock(self) -> None:
-        steps, self._adam_steps = self._adam_steps, None
-        patience = PAUSE if self.steps else SILENCE
-        if self._silence > patience:
-            self._tell(
-                f"{patience} losses were observed and no upgraded optimizer has stepped: {{}} do "
-                "nothing; call upgrade(...) again where the trainer makes its optimizers anew"
+        """Look for mistakes that an iteration shows; called with each energy."""
+        adam_steps, self._adam_steps = self._adam_steps, None
+        patience = LONG_PATIENCE if self.steps else PATIENCE
+        if self._iterations_without_step > patience:
+            self._report(
+                "no step",
+                f"{patience} losses were observed and no upgraded optimizer has stepped: "
+                f"{self._names()} do nothing; call upgrade(...) again where the trainer makes its "
+                "optimizers anew; where it freezes the Gaussians before the end, give total_steps "
+                "as the iteration after their last step, since the last thirtieth is averaged",
             )
-        self._silence, self._unheard = self._silence + 1, 0
+        if self.num_observed == 0 and self._stepped_before_first_energy():
+            self._report(
+                "late",
+                "the optimizers had stepped before the first observe(loss), so each step has the "
+                "energy of the iteration before; call observe after backward, before the steps",
+            )
+        lost = self.num_lost_followers
+        if lost and lost < self._num_optimizers and len(self.followers()) < self._num_optimizers:
+            self._report(
+                "lost",
+                f"{lost} of {self._num_optimizers} upgraded optimizers do not exist any more: the "
+                "trainer has made some of them anew, whose steps have no parts; call upgrade(...) "
+                "again there",
+            )
+        self._iterations_without_step += 1
+        self._steps_without_energy = 0
         # Trainers that count from 1 end at total_steps.
-        if self.current > self.total_steps and not self._overrun:
-            self._overrun = True
-            warn_user(
-                f"{CALL}: iteration {self.current} of total_steps={self.total_steps}: the schedule "
-                "came too early for this run; pass the training's number of iterations"
+        if self.current > self.total_steps:
+            self._report(
+                "overrun",
+                f"iteration {self.current} of total_steps={self.total_steps}: the schedule came "
+                "too early for this run; pass the training's number of iterations",
             )
-        if steps is not None and abs(steps - self.current) > max(SILENCE, 0.1 * steps):
+        if adam_steps is not None and abs(adam_steps - self.current) > max(
+            PATIENCE, 0.1 * adam_steps
+        ):
             warn_user(
-                f"{CALL}: Adam's moments have made {steps} steps, but this is iteration "
+                f"{CALL}: Adam's moments have made {adam_steps} steps, but this is iteration "
                 f"{self.current} of {self.total_steps}; a training that goes on from a checkpoint "
                 "of the stock trainer needs observe(loss, iteration=...)"
+            )
+
+    def _stepped_before_first_energy(self) -> bool:
+        """Whether each optimizer made one step, with a learning rate, before there was a loss."""
+        rates = [group["lr"] for each in self.followers() for group in each.param_groups]
+        return self.steps == self._num_optimizers and any(float(rate) != 0 for rate in rates)
+
+    def _watch_losses(self) -> None:
+        """Say once that losses have not been finite for long, as far as the host knows them."""
+        self._losses_not_finite = self._losses_not_finite + 1 if self.valid is False else 0
+        if self._losses_not_finite > PATIENCE:
+            self._report(
+                "not finite",
+                f"{self._losses_not_finite} losses in a row were not finite, the last in iteration "
+                f"{self.current}: none of these steps was made; look for the first NaN",
             )
 
     def expect(self, steps: int) -> None:
         """Moments came without a state of ours; the next energy's iteration should fit them."""
         self._adam_steps = steps or self._adam_steps
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Two would write into one file; a copy begins without a log.
+        return {**super().__getstate__(), "log": None}
 
     def __repr__(self) -> str:
         switch = f"switch at {self.switch_step}"

@@ -1,59 +1,185 @@
 """The only Adam: torch's own step, with the parts of a course before, in and after it."""
 
+from __future__ import annotations
+
+import functools
 from collections.abc import Callable
-from typing import Any, cast
+from dataclasses import dataclass, field
+from itertools import chain
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
 from torch._compile import _disable_dynamo
 from torch.optim import Adam
 
+from opt3dgs_optim.checkpoint import (
+    Saved,
+    inspect_checkpoint,
+    number_of_steps,
+    pack_optimizer,
+    restore_numbers,
+)
+from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.course import STATE_KEY, Course
-from opt3dgs_optim.lending import Lent, guard, own_step, refuse_capture, use_fused
-from opt3dgs_optim.names import SLOT, block, canonical_name, group_name
-from opt3dgs_optim.part import Group, Part
-from opt3dgs_optim.rows import Frozen, Ledger, check_mask, check_rows, shaped
+from opt3dgs_optim.names import NamedGroup, block, gaussian_of, group_name, split_name
+from opt3dgs_optim.overrides import (
+    TemporaryOverrides,
+    can_be_fused,
+    decay_weights,
+    own_step,
+    refuse_capture,
+    scale_learning_rate,
+    use_fused,
+    zero_nonfinite,
+)
+from opt3dgs_optim.part import Group, Part, Window
+from opt3dgs_optim.state import (
+    MOMENTS,
+    HeldRows,
+    ParameterRecord,
+    ParameterState,
+    RowOwnership,
+    broadcast_rows,
+    check_mask,
+    rows_of,
+)
+
+DEVICE_LOOK_INTERVAL = 16  # energies between two looks at a device's gradients for NaN
+NamedPart = tuple[str, Part]
+
+
+class ActingParts(NamedTuple):
+    """The parts that act on a group in a step, by their hooks, with their names."""
+
+    before: list[NamedPart]
+    factor: list[NamedPart]
+    displacement: list[NamedPart]
+    after: list[NamedPart]
+
+
+NO_PARTS = ActingParts([], [], [], [])
+
+
+@dataclass
+class MovingParameter:
+    """A parameter in the middle of a step.
+
+    Attributes:
+        state: what the hooks see of its state.
+        rows: [N] bool, those that a mask lets move; None: all.
+        counts: whether the step counts, 0-d where only the device knows.
+        buffer: where Adam writes its step, if a part says what becomes of it; else None.
+    """
+
+    group: Group
+    param: Tensor
+    record: ParameterRecord
+    parts: ActingParts
+    state: ParameterState | None = None
+    rows: Tensor | None = None
+    counts: Tensor | bool = True
+    buffer: Tensor | None = None
+
+    @property
+    def guarded(self) -> bool:
+        """Whether something of what the hooks do is to be undone."""
+        return self.rows is not None or self.counts is not True
+
+    def where_it_moves(self, new: Tensor, old: Tensor | float) -> Tensor:
+        """`new` in the rows that move, if the step counts, else `old`."""
+        keep: Any = self.counts
+        if self.rows is not None:
+            keep = broadcast_rows(self.rows, new) & keep
+        return torch.where(torch.as_tensor(keep, device=new.device), new, old)
+
+
+@dataclass
+class StepInProgress:
+    """What a step has to finish, or to undo, once Adam has moved the parameters."""
+
+    mask: Tensor | None
+    acting: bool
+    counts: Tensor | bool
+    overrides: TemporaryOverrides
+    moving: list[MovingParameter] = field(default_factory=list)
+    held: list[HeldRows] = field(default_factory=list)
 
 
 class StepAdam(Adam):
     """`torch.optim.Adam` whose steps have the parts of a `Course`.
 
     The arithmetic is torch's own `Adam.step`, bit for bit, on every path (single tensor, foreach,
-    fused, capturable): a step lends it scaled learning rates and other gradients, and takes them
-    back, whatever happens. Made by `PhaseScheduler.upgrade`, `AWSGLD` and `LQNAdam`.
+    fused, capturable). A step overrides learning rates and gradients for the time of that call, and
+    restores them, whatever happens. Without parts nothing of this class touches the step.
+
+    Made by `PhaseScheduler.upgrade`, `AWSGLD` and `LQNAdam`. An upgraded optimizer is an instance
+    of this class *and* of the class that it had.
     """
 
     course: Course
     any_group = False  # whether the parts act on groups that are no Gaussian parameter's, too
-    base: type[Adam] = Adam  # whose step it is that the parts surround
-    _ledger: Ledger
-    _told = False  # of a gradient that is not finite
-    _split: tuple[Any, dict[str | None, list[list[Part]]]] = (None, {})  # hooks, by groups' slots
+    _base: type[Adam] = Adam  # whose step it is that the parts surround
+    _ownership: RowOwnership
+    _records: list[list[ParameterRecord]]  # by group, and by parameter in it
+    _slots: list[tuple[str, str | None]]  # by group: the set of Gaussians, and which parameter
+    _open_windows: dict[str, Window | None]
+    _rewinds = 0
+    _nonfinite_reported = False
+    _nonfinite: Tensor | None = None  # seen on a device, and not looked at yet
+    _acting: tuple[Any, dict[str | None, ActingParts]] = (None, {})  # for these hooks, by slot
 
     def follow(self, course: Course, base: type[Adam] = Adam) -> None:
         """Have the parts of `course` from now on, around the step of `base`.
 
         Another class than torch's Adam has arithmetic of its own, and its step gets the mask.
         """
-        self.course, self.base, self._ledger = course, base, Ledger()
+        self.course, self._base, self._ownership = course, base, RowOwnership()
+        if "_slots" not in vars(self):
+            self._slots = []
+        self._records, self._open_windows = [], {}
+        self._name_groups()
         self._patch_step_function()  # torch's, for a class that was given to a made optimizer
-        groups = self.param_groups
-        asked = any(g["capturable"] or (g["fused"], g["foreach"]) != (None, None) for g in groups)
-        tensors = [p for group in groups for p in group["params"]]
-        if base is Adam and not asked and tensors and all(p.is_cuda for p in tensors):
+        if base is Adam and course.parts and can_be_fused(self):
             use_fused(self)
-        self.trust_rows()
+        self._claim_rows()
+        course.register(self)
+
+    def hold(self, slots: list[tuple[str, str | None]]) -> None:
+        """Say which set of Gaussians, and which of its parameters, each group holds."""
+        self._slots = list(slots)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """As torch's; notes which Gaussian parameter the group's name says that it holds."""
         super().add_param_group(param_group)
-        group, self._split = self.param_groups[-1], (None, {})
-        group.setdefault(SLOT, canonical_name(group.get("name")))
+        if "course" in vars(self):
+            self._name_groups()
+
+    def _name_groups(self) -> None:
+        """Know what each group holds; of those that came or were exchanged their names say it."""
+        groups, known = self.param_groups, vars(self).setdefault("_slots", [])
+        for i, group in enumerate(groups):
+            if i == len(known):
+                known.append(split_name(group.get("name")))
+                if i < len(self._records) or self._records:
+                    taken = known[i][1] or "left alone"
+                    LOGGER.info("a group was added: %s, %s", group_name(i, group), taken)
+            if type(group) is not NamedGroup:
+                name = split_name(group.get("name"))
+                known[i] = name if name[1] is not None else known[i]
+                groups[i] = NamedGroup(group, *known[i])
+                self._acting = (None, {})
+            if i == len(self._records):
+                self._records.append([])
+            while len(self._records[i]) < len(group["params"]):
+                self._records[i].append(ParameterRecord())
 
     def acts_on(self, part: Part, group: Group) -> bool:
         """Whether a part acts on a group."""
-        name = group.get(SLOT)
+        name = gaussian_of(group)
         return part.names is None or name in part.names or (name is None and self.any_group)
+
+    # -- a step ----------------------------------------------------------------------------------
 
     # Under torch.compile a step runs as it is, like those of torch's own optimizers.
     @_disable_dynamo
@@ -82,116 +208,273 @@ class StepAdam(Adam):
             RuntimeError: a CUDA graph is being captured, and there are parts.
         """
         self._opt_called = True  # what learning-rate schedulers would note by wrapping this method
-        refuse_capture(type(self).__name__, self.course)
+        refuse_capture(self.call_name, self.course)
         masks: list[Any] = [each for each in (visible, visibility) if each is not None]
         if isinstance(closure, Tensor):
             masks, closure = [closure, *masks], None
-        mask = check_mask(type(self).__name__, masks, num_points) if masks else None
+        mask = check_mask(self.call_name, masks, num_points) if masks else None
         loss = None
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
         with torch.set_grad_enabled(self.defaults["differentiable"]):
             acting = self.course.stepping(loss)
-            found, valid = getattr(self, "found_inf", None), self.course.valid
-            if found is not None and isinstance(valid, Tensor):  # a GradScaler's word counts, too
-                self.course.valid = (found.reshape(()) == 0) & valid
-            try:
-                if valid is not False and (isinstance(valid, Tensor) or not found):
-                    self._step(mask, acting)
-            finally:
-                self.course.valid = valid
+            if mask is None and not self.course.parts:
+                self._step_base(None)
+            else:
+                self._step(mask, acting)
         return loss
 
     # Learning-rate schedulers, which would wrap `step` on the instance, need not: `step` tells.
     step._wrapped_by_lr_sched = True  # pyright: ignore[reportFunctionMemberAccess]
 
+    def _counts(self, mask: Tensor | None) -> Tensor | bool:
+        """Whether this step counts; a 0-d tensor where the device knows, and can be told.
+
+        The loss must be finite, and a GradScaler, if there is one, must have found no overflow.
+        """
+        counts, overflow = self.course.valid, getattr(self, "found_inf", None)
+        if overflow is not None:
+            clean = overflow.reshape(()) == 0
+            if isinstance(counts, Tensor):
+                counts = clean.to(counts.device, non_blocking=True) & counts
+            elif clean.is_cpu:
+                counts = bool(clean) and counts
+            elif counts:
+                counts = clean
+        if not isinstance(counts, Tensor):
+            return counts
+        groups = self.param_groups
+        told = self._base is not Adam and mask is not None
+        told = told or (self._base is Adam and all(group["fused"] for group in groups))
+        tensors = chain.from_iterable(group["params"] for group in groups)
+        if told and all(counts.is_cpu or not param.is_cpu for param in tensors):
+            return counts
+        return self.course.valid_on_host() if overflow is None else bool(counts)
+
     def _step(self, mask: Tensor | None, acting: bool) -> None:
-        """Lend the base's step what the parts say, if they act, and take it back."""
-        course, moved = self.course, []
+        """Override what the base's step reads by what the parts say, and restore it."""
+        course, counts = self.course, self._counts(mask)
+        self._name_groups()
+        if acting:
+            self._follow_windows()
         if mask is not None:
             self._check_mask(mask)
-        unknown = isinstance(course.valid, Tensor)  # only the device knows whether the step counts
-        drops = unknown and self.base is Adam and all(g["fused"] for g in self.param_groups)
-        back = unknown and not drops and (self.base is Adam or mask is None)
-        with Lent() as lent:
-            for group in self.param_groups:
-                befores, factors, afters = self._parts_of(group) if acting else ([], [], [])
-                masked = mask is not None and self._takes_mask(group, mask.numel())
-                # Another base's own step knows its mask; the parts' doing it does not.
-                own = mask if masked and (self.base is Adam or befores or afters) else None
-                for param in group["params"]:
-                    if param.grad is None or param.grad.is_sparse:
-                        continue
-                    self._told |= guard(param.grad, course, self._told)
-                    if own is not None or befores or back or course.keys:
-                        self._lend_gradient(group, param, befores, lent, own, back)
-                    moved.append((group, param, afters))
-                said = [part.factor(group, course) for part in factors]
-                lent.rate(group, [factor for factor in said if factor is not None], course.valid)
-            if drops:  # as a GradScaler tells torch's step not to be made
-                lent.attribute(self, "found_inf", (~cast(Tensor, course.valid)).to(torch.float32))
-            self._step_base(mask)
-        for group, param, parts in moved:
-            for part in parts:
-                part.after(group, param, self.state[param], course)
-            if course.keys:
-                self._ledger.remember(param, self.state[param], course.keys)
-        for rows in reversed(lent.frozen):
+        with TemporaryOverrides() as overrides:
+            step = StepInProgress(mask, acting, counts, overrides)
+            for group, records in zip(self.param_groups, self._records, strict=True):
+                parts = self._parts_of(group) if acting else NO_PARTS
+                self._prepare_group(step, group, records, parts)
+                said = [part.factor(group, course) for _, part in parts.factor]
+                factors = [factor for factor in said if factor is not None]
+                scale_learning_rate(overrides, group, factors, counts)
+            if counts is not False:
+                if isinstance(counts, Tensor) and self._base is Adam:
+                    # As a GradScaler tells torch's fused step not to be made.
+                    overrides.attribute(self, "found_inf", (~counts).to(torch.float32))
+                self._step_base(mask)
+        for moving in step.moving:
+            self._finish(moving, course)
+        for rows in reversed(step.held):
             rows.put_back()
 
-    def _parts_of(self, group: Group) -> list[list[Part]]:
-        """The parts that act on a group before, in and after its step; sought when they change."""
-        hooks, slot = self.course.hooks, group.get(SLOT)
-        if self._split[0] is not hooks:
-            self._split = hooks, {}
-        found = self._split[1]
-        if slot not in found:
-            acting = [hooks[name] for name in ("before", "factor", "after")]
-            found[slot] = [[part for part in each if self.acts_on(part, group)] for each in acting]
-        return found[slot]
+    def _parts_of(self, group: Group) -> ActingParts:
+        """The parts that act on a group in this step; sought when they change."""
+        hooks, slot = self.course.hooks, gaussian_of(group)
+        if self._acting[0] is not hooks:
+            self._acting = hooks, {}
+        known = self._acting[1]
+        if slot not in known:
+            name_of = self.course.name_of
+            known[slot] = ActingParts(
+                *(
+                    [(name_of(part), part) for part in hooks[hook] if self.acts_on(part, group)]
+                    for hook in ActingParts._fields
+                )
+            )
+        return known[slot]
 
     def _step_base(self, mask: Tensor | None) -> None:
-        step, takes_number = own_step(self.base)
-        if mask is None or self.base is Adam:
+        step, takes_number = own_step(self._base)
+        if mask is None or self._base is Adam:
             step(self)
             return
         if isinstance(self.course.valid, Tensor):
             mask = mask & self.course.valid.to(mask.device)
         step(self, mask, mask.numel()) if takes_number else step(self, mask)
 
-    def _lend_gradient(
-        self, group: Group, param: Tensor, parts: list[Part], lent: Lent, mask: Any, back: bool
+    def _prepare_group(
+        self,
+        step: StepInProgress,
+        group: Group,
+        records: list[ParameterRecord],
+        parts: ActingParts,
     ) -> None:
-        """Put what Adam is to be fed into `param.grad`: zero in rows that a mask holds still.
+        """Have the base's step read what the parts say of a group's gradients."""
+        masked = step.mask is not None and self._takes_mask(group, step.mask.numel())
+        # Another base's own step knows its mask; what the parts do does not.
+        rows = step.mask if masked and (self._base is Adam or any(parts)) else None
+        if parts.displacement and group["weight_decay"]:
+            self._decay_before(step, group)
+        params = list(group["params"])
+        for i, (param, record) in enumerate(zip(params, records, strict=True)):
+            if param.grad is None or param.grad.is_sparse:
+                continue
+            self._zero_nonfinite(param)
+            moving = MovingParameter(group, param, record, parts)
+            if rows is not None:
+                moving.rows = rows.to(param.device)
+            moving.counts = step.counts
+            if isinstance(step.counts, Tensor):
+                moving.counts = step.counts.to(param.device, non_blocking=True)
+            if rows is not None or any(parts) or self.course.row_keys:
+                self._prepare(step, moving)
+            if moving.buffer is not None:
+                params[i] = moving.buffer
+            if step.acting:
+                record.last_step = max(self.course.current, 0)  # a course may have no clock
+            step.moving.append(moving)
+        if parts.displacement:
+            step.overrides.item(group, "params", params)
 
-        `back`: whether the step is to be put back where it does not count.
-        """
+    def _prepare(self, step: StepInProgress, moving: MovingParameter) -> None:
+        """Put what Adam is to be fed into `param.grad`: zero in rows that a mask holds still."""
+        group, param, parts = moving.group, moving.param, moving.parts
         fed, state = cast(Tensor, param.grad), self.state[param]
         if not state:  # torch makes its moments only where there is nothing else yet
             self._init_group({**group, "params": [param]}, [], [], [], [], [], [])
-        if self.course.keys:
-            self._ledger.drop_strangers(param, state, self.course.keys)
-        if mask is not None:
-            moving = mask.to(param.device)
-            lent.frozen.append(Frozen(moving, param, state))
-            fed = torch.where(shaped(moving, fed), fed, 0.0)
+        self._ownership.drop_foreign(param, state, self.course.row_keys)
+        course = self.course
+        view = moving.record.view(param, state, course.declared, course.kept_numbers)
+        moving.state = view
+        if moving.rows is not None:
+            if self._base is Adam:
+                step.held.append(HeldRows(moving.rows, param, state))
+            fed = torch.where(broadcast_rows(moving.rows, fed), fed, 0.0)
+        if moving.guarded and any(parts):
+            view.guard(moments=moving.rows is not None and self._base is not Adam)
+            if moving.counts is not True:  # a step that does not count has no gradient
+                fed = moving.where_it_moves(fed, 0.0)
         # Parts see the gradient of what is minimised, without AMP's scale.
-        scale = getattr(self, "grad_scale", None) if parts else None
+        shaping = bool(parts.before or parts.displacement)
+        scale = getattr(self, "grad_scale", None) if shaping else None
         unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
-        plain = not parts or (scale is None and unit == 1.0)
+        plain = not shaping or (scale is None and unit == 1.0)
         fed = fed if plain else fed / unit
-        for part in parts:
-            fed = part.before(group, param, fed, state, self.course)
+        if parts.displacement and group["weight_decay"]:
+            fed = fed.add(param.detach(), alpha=group["weight_decay"])
+        for name, part in parts.before:
+            fed = part.before(group, param, fed, view.of(name), course)
         fed = fed if plain else fed * unit
-        if back:  # what Adam does; the parts' doing is not the step's
-            lent.frozen.append(Frozen(cast(Tensor, self.course.valid), param, state))
-        if fed is not param.grad:
-            lent.attribute(param, "grad", fed)
+        if parts.displacement:  # Adam moves a buffer, whose state is the parameter's
+            moving.buffer = torch.zeros_like(param, requires_grad=False)
+            moving.buffer.grad = fed
+            step.overrides.extra_item(self.state, moving.buffer, state)
+        elif fed is not param.grad:
+            step.overrides.attribute(param, "grad", fed)
+
+    def _decay_before(self, step: StepInProgress, group: Group) -> None:
+        """Weight decay is of the parameter itself, not of the buffer that Adam will move."""
+        if group.get("decoupled_weight_decay"):
+            decay_weights(step.overrides, group, step.counts)
+
+    def _finish(self, moving: MovingParameter, course: Course) -> None:
+        """Move the parameter by what the parts make of Adam's step; have them act after it."""
+        group, param, parts, view = moving.group, moving.param, moving.parts, moving.state
+        if view is None:
+            return
+        if moving.buffer is not None:
+            step = moving.buffer
+            for name, part in parts.displacement:
+                step = part.displacement(group, param, step, view.of(name), course)
+            param.add_(moving.where_it_moves(step, 0.0) if moving.guarded else step)
+        if parts.after:
+            before = param.detach().clone() if moving.guarded else None
+            for name, part in parts.after:
+                part.after(group, param, view.of(name), course)
+            if before is not None:
+                # .data: no write that a part should notice by the version counter.
+                param.data.copy_(moving.where_it_moves(param.data, before))
+        if moving.guarded and any(parts):
+            view.settle(moving.rows, moving.counts)
+        self._ownership.claim(param, self.state[param], course.row_keys)
+
+    def _zero_nonfinite(self, param: Tensor) -> None:
+        """Take what is not finite in a gradient as zero, and say so once."""
+        found = zero_nonfinite(cast(Tensor, param.grad))
+        if isinstance(found, Tensor):
+            if self.course.num_observed % DEVICE_LOOK_INTERVAL == 0:
+                seen = (
+                    found if self._nonfinite is None else self._nonfinite.to(found.device) | found
+                )
+                self._nonfinite = seen
+            return
+        if found:
+            self._report_nonfinite(f"a gradient of shape {tuple(param.shape)}")
+
+    def _report_nonfinite(self, what: str) -> None:
+        if not self._nonfinite_reported:
+            self._nonfinite_reported = True
+            said = "iteration %d: %s is not finite; such numbers count as zero"
+            LOGGER.warning(said, self.course.current, what)
+
+    # -- whose state it is -----------------------------------------------------------------------
+
+    def _follow_windows(self) -> None:
+        """Drop what parts have kept for a window that is over, or that begins."""
+        now, course = self.course.open_windows(), self.course
+        if now == self._open_windows and self._rewinds == course.rewinds:
+            return
+        rewound, self._rewinds = self._rewinds != course.rewinds, course.rewinds
+        for name, window in now.items():
+            if rewound or window is None or self._open_windows.get(name) != window:
+                self._drop_kept(name)
+        self._open_windows = now
+
+    def _drop_kept(self, part: str) -> None:
+        """Forget all that a part keeps, and give its memory back."""
+        prefix = f"{part}."
+        numbers = [record.numbers for records in self._records for record in records]
+        for store in (*self.state.values(), *numbers, self.course.kept_numbers):
+            for key in [key for key in store if str(key).startswith(prefix)]:
+                del store[key]
+
+    @torch.no_grad()
+    def reset_rows(self, param: Tensor, rows: Tensor) -> None:
+        """Zero Adam's moments, and what the parts keep, of rows that the trainer has written.
+
+        For trainers that move points *in place* (`param.data[dead] = ...`): one call, instead of
+        zeroing `exp_avg` and `exp_avg_sq` by hand. Those that exchange the `Parameter` need not.
+
+        Args:
+            param: a parameter of this optimizer, [N, ..].
+            rows: their indices, or an [N] bool mask.
+
+        Raises:
+            ValueError: the parameter is not one of this optimizer's, or there are no such rows.
+        """
+        call = f"{self.call_name}.reset_rows"
+        if not any(param is each for group in self.param_groups for each in group["params"]):
+            raise ValueError(f"{call}: a parameter of shape {tuple(param.shape)} is none of these")
+        rows = torch.as_tensor(rows, device=param.device)
+        whole = not rows.is_floating_point() and not rows.is_complex()
+        fits = rows.dtype == torch.bool and rows.shape == param.shape[:1]
+        if rows.dtype != torch.bool and whole and param.dim():
+            count = rows_of(param)
+            fits = not rows.numel() or (-count <= int(rows.min()) and int(rows.max()) < count)
+        if not fits:
+            raise ValueError(
+                f"{call}: rows={rows!r}, but indices of, or a bool mask over, {rows_of(param)} "
+                "rows are needed"
+            )
+        state = self.state.get(param, {})
+        for key in (*MOMENTS, *self.course.row_keys):
+            if key in state:
+                state[key][rows] = 0
 
     def _takes_mask(self, group: Group, rows: int) -> bool:
         """Whether a mask of so many rows is about this group."""
-        if group.get(SLOT) is not None:
+        if gaussian_of(group) is not None:
             return True
         return self.any_group and any(p.shape[:1] == (rows,) for p in group["params"])
 
@@ -200,7 +483,7 @@ class StepAdam(Adam):
 
         Only those with a gradient: the others are not stepped, and it may be older than they are.
         """
-        call, rows = f"{type(self).__name__}.step", mask.numel()
+        call, rows = f"{self.call_name}.step", mask.numel()
         if self.defaults["differentiable"]:
             raise ValueError(f"{call}: a mask with differentiable=True is not possible")
         every = [(group, p) for group in self.param_groups for p in group["params"]]
@@ -213,37 +496,46 @@ class StepAdam(Adam):
                 "mask of their first dimension is needed"
             )
 
-    def trust_rows(self) -> None:
+    def _claim_rows(self) -> None:
         """Take what the parts have kept as that of the parameters' present rows."""
         for param, state in self.state.items():
-            self._ledger.remember(param, state, self.course.keys)
+            self._ownership.claim(param, state, self.course.row_keys)
+
+    # -- copies and checkpoints ------------------------------------------------------------------
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        # A made class is found by the class that it was made of, not by its name.
+        made_of = vars(type(self)).get("_made_of")
+        if made_of is None:
+            return super().__reduce_ex__(protocol)
+        return _new_upgraded, (made_of,), self.__getstate__()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "course": self.course, "base": self.base}
+        names = ("course", "_base", "_records", "_slots", "_open_windows", "_rewinds")
+        return {**super().__getstate__(), **{name: getattr(self, name) for name in names}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        is_copy = "course" in state
-        if not is_copy:  # called by torch's load_state_dict, after its hooks
-            call = f"{type(self).__name__}.load_state_dict"
-            params = [p for group in state["param_groups"] for p in group["params"]]
-            check_rows(call, params, self.course.keys, state["state"])
         super().__setstate__(state)
-        if is_copy:  # the parameters are other objects, the rows the same
-            self._ledger = Ledger()
-            self.trust_rows()
+        if "course" in state:  # a copy: the parameters are other objects, the rows the same
+            self._ownership = RowOwnership()
+            self._claim_rows()
+            self.course.register(self)
 
     def state_dict(self) -> dict[str, Any]:
-        """torch's, with the course's inside `param_groups[0]`, and nothing of strangers' rows."""
+        """torch's, with the course's inside `param_groups[0]`, and nothing of foreign rows."""
         for param, state in self.state.items():
-            self._ledger.drop_strangers(param, state, self.course.keys)
+            self._ownership.drop_foreign(param, state, self.course.row_keys)
+        if self._nonfinite is not None and bool(self._nonfinite):
+            self._report_nonfinite("a gradient")
+        self._nonfinite = None
         if not self.course.keeps_state:
             return super().state_dict()
-        group = self.param_groups[0]
-        group[STATE_KEY] = self.course.state_dict()
-        try:
+        self._name_groups()
+        own = pack_optimizer(self, self._records, self._open_windows)
+        with TemporaryOverrides() as overrides:
+            shared = {**self.course.state_dict(), "optimizer": own}
+            overrides.extra_item(self.param_groups[0], STATE_KEY, shared)
             return super().state_dict()
-        finally:
-            del group[STATE_KEY]
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """As torch's; also takes the `state_dict()` of a plain Adam.
@@ -251,18 +543,66 @@ class StepAdam(Adam):
         Raises:
             ValueError: it does not fit; then nothing has been loaded.
         """
-        before = self.state, self.param_groups
-        super().load_state_dict(state_dict)
+        before = self.state, self.param_groups, self._records, self._open_windows
+        found: list[Saved] = []
+
+        def inspect(_: Any, loaded: dict[str, Any]) -> dict[str, Any]:
+            # torch would cast what parts keep to the parameters' dtype.
+            saved, rest = inspect_checkpoint(self, loaded)
+            found.append(saved)
+            return rest
+
+        handle = self.register_load_state_dict_pre_hook(inspect)  # after those of others
         try:
-            self.course.take_loaded(self)
+            super().load_state_dict(state_dict)
+        finally:
+            handle.remove()
+        try:
+            # A base class with a load_state_dict of its own may have called no hook.
+            self._restore(found[0] if found else None)
         except ValueError:
-            self.state, self.param_groups = before
+            self.state, self.param_groups, self._records, self._open_windows = before
             raise
-        for group, old in zip(self.param_groups, before[1], strict=True):
-            group[SLOT] = old.get(SLOT)  # a plain Adam's checkpoint does not say it
-        if self.base is Adam and self.defaults["fused"]:
+        if self._base is Adam and self.defaults["fused"]:
             use_fused(self)
-        self.trust_rows()
+
+    def _restore(self, saved: Saved | None) -> None:
+        """Take the clock and what parts have kept, once torch has loaded the moments.
+
+        Args:
+            saved: what was found in a checkpoint; None: it lies in the state and in the groups,
+                where a stock optimizer has loaded it.
+        """
+        if saved is None:
+            saved = inspect_checkpoint(self, _as_loaded(self))[0]
+            self.param_groups[0].pop(STATE_KEY, None)
+        self._acting, self._records = (None, {}), []
+        self._name_groups()
+        params = chain.from_iterable(group["params"] for group in self.param_groups)
+        for param, rows in zip(params, saved.rows, strict=True):
+            own = self.state.get(param)
+            for key in [key for key in own or () if "." in str(key)]:
+                del self.state[param][key]
+            for key, value in rows.items():
+                self.state[param][key] = value.detach().to(param.device, copy=True)
+        if saved.course is not None:
+            self.course.load_state_dict(saved.course)
+        else:
+            self.course.expect(number_of_steps(self.state.values()))
+        restore_numbers(self, self._records, saved)
+        self._open_windows = dict(saved.windows)
+        self._rewinds = self.course.rewinds
+        self._claim_rows()
+
+    def take_loaded(self) -> None:
+        """Take what a checkpoint of ours has left in a stock optimizer, before it was upgraded."""
+        self._restore(None)
+
+    @property
+    def call_name(self) -> str:
+        """How messages call it."""
+        own = (cls.__name__ for cls in type(self).__mro__ if "_made_of" not in vars(cls))
+        return next(own)
 
     def __repr__(self) -> str:
         lines = [str(part) for part in self.course.parts]
@@ -270,4 +610,33 @@ class StepAdam(Adam):
             sizes = [list(param.shape) for param in group["params"]]
             size = sizes[0] if len(sizes) == 1 else f"{len(sizes)} tensors"
             lines.append(f"{group_name(i, group)} {size}: lr {float(group['lr']):.4g}")
-        return block(type(self).__name__, lines)
+        return block(self.call_name, lines)
+
+
+@functools.cache
+def upgraded_class(base: type[Adam]) -> type[StepAdam]:
+    """The class of an upgraded optimizer: a `StepAdam` that is still a `base`.
+
+    Trainers choose by `isinstance`, call what their own class overrides, and look at the module of
+    the class: name, module and everything but the step are `base`'s.
+    """
+    bases = (StepAdam,) if base is Adam else (StepAdam, base)
+    about = {"__module__": base.__module__, "__qualname__": base.__qualname__, "_made_of": base}
+    return type(base.__name__, bases, about)
+
+
+def _new_upgraded(base: type[Adam]) -> StepAdam:
+    made = upgraded_class(base)
+    return made.__new__(made)
+
+
+def _as_loaded(optimizer: StepAdam) -> dict[str, Any]:
+    """The state of an optimizer as a checkpoint has it, without a copy."""
+    params = list(chain.from_iterable(group["params"] for group in optimizer.param_groups))
+    numbers = iter(range(len(params)))
+    groups = [
+        {**group, "params": [next(numbers) for _ in group["params"]]}
+        for group in optimizer.param_groups
+    ]
+    state = {i: optimizer.state[p] for i, p in enumerate(params) if p in optimizer.state}
+    return {"state": state, "param_groups": groups, "cast": True}

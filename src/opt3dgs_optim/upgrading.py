@@ -4,17 +4,42 @@ import inspect
 import logging
 import sys
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from torch.optim import Adam, Optimizer
 
-from opt3dgs_optim.checks import LOGGER
+from opt3dgs_optim.checks import LOGGER, warn_user
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.names import GAUSSIAN_NAMES, SLOT, canonical_name, group_name
-from opt3dgs_optim.stepadam import StepAdam
+from opt3dgs_optim.names import (
+    GAUSSIAN_NAMES,
+    canonical_name,
+    gaussian_of,
+    group_name,
+    set_of,
+    split_name,
+)
+from opt3dgs_optim.state import rows_of
+from opt3dgs_optim.stepadam import StepAdam, upgraded_class
 from opt3dgs_optim.version import __version__
 
 CALL = "PhaseScheduler.upgrade"
+
+
+class Candidate(NamedTuple):
+    """An optimizer that was looked at."""
+
+    key: str | None  # its key in a dict of optimizers, which says what it holds
+    optimizer: Any
+    shown: str  # how messages call it
+
+
+class Plan(NamedTuple):
+    """What is to be done with an optimizer that the parts do not surround yet."""
+
+    optimizer: Optimizer
+    base: type[Adam]  # whose step the parts surround
+    made: type[StepAdam]  # the class that it gets
+    slots: list[tuple[str, str | None]]  # by group: set of Gaussians, which parameter
 
 
 def upgrade(optimizers: Any, course: Course) -> int:
@@ -22,38 +47,44 @@ def upgrade(optimizers: Any, course: Course) -> int:
 
     Arguments and errors are those of `PhaseScheduler.upgrade`.
     """
-    if isinstance(optimizers, Optimizer):
-        found = [(None, optimizers, "the optimizer")]
-    elif isinstance(optimizers, Mapping):
-        found = [(key, each, f"optimizers[{key!r}]") for key, each in optimizers.items()]
-    else:
-        raise TypeError(
-            f"{CALL}: optimizers is a {type(optimizers).__name__}, but a dict of optimizers, or "
-            "one optimizer with named groups, is needed"
-        )
-    taken, left, plans = [], [], []
-    for key, optimizer, shown in found:  # all are looked at before the first is changed
+    candidates = _candidates(optimizers)
+    taken, left, plans, held = list[str](), list[str](), list[Plan](), list[tuple[str, str]]()
+    unknown: list[tuple[str, Any]] = []
+    known_rows = set[int]()
+    for key, optimizer, shown in candidates:  # all are looked at before the first is changed
         if key is not None and canonical_name(key) is None:
             left.append(str(key))
+            unknown += [(str(key), group) for group in getattr(optimizer, "param_groups", ())]
             continue
-        base, slots = _look_at(optimizer, course, shown, key)
+        plan, slots = _look_at(optimizer, course, shown, key)
         for i, (group, slot) in enumerate(zip(optimizer.param_groups, slots, strict=True)):
-            (left if slot is None else taken).append(key or group_name(i, group))
-        if base is not None and any(slots):
-            plans.append((optimizer, base, slots))
+            set_name, name = slot
+            called = key or group_name(i, group)
+            if name is None:
+                left.append(called)
+                unknown.append((called, group))
+                continue
+            if (set_name, name) in held:
+                raise ValueError(f"{CALL}: two groups of {shown} hold {name!r}")
+            held.append((set_name, name))
+            taken.append(called)
+            known_rows |= {rows_of(param) for param in group["params"] if param.dim()}
+        if plan is not None and any(name for _, name in slots):
+            plans.append(plan)
     if not taken:
         names = sorted(alias for aliases in GAUSSIAN_NAMES.values() for alias in aliases)
         raise ValueError(
             f"{CALL}: none of the names {left} is a Gaussian parameter's; allowed are "
             f"{', '.join(names)}"
         )
-    for optimizer, base, slots in plans:
-        for group, slot in zip(optimizer.param_groups, slots, strict=True):
-            group[SLOT] = slot
+    for plan in plans:
+        optimizer: Any = plan.optimizer
         vars(optimizer).pop("step", None)  # a learning-rate scheduler's wrapper of the old class's
-        optimizer.__class__ = StepAdam
-        optimizer.follow(course, base)
-        course.take_loaded(optimizer)
+        optimizer.__class__ = plan.made
+        optimizer.hold(plan.slots)
+        optimizer.follow(course, plan.base)
+        optimizer.take_loaded()
+    _warn_of_unknown(unknown, known_rows)
     parts = ", ".join(str(part) for part in course.parts) or "none"
     others = f"; left alone: {', '.join(left)}" if left else ""
     again = f" from iteration {course.iteration}" if course.iteration else ""
@@ -64,28 +95,65 @@ def upgrade(optimizers: Any, course: Course) -> int:
     return len(plans)
 
 
+def _candidates(optimizers: Any) -> list[Candidate]:
+    if isinstance(optimizers, Optimizer):
+        return [Candidate(None, optimizers, "the optimizer")]
+    if isinstance(optimizers, Mapping):
+        return [Candidate(key, each, f"optimizers[{key!r}]") for key, each in optimizers.items()]
+    if isinstance(optimizers, (list, tuple)):
+        return [Candidate(None, each, f"optimizers[{i}]") for i, each in enumerate(optimizers)]
+    raise TypeError(
+        f"{CALL}: optimizers is a {type(optimizers).__name__}, but a dict or a list of optimizers, "
+        "or one optimizer with named groups, is needed"
+    )
+
+
+def _warn_of_unknown(unknown: list[tuple[str, Any]], known_rows: set[int]) -> None:
+    """Say which groups may be Gaussian parameters under names that are not known here."""
+    suspects = [
+        name
+        for name, group in unknown
+        if any(param.dim() and rows_of(param) in known_rows for param in group["params"])
+        and max(known_rows) > 1
+    ]
+    if suspects:
+        warn_user(
+            f"{CALL}: {', '.join(suspects)} stay as they are, though they have as many rows as the "
+            "Gaussian parameters. If they are some, the parts act on a half of the Gaussians; put "
+            f"the optimizers into a dict under names that are known: {', '.join(GAUSSIAN_NAMES)}"
+        )
+
+
 def _look_at(
     optimizer: Any, course: Course, shown: str, key: str | None
-) -> tuple[type[Adam] | None, list[str | None]]:
-    """Whose step the parts surround (None: it has them already); what each group holds.
-
-    `shown` is how messages call it, `key` what a dict of optimizers says that it holds; None: its
-    groups' names say.
-    """
-    base = None
-    if not isinstance(optimizer, StepAdam):
-        base = _base_of(optimizer, shown)
-    elif optimizer.course is not course:
-        raise TypeError(f"{CALL}: {shown} is a {type(optimizer).__name__} with parts of its own")
-    groups = optimizer.param_groups
+) -> tuple[Plan | None, list[tuple[str, str | None]]]:
+    """How an optimizer gets the parts (None: it has them already); what each group holds."""
+    if isinstance(optimizer, StepAdam):
+        if optimizer.course is not course:
+            raise TypeError(f"{CALL}: {shown} is a {optimizer.call_name} with parts of its own")
+        groups = optimizer.param_groups
+        return None, [(set_of(group), gaussian_of(group)) for group in groups]
+    base = _base_of(optimizer, shown)
     # A dict's key says what its optimizer holds, whatever the group is called.
-    slots = [canonical_name(key or group.get("name")) for group in groups]
-    if base is None:
-        slots = [group.get(SLOT) for group in groups]
-    twice = sorted({name for name in slots if name is not None and slots.count(name) > 1})
-    if twice:
-        raise ValueError(f"{CALL}: two groups of {shown} hold {twice[0]!r}")
-    return base, slots
+    slots = [split_name(key or group.get("name")) for group in optimizer.param_groups]
+    if not any(name for _, name in slots):
+        return None, slots
+    return Plan(optimizer, base, _made_class(optimizer, shown), slots), slots
+
+
+def _made_class(optimizer: Any, shown: str) -> type[StepAdam]:
+    """The class that the optimizer gets; TypeError where its own cannot be kept."""
+    kind = type(optimizer)
+    try:
+        made = upgraded_class(kind)
+        # What assignment of a class asks: the same layout.
+        object.__new__(kind).__class__ = made
+    except TypeError as error:
+        raise TypeError(
+            f"{CALL}: {shown} is a {kind.__module__}.{kind.__qualname__}, of which no class with "
+            f"parts can be made ({error})"
+        ) from None
+    return made
 
 
 def _base_of(optimizer: Any, shown: str) -> type[Adam]:
@@ -98,6 +166,7 @@ def _base_of(optimizer: Any, shown: str) -> type[Adam]:
         raise TypeError(f"{CALL}: somebody has replaced the step of {shown}, a {kind}")
     step = inspect.unwrap(type(optimizer).step)
     if step is inspect.unwrap(Adam.step):
+        _check_device_path(optimizer, shown)
         return Adam
     if list(inspect.signature(step).parameters)[1:2] == ["visibility"]:
         return type(optimizer)  # gsplat's SelectiveAdam, INRIA's SparseGaussianAdam
@@ -105,6 +174,17 @@ def _base_of(optimizer: Any, shown: str) -> type[Adam]:
         f"{CALL}: {shown} is a {kind} with a step of its own, but Adam's, or one that takes a "
         "visibility mask, is needed"
     )
+
+
+def _check_device_path(optimizer: Any, shown: str) -> None:
+    """TypeError for tensors whose steps are another matter, such as DTensor's shards."""
+    for group in optimizer.param_groups:
+        for param in group["params"]:
+            if type(param).__name__ == "DTensor" or type(param.data).__name__ == "DTensor":
+                raise TypeError(
+                    f"{CALL}: {shown} holds a DTensor, but parts act on the rows of plain tensors; "
+                    "upgrade optimizers of local tensors, as gsplat's distributed trainer has them"
+                )
 
 
 def _say(message: str) -> None:

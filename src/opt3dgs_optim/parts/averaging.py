@@ -1,16 +1,17 @@
 """Averaging: a training ends at the mean of its last iterates."""
 
+from __future__ import annotations
+
+import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.part import Group, Part
-from opt3dgs_optim.rows import shaped
-
-MEAN, COUNT = "mean_iterate", "num_averaged"  # of a row, and of how many of its iterates
+from opt3dgs_optim.part import Group, Kept, Part, State, Window
+from opt3dgs_optim.state import broadcast_rows
 
 
 @dataclass(frozen=True, repr=False)
@@ -18,27 +19,35 @@ class Averaging(Part):
     """Put the mean of the last iterates in the place of the last one (Polyak and Juditsky 1992).
 
     Every step follows one view, so the parameters wander about what fits all of them, the further
-    the higher their learning rates; the mean does not. That of the last thirtieth of the run takes
-    their place in the last tenth of it, in rows that a mask lets move; what is infinite, as colours
-    of gsplat's `--app_opt`, stays, and edited rows begin anew. Until then nothing is changed. It
-    takes the parameters' memory once more.
+    the higher their learning rates; their mean does not. Averaging covers the last thirtieth of the
+    run. In the last tenth of that the mean takes the parameters' place, because trainers save
+    before their last step. Until then nothing is changed.
+
+    With masked steps every row has the mean of its own iterates, and takes it in a step that moves
+    it. Rows that density control edits begin anew. Numbers that are not finite are left alone, such
+    as the colours of gsplat's `--app_opt`, which are logits.
+
+    It takes the memory of the parameters once more, in the last thirtieth.
     """
 
     share: ClassVar[float] = 1 / 30  # of the run
 
-    keys = (MEAN, COUNT)
+    keeps = (Kept("mean"), Kept("count", shape=()))
+
+    def window(self, course: Course) -> Window:
+        """The last thirtieth of the run, in which iterates are averaged."""
+        return course.total_steps - math.floor(self.share * course.total_steps), course.total_steps
 
     @torch.no_grad()
-    def after(self, group: Group, param: Tensor, state: dict[str, Any], course: Course) -> None:
+    def after(self, group: Group, param: Tensor, state: State, course: Course) -> None:
         """Take the parameter [N, ..] into its mean; in the last steps put that in its place."""
-        left, length = course.total_steps - course.current, self.share * course.total_steps
-        if not 0 < left <= length:
+        start, end = self.window(course)
+        if not start <= course.current < end:
             return
-        if COUNT not in state:  # from the next step on: this one may yet be taken back
-            state[MEAN] = torch.zeros_like(param, dtype=torch.float32)
-            state[COUNT] = torch.zeros(param.shape[:1], device=param.device)
-            return
-        mean, count = state[MEAN], shaped(state[COUNT].add_(course.valid), param)
-        mean.lerp_(param.float(), course.valid / count.clamp(min=1.0))
-        if left <= max(2, length / 10):  # trainers save before the last step, or do not make it
-            param.copy_(torch.where(mean.isfinite() & course.valid, mean, param))
+        count = state["count"].add_(1.0)
+        mean, finite = state["mean"], param.isfinite()
+        iterate = torch.where(finite, param, 0.0).to(mean.dtype)
+        mean.lerp_(iterate, 1.0 / broadcast_rows(count, param))
+        # Trainers save before the last step, or do not make it.
+        if end - course.current <= max(2, (end - start) / 10):
+            param.copy_(torch.where(finite, mean, param))

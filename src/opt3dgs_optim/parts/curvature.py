@@ -1,6 +1,7 @@
 """Curvature: a per-point L-BFGS direction as the gradient that Adam is fed (eq. 17)."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,7 +13,7 @@ from opt3dgs_optim.course import Course
 from opt3dgs_optim.lbfgs.history import MAX_HISTORY, history_shape, laid_out, new_history
 from opt3dgs_optim.lbfgs.two_loop import foresight, lqn_direction
 from opt3dgs_optim.names import check_names
-from opt3dgs_optim.part import Group, Part, Phase
+from opt3dgs_optim.part import Group, Kept, Part, Phase, State
 
 HISTORY = "history"
 PROBE_STEPS = 10  # exploitation steps between two looks at what the pairs foretell
@@ -21,6 +22,24 @@ MIN_ACCEPTED = 0.1  # share of the candidate pairs
 # Pairs that are mostly the difference between views reach 0.03 to 0.07, exact ones of a quadratic
 # with condition 100 reach 0.2.
 MIN_FORESIGHT = 0.1
+
+
+def points_of(param: Tensor) -> Tensor:
+    """A parameter [N, ..] as points [N, D]; a number alone is one point."""
+    return param.detach().reshape(param.shape[0] if param.dim() else 1, -1)
+
+
+@dataclass(frozen=True)
+class KeptHistory(Kept):
+    """The curvature pairs of every point, laid out as `lbfgs.history` says."""
+
+    history_size: int = 0
+
+    def shape_for(self, param: Tensor) -> tuple[int, ...]:
+        return history_shape(points_of(param), self.history_size)
+
+    def make(self, param: Tensor) -> Tensor:
+        return new_history(points_of(param), self.history_size, contiguous=param.is_cuda)
 
 
 class Curvature(Part):
@@ -47,7 +66,6 @@ class Curvature(Part):
     """
 
     during = Phase.EXPLOITATION
-    keys = (HISTORY,)
 
     def __init__(
         self,
@@ -64,6 +82,7 @@ class Curvature(Part):
         self.graft = check_choice(call, "graft", graft)
         self.names = None if names is None else check_names(call, names)
         self.backend: Backend = check_choice(call, "backend", backend, BACKENDS)
+        self.keeps = (KeptHistory(HISTORY, history_size=self.history_size),)
         self._step = -1  # of the tally
         self._tally = torch.zeros(2)  # [accepted, candidates] of the last step
         self._seen = torch.zeros(4)  # those and [foresight, points looked at], of all steps
@@ -81,17 +100,15 @@ class Curvature(Part):
         return None if self._step < 0 else self._tally[0] / self._tally[1].clamp(min=1)
 
     def before(
-        self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
+        self, group: Group, param: Tensor, grad: Tensor, state: State, course: Course
     ) -> Tensor:
         """Store the pairs that this step completes; return the pseudo-gradient."""
         if param.is_complex():
             raise ValueError("Curvature: complex parameters have no real curvature pairs")
         if param.numel() == 0:
             return grad
-        position = param.detach().reshape(param.shape[0] if param.dim() else 1, -1)
+        position = points_of(param)
         gradient = grad.reshape(position.shape)
-        if isinstance(course.valid, Tensor):  # a gradient of zero leaves no pair
-            gradient = torch.where(course.valid, gradient, 0.0)
         history = self._history(state, position)
         if course.adaptive:
             self._seen = self._seen.to(grad.device)
@@ -108,16 +125,16 @@ class Curvature(Part):
             self._seen[:2] += tally
         return fed.reshape(grad.shape)
 
-    def _history(self, state: dict[str, Any], position: Tensor) -> Tensor:
-        shape = history_shape(position, self.history_size)
+    def _history(self, state: Any, position: Tensor) -> Tensor:
+        """The points' history, laid out for what will compute on it."""
         like = position.device, position.dtype, position.shape[1], self.history_size
         asked = position.is_cuda or self.backend == "cuda"
         kernel = asked and obstacle(self.backend, *like) is None
-        if HISTORY not in state or tuple(state[HISTORY].shape) != shape:
-            state.pop(HISTORY, None)  # before the new one, or both would be in memory
-            state[HISTORY] = new_history(position, self.history_size, contiguous=kernel)
-        state[HISTORY] = laid_out(state[HISTORY], contiguous=kernel)
-        return state[HISTORY]
+        history = state[HISTORY]
+        laid = laid_out(history, contiguous=kernel)
+        if laid is not history:
+            state.exchange(HISTORY, laid)
+        return laid
 
     def numbers(self, course: Course) -> Mapping[str, float | Tensor]:
         """`accepted`: the share of the candidate pairs that the last step accepted."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -10,14 +9,14 @@ from torch import Tensor
 from opt3dgs_optim.checks import check_count, check_number
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import GAUSSIAN, check_names
-from opt3dgs_optim.part import Group, Part
-from opt3dgs_optim.rows import shaped
+from opt3dgs_optim.part import Group, Part, State
+from opt3dgs_optim.state import broadcast_rows
 
 CALL = "Fading"
-DONE = "faded"  # of a group: events that its parameter has had
-MOST = 32  # events made up for at once, where a trainer's iteration count jumps
-MANY = 10_000  # points from which on fewer of the events happen
-APART = 4  # iterations between two events; in 600, events 1 apart lose half of what 4 apart gain
+MAX_CATCH_UP_EVENTS = 32  # made up for at once, where a trainer's iteration count jumps
+MAX_POINTS_OF_ALL_EVENTS = 10_000  # of more points, fewer of the events happen
+# In 600 iterations, events 1 apart lose half of what events 4 apart gain.
+MIN_ITERATIONS_BETWEEN_EVENTS = 4
 
 
 @dataclass(frozen=True, repr=False)
@@ -67,11 +66,14 @@ class Fading(Part):
         """Number of events before the step of this iteration (from 0)."""
         length = self.stop - self.start
         share = (iteration / total_steps - self.start) / length
-        return int(min(max(share, 0.0), 1.0) * min(self.events, length * total_steps / APART))
+        return int(
+            min(max(share, 0.0), 1.0)
+            * min(self.events, length * total_steps / MIN_ITERATIONS_BETWEEN_EVENTS)
+        )
 
     def happens(self, event: int, num_points: int) -> bool:
         """Whether an event fades any of so many points: of more than 10,000, some do."""
-        share = min(1.0, MANY / num_points) ** (2 / 3) if num_points else 0.0
+        share = min(1.0, MAX_POINTS_OF_ALL_EVENTS / num_points) ** (2 / 3) if num_points else 0.0
         return int((event + 1) * share) > int(event * share)
 
     def chosen(self, event: int, num_points: int, device: torch.device) -> Tensor:
@@ -79,29 +81,37 @@ class Fading(Part):
         # A CPU's generator reads 32 bits; consecutive seeds are far apart in them.
         seed = (event + self.seed * 0x9E3779B1) % 2**32
         generator = torch.Generator(device).manual_seed(seed)
-        return torch.rand(num_points, generator=generator, device=device) < self.share
+        return (
+            torch.rand(num_points, generator=generator, device=device, dtype=torch.float32)
+            < self.share
+        )
 
     def before(
-        self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
+        self, group: Group, param: Tensor, grad: Tensor, state: State, course: Course
     ) -> Tensor:
-        """Fade the moments by the events since this parameter's last step."""
+        """Fade the moments by the events since this parameter's last step.
+
+        Events are of the clock: they happen whether or not the step of their iteration counts.
+        """
         # The step of iteration i comes after i + 1 observations.
         now = self.events_before(course.iteration, course.total_steps)
-        done = group.get(DONE, self.events_before(course.iteration - 1, course.total_steps))
-        group[DONE] = now
+        last = getattr(state, "last_step", None)
+        if last is None or last > course.current:  # the first step, or the clock was set back
+            last = course.current - 1
+        done = self.events_before(last + 1, course.total_steps)
         count = len(param) if param.dim() > 0 else 0
-        due = [e for e in range(max(done, now - MOST), now) if self.happens(e, count)]
-        for event in due:
-            chosen = self.chosen(event, count, param.device)
-            if isinstance(course.valid, Tensor):
-                chosen = chosen & course.valid
-            chosen = shaped(chosen, param)
-            state["exp_avg"].mul_(torch.where(chosen, self.exp_avg, 1.0))
-            second = torch.where(chosen, self.exp_avg_sq, 1.0)
-            for key in ("exp_avg_sq", "max_exp_avg_sq"):
+        due = range(max(done, now - MAX_CATCH_UP_EVENTS), now)
+        for event in [each for each in due if self.happens(each, count)]:
+            chosen = broadcast_rows(self.chosen(event, count, param.device), param)
+            for key, factor in self._factors():
                 if key in state:
-                    state[key].mul_(second)
+                    moment = state[key]
+                    moment.copy_(torch.where(chosen, moment * factor, moment))
         return grad
+
+    def _factors(self) -> tuple[tuple[str, float], ...]:
+        second = self.exp_avg_sq
+        return ("exp_avg", self.exp_avg), ("exp_avg_sq", second), ("max_exp_avg_sq", second)
 
     def numbers(self, course: Course) -> Mapping[str, float]:
         """`faded`: the share of up to 10,000 points that the present iteration's events fade."""

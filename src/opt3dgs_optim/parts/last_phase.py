@@ -1,16 +1,13 @@
 """What changes at the switch besides the positions' direction: the loss, and Adam's moments."""
 
 from dataclasses import dataclass
-from typing import Any
 
 from torch import Tensor
 
 from opt3dgs_optim.checks import check_count
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.part import Group, Part, Phase
-from opt3dgs_optim.rows import MOMENTS
-
-FRESH = "fresh_since"  # of a group: the switch at which its moments were started anew
+from opt3dgs_optim.part import Group, Part, Phase, State
+from opt3dgs_optim.state import MOMENTS
 
 
 class SquaredLoss(Part):
@@ -48,12 +45,12 @@ class FreshMoments(Part):
         check_count("FreshMoments", "settling", self.settling, 0)
 
     def before(
-        self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
+        self, group: Group, param: Tensor, grad: Tensor, state: State, course: Course
     ) -> Tensor:
-        """Zero the moments at the first step after the switch."""
+        """Zero the moments in the parameter's first step after the switch."""
         left = course.total_steps - course.switch_step
-        if group.get(FRESH) != course.switch_step and left >= self.settling:
-            group[FRESH] = course.switch_step
+        last = getattr(state, "last_step", None)
+        if (last is None or last < course.switch_step) and left >= self.settling:
             for key in ("step", *MOMENTS):
                 if key in state:
                     state[key].zero_()

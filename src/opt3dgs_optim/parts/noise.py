@@ -10,12 +10,14 @@ from torch import Tensor
 from opt3dgs_optim.checks import check_number, warn_user
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.lbfgs.pairs import columns, put, row_chunks
-from opt3dgs_optim.part import Group, Part, Phase
+from opt3dgs_optim.part import Group, Part, Phase, State
 
 GaussianTensors = Mapping[str, Tensor]
+MAX_SETS = 16  # tensors of positions that are watched
 GATE_SHARPNESS = 100.0  # k of eq. 2's gate
 GATE_OPACITY = 0.005  # t of eq. 2's gate: the opacity under which a Gaussian counts as dead
-TWICE = 5  # steps in a row with positions changed by somebody else before it is said
+# Steps in a row with positions changed by somebody else before it is said.
+MIN_STEPS_CHANGED_BY_OTHERS = 5
 
 
 class PositionNoise(Part):
@@ -28,7 +30,8 @@ class PositionNoise(Part):
     Args:
         gaussians: the trainer's dict with `scales` [N, 3] log, `quats` [N, 4] wxyz and
             `opacities` [N] or [N, 1] logits, or a function that returns it; read in every step,
-            because density control replaces the tensors in it.
+            because density control replaces the tensors in it. None: they are looked up in the
+            groups of the upgraded optimizers.
         scale: noise_lr of 3DGS-MCMC.
         during: the phase in which it is added; None: both.
         generator: random generator of the parameters' device, or None for torch's own.
@@ -41,7 +44,7 @@ class PositionNoise(Part):
 
     def __init__(
         self,
-        gaussians: GaussianTensors | Callable[[], GaussianTensors],
+        gaussians: GaussianTensors | Callable[[], GaussianTensors] | None = None,
         scale: float = 5e5,
         *,
         during: Phase | None = None,
@@ -51,40 +54,52 @@ class PositionNoise(Part):
         self.scale = check_number("PositionNoise", "scale", scale, 0.0)
         self.during = during  # pyright: ignore[reportAttributeAccessIssue]
         self.generator = generator
-        # Where the positions lay after the last step, and how often they had been written.
-        self._left = (None, None)
-        self._moved = 0
+        # Where positions lay after their last step -> how often they had been written.
+        self._versions: dict[int, int] = {}
+        self._num_changed_by_others = 0
 
     def __repr__(self) -> str:
         during = "" if self.during is None else f", during={self.during.value}"
         return f"PositionNoise(scale={self.scale:g}{during})"
 
     def before(
-        self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
+        self, group: Group, param: Tensor, grad: Tensor, state: State, course: Course
     ) -> Tensor:
         """Say once that somebody else moves the positions too, as a trainer's own noise does."""
         # Density control puts another tensor in place; noise writes into this one, every time.
-        written = self._left[0] == param.data_ptr() and self._left[1] != param._version
-        if self._moved <= TWICE:
-            self._moved = self._moved + 1 if written else 0
-            if self._moved > TWICE:
+        written = self._versions.get(param.data_ptr(), param._version) != param._version
+        if self._num_changed_by_others <= MIN_STEPS_CHANGED_BY_OTHERS:
+            self._num_changed_by_others = self._num_changed_by_others + 1 if written else 0
+            if self._num_changed_by_others > MIN_STEPS_CHANGED_BY_OTHERS:
                 warn_user(
-                    f"PositionNoise: the positions were changed in place between {TWICE} steps in "
-                    "a row, while this part adds noise in every step; if the trainer injects its "
-                    "own noise, set its noise_lr to 0, or leave this part out"
+                    f"PositionNoise: the positions were changed in place between "
+                    f"{MIN_STEPS_CHANGED_BY_OTHERS} steps in a row, while this part adds noise in "
+                    "every step; if the trainer injects its own noise, set its noise_lr to 0, or "
+                    "leave this part out"
                 )
         return grad
 
-    def after(self, group: Group, param: Tensor, state: dict[str, Any], course: Course) -> None:
+    def after(self, group: Group, param: Tensor, state: State, course: Course) -> None:
         """Add the noise to the positions [N, 3] in place."""
-        lr, valid = group["lr"], course.valid
-        self.add_to(param, torch.where(valid, lr, 0.0) if isinstance(valid, Tensor) else lr)
-        self._left = (param.data_ptr(), param._version)
+        source = self.gaussians if self.gaussians is not None else course.gaussians_of(param)
+        self._add(param, group["lr"], source() if callable(source) else source)
+        if len(self._versions) >= MAX_SETS:  # of tensors that density control replaced
+            self._versions.clear()
+        self._versions[param.data_ptr()] = param._version
 
     @torch.no_grad()
     def add_to(self, means: Tensor, lr: float | Tensor) -> None:
         """Add the noise to `means` [N, 3] in place; lr is their rate. ValueError: see the class."""
         source = self.gaussians() if callable(self.gaussians) else self.gaussians
+        if source is None:
+            raise ValueError(
+                "PositionNoise.add_to: gaussians=None, but outside of a step nobody knows the "
+                "Gaussians' tensors; give them to PositionNoise"
+            )
+        self._add(means, lr, source)
+
+    @torch.no_grad()
+    def _add(self, means: Tensor, lr: float | Tensor, source: GaussianTensors) -> None:
         missing = [name for name in ("scales", "quats", "opacities") if name not in source]
         if missing:
             raise ValueError(
@@ -125,13 +140,11 @@ class IsotropicNoise(Part):
         name = "std" if self.temperature is None else "temperature"
         check_number("IsotropicNoise", name, getattr(self, name), 0.0)
 
-    def after(self, group: Group, param: Tensor, state: dict[str, Any], course: Course) -> None:
+    def after(self, group: Group, param: Tensor, state: State, course: Course) -> None:
         """Add the noise to the parameter (any shape) in place."""
         deviation: Any = self.std
         if self.temperature is not None:
             deviation = (2 * group["lr"] * self.temperature) ** 0.5
-        if isinstance(course.valid, Tensor):
-            deviation = deviation * course.valid
         param.add_(_normal_like(param, self.generator) * deviation)
 
 

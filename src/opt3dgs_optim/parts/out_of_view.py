@@ -8,53 +8,79 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.names import SLOT
-from opt3dgs_optim.part import Group, Part
-from opt3dgs_optim.rows import shaped
+from opt3dgs_optim.names import gaussian_of
+from opt3dgs_optim.part import Group, Kept, Part, State
+from opt3dgs_optim.state import broadcast_rows
 
-SHARE = "visible_share"  # of the positions' group: mean share of the points that a view sees
-MEMORY, SAMPLE = 100, 16_384  # views of the mean; points of each that are asked
-BELOW, LEAST = 1 / 3, 0.01  # where it acts; least of a view
+OUT_OF_VIEW, SEEN_SHARE = "out_of_view", "seen_share"  # what it publishes, and keeps
+NUM_VIEWS_AVERAGED = 100
+MAX_POINTS_LOOKED_AT = 16_384  # of each view, for the mean share
+MAX_SEEN_SHARE = 1 / 3  # above it nothing is changed
+MIN_SEEN_SHARE = 0.01  # a view counts as seeing at least so much
 
 
 @dataclass(frozen=True, repr=False)
 class OutOfView(Part):
     """Keep the scales and opacities of points that few views see from melting.
 
-    3DGS-MCMC's regularisers pull at every point in every iteration, and Adam makes a full step of
-    a gradient however small. Relocation and `Fading` empty second moments: a point out of view
-    then shrinks and fades until a view sees it, and where views see a tenth of the points, most
-    are dead by then. While the mean visible share s of the points is below a third, the second
-    moment of one out of view is at least (gradient / (3 s))^2, for steps of at most about 3 s of
-    a full one; above, nothing is changed, bit for bit. Out of view is a point whose position's
-    gradient is zero; the positions must be stepped first, as in every known trainer. No memory.
+    3DGS-MCMC's regularisers pull at the scale and the opacity of every point in every iteration,
+    and Adam makes a full step of a gradient however small it is. Relocation and `Fading` empty
+    second moments, so a point out of view then shrinks and fades until a view sees it again. Where
+    each view sees a tenth of the points, most of them are dead by then.
+
+    This part keeps the mean share s of the points that a view sees, over the last 100 views. While
+    s is below a third, the second moment of a point out of view is raised to at least
+    (gradient / (3 s))^2, so that its steps are at most about 3 s of a full one. Above a third
+    nothing is changed, bit for bit.
+
+    A point is out of view where the gradient of its position is zero. The positions may be stepped
+    before or after the scales and opacities; where the trainer clears their gradient first, they
+    must be stepped first, as in every known trainer. It costs no memory.
     """
 
     names = ("means", "scales", "opacities")
+    keeps = (Kept(SEEN_SHARE, per="parameter", initial=1.0),)
 
     def before(
-        self, group: Group, param: Tensor, grad: Tensor, state: dict[str, Any], course: Course
+        self, group: Group, param: Tensor, grad: Tensor, state: State, course: Course
     ) -> Tensor:
-        """See at the positions [N, 3] who is out of view; raise the others' second moments."""
+        """See at the positions [N, ..] who is out of view; raise the others' second moments."""
         if grad.dim() == 0 or len(grad) == 0:
             return grad
-        if group[SLOT] == "means":
-            some, share = grad[:: 1 + len(grad) // SAMPLE], group.get(SHARE, 1.0)
-            now: Any = some.any(1).mean(dtype=torch.float32)
-            now = max(now.item(), LEAST) if grad.is_cpu else now.clamp(min=LEAST)
-            group[SHARE] = share = share + (now - share) * (course.valid / MEMORY)
-            off = grad.is_cpu and share >= BELOW  # on a GPU nothing is read
-            unseen = None if off else ~grad.any(1) & course.valid
-            course.unseen = course.current, unseen, share
+        if gaussian_of(group) == "means":
+            share: Any = state[SEEN_SHARE]
+            some = _has_gradient(grad[:: 1 + len(grad) // MAX_POINTS_LOOKED_AT])
+            now = some.mean(dtype=torch.float32).clamp_(min=MIN_SEEN_SHARE)
+            share.lerp_(now.to(share.dtype), 1 / NUM_VIEWS_AVERAGED)
+            if grad.is_cpu:
+                share = share.item()
+            course.publish(SEEN_SHARE, param, share)
+            if not isinstance(share, float) or share < MAX_SEEN_SHARE:  # a GPU is not waited for
+                course.publish(OUT_OF_VIEW, param, ~_has_gradient(grad))
             return grad
-        iteration, unseen, share = course.unseen
-        if unseen is None or iteration != course.current or len(unseen) != len(grad):
+        share = course.published(SEEN_SHARE, param, earlier=True)
+        if share is None or (isinstance(share, float) and share >= MAX_SEEN_SHARE):
             return grad
-        factor = BELOW / share * (share < BELOW)
-        least = torch.where(shaped(unseen, grad), grad * factor, 0.0).square_()
-        state["exp_avg_sq"].copy_(torch.maximum(state["exp_avg_sq"], least))
+        unseen = course.published(OUT_OF_VIEW, param)
+        if unseen is None:  # the positions come later
+            means = course.gaussians_of(param).get("means")
+            unseen = None if means is None or means.grad is None else ~_has_gradient(means.grad)
+        if unseen is None or len(unseen) != len(grad):
+            return grad
+        factor = MAX_SEEN_SHARE / share * (share < MAX_SEEN_SHARE)
+        if isinstance(factor, Tensor):
+            factor = factor.to(grad.device)
+        least = torch.where(broadcast_rows(unseen.to(grad.device), grad), grad * factor, 0.0)
+        second = state["exp_avg_sq"]
+        second.copy_(torch.maximum(second, least.square_()))
         return grad
 
     def numbers(self, course: Course) -> Mapping[str, float | Tensor]:
-        """The mean visible share."""
-        return {SHARE: course.unseen[2]}
+        """`visible_share`: the mean share of the points that a view sees."""
+        share = course.last_published(SEEN_SHARE)
+        return {"visible_share": 1.0 if share is None else share}
+
+
+def _has_gradient(grad: Tensor) -> Tensor:
+    """Which points have a gradient, [N] bool."""
+    return grad.reshape(len(grad), -1).any(1)

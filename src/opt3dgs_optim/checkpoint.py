@@ -1,0 +1,287 @@
+"""What a checkpoint holds besides torch's moments: how it is packed, checked and taken apart.
+
+Inside `param_groups[0]["opt3dgs"]` of an optimizer's `state_dict()`: the course's own state, and
+under `"optimizer"` what belongs to this optimizer,
+
+    steps      how many steps Adam's moments have made
+    windows    for which iterations each part's state is valid, see `Part.window`
+    records    by group and parameter: the iteration of its last step, the numbers kept for it
+    kept       by parameter: the keys of what parts keep per row, beside the moments
+
+All are plain numbers, strings, lists and dicts, so that `torch.load(weights_only=True)` and torch's
+distributed checkpoints take them. Checkpoints of format 2 are still read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from itertools import chain
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim.checks import LOGGER, check_count, check_keys, check_number, warn_user
+from opt3dgs_optim.course import STATE_KEY, Course
+from opt3dgs_optim.names import SLOT
+from opt3dgs_optim.part import Window
+from opt3dgs_optim.state import ParameterRecord, check_kept, check_moments, key_of, rows_of
+
+if TYPE_CHECKING:
+    from opt3dgs_optim.stepadam import StepAdam
+
+# Format 2 kept these under names that all parts shared, and numbers in the groups.
+ROW_KEYS_OF_FORMAT_2 = {
+    "history": "Curvature.history",
+    "mean_iterate": "Averaging.mean",
+    "num_averaged": "Averaging.count",
+}
+SHARE_OF_FORMAT_2 = "visible_share"
+GROUP_KEYS_OF_FORMAT_2 = (SLOT, "faded", "fresh_since", SHARE_OF_FORMAT_2)
+
+
+class Saved(NamedTuple):
+    """What a checkpoint has for one optimizer, checked."""
+
+    course: dict[str, Any] | None  # None: it is no checkpoint of ours
+    windows: dict[str, Window | None]
+    records: list[list[tuple[int | None, dict[str, float]]]]  # by group, by parameter
+    rows: list[dict[str, Tensor]]  # by parameter: what parts keep per row
+
+
+def number_of_steps(states: Iterable[Mapping[str, Any]]) -> int:
+    """How many steps Adam's moments have made, the most of all parameters."""
+    return int(max((float(state["step"]) for state in states if "step" in state), default=0))
+
+
+def pack_optimizer(
+    optimizer: StepAdam,
+    records: list[list[ParameterRecord]],
+    windows: Mapping[str, Window | None],
+) -> dict[str, Any]:
+    """What belongs to one optimizer. Synchronises with the device."""
+    keys, kept = optimizer.course.row_keys, {}
+    for i, param in enumerate(_parameters(optimizer)):
+        present = [key for key in keys if key in optimizer.state.get(param, {})]
+        if present:
+            kept[str(i)] = present
+    return {
+        "steps": number_of_steps(optimizer.state.values()),
+        "windows": {name: list(window) for name, window in windows.items() if window is not None},
+        "records": [
+            [
+                {
+                    "last_step": record.last_step,
+                    "numbers": {key: value.item() for key, value in record.numbers.items()},
+                }
+                for record in group
+            ]
+            for group in records
+        ],
+        "kept": kept,
+    }
+
+
+def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Saved, dict[str, Any]]:
+    """Check a `state_dict()`; return what parts have in it, and the rest, for torch to load.
+
+    Raises:
+        ValueError: it is damaged.
+    """
+    call = f"{optimizer.call_name}.load_state_dict"
+    params = _parameters(optimizer)
+    groups = [dict(group) for group in loaded["param_groups"]]
+    shared = groups[0].pop(STATE_KEY, None) if groups else None
+    share = [group.get(SHARE_OF_FORMAT_2) for group in groups]
+    for group in groups:
+        for key in GROUP_KEYS_OF_FORMAT_2:
+            group.pop(key, None)
+    numbers = list(chain.from_iterable(group["params"] for group in groups))
+    nothing = Saved(None, {}, [], [{} for _ in params])
+    if len(numbers) != len(params):  # torch says so
+        return nothing, {**loaded, "param_groups": groups}
+    own, clock = _unpack(call, shared, optimizer, share)
+    state = dict(loaded["state"])
+    for number, param in zip(numbers, params, strict=True):
+        saved = state.get(number)
+        if saved or not isinstance(saved, (Mapping, type(None))):
+            check_moments(call, param, saved)
+    steps = number_of_steps(value for value in state.values() if isinstance(value, Mapping))
+    stale = own is not None and own["steps"] not in (None, steps)
+    if stale and own is not None and clock is not None:
+        further = max(steps - own["steps"], 0)
+        clock = {**clock, "iteration": clock["iteration"] + further}
+        warn_user(
+            f"{call}: Adam's moments have made {steps} steps, but {own['steps']} when our state "
+            "was saved: another optimizer has gone on with them. The clock is moved on to iteration "
+            f"{clock['iteration']}, and what the parts had kept per point begins anew"
+        )
+    rows, orphaned = [], False
+    for i, (number, param) in enumerate(zip(numbers, params, strict=True)):
+        saved = state.get(number)
+        if not saved:
+            rows.append({})
+            continue
+        kept, rest = _split(saved)
+        state[number] = rest
+        if own is None or stale:
+            orphaned |= bool(kept) and own is None
+            rows.append({})
+            continue
+        listed = own["kept"].get(str(i), ())
+        rows.append(_rows(call, optimizer.course, own, param, rest, kept, listed, loaded))
+    if orphaned:
+        warn_user(
+            f"{call}: this checkpoint has what parts keep per point, but not for which iterations: "
+            "it begins anew (a consolidated or flattened checkpoint leaves that out)"
+        )
+    windows = {} if own is None or stale else own["windows"]
+    records = [] if own is None else own["records"]
+    rest = {**loaded, "state": state, "param_groups": groups}
+    return Saved(clock, windows, records, rows), rest
+
+
+def restore_numbers(
+    optimizer: StepAdam, records: list[list[ParameterRecord]], saved: Saved
+) -> None:
+    """Give each parameter's record what a checkpoint has for it."""
+    entries = optimizer.course.number_entries("parameter")
+    for group, own, theirs in zip(optimizer.param_groups, records, saved.records, strict=False):
+        for param, record, (last_step, numbers) in zip(group["params"], own, theirs, strict=False):
+            record.last_step = last_step
+            record.numbers = {
+                key: torch.tensor(value, dtype=entries[key].dtype_for(param), device=param.device)
+                for key, value in numbers.items()
+            }
+
+
+def _parameters(optimizer: StepAdam) -> list[Tensor]:
+    return list(chain.from_iterable(group["params"] for group in optimizer.param_groups))
+
+
+def _unpack(
+    call: str, shared: Any, optimizer: StepAdam, share: list[Any]
+) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
+    """The optimizer's own part of a checkpoint, checked, and the course's."""
+    if shared is None:
+        return None, None
+    check_keys(call, shared, ("format", "iteration"))
+    clock = {key: value for key, value in shared.items() if key != "optimizer"}
+    check_count(call, "iteration", clock["iteration"], 0)
+    if clock["format"] == 2:
+        own = _from_format_2(clock, optimizer, share)
+    else:
+        own = shared.get("optimizer")
+        check_keys(f"{call}: optimizer", own, ("steps", "windows", "records", "kept"))
+    keys = set(optimizer.course.number_entries("parameter"))
+    windows = {}
+    check_keys(f"{call}: windows", own["windows"], ())
+    for name, window in own["windows"].items():
+        pair = isinstance(window, (list, tuple)) and len(window) == 2
+        if not pair or not all(isinstance(each, int) for each in window):
+            raise ValueError(f"{call}: windows[{name!r}]={window!r}, but two iterations are needed")
+        windows[name] = tuple(window)
+    records = []
+    if not isinstance(own["records"], list):
+        raise ValueError(f"{call}: records={own['records']!r}, but a list is needed")
+    for group in own["records"]:
+        if not isinstance(group, list):
+            raise ValueError(f"{call}: records has {group!r}, but a list is needed")
+        records.append([])
+        for entry in group:
+            check_keys(f"{call}: records", entry, ("last_step", "numbers"))
+            check_keys(f"{call}: records", entry["numbers"], ())
+            last_step = entry["last_step"]
+            if last_step is not None:
+                check_count(call, "last_step", last_step, -1)
+            numbers = {
+                key: check_number(call, key, value)
+                for key, value in entry["numbers"].items()
+                if key in keys
+            }
+            records[-1].append((last_step, numbers))
+    if own["steps"] is not None:
+        check_count(call, "steps", own["steps"], 0)
+    check_keys(f"{call}: kept", own["kept"], ())
+    return {**own, "windows": windows, "records": records}, clock
+
+
+def _from_format_2(clock: dict[str, Any], optimizer: StepAdam, share: list[Any]) -> dict[str, Any]:
+    """What format 2 did not say: the present windows hold where its iteration lies in them."""
+    course, last_step = optimizer.course, clock["iteration"] - 1
+    windows = {}
+    for name, part in course.named().items():
+        window = part.window(course)
+        if window is not None and window[0] <= last_step < window[1]:
+            windows[name] = list(window)
+    records = []
+    for group, seen in zip(optimizer.param_groups, share, strict=True):
+        numbers = {} if seen is None else {"OutOfView.seen_share": float(seen)}
+        records.append(
+            [{"last_step": last_step, "numbers": dict(numbers)} for _ in group["params"]]
+        )
+    return {"steps": None, "windows": windows, "records": records, "kept": {}}
+
+
+def _split(saved: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What parts keep, under today's keys, and what is torch's or the base class's."""
+    kept, rest = {}, {}
+    for key, value in saved.items():
+        new = ROW_KEYS_OF_FORMAT_2.get(key, key)
+        (kept if "." in str(new) else rest)[new] = value
+    return kept, rest
+
+
+def _rows(
+    call: str,
+    course: Course,
+    own: Mapping[str, Any],
+    param: Tensor,
+    moments: Mapping[str, Any],
+    kept: Mapping[str, Any],
+    listed: Iterable[str],
+    loaded: Mapping[str, Any],
+) -> dict[str, Tensor]:
+    """What parts keep per row of a parameter, checked; without what is not valid any more."""
+    found = {}
+    first = moments["exp_avg"]
+    rows = first.shape[0] if first.dim() else 1
+    for name, part in course.named().items():
+        window = part.window(course)
+        entries = {key_of(name, e): e for e in course.declared[name].values() if e.per == "row"}
+        absent = [key for key in entries if not _is_there(kept.get(key))]
+        missing = [key for key in absent if key in listed]
+        if len(absent) < len(entries):
+            missing = absent  # what a part keeps is of use together only
+        if missing:
+            raise ValueError(f"{call}: {missing} are missing, which the checkpoint says are there")
+        for key, entry in entries.items():
+            value = kept.get(key)
+            if not _is_there(value):
+                continue
+            if loaded.get("cast") and isinstance(value, Tensor) and value.is_floating_point():
+                value = value.to(entry.dtype_for(param))  # a stock optimizer has loaded it
+            check_kept(call, key, entry, value, param, rows)
+            if own["windows"].get(name) != window or _too_many(key, value, own, window):
+                LOGGER.info("%s: %s is of other iterations: it begins anew", call, key)
+            elif rows != rows_of(param):
+                warn_user(
+                    f"{call}: {key} of {rows} rows for a parameter of {rows_of(param)}: dropped, "
+                    "and collected anew"
+                )
+            else:
+                found[key] = value
+    return found
+
+
+def _is_there(value: Any) -> bool:
+    """Torch's flat checkpoints have an empty dict in the place of what they do not hold."""
+    return value is not None and not (isinstance(value, dict) and not value)
+
+
+def _too_many(key: str, value: Tensor, own: Mapping[str, Any], window: Window | None) -> bool:
+    """Whether a mean of format 2 holds iterates of a shorter run: more than this window has had."""
+    if own["steps"] is not None or key != "Averaging.count" or window is None or not value.numel():
+        return False
+    last_step = own["records"][0][0][0] if own["records"] and own["records"][0] else None
+    return last_step is not None and float(value.max()) > last_step - window[0] + 1

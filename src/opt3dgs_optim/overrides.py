@@ -1,0 +1,162 @@
+"""What a step puts in place of the trainer's values for torch's Adam, and takes back."""
+
+import cmath
+import functools
+import inspect
+import operator
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any, TypedDict
+
+import torch
+from torch import Tensor
+from torch.optim import Adam
+
+from opt3dgs_optim.course import Course
+from opt3dgs_optim.part import Group
+
+
+class AdamOptions(TypedDict, total=False):
+    """torch.optim.Adam's keyword-only options."""
+
+    foreach: bool | None
+    maximize: bool
+    capturable: bool
+    differentiable: bool
+    fused: bool | None
+    decoupled_weight_decay: bool
+
+
+class TemporaryOverrides(AbstractContextManager["TemporaryOverrides"]):
+    """Learning rates, gradients and flags that stand in place of others until the `with` ends.
+
+    They are restored in reverse order, whatever happens in between.
+    """
+
+    def __init__(self) -> None:
+        # A list of our own, because an ExitStack takes 5 us.
+        self._previous: list[tuple[Callable[..., None], Any, Any, Any]] = []
+
+    def __exit__(self, *_: object) -> None:
+        for restore, owner, name, value in reversed(self._previous):
+            restore(owner, name, value)
+
+    def item(self, owner: Any, key: Any, value: Any) -> None:
+        """Put `value` in place of `owner[key]`."""
+        self._previous.append((operator.setitem, owner, key, owner[key]))
+        owner[key] = value
+
+    def attribute(self, owner: Any, name: str, value: Any) -> None:
+        """Put `value` in place of `owner.name`; None where there is none."""
+        self._previous.append((setattr, owner, name, getattr(owner, name, None)))
+        setattr(owner, name, value)
+
+    def extra_item(self, owner: Any, key: Any, value: Any) -> None:
+        """Have `owner[key]`, which is not there otherwise."""
+        self._previous.append((_delete, owner, key, None))
+        owner[key] = value
+
+
+def _delete(owner: Any, key: Any, _: Any) -> None:
+    owner.pop(key, None)
+
+
+def scale_learning_rate(
+    overrides: TemporaryOverrides, group: Group, factors: list[Any], counts: Tensor | bool
+) -> None:
+    """lr times the factors, never left in the group: schedulers would compound it.
+
+    Not on decoupled weight decay, which would grow weights where a factor is negative. `counts` is
+    whether the step will be made, 0-d where only the device knows.
+    """
+    if not factors:
+        return
+    rate, factor = group["lr"], functools.reduce(operator.mul, factors)
+    if isinstance(factor, Tensor):
+        device = group["params"][0].device
+        # A number on the host is needed where the parameters are, and a copy that is not waited for
+        # may be read before it is finished. Fused Adam reads a float32 rate from the device.
+        if factor.device.type == "cpu" or device.type == "cpu":
+            factor = factor.item()
+        else:
+            factor = factor.to(device=device, dtype=torch.float32, non_blocking=True)
+    if group.get("decoupled_weight_decay") and group["weight_decay"]:
+        decay_weights(overrides, group, counts)
+    overrides.item(group, "lr", rate * factor)
+
+
+@torch.no_grad()
+def decay_weights(overrides: TemporaryOverrides, group: Group, counts: Tensor | bool) -> None:
+    """Decoupled weight decay of a group, made now with the trainer's own learning rate."""
+    if counts is False:
+        return
+    kept = 1 - group["lr"] * group["weight_decay"]
+    for param in group["params"]:
+        if param.grad is not None:
+            if isinstance(counts, Tensor):
+                param.mul_(torch.where(counts.to(param.device), kept, 1.0))
+            else:
+                param.mul_(kept)
+    overrides.item(group, "weight_decay", 0.0)
+
+
+def can_be_fused(optimizer: Any) -> bool:
+    """Whether torch's fused path can take the optimizer, whose user has asked for no other path."""
+    tensors = [param for group in optimizer.param_groups for param in group["params"]]
+    asked = any(
+        group["capturable"]
+        or group.get("differentiable")
+        or (group["fused"], group["foreach"]) != (None, None)
+        for group in optimizer.param_groups
+    )
+    return (
+        bool(tensors)
+        and not asked
+        and all(param.is_cuda and param.is_floating_point() for param in tensors)
+    )
+
+
+def use_fused(optimizer: Any) -> None:
+    """Take torch's fused path: it alone takes a factor, and drops a step, on the device."""
+    optimizer.defaults["fused"] = True
+    optimizer._step_supports_amp_scaling = True
+    for group in optimizer.param_groups:
+        group["fused"] = True
+        for param in group["params"]:
+            state = optimizer.state.get(param)
+            if state:
+                state["step"] = state["step"].to(param.device, torch.float32)
+
+
+def zero_nonfinite(grad: Tensor) -> bool | Tensor:
+    """Take numbers in a gradient that are not finite as zero, in place.
+
+    Returns whether there were any, 0-d where only the device knows.
+    """
+    if grad.is_cpu:
+        # The sum is finite unless a summand is not, or it overflows.
+        if cmath.isfinite(grad.sum().item()):
+            return False
+        found = not bool(grad.isfinite().all())
+        grad.nan_to_num_(0.0, 0.0, 0.0)
+        return found
+    found = ~grad.sum().isfinite()
+    grad.nan_to_num_(0.0, 0.0, 0.0)
+    return found
+
+
+def refuse_capture(call: str, course: Course) -> None:
+    """RuntimeError in the capture of a CUDA graph: its replays would repeat what parts say now."""
+    if course.parts and torch.cuda.is_initialized() and torch.cuda.is_current_stream_capturing():
+        raise RuntimeError(
+            f"{call}.step: a CUDA graph is being captured, but its replays would repeat this "
+            "iteration's factors and phase; leave the optimizers' steps out of it"
+        )
+
+
+@functools.cache
+def own_step(base: type[Adam]) -> tuple[Callable[..., Any], bool]:
+    """The step of an Adam; whether it is INRIA's `step(mask, N)`."""
+    # Unwrapped: torch's step hooks and its profiler are around our step already.
+    step = inspect.unwrap(base.step)
+    return step, len(inspect.signature(step).parameters) > 2

@@ -1,0 +1,272 @@
+"""The state of a parameter: Adam's moments, what parts keep, and to whose rows it belongs."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Iterable, Iterator, Mapping, MutableMapping
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.weak import WeakIdKeyDictionary
+
+from opt3dgs_optim.checks import check_keys
+from opt3dgs_optim.part import Kept
+
+MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # torch's names of Adam's, the last amsgrad's
+ADAM_KEYS = ("step", *MOMENTS)
+Declared = Mapping[str, Mapping[str, Kept]]  # a part's name -> a name -> what it keeps under it
+
+
+def key_of(part: str, kept: Kept) -> str:
+    """Where a part keeps something: in `optimizer.state[param]`, if it is kept per row."""
+    return f"{part}.{kept.name}"
+
+
+def rows_of(param: Tensor) -> int:
+    """The number of points of a parameter; a number alone is one."""
+    return param.shape[0] if param.dim() else 1
+
+
+def broadcast_rows(rows: Tensor, like: Tensor) -> Tensor:
+    """[N] as [N, 1, ..] for broadcasting over `like` [N, ..]; 0-d as it is."""
+    return rows.reshape(-1, *[1] * (like.dim() - 1)) if rows.dim() else rows
+
+
+class RowOwnership:
+    """Remembers to which rows of which parameter the tensors that parts keep belong.
+
+    Some trainers edit every tensor of the state by rows, others (INRIA, 3dgs-mcmc) the two moments
+    only. The rule that is safe with all of them: what was not seen with this parameter object, at
+    this number of rows, is dropped. The number of rows alone is not enough, because pruning and
+    splitting between two steps can bring it back to what it was.
+    """
+
+    def __init__(self) -> None:
+        self._owners: Any = WeakIdKeyDictionary()  # kept tensor -> (weak parameter, rows)
+
+    def drop_foreign(self, param: Tensor, state: dict[str, Any], keys: Iterable[str]) -> None:
+        """Remove the tensors under `keys` that are of other rows than the parameter's present."""
+        for key in [key for key in keys if key in state]:
+            owner, rows = self._owners.get(state[key], (None, 0))
+            if owner is None or owner() is not param or rows != rows_of(param):
+                del state[key]
+
+    def claim(self, param: Tensor, state: dict[str, Any], keys: Iterable[str]) -> None:
+        """Take the tensors under `keys` as those of the parameter's present rows."""
+        for key in keys:
+            if key in state:
+                self._owners[state[key]] = weakref.ref(param), rows_of(param)
+
+
+class HeldRows:
+    """Rows of a parameter [N, ..] that a mask holds still in Adam's step: put back after it.
+
+    `moving` [N] bool are the others. Adam's step count is the whole parameter's and goes on.
+    """
+
+    def __init__(self, moving: Tensor, param: Tensor, state: Mapping[str, Any]) -> None:
+        # .data: putting back is no write that a part should notice by the version counter.
+        tensors = [param.data, *(state[key] for key in MOMENTS if key in state)]
+        self._saved = [(each, each.clone(), broadcast_rows(moving, each)) for each in tensors]
+
+    @torch.no_grad()
+    def put_back(self) -> None:
+        """Give the rows that were not to move what they had."""
+        for tensor, saved, moving in self._saved:
+            tensor.copy_(torch.where(moving, tensor, saved))
+
+
+class ParameterRecord:
+    """What is known of the parameter at one place of an optimizer's groups.
+
+    Density control puts other parameter objects there; what a part keeps *per parameter*, and the
+    clock of the last step, belong to the place.
+
+    Attributes:
+        last_step: the iteration of the parameter's last step, whether that counted or not; None
+            before the first.
+        numbers: what parts keep per parameter, key -> 0-d tensor.
+    """
+
+    def __init__(self) -> None:
+        self.last_step: int | None = None
+        self.numbers: dict[str, Tensor] = {}
+        self._view: ParameterState | None = None
+
+    def view(
+        self, param: Tensor, adam: dict[str, Any], declared: Declared, training: dict[str, Tensor]
+    ) -> ParameterState:
+        """The state that hooks see, made anew where the parameter or its state is another object.
+
+        Args:
+            adam: `optimizer.state[param]`.
+            declared: what the parts keep.
+            training: what parts keep per training, shared by all optimizers.
+        """
+        view = self._view
+        if view is None or view.param is not param or view.adam is not adam:
+            view = ParameterState(param, adam, self, declared, training)
+            self._view = view
+        return view
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_view": None}
+
+
+class ParameterState(MutableMapping[str, Any]):
+    """The `state` of the hooks: Adam's moments, and what the part that is asked keeps.
+
+    While it is `guarded`, each tensor that a hook reads is saved before, so that what the hook
+    writes can be undone: where a mask holds rows still, or where the step does not count.
+    """
+
+    def __init__(
+        self,
+        param: Tensor,
+        adam: dict[str, Any],
+        record: ParameterRecord,
+        declared: Declared,
+        training: dict[str, Tensor],
+    ) -> None:
+        self.param, self.adam = param, adam
+        self._record, self._declared, self._training = record, declared, training
+        self._part, self._kept = "", dict[str, Kept]()
+        self._guarded = self._moments_guarded = False
+        self._saved: list[tuple[dict[str, Any], str, Tensor]] = []
+
+    @property
+    def last_step(self) -> int | None:
+        """The iteration of the parameter's last step, see `ParameterRecord`."""
+        return self._record.last_step
+
+    def of(self, part: str) -> ParameterState:
+        """This state as the part of that name sees it."""
+        self._part, self._kept = part, self._declared[part]
+        return self
+
+    def guard(self, moments: bool) -> None:
+        """Save what hooks read from now on, until `settle`; Adam's moments too if `moments`."""
+        self._guarded, self._moments_guarded = True, moments
+
+    @torch.no_grad()
+    def settle(self, rows: Tensor | None, counts: Tensor | bool) -> None:
+        """Undo what hooks have written to rows that are held still, or in a step that is dropped.
+
+        Args:
+            rows: [N] bool, those that move; None: all.
+            counts: whether the step counts, 0-d on the parameter's device where it is a tensor.
+        """
+        saved, self._saved = self._saved, []
+        self._guarded = self._moments_guarded = False
+        for store, key, old in saved:
+            new = store[key]
+            moments = store is self.adam and key in ADAM_KEYS
+            keep: Any = True if moments else counts  # moments are edited by the clock
+            if rows is not None and old.dim():
+                keep = broadcast_rows(rows, old) & keep
+            if keep is not True:
+                new.copy_(torch.where(torch.as_tensor(keep, device=new.device), new, old))
+
+    def _place(self, kept: Kept) -> dict[str, Any]:
+        if kept.per == "row":
+            return self.adam
+        return self._record.numbers if kept.per == "parameter" else self._training
+
+    def _find(self, kept: Kept) -> Tensor:
+        store, key = self._place(kept), f"{self._part}.{kept.name}"
+        tensor = store.get(key)
+        if tensor is None:
+            tensor = store[key] = kept.make(self.param)
+        elif tensor.device != self.param.device:  # numbers of a checkpoint, offloaded parameters
+            tensor = store[key] = tensor.to(self.param.device)
+        if self._guarded:
+            self._save(store, key, tensor)
+        return tensor
+
+    def _save(self, store: dict[str, Any], key: str, tensor: Tensor) -> None:
+        if not any(key == known and store is place for place, known, _ in self._saved):
+            self._saved.append((store, key, tensor.clone()))
+
+    def __getitem__(self, name: str) -> Any:
+        kept = self._kept.get(name)
+        if kept is not None:
+            return self._find(kept)
+        value = self.adam[name]
+        if self._moments_guarded and name in MOMENTS:
+            self._save(self.adam, name, value)
+        return value
+
+    @torch.no_grad()
+    def __setitem__(self, name: str, value: Any) -> None:
+        tensor = self[name]
+        if value is not tensor:
+            tensor.copy_(value) if isinstance(value, Tensor) else tensor.fill_(value)
+
+    def exchange(self, name: str, tensor: Tensor) -> None:
+        """Keep these rows in the place of those under `name`: the same numbers, laid out anew."""
+        kept = self._kept[name]
+        self._place(kept)[key_of(self._part, kept)] = tensor
+
+    def __delitem__(self, name: str) -> None:
+        kept = self._kept[name]
+        self._place(kept).pop(key_of(self._part, kept), None)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._kept or (name in ADAM_KEYS and name in self.adam)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter([*(key for key in ADAM_KEYS if key in self.adam), *self._kept])
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+
+def check_mask(call: str, masks: list[Any], num_points: int | None) -> Tensor:
+    """The only mask as a flat bool tensor [N]; ValueError where there is another number of them."""
+    if len(masks) != 1:
+        raise ValueError(f"{call}.step: {len(masks)} masks, but one is needed")
+    mask = masks[0]
+    if not isinstance(mask, Tensor) or mask.dim() == 0 or mask.is_complex():
+        raise ValueError(f"{call}.step: visible={mask!r}, but a mask of shape [N] is needed")
+    mask = mask.detach().reshape(-1)
+    if num_points is not None and num_points != mask.numel():
+        raise ValueError(
+            f"{call}.step: num_points={num_points}, but the mask has {mask.numel()} rows"
+        )
+    return mask if mask.dtype == torch.bool else mask != 0
+
+
+def check_moments(call: str, param: Tensor, saved: Any) -> None:
+    """ValueError unless these are Adam's moments of a parameter like `param`.
+
+    The number of rows may differ: some trainers load the optimizer first, the points afterwards.
+    """
+    check_keys(call, saved, ("step", "exp_avg", "exp_avg_sq"))
+    for key in ("exp_avg", "exp_avg_sq"):
+        value = saved[key]
+        if not isinstance(value, Tensor) or value.shape[1:] != param.shape[1:]:
+            shape = tuple(value.shape) if isinstance(value, Tensor) else value
+            raise ValueError(
+                f"{call}: {key} has shape {shape}, but the parameter has {tuple(param.shape)}"
+            )
+
+
+def check_kept(call: str, key: str, kept: Kept, value: Any, param: Tensor, rows: int) -> None:
+    """ValueError unless `value` is what a part keeps per row of a parameter, of `rows` points."""
+    if not isinstance(value, Tensor):
+        raise ValueError(f"{call}: {key}={value!r}, but a tensor is needed")
+    needed = kept.shape_for(param)
+    if param.dim():
+        needed = (rows, *needed[1:])
+    if tuple(value.shape) != needed:
+        raise ValueError(
+            f"{call}: {key} has shape {tuple(value.shape)}, but {needed} is needed beside a "
+            f"parameter of shape {tuple(param.shape)} and moments of {rows} rows"
+        )
+    if value.dtype != kept.dtype_for(param):
+        raise ValueError(
+            f"{call}: {key} is of {value.dtype}, but {kept.dtype_for(param)} is needed"
+        )
+    if value.is_floating_point() and not bool(value.isfinite().all()):
+        raise ValueError(f"{call}: {key} has numbers that are not finite")
