@@ -18,7 +18,7 @@ from trainers import assert_same
 
 from opt3dgs_optim import Course, Part, PhaseScheduler
 
-HISTORY = "history"
+HISTORY = "Curvature.history"
 USELESS = {"Curvature": Scene(views_disagree=1.0), "GatedNoise": Scene(opacity=2.0)}
 
 

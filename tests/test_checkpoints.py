@@ -273,11 +273,11 @@ def test_pairs_of_other_rows_are_dropped_and_it_is_said() -> None:
     optimizer = LQNAdam([x], lr=0.01)
     with pytest.warns(UserWarning, match="history of 6 rows for a parameter of 4"):
         optimizer.load_state_dict(saved)
-    assert "history" not in optimizer.state[x]
+    assert "Curvature.history" not in optimizer.state[x]
     assert "exp_avg" in optimizer.state[x]
     x.grad = torch.ones(4, 3)
     optimizer.step()
-    assert optimizer.state[x]["history"].shape[0] == 4
+    assert optimizer.state[x]["Curvature.history"].shape[0] == 4
 
 
 def test_parts_that_a_checkpoint_does_not_know_begin_anew_and_others_are_left_out() -> None:

@@ -50,7 +50,7 @@ def test_moments_have_the_parameters_dtype_and_the_history_float32(
     assert all(value.shape[0] == 8 for key, value in state.items() if key != "step")
     if cls is LQNAdam:
         wide = torch.float64 if dtype == torch.float64 else torch.float32
-        assert state["history"].dtype == wide
+        assert state["Curvature.history"].dtype == wide
     assert bool(torch.isfinite(x).all())
 
 
@@ -127,7 +127,7 @@ def test_learning_rate_zero_moves_nothing(cls: Any, path: dict, lr: Any) -> None
     assert torch.equal(x, torch.ones(8, 3))
     assert bool((optimizer.state[x]["exp_avg_sq"] > 0).all())
     if cls is LQNAdam:
-        assert float(header(optimizer.state[x]["history"], 5).counter.max()) == 1.0
+        assert float(header(optimizer.state[x]["Curvature.history"], 5).counter.max()) == 1.0
 
 
 @pytest.mark.parametrize("path", [{}, {"fused": True}, {"foreach": False}], ids=str)
@@ -152,7 +152,7 @@ def test_far_from_the_origin_a_step_below_the_last_place_makes_no_pair() -> None
         optimizer.step()
         assert float(optimizer.accepted_share or 0.0) == 0.0
     assert torch.equal(x, torch.full((8, 3), 1e6))
-    assert bool(torch.isfinite(optimizer.state[x]["history"]).all())
+    assert bool(torch.isfinite(optimizer.state[x]["Curvature.history"]).all())
 
 
 def test_far_from_the_origin_float64_has_the_digits() -> None:
@@ -175,7 +175,7 @@ def test_identical_successive_gradients_make_no_pair() -> None:
     assert torch.equal(
         run(ours, x, [torch.ones(8, 3)] * 20), run(theirs, y, [torch.ones(8, 3)] * 20)
     )
-    assert float(header(ours.state[x]["history"], 5).counter.max()) == 1.0
+    assert float(header(ours.state[x]["Curvature.history"], 5).counter.max()) == 1.0
 
 
 def test_alternating_gradients_make_no_pair_of_negative_curvature() -> None:
@@ -183,7 +183,7 @@ def test_alternating_gradients_make_no_pair_of_negative_curvature() -> None:
     x = points()
     optimizer = LQNAdam([x], lr=0.01)
     run(optimizer, x, [g * (-1) ** k for k, g in enumerate([torch.ones(8, 3)] * 200)])
-    history = optimizer.state[x]["history"]
+    history = optimizer.state[x]["Curvature.history"]
     s, y = history[:, :, :3], history[:, :, 4:7]
     assert bool(((s * y).sum(2) >= 0).all())
     assert float((x.detach() - 1).abs().max()) < 0.1  # they cancel
@@ -205,7 +205,7 @@ def test_most_rows_unseen_in_each_step(share: float) -> None:
         seen += visible
         x.grad = x.detach() * weights * visible[:, None]
         optimizer.step()
-    counter = header(optimizer.state[x]["history"], 5).counter
+    counter = header(optimizer.state[x]["Curvature.history"], 5).counter
     assert torch.equal(counter == 0, seen == 0)
     assert bool((counter <= seen).all())
     assert bool(torch.isfinite(x).all())
@@ -219,10 +219,10 @@ def test_all_rows_unseen_for_long(steps: int) -> None:
     ours, theirs = LQNAdam([x], lr=0.01), torch.optim.Adam([y], lr=0.01)
     run(ours, x, [torch.ones(8, 3)] * 3)
     run(theirs, y, [torch.ones(8, 3)] * 3)
-    history = ours.state[x]["history"].clone()
+    history = ours.state[x]["Curvature.history"].clone()
     unseen = [torch.zeros(8, 3)] * steps
     assert torch.equal(run(ours, x, unseen), run(theirs, y, unseen))
-    assert torch.equal(ours.state[x]["history"], history)
+    assert torch.equal(ours.state[x]["Curvature.history"], history)
     back = run(ours, x, [torch.ones(8, 3)] * 3)
     assert bool(torch.isfinite(back).all())
 

@@ -86,7 +86,7 @@ def test_a_whole_run_with_the_switch_in_the_middle(version: str, kind: str, orde
                 assert state[key].dtype == torch.float32
             decay = 0.01 ** ((step + 1) / TOTAL) if name == "means" else 1.0
             assert optimizer.param_groups[0]["lr"] == pytest.approx(RATES[name] * decay)
-        held = "history" in trainer.optimizers["means"].state[trainer.splats["means"]]
+        held = "Curvature.history" in trainer.optimizers["means"].state[trainer.splats["means"]]
         # In the other order a refinement takes the gradients away: a no-op of the optimizer (10).
         assert held == (step >= SWITCH)
     assert len(sizes) > 3
@@ -140,14 +140,14 @@ def test_opacity_reset_zeroes_the_moments_and_keeps_the_pairs(version: str) -> N
     package = strategies(version)
     trainer = build(version, "default", ORDERS[0], phased())
     trainer.run(0, 53)
-    held = trainer.optimizers["means"].state[trainer.splats["means"]]["history"].clone()
+    held = trainer.optimizers["means"].state[trainer.splats["means"]]["Curvature.history"].clone()
     package.ops.reset_opa(trainer.splats, trainer.optimizers, trainer.state, value=0.1)
     assert bool((torch.sigmoid(trainer.splats["opacities"]) <= 0.1 + 1e-6).all())
     assert not bool(
         trainer.optimizers["opacities"].state[trainer.splats["opacities"]]["exp_avg"].any()
     )
     trainer.run(53, 54)
-    now = trainer.optimizers["means"].state[trainer.splats["means"]]["history"]
+    now = trainer.optimizers["means"].state[trainer.splats["means"]]["Curvature.history"]
     assert now.shape == held.shape
     assert int((now != 0).sum()) >= int((held != 0).sum())
 
@@ -158,15 +158,15 @@ def test_relocation_drops_the_pairs(version: str) -> None:
     trainer = build(version, "mcmc", ORDERS[0], phased())
     trainer.strategy.cap_max = POINTS
     trainer.run(0, 43)
-    before = trainer.optimizers["means"].state[trainer.splats["means"]]["history"].clone()
+    before = trainer.optimizers["means"].state[trainer.splats["means"]]["Curvature.history"].clone()
     assert bool(before.any())
     trainer.splats["opacities"].data[:5] = -9.0
     trainer.strategy._relocate_gs(trainer.splats, trainer.optimizers, trainer.state["binoms"])
-    stale = trainer.optimizers["means"].state[trainer.splats["means"]]["history"]
+    stale = trainer.optimizers["means"].state[trainer.splats["means"]]["Curvature.history"]
     assert bool(stale[:5].any())  # gsplat leaves it
     trainer.strategy.refine_every = 1000
     trainer.run(43, 44)
-    after = trainer.optimizers["means"].state[trainer.splats["means"]]["history"]
+    after = trainer.optimizers["means"].state[trainer.splats["means"]]["Curvature.history"]
     # one visible step: the header of rows that were seen, and no pair in any row
     assert int((after != 0).sum()) < int((before != 0).sum()) / 2
 

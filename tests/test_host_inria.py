@@ -95,10 +95,10 @@ def test_a_whole_run_with_no_op_iterations(kind: str) -> None:
     assert no_ops == 4
     state = model.optimizer.state[model._xyz]
     assert float(state["step"]) == SWITCH - no_ops
-    assert "history" not in state
+    assert "Curvature.history" not in state
     run(model, phases, SWITCH, TOTAL)
     state = model.optimizer.state[model._xyz]
-    assert state["history"].shape[0] == len(model._xyz)
+    assert state["Curvature.history"].shape[0] == len(model._xyz)
     for attribute in ATTRIBUTES.values():
         assert bool(torch.isfinite(getattr(model, attribute)).all())
     for group in model.optimizer.param_groups:  # 5: under these very names
@@ -114,7 +114,7 @@ def test_pairs_left_behind_by_an_edit_are_dropped(kind: str) -> None:
     model = make_model(kind)
     phases = upgrade(model)
     run(model, phases, 0, SWITCH + 8, edits=False)
-    held = model.optimizer.state[model._xyz]["history"]
+    held = model.optimizer.state[model._xyz]["Curvature.history"]
     assert bool(held.any())
     mask = torch.arange(len(model._xyz)) < 2
     with torch.no_grad():
@@ -122,7 +122,7 @@ def test_pairs_left_behind_by_an_edit_are_dropped(kind: str) -> None:
         model.add_new_gs(cap_max=POINTS)
     count = len(model._xyz)
     run(model, phases, SWITCH + 8, SWITCH + 9, edits=False)  # has gradients: backward came after
-    now = model.optimizer.state[model._xyz]["history"]
+    now = model.optimizer.state[model._xyz]["Curvature.history"]
     assert now.shape[0] == count
     assert int((now != 0).sum()) < int((held != 0).sum()) / 2
 
@@ -167,11 +167,11 @@ def test_opacity_reset_of_inria() -> None:
     model = make_model("simulated")
     phases = upgrade(model)
     run(model, phases, 0, SWITCH + 4)
-    pairs = model.optimizer.state[model._xyz]["history"].clone()
+    pairs = model.optimizer.state[model._xyz]["Curvature.history"].clone()
     model.reset_opacity()
     assert not bool(model.optimizer.state[model._opacity]["exp_avg"].any())
     run(model, phases, SWITCH + 4, SWITCH + 5, edits=False)
-    assert model.optimizer.state[model._xyz]["history"].shape == pairs.shape
+    assert model.optimizer.state[model._xyz]["Curvature.history"].shape == pairs.shape
 
 
 def test_sparse_adam_style_steps_through_edits() -> None:

@@ -34,7 +34,7 @@ def test_without_pairs_it_is_torch_adam_bit_for_bit(path: dict) -> None:
         theirs.grad = -(theirs.detach() - start) + 0.3
         a.step()
         b.step()
-    assert float(header(a.state[ours]["history"], 5).counter.max()) == 1
+    assert float(header(a.state[ours]["Curvature.history"], 5).counter.max()) == 1
     assert torch.equal(ours, theirs)
     assert float(a.accepted_share) == 0.0  # pyright: ignore[reportArgumentType]
 
@@ -82,7 +82,7 @@ def test_direction_points_at_the_minimum_where_steps_span_the_space(
         with torch.no_grad():
             x += 0.05 * torch.randn(x.shape, generator=generator, dtype=x.dtype)
     gradient = torch.einsum("nij,nj->ni", hessian, x.detach())
-    found = two_loop(gradient, optimizer.state[x]["history"], 16)
+    found = two_loop(gradient, optimizer.state[x]["Curvature.history"], 16)
     cosine = torch.nn.functional.cosine_similarity
     plain, newton = cosine(gradient, x.detach()).mean(), cosine(found, x.detach()).mean()
     assert float(newton) > max(at_least, float(plain) + 0.05)
@@ -118,7 +118,7 @@ def test_pairs_of_another_history_size_are_collected_anew() -> None:
     second.load_state_dict(first.state_dict())
     y.grad = torch.ones(6, 3)
     second.step()
-    assert second.state[y]["history"].shape == (6, 7, 8)
+    assert second.state[y]["Curvature.history"].shape == (6, 7, 8)
 
 
 def test_complex_parameters_are_refused() -> None:

@@ -146,10 +146,10 @@ def test_pairs_are_kept_between_two_visible_steps_of_a_point() -> None:
     twins = [LQNAdam([row], lr=0.01, history_size=3) for row in alone]
     for mask in masks():
         x.grad = gradients(x, 1)
-        before = optimizer.state[x]["history"].clone() if optimizer.state else None
+        before = optimizer.state[x]["Curvature.history"].clone() if optimizer.state else None
         optimizer.step(mask)
         if before is not None:
-            assert torch.equal(optimizer.state[x]["history"][~mask], before[~mask])
+            assert torch.equal(optimizer.state[x]["Curvature.history"][~mask], before[~mask])
         for i, (row, twin) in enumerate(zip(alone, twins, strict=True)):
             row.grad = gradients(row, 1)
             twin.step(visible=mask[i : i + 1])
@@ -195,8 +195,8 @@ def test_invisible_rows_stand_still_in_both_phases(kind: Any, exploiting: bool, 
     for old, new in zip(states, after, strict=True):
         for key in set(old) - {"step"}:
             assert torch.equal(old[key][~mask], new[key][~mask]), key
-    assert any("history" in state for state in after) == exploiting
-    averaged = state_of(optimizers, splats["means"])["num_averaged"]
+    assert any("Curvature.history" in state for state in after) == exploiting
+    averaged = state_of(optimizers, splats["means"])["Averaging.count"]
     assert averaged[mask].tolist() == [averaged[1] + 1] * 6
 
 

@@ -198,10 +198,10 @@ def test_density_control_between_steps_is_survived_in_both_phases() -> None:
     assert splats["means"].shape[0] > 12
     assert all(bool(torch.isfinite(p).all()) for p in splats.values())
     state = state_of(optimizers, splats["means"])
-    assert state["history"].shape[0] == len(splats["means"])
-    assert torch.equal(state["mean_iterate"], splats["means"])
-    assert state["num_averaged"].shape == (len(splats["means"]),)
-    holders = {name for name, p in splats.items() if "history" in state_of(optimizers, p)}
+    assert state["Curvature.history"].shape[0] == len(splats["means"])
+    assert torch.equal(state["Averaging.mean"], splats["means"])
+    assert state["Averaging.count"].shape == (len(splats["means"]),)
+    holders = {name for name, p in splats.items() if "Curvature.history" in state_of(optimizers, p)}
     assert holders == {"means"}
 
 

@@ -149,7 +149,7 @@ def test_the_twins_notice_a_foreign_history(kind: str) -> None:
     for _ in range(4):
         trainer.step([1.0] * 3, masked=False)
     assert trainer.difference() < TOLERANCE
-    history = trainer.ours.state("means")["history"]
+    history = trainer.ours.state("means")["Curvature.history"]
     history.copy_(history.flip(0).clone())
     trainer.step([1.0] * 3, masked=False)
     assert trainer.difference() > 1e-4
@@ -173,10 +173,10 @@ def test_a_point_moved_in_place_begins_anew_where_its_row_is_zeroed(zeroed: bool
     trainer.iteration = SWITCH
     for _ in range(6):
         trainer.step([1.0] * 3, masked=False)
-    kept = trainer.ours.state("means")["history"][2].clone()
+    kept = trainer.ours.state("means")["Curvature.history"][2].clone()
     trainer.zero_row(2)
     if not zeroed:
-        trainer.ours.state("means")["history"][2] = kept
+        trainer.ours.state("means")["Curvature.history"][2] = kept
     with torch.no_grad():
         for params, row in ((trainer.ours.params, 2), (trainer.twins[2].params, 0)):
             params["means"][row] = torch.tensor([0.4, -0.3, 0.2])

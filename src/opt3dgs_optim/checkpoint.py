@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.checks import LOGGER, check_count, check_keys, check_number, warn_user
-from opt3dgs_optim.course import STATE_KEY, Course
+from opt3dgs_optim.course import READABLE_FORMATS, STATE_KEY, Course
 from opt3dgs_optim.names import SLOT
 from opt3dgs_optim.part import Window
 from opt3dgs_optim.state import ParameterRecord, check_kept, check_moments, key_of, rows_of
@@ -100,7 +100,7 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
     nothing = Saved(None, {}, [], [{} for _ in params])
     if len(numbers) != len(params):  # torch says so
         return nothing, {**loaded, "param_groups": groups}
-    own, clock = _unpack(call, shared, optimizer, share)
+    own, clock = _unpack(call, shared, optimizer, share)  # dict[str, Any], or None
     state = dict(loaded["state"])
     for number, param in zip(numbers, params, strict=True):
         saved = state.get(number)
@@ -109,12 +109,12 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
     steps = number_of_steps(value for value in state.values() if isinstance(value, Mapping))
     stale = own is not None and own["steps"] not in (None, steps)
     if stale and own is not None and clock is not None:
-        further = max(steps - own["steps"], 0)
+        further = max(steps - int(own["steps"] or 0), 0)
         clock = {**clock, "iteration": clock["iteration"] + further}
         warn_user(
             f"{call}: Adam's moments have made {steps} steps, but {own['steps']} when our state "
-            "was saved: another optimizer has gone on with them. The clock is moved on to iteration "
-            f"{clock['iteration']}, and what the parts had kept per point begins anew"
+            "was saved: another optimizer has gone on with them. The clock is moved on to "
+            f"iteration {clock['iteration']}, and what the parts had kept per point begins anew"
         )
     rows, orphaned = [], False
     for i, (number, param) in enumerate(zip(numbers, params, strict=True)):
@@ -168,6 +168,10 @@ def _unpack(
     check_keys(call, shared, ("format", "iteration"))
     clock = {key: value for key, value in shared.items() if key != "optimizer"}
     check_count(call, "iteration", clock["iteration"], 0)
+    if clock["format"] not in READABLE_FORMATS:
+        raise ValueError(
+            f"{call}: format={clock['format']!r}, but one of {READABLE_FORMATS} is needed"
+        )
     if clock["format"] == 2:
         own = _from_format_2(clock, optimizer, share)
     else:
@@ -279,7 +283,7 @@ def _is_there(value: Any) -> bool:
     return value is not None and not (isinstance(value, dict) and not value)
 
 
-def _too_many(key: str, value: Tensor, own: Mapping[str, Any], window: Window | None) -> bool:
+def _too_many(key: str, value: Any, own: Mapping[str, Any], window: Window | None) -> bool:
     """Whether a mean of format 2 holds iterates of a shorter run: more than this window has had."""
     if own["steps"] is not None or key != "Averaging.count" or window is None or not value.numel():
         return False

@@ -26,22 +26,24 @@ def check_number(
 ) -> float:
     """Return `value` as a float, or raise ValueError if it lies outside the interval."""
     number = isinstance(value, Real) and not isinstance(value, bool)  # numpy's scalars, too
-    outside = not number or not low <= value <= high or not math.isfinite(value)
-    if outside or (open_low and value == low) or (open_high and value == high):
+    found = float(value) if number else math.nan
+    outside = not low <= found <= high or not math.isfinite(found)
+    if outside or (open_low and found == low) or (open_high and found == high):
         left, right = ("(" if open_low else "["), (")" if open_high else "]")
         raise ValueError(
             f"{call}: {name}={value!r}, but a finite number in {left}{low}, {high}{right} is needed"
         )
-    return float(value)
+    return found
 
 
 def check_count(call: str, name: str, value: Any, low: int, high: int | None = None) -> int:
     """Return `value` as an int, or raise ValueError unless it is an integer in low..high."""
     whole = isinstance(value, Integral) and not isinstance(value, bool)  # numpy's, too
-    if not whole or value < low or (high is not None and value > high):
+    count = int(value) if whole else low - 1
+    if count < low or (high is not None and count > high):
         allowed = f"at least {low}" if high is None else f"in {low}..{high}"
         raise ValueError(f"{call}: {name}={value!r}, but an integer {allowed} is needed")
-    return int(value)
+    return count
 
 
 def check_choice(call: str, name: str, value: Any, allowed: Sequence[Any] = (True, False)) -> Any:

@@ -32,7 +32,7 @@ class Place(NamedTuple):
     """Where a Gaussian parameter stands: which set of Gaussians, which tensor of its group."""
 
     set_name: str  # "" where an optimizer holds one set
-    index: int
+    number: int  # of the tensor in its group
 
 
 class Change(NamedTuple):

@@ -74,9 +74,10 @@ def scale_learning_rate(
     rate, factor = group["lr"], functools.reduce(operator.mul, factors)
     if isinstance(factor, Tensor):
         device = group["params"][0].device
-        # A number on the host is needed where the parameters are, and a copy that is not waited for
-        # may be read before it is finished. Fused Adam reads a float32 rate from the device.
-        if factor.device.type == "cpu" or device.type == "cpu":
+        # Fused Adam reads a float32 rate from the device. Other paths need a number on the host, as
+        # do parameters there, where a copy that is not waited for may be read before it is made.
+        on_device = device.type != "cpu" and factor.device.type != "cpu"
+        if not on_device or not (group["fused"] or group["capturable"]):
             factor = factor.item()
         else:
             factor = factor.to(device=device, dtype=torch.float32, non_blocking=True)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from opt3dgs_optim.course import Course
 
 Group = MutableMapping[str, Any]  # a parameter group of an optimizer
-State = MutableMapping[str, Any]  # what a hook sees of a parameter's state, see `Part`
+State = Any  # what a hook sees of a parameter's state: `state.ParameterState`, see `Part`
 Window = tuple[int, int]  # first iteration, and the one after the last
 
 
@@ -85,10 +85,9 @@ class Part:
     parameter any more, and everything once the part's `window` is over or another one begins.
 
     The hooks' `state` is a mapping. `state["exp_avg"]`, `state["exp_avg_sq"]` and `state["step"]`
-    are Adam's own moments under torch's names, and a declared name is what the part keeps. If a
-    step turns out not to count (its loss is not finite, or a GradScaler skips it), what hooks have
-    written to what they keep, or to the parameter, is undone, and its gradient is zero. A hook
-    that edits Adam's moments in place does so by the clock: such an edit holds in any case.
+    are Adam's own moments under torch's names, and a declared name is what the part keeps. Both may
+    be edited in place or assigned. If a step turns out not to count (its loss is not finite, or a
+    GradScaler skips it), its gradient is zero, and all that hooks have written is undone.
 
     `docs/write-a-part.md` has examples.
 
@@ -99,7 +98,7 @@ class Part:
     """
 
     during: ClassVar[Phase | None] = None
-    keeps: ClassVar[tuple[Kept, ...]] = ()
+    keeps: tuple[Kept, ...] = ()
     names: Any = GAUSSIAN  # tuple[str, ...] | None
 
     def __repr__(self) -> str:

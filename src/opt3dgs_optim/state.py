@@ -160,9 +160,7 @@ class ParameterState(MutableMapping[str, Any]):
         saved, self._saved = self._saved, []
         self._guarded = self._moments_guarded = False
         for store, key, old in saved:
-            new = store[key]
-            moments = store is self.adam and key in ADAM_KEYS
-            keep: Any = True if moments else counts  # moments are edited by the clock
+            new, keep = store.setdefault(key, old), counts
             if rows is not None and old.dim():
                 keep = broadcast_rows(rows, old) & keep
             if keep is not True:
@@ -193,9 +191,17 @@ class ParameterState(MutableMapping[str, Any]):
         if kept is not None:
             return self._find(kept)
         value = self.adam[name]
-        if self._moments_guarded and name in MOMENTS:
+        if self._moments_guarded and name in ADAM_KEYS:
             self._save(self.adam, name, value)
         return value
+
+    def peek(self, name: str) -> Tensor:
+        """One of Adam's moments, to be read, or edited by what is zero where the gradient is.
+
+        A row that is held still, and a step that does not count, have a gradient of zero, so that
+        such an edit needs no copy to be undone with.
+        """
+        return self.adam[name]
 
     @torch.no_grad()
     def __setitem__(self, name: str, value: Any) -> None:

@@ -352,7 +352,8 @@ class StepAdam(Adam):
                 step.held.append(HeldRows(moving.rows, param, state))
             fed = torch.where(broadcast_rows(moving.rows, fed), fed, 0.0)
         if moving.guarded and any(parts):
-            view.guard(moments=moving.rows is not None and self._base is not Adam)
+            held_by_adam = moving.rows is not None and self._base is Adam
+            view.guard(moments=moving.counts is not True or not held_by_adam)
             if moving.counts is not True:  # a step that does not count has no gradient
                 fed = moving.where_it_moves(fed, 0.0)
         # Parts see the gradient of what is minimised, without AMP's scale.

@@ -270,7 +270,7 @@ def test_a_run_with_the_switch_and_row_edits(ours: Any, attribute: str) -> None:
     assert phases.iteration == TOTAL
     assert own["means"].param_groups[0]["lr"] == pytest.approx(5e-3 * 0.01)
     assert own["scales"].param_groups[0]["lr"] == 5e-3
-    assert own["means"].state[model.gauss_params["means"]]["history"].shape[0] == 15
+    assert own["means"].state[model.gauss_params["means"]]["Curvature.history"].shape[0] == 15
 
 
 def test_the_package_defaults_unless_the_paper_is_asked_for(ours: Any) -> None:

@@ -29,9 +29,9 @@ def test_it_acts_on_its_parameters_from_the_switch_on(make: Any, names: Any) -> 
     curvature = Curvature(3, names=names)
     splats, phases, optimizers = upgraded(TOTAL, curvature, switch=SWITCH, make=make)
     train(splats, optimizers, phases, 0, SWITCH)
-    assert not any("history" in state_of(optimizers, p) for p in splats.values())
+    assert not any("Curvature.history" in state_of(optimizers, p) for p in splats.values())
     train(splats, optimizers, phases, SWITCH, SWITCH + 3)
-    holders = {name for name, p in splats.items() if "history" in state_of(optimizers, p)}
+    holders = {name for name, p in splats.items() if "Curvature.history" in state_of(optimizers, p)}
     assert holders == (set(splats) if names is None else set(curvature.names))
 
 
@@ -65,7 +65,7 @@ def test_it_sees_the_unscaled_gradient_of_what_is_minimised(maximize: bool, scal
             means.found_inf = torch.zeros(())
             means.step()
             assert torch.equal(x.grad, gradient * factor * (-1.0 if up else 1.0))
-        histories.append(means.state[x]["history"])
+        histories.append(means.state[x]["Curvature.history"])
     torch.testing.assert_close(histories[0], histories[1])
 
 
@@ -135,7 +135,7 @@ def test_a_step_that_the_device_drops_leaves_no_pair() -> None:
     curvature, course, state = Curvature(3), Course(), {}
     x, grad = torch.zeros(4, 3), torch.ones(4, 3)
     curvature.before({}, x, grad, state, course)
-    before: Tensor = state["history"].clone()
+    before: Tensor = state["Curvature.history"].clone()
     course.valid = torch.tensor(False)
     curvature.before({}, x + 1, 3 * grad, state, course)
-    assert torch.equal(state["history"], before)
+    assert torch.equal(state["Curvature.history"], before)

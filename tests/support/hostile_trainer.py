@@ -21,7 +21,7 @@ TOTAL, SWITCH = 400, 8
 RATES = {"means": 1e-2, "opacities": 5e-2}
 INRIA = {"means": "xyz", "opacities": "opacity"}
 MOMENTS = ("exp_avg", "exp_avg_sq")
-PAIRS = "history"
+PAIRS = "Curvature.history"
 FRESH = "fresh_since"  # the group's note of what happened at the switch
 
 

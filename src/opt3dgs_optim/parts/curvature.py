@@ -119,7 +119,8 @@ class Curvature(Part):
         options = {"min_cosine": self.min_cosine, "graft": self.graft, "backend": self.backend}
         fed, accepted, candidates = lqn_direction(*given, **options)
         tally = torch.stack([accepted.count_nonzero(), candidates.count_nonzero()])
-        self._tally = tally if course.steps != self._step else self._tally + tally
+        first = course.steps != self._step
+        self._tally = tally if first else self._tally.to(tally.device) + tally
         self._step = course.steps
         if course.adaptive:
             self._seen[:2] += tally

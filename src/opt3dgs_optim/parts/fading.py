@@ -91,11 +91,12 @@ class Fading(Part):
     ) -> Tensor:
         """Fade the moments by the events since this parameter's last step.
 
-        Events are of the clock: they happen whether or not the step of their iteration counts.
+        The events of a step that does not count are lost with it: a GPU says too late that it
+        does not.
         """
         # The step of iteration i comes after i + 1 observations.
         now = self.events_before(course.iteration, course.total_steps)
-        last = getattr(state, "last_step", None)
+        last = state.last_step
         if last is None or last > course.current:  # the first step, or the clock was set back
             last = course.current - 1
         done = self.events_before(last + 1, course.total_steps)

@@ -2,12 +2,16 @@
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from opt3dgs_optim.checks import check_count
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.part import Group, Part, Phase, State
-from opt3dgs_optim.state import MOMENTS
+from opt3dgs_optim.part import Group, Kept, Part, Phase, State
+from opt3dgs_optim.state import ADAM_KEYS
+
+# Iterations after the switch in which moments may still be restarted, where steps did not count.
+MAX_LATE_ITERATIONS = 10
 
 
 class SquaredLoss(Part):
@@ -39,7 +43,9 @@ class FreshMoments(Part):
     """
 
     settling: int = 0
+
     during = Phase.EXPLOITATION
+    keeps = (Kept("fresh", per="parameter"),)
 
     def __post_init__(self) -> None:
         check_count("FreshMoments", "settling", self.settling, 0)
@@ -47,11 +53,16 @@ class FreshMoments(Part):
     def before(
         self, group: Group, param: Tensor, grad: Tensor, state: State, course: Course
     ) -> Tensor:
-        """Zero the moments in the parameter's first step after the switch."""
+        """Zero the moments in the parameter's first step after the switch that counts."""
         left = course.total_steps - course.switch_step
-        last = getattr(state, "last_step", None)
-        if (last is None or last < course.switch_step) and left >= self.settling:
-            for key in ("step", *MOMENTS):
-                if key in state:
-                    state[key].zero_()
+        late = course.switch_step + MAX_LATE_ITERATIONS
+        if left < self.settling or (state.last_step or 0) >= late:
+            return grad
+        fresh: Tensor = state["fresh"]
+        if fresh.is_cpu and fresh.item():
+            return grad
+        for key in [key for key in ADAM_KEYS if key in state]:
+            moment = state[key]
+            moment.copy_(torch.where((fresh == 0).to(moment.device), 0.0, moment))
+        fresh.fill_(1.0)
         return grad

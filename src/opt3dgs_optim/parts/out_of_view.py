@@ -71,7 +71,7 @@ class OutOfView(Part):
         if isinstance(factor, Tensor):
             factor = factor.to(grad.device)
         least = torch.where(broadcast_rows(unseen.to(grad.device), grad), grad * factor, 0.0)
-        second = state["exp_avg_sq"]
+        second = state.peek("exp_avg_sq")
         second.copy_(torch.maximum(second, least.square_()))
         return grad
 
