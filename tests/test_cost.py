@@ -21,7 +21,7 @@ from opt3dgs_optim.lbfgs import lqn_direction
 PACKAGE = str(Path(opt3dgs_optim.__file__).parent)
 EXPLORING, EXPLOITING = 5_000, 29_500  # fading is on in the first
 PLAIN = 24  # six fused Adams
-MOST = {"none": 40, "defaults": 42, "exploitation": 80, "histogram": 56}
+MOST = {"none": PLAIN, "defaults": 44, "exploitation": 80, "histogram": 56}
 
 
 class Counter(TorchDispatchMode):
@@ -113,9 +113,9 @@ def exploiting_step() -> list[tuple[str, str]]:
 
 
 def test_the_path_of_a_gradient_through_an_exploiting_step_is_short() -> None:
-    assert len(exploiting_step()) <= 90
+    assert len(exploiting_step()) <= 100
 
 
 def test_the_path_of_a_gradient_is_in_few_files() -> None:
     files = {file for file, _ in exploiting_step()}
-    assert len(files) <= 10, sorted(files)
+    assert len(files) <= 12, sorted(files)

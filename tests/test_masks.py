@@ -196,7 +196,7 @@ def test_invisible_rows_stand_still_in_both_phases(kind: Any, exploiting: bool, 
         for key in set(old) - {"step"}:
             assert torch.equal(old[key][~mask], new[key][~mask]), key
     assert any("Curvature.history" in state for state in after) == exploiting
-    averaged = state_of(optimizers, splats["means"])["Averaging.count"]
+    averaged = state_of(optimizers, splats["means"])["AveragedThroughout.count"]
     assert averaged[mask].tolist() == [averaged[1] + 1] * 6
 
 

@@ -199,8 +199,8 @@ def test_density_control_between_steps_is_survived_in_both_phases() -> None:
     assert all(bool(torch.isfinite(p).all()) for p in splats.values())
     state = state_of(optimizers, splats["means"])
     assert state["Curvature.history"].shape[0] == len(splats["means"])
-    assert torch.equal(state["Averaging.mean"], splats["means"])
-    assert state["Averaging.count"].shape == (len(splats["means"]),)
+    assert torch.equal(state["AveragedThroughout.mean"], splats["means"])
+    assert state["AveragedThroughout.count"].shape == (len(splats["means"]),)
     holders = {name for name, p in splats.items() if "Curvature.history" in state_of(optimizers, p)}
     assert holders == {"means"}
 
@@ -218,8 +218,8 @@ def test_presets() -> None:
     warmup = short.part(EnergyHistogram)
     assert warmup is not None
     assert (short.switch_step, warmup.warmup) == (2_900, 250)
-    assert PhaseScheduler(10).parts == [*DEFAULTS] == [Fading(), OutOfView(), Averaging()]
-    assert PhaseScheduler(10, parts=[]).parts == []
+    assert PhaseScheduler(10).parts == DEFAULTS == (Fading(), OutOfView(), Averaging())
+    assert PhaseScheduler(10, parts=[]).parts == ()
     more = ConstantMultiplier(2.0)
     assert PhaseScheduler(10, parts=[*DEFAULTS, more]).parts[-1] == more
 
@@ -231,8 +231,8 @@ def test_optimizers_that_cannot_be_upgraded_are_named() -> None:
     with pytest.raises(TypeError, match=re.escape("optimizers['scales'] is a torch.optim.sgd.SGD")):
         scheduler().upgrade(mixed)
     assert {type(each) for each in mixed.values()} == {torch.optim.Adam, torch.optim.SGD}
-    with pytest.raises(TypeError, match="a dict of optimizers"):
-        scheduler().upgrade([torch.optim.Adam([splats["means"]])])  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="a dict or a list of optimizers"):
+        scheduler().upgrade(splats["means"])  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"none of the names \['pose'\]"):
         scheduler().upgrade({"pose": gsplat_optimizers(splats)["sh0"]})
     with pytest.raises(ValueError, match="none of the names"):

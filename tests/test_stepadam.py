@@ -35,8 +35,10 @@ from opt3dgs_optim import (
     EnergyHistogram,
     Fading,
     FreshMoments,
+    IsotropicNoise,
     LQNAdam,
     Part,
+    PhaseScheduler,
     PositionNoise,
 )
 from opt3dgs_optim.names import GAUSSIAN
@@ -196,6 +198,28 @@ def test_sparse_gradients_are_refused_by_torch() -> None:
         means.step()
 
 
+def with_a_part(cls: Any, x: Parameter, **path: Any) -> Any:
+    """An optimizer of ours that has a part; without any it is torch's Adam, which takes NaN."""
+    options = {"noise": IsotropicNoise(std=0.0)} if cls is AWSGLD else {}
+    return cls([x], lr=0.01, **options, **path)
+
+
+def test_without_parts_nothing_of_ours_touches_the_step() -> None:
+    """What torch's own Adam makes of NaN and of a broken loss, this one makes of it, too."""
+    x, y = Parameter(torch.ones(4, 3)), Parameter(torch.ones(4, 3))
+    phases = PhaseScheduler(100, parts=[])
+    ours: Any = phases.upgrade({"means": torch.optim.Adam([x], lr=0.1)})["means"]
+    theirs = torch.optim.Adam([y], lr=0.1)
+    for slope, loss in ((1.0, 0.1), (2.0, math.nan), (math.nan, 0.1)):
+        for param, optimizer in ((x, ours), (y, theirs)):
+            param.grad = torch.full((4, 3), 1.0)
+            param.grad[0] = slope
+            if optimizer is ours:
+                phases.observe(loss)
+            optimizer.step()
+        torch.testing.assert_close(x, y, rtol=0, atol=0, equal_nan=True)
+
+
 # -- gradients that are not finite -----------------------------------------------------------------
 
 
@@ -213,7 +237,7 @@ def test_numbers_that_are_not_finite_are_zero_and_nobody_else_notices(
 
     def optimizer(x: Parameter) -> tuple[Any, Any]:
         if make != "phases":
-            return make([x], lr=0.01, **path), None
+            return with_a_part(make, x, **path), None
         phases = only(TOTAL, Annealing(names=GAUSSIAN), AveragedThroughout())
         adam = torch.optim.Adam([x], lr=0.01, **path)
         return phases.upgrade({"means": adam})["means"], phases
@@ -242,7 +266,7 @@ def test_numbers_that_are_not_finite_are_zero_and_nobody_else_notices(
 def test_rows_broken_for_ever_stand_still_for_ever(cls: Any) -> None:
     x = Parameter(torch.randn(5, 3, generator=torch.Generator().manual_seed(0)))
     start = x.detach().clone()
-    optimizer = cls([x], lr=0.01)
+    optimizer = with_a_part(cls, x)
     for step in range(50):
         x.grad = torch.randn(5, 3, generator=torch.Generator().manual_seed(step))
         x.grad[2] = math.nan
@@ -257,7 +281,7 @@ def test_rows_broken_for_ever_stand_still_for_ever(cls: Any) -> None:
 
 def test_it_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     x = Parameter(torch.ones(4, 3))
-    optimizer = AWSGLD([x], lr=0.01)
+    optimizer = with_a_part(AWSGLD, x)
     for _ in range(3):
         x.grad = torch.full((4, 3), math.nan)
         optimizer.step()

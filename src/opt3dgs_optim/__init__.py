@@ -5,7 +5,7 @@ from opt3dgs_optim.backend import backend_info
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.lbfgs import two_loop
 from opt3dgs_optim.lqnadam import LQNAdam
-from opt3dgs_optim.part import Part, Phase
+from opt3dgs_optim.part import Kept, Part, Phase
 from opt3dgs_optim.parts.annealing import Annealing
 from opt3dgs_optim.parts.averaging import Averaging
 from opt3dgs_optim.parts.constant import ConstantMultiplier
@@ -34,6 +34,7 @@ __all__ = [
     "Fading",
     "FreshMoments",
     "IsotropicNoise",
+    "Kept",
     "LQNAdam",
     "OutOfView",
     "Part",

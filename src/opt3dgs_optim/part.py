@@ -86,8 +86,13 @@ class Part:
 
     The hooks' `state` is a mapping. `state["exp_avg"]`, `state["exp_avg_sq"]` and `state["step"]`
     are Adam's own moments under torch's names, and a declared name is what the part keeps. Both may
-    be edited in place or assigned. If a step turns out not to count (its loss is not finite, or a
-    GradScaler skips it), its gradient is zero, and all that hooks have written is undone.
+    be edited in place or assigned; `state.last_step` is the iteration of the parameter's last step.
+
+    If a step turns out not to count (its loss is not finite, or a GradScaler skips it), its
+    gradient is zero, and what hooks have written to the parameter and to what they keep is undone.
+    An edit of Adam's moments is undone on a host, and `last_step` stays, so that an event that was
+    due comes with the next step. A GPU knows too late, and there the edit of the dropped step
+    holds, and `last_step` goes on: the next step finds the same moments either way.
 
     `docs/write-a-part.md` has examples.
 

@@ -96,6 +96,7 @@ class PhaseScheduler(Course):
         self._iterations_without_step = 1
         self._steps_without_energy = 0
         self._losses_not_finite = 0  # in a row
+        self._iterations_incomplete = 0  # since an upgraded optimizer does not exist any more
         self._num_optimizers = 0
         self._adam_steps: int | None = None  # of moments that came without a state of ours
 
@@ -233,8 +234,10 @@ class PhaseScheduler(Course):
                 "the optimizers had stepped before the first observe(loss), so each step has the "
                 "energy of the iteration before; call observe after backward, before the steps",
             )
-        lost = self.num_lost_followers
-        if lost and lost < self._num_optimizers and len(self.followers()) < self._num_optimizers:
+        lost, alive = self.num_lost_followers, len(self.followers())
+        incomplete = lost and 0 < alive < self._num_optimizers
+        self._iterations_incomplete = self._iterations_incomplete + 1 if incomplete else 0
+        if self._iterations_incomplete > LONG_PATIENCE:
             self._report(
                 "lost",
                 f"{lost} of {self._num_optimizers} upgraded optimizers do not exist any more: the "

@@ -331,7 +331,7 @@ class StepAdam(Adam):
                 self._prepare(step, moving)
             if moving.buffer is not None:
                 params[i] = moving.buffer
-            if step.acting:
+            if step.acting and step.counts is not False:
                 record.last_step = max(self.course.current, 0)  # a course may have no clock
             step.moving.append(moving)
         if parts.displacement:
@@ -352,8 +352,8 @@ class StepAdam(Adam):
                 step.held.append(HeldRows(moving.rows, param, state))
             fed = torch.where(broadcast_rows(moving.rows, fed), fed, 0.0)
         if moving.guarded and any(parts):
-            held_by_adam = moving.rows is not None and self._base is Adam
-            view.guard(moments=moving.counts is not True or not held_by_adam)
+            own_mask = moving.rows is not None and self._base is not Adam
+            view.guard(moments=moving.counts is False or own_mask)
             if moving.counts is not True:  # a step that does not count has no gradient
                 fed = moving.where_it_moves(fed, 0.0)
         # Parts see the gradient of what is minimised, without AMP's scale.
@@ -611,7 +611,7 @@ class StepAdam(Adam):
             sizes = [list(param.shape) for param in group["params"]]
             size = sizes[0] if len(sizes) == 1 else f"{len(sizes)} tensors"
             lines.append(f"{group_name(i, group)} {size}: lr {float(group['lr']):.4g}")
-        return block(self.call_name, lines)
+        return block(type(self).__name__, lines)
 
 
 @functools.cache

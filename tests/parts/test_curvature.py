@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import devices
 import pytest
 import torch
-from torch import Tensor
 from torch.nn import Parameter
 from trainers import (
     gsplat_optimizers,
@@ -130,12 +130,15 @@ def test_an_empty_parameter_and_one_without_dimensions() -> None:
         assert bool(torch.isfinite(x).all())
 
 
-def test_a_step_that_the_device_drops_leaves_no_pair() -> None:
+def test_a_step_that_the_device_drops_leaves_no_pair(monkeypatch: Any) -> None:
     """As zero gradients do: the point was not seen."""
-    curvature, course, state = Curvature(3), Course(), {}
-    x, grad = torch.zeros(4, 3), torch.ones(4, 3)
-    curvature.before({}, x, grad, state, course)
-    before: Tensor = state["Curvature.history"].clone()
-    course.valid = torch.tensor(False)
-    curvature.before({}, x + 1, 3 * grad, state, course)
-    assert torch.equal(state["Curvature.history"], before)
+    devices.on_a_device(monkeypatch)
+    x = Parameter(torch.zeros(4, 3))
+    phases = only(TOTAL, Curvature(3), switch=0)
+    means: Any = phases.upgrade({"means": torch.optim.Adam([x], lr=0.1, fused=True)})["means"]
+    for loss, slope in ((0.1, 1.0), (float("nan"), 3.0)):
+        x.grad = torch.full((4, 3), slope)
+        before = means.state[x]["Curvature.history"].clone() if means.state else None
+        phases.observe(loss)
+        means.step()
+    assert torch.equal(means.state[x]["Curvature.history"], before)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import re
 import warnings
+from typing import Any
 
+import devices
 import numpy as np
 import pytest
 import torch
@@ -150,7 +152,8 @@ def test_it_can_stop_at_the_switch() -> None:
         splats = make_splats()
         splats["opacities"].data.fill_(-9.0)
         phases = only(60, PositionNoise(splats, 1.0, during=during), switch=40)
-        means = phases.upgrade(gsplat_optimizers(splats))["means"]
+        adams = phases.upgrade(gsplat_optimizers(splats))
+        means = adams["means"]
         for iteration, expected in ((10, during is not Phase.EXPLOITATION), (50, moves)):
             before = values_of(splats)
             phases.observe(0.1, iteration=iteration)
@@ -167,7 +170,8 @@ def test_its_size_goes_by_the_trainers_rate_without_any_factor() -> None:
         splats["opacities"].data.fill_(-9.0)
         noise = PositionNoise(splats, 1.0, generator=torch.Generator().manual_seed(5))
         phases = only(60, *parts, noise)
-        means = phases.upgrade(gsplat_optimizers(splats))["means"]
+        adams = phases.upgrade(gsplat_optimizers(splats))
+        means = adams["means"]
         phases.observe(0.1)
         splats["means"].grad = torch.zeros(12, 3)  # Adam's step is then zero
         means.step()
@@ -213,26 +217,32 @@ def test_six_writes_in_a_row_are_one_too_many(writes: tuple[int, ...]) -> None:
     assert any("noise_lr to 0" in str(warning.message) for warning in told) == (writes == (6,))
 
 
-def test_a_step_that_only_the_device_may_drop() -> None:
-    splats = make_splats()
-    splats["opacities"].data.fill_(-9.0)
-    start = splats["means"].detach().clone()
+@pytest.mark.parametrize("kind", [PositionNoise, IsotropicNoise])
+def test_a_dropped_step_adds_no_noise_and_draws_as_many_numbers(
+    kind: Any, monkeypatch: Any
+) -> None:
+    """The same training goes the same way where only the device knows which steps count."""
     ends = []
-    for valid in (True, torch.tensor(True), torch.tensor(False)):
-        noise = PositionNoise(splats, 1e4, generator=torch.Generator().manual_seed(5))
-        means = start.clone()
-        course = Course()
-        course.valid = valid
-        noise.after({"lr": 0.01}, means, {}, course)
-        ends.append(means)
-    assert not torch.equal(ends[0], start)
-    torch.testing.assert_close(ends[1], ends[0])
-    assert torch.equal(ends[2], start)
-    for valid in (True, False):
-        course, point = Course(), start.clone()
-        course.valid = torch.tensor(valid)
-        IsotropicNoise(std=0.5).after({"lr": 0.02}, point, {}, course)
-        assert torch.equal(point, start) != valid
+    for on_device in (False, True):
+        with monkeypatch.context() as patch:
+            if on_device:
+                devices.on_a_device(patch)
+            splats = make_splats()
+            splats["opacities"].data.fill_(-9.0)
+            generator = torch.Generator().manual_seed(5)
+            options = {"scale": 1e4} if kind is PositionNoise else {"std": 0.5}
+            phases = only(60, kind(generator=generator, **options))
+            adams = phases.upgrade(gsplat_optimizers(splats, fused=True))
+            for i in range(6):
+                phases.observe(float("nan") if i in (1, 4) else 0.1)
+                before = splats["means"].detach().clone()
+                for name in ("means", "scales"):
+                    splats[name].grad = torch.ones_like(splats[name])
+                    adams[name].step()
+                assert torch.equal(before, splats["means"]) == (i in (1, 4))
+            ends.append((splats["means"].detach(), generator.get_state()))
+    assert torch.equal(ends[0][0], ends[1][0])
+    assert torch.equal(ends[0][1], ends[1][1])
 
 
 def test_a_trainers_noise_is_fine_where_ours_is_off() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from typing import Any
 
+import devices
 import pytest
 import torch
 from torch.nn import Parameter
@@ -23,10 +24,34 @@ from trainers import (
 )
 
 from opt3dgs_optim import Fading, OutOfView, Part
-from opt3dgs_optim.parts.out_of_view import BELOW, SAMPLE
+from opt3dgs_optim.parts.out_of_view import MAX_POINTS_LOOKED_AT, MAX_SEEN_SHARE
 
 POINTS, SEEN = 200, 4  # a view sees 2 % of them
 PULL = 1e-3  # of the regulariser; the images' gradients are about 1
+
+
+def numbers_of(optimizers: Any) -> dict[str, torch.Tensor]:
+    """What is kept for the positions."""
+    first = optimizers["means"] if isinstance(optimizers, dict) else optimizers
+    return first._records[0][0].numbers
+
+
+def share_of(optimizers: Any) -> float:
+    return float(numbers_of(optimizers)["OutOfView.seen_share"])
+
+
+def set_share(optimizers: Any, share: float) -> None:
+    numbers_of(optimizers)["OutOfView.seen_share"] = torch.tensor(share)
+
+
+def hook(phases: Any, optimizer: Any, param: torch.Tensor, grad: torch.Tensor) -> torch.Tensor:
+    """The part's `before` for a parameter in the place of the optimizer's; its second moments."""
+    group, record = optimizer.param_groups[0], optimizer._records[0][0]
+    group["params"] = [param]
+    moments = {"exp_avg_sq": torch.zeros_like(param)}
+    view = record.view(param, moments, phases.declared, phases.kept_numbers)
+    phases.part(OutOfView).before(group, param, grad, view.of("OutOfView"), phases)
+    return moments["exp_avg_sq"]
 
 
 def large(total_steps: int, *parts: Part, make: Any = gsplat_optimizers) -> tuple[Any, Any, Any]:
@@ -34,8 +59,7 @@ def large(total_steps: int, *parts: Part, make: Any = gsplat_optimizers) -> tupl
     phases = only(total_steps, *parts)
     splats = make_splats(POINTS)
     optimizers = phases.upgrade(make(splats))
-    first = optimizers["means"] if isinstance(optimizers, dict) else optimizers
-    first.param_groups[0]["visible_share"] = SEEN / POINTS
+    set_share(optimizers, SEEN / POINTS)
     return splats, phases, optimizers
 
 
@@ -78,7 +102,7 @@ def test_an_emptied_point_out_of_view_makes_a_share_of_a_step(make: Any) -> None
     rates = {"scales": 0.005, "opacities": 0.05}
     for name, rate in rates.items():
         assert moved[False][name][0].min() > 30 * rate  # a full step each, and more at first
-        most = 40 * rate * (SEEN / POINTS) / BELOW
+        most = 40 * rate * (SEEN / POINTS) / MAX_SEEN_SHARE
         assert 0.2 * most < moved[True][name][0].min()  # what no view sees is still let go
         assert moved[True][name][0].max() < 1.3 * most
     for name in ("means", "quats", "sh0"):
@@ -89,7 +113,7 @@ def test_fading_does_not_undo_it() -> None:
     splats, phases, optimizers = large(600, Fading(share=1.0), OutOfView())
     iterate(splats, optimizers, phases, 0, 290, seen=SEEN)
     second = state_of(optimizers, splats["opacities"])["exp_avg_sq"]
-    least = (PULL * BELOW * POINTS / SEEN) ** 2
+    least = (PULL * MAX_SEEN_SHARE * POINTS / SEEN) ** 2
     assert second.min() > 0.9 * least
 
 
@@ -119,48 +143,8 @@ def test_the_share_is_the_mean_over_a_hundred_views() -> None:
     shares = []
     for i in range(3):
         iterate(splats, optimizers, phases, i, i + 1, seen=3)  # of 12
-        shares.append(optimizers["means"].param_groups[0]["visible_share"])
+        shares.append(share_of(optimizers))
     assert shares == pytest.approx([1 - 0.75 * (1 - 0.99**k) for k in (1, 2, 3)], rel=1e-6)
-
-
-def test_on_a_device_the_share_is_never_read() -> None:
-    """The branch for numbers that live on a device, on the host: the same to rounding."""
-    runs = []
-    for start in (1.0, torch.tensor(1.0)):
-        splats, phases, optimizers = large(2_000, OutOfView())
-        optimizers["means"].param_groups[0]["visible_share"] = start
-        iterate(splats, optimizers, phases, 0, 400, seen=SEEN)
-        share = optimizers["means"].param_groups[0]["visible_share"]
-        assert isinstance(share, type(start))
-        runs.append((splats, float(share)))
-    assert runs[0][1] == pytest.approx(runs[1][1], rel=1e-4)
-    for name, param in runs[0][0].items():
-        torch.testing.assert_close(param, runs[1][0][name], rtol=1e-4, atol=1e-5)
-
-
-class OnDevice(torch.Tensor):
-    """A host's tensor that says that it is none."""
-
-    is_cpu = False  # pyright: ignore[reportAssignmentType, reportIncompatibleMethodOverride]
-
-
-@pytest.mark.parametrize("seen", [POINTS // 2, 0])
-def test_on_a_device_the_bounds_are_those_of_the_host(seen: int) -> None:
-    """Above a third nothing changes, though no branch is taken; less than a hundredth is one."""
-    _, phases, optimizers = large(2_000, part := OutOfView())
-    grad = torch.zeros(POINTS, 3)
-    grad[:seen] = 1.0
-    group = optimizers["means"].param_groups[0]
-    group["visible_share"] = torch.tensor(0.02 if seen == 0 else 0.9)
-    for _ in range(1 if seen else 1000):
-        phases.take(torch.tensor(0.1))
-        part.before(group, grad, grad.as_subclass(OnDevice), {}, phases)
-    share, state = float(group["visible_share"]), {"exp_avg_sq": torch.zeros(POINTS)}
-    pull = torch.full((POINTS,), PULL)
-    part.before(optimizers["opacities"].param_groups[0], pull, pull, state, phases)
-    assert share == pytest.approx(0.896 if seen else 0.01, rel=1e-3)
-    least = 0.0 if seen else (PULL * BELOW / 0.01) ** 2
-    torch.testing.assert_close(state["exp_avg_sq"], torch.full((POINTS,), least), rtol=3e-3, atol=0)
 
 
 def test_two_trainings_may_share_it() -> None:
@@ -178,18 +162,15 @@ def test_two_trainings_may_share_it() -> None:
 
 
 def test_of_many_points_some_are_asked_and_all_are_held() -> None:
-    points = 3 * SAMPLE
-    _, phases, optimizers = large(2_000, part := OutOfView())
-    group = optimizers["means"].param_groups[0]
+    points = 3 * MAX_POINTS_LOOKED_AT
+    _, phases, optimizers = large(2_000, OutOfView())
     grad = torch.zeros(points, 3)
     grad[torch.arange(points) % 16 < 3, 2] = 1.0  # 3 of 16; of every fourth, a quarter
     phases.take(torch.tensor(0.1))
-    part.before(group, grad, grad, {}, phases)
-    assert group["visible_share"] == pytest.approx(0.02 + 0.01 * (0.25 - 0.02))
-    state = {"exp_avg_sq": torch.zeros(points)}
-    pull = torch.full((points,), PULL)
-    part.before(optimizers["opacities"].param_groups[0], pull, pull, state, phases)
-    assert torch.equal(state["exp_avg_sq"] > 0, grad[:, 2] == 0)
+    hook(phases, optimizers["means"], torch.zeros(points, 3), grad)
+    assert share_of(optimizers) == pytest.approx(0.02 + 0.01 * (0.25 - 0.02))
+    found = hook(phases, optimizers["opacities"], torch.zeros(points), torch.full((points,), PULL))
+    assert torch.equal(found > 0, grad[:, 2] == 0)
 
 
 def test_the_run_log_has_the_share() -> None:
@@ -198,58 +179,71 @@ def test_the_run_log_has_the_share() -> None:
     assert phases.numbers() == {"visible_share": pytest.approx(1 - 0.75 * (1 - 0.99**3))}
 
 
-def test_an_iteration_that_does_not_count_leaves_no_trace() -> None:
-    splats, phases, optimizers = large(2_000, part := OutOfView())
-    optimizers["means"].param_groups[0]["visible_share"] = torch.tensor(0.02)
+@pytest.mark.parametrize("on_device", [False, True])
+def test_an_iteration_that_does_not_count_leaves_no_trace(
+    on_device: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if on_device:
+        devices.on_a_device(monkeypatch)
+    splats, phases, optimizers = large(2_000, OutOfView(), make=fused)
     iterate(splats, optimizers, phases, 0, 3, seen=SEEN)
-    share = float(optimizers["means"].param_groups[0]["visible_share"])
+    share, before = share_of(optimizers), values_of(splats)
+    second = state_of(optimizers, splats["opacities"])["exp_avg_sq"].clone()
+    for name, param in splats.items():
+        param.grad = torch.full_like(param, PULL if name in ("scales", "opacities") else 0.0)
+    phases.observe(float("nan"))
+    step_all(optimizers)
+    assert_same(before, splats)
+    assert share_of(optimizers) == share
+    assert torch.equal(state_of(optimizers, splats["opacities"])["exp_avg_sq"], second)
+
+
+def fused(splats: dict[str, Parameter]) -> Any:
+    return gsplat_optimizers(splats, fused=True)
+
+
+def test_where_the_positions_come_later_it_looks_at_their_gradient() -> None:
+    splats, phases, optimizers = large(2_000, OutOfView())
+    iterate(splats, optimizers, phases, 0, 3, seen=SEEN)
+    phases.take(torch.tensor(0.1))
     phases.current += 1
-    phases.valid = torch.tensor(False)
-    for name in ("means", "scales", "opacities"):
-        group, param = optimizers[name].param_groups[0], splats[name]
-        state = optimizers[name].state[param]
-        before = state["exp_avg_sq"].clone()
-        pulled = torch.full_like(param, 0.0 if name == "means" else PULL)
-        part.before(group, param, pulled, state, phases)
-        assert torch.equal(state["exp_avg_sq"], before)
-    assert float(optimizers["means"].param_groups[0]["visible_share"]) == share
+    splats["means"].grad = torch.zeros(POINTS, 3)
+    splats["means"].grad[:SEEN] = 1.0
+    pull = torch.full((POINTS,), PULL)
+    found = hook(phases, optimizers["opacities"], torch.zeros(POINTS), pull)
+    assert torch.equal(found > 0, torch.arange(POINTS) >= SEEN)
 
 
 def test_without_the_positions_of_this_iteration_it_does_nothing() -> None:
-    """They are stepped last, or there are other points than at their last step."""
-    splats, phases, optimizers = large(2_000, part := OutOfView())
+    """Nobody has a gradient of theirs, or there are other points than at their last step."""
+    splats, phases, optimizers = large(2_000, OutOfView())
     iterate(splats, optimizers, phases, 0, 3, seen=SEEN)
+    splats["means"].grad = None
     for iteration, points in ((phases.current + 1, POINTS), (phases.current, POINTS + 1)):
         phases.current = iteration
-        param = torch.zeros(points)
-        state = {"exp_avg_sq": torch.zeros(points)}
-        group = optimizers["opacities"].param_groups[0]
-        part.before(group, param, torch.full_like(param, PULL), state, phases)
-        assert not state["exp_avg_sq"].any()
+        pull = torch.full((points,), PULL)
+        assert not hook(phases, optimizers["opacities"], torch.zeros(points), pull).any()
 
 
 @pytest.mark.parametrize("shape", [(), (0, 3)])
 def test_no_points_are_no_error(shape: tuple[int, ...]) -> None:
-    splats, phases, optimizers = upgraded(60, part := OutOfView())
+    splats, phases, optimizers = upgraded(60, OutOfView())
     train(splats, optimizers, phases, 0, 1)
-    param = torch.zeros(shape)
-    group = optimizers["means"].param_groups[0]
-    share = group["visible_share"]
-    assert part.before(group, param, param, {}, phases) is param
-    assert group["visible_share"] == share
+    share = share_of(optimizers)
+    hook(phases, optimizers["means"], torch.zeros(shape), torch.zeros(shape))
+    assert share_of(optimizers) == share
 
 
 def test_views_that_see_nothing_count_as_a_hundredth() -> None:
     splats, phases, optimizers = large(2_000, OutOfView())
     iterate(splats, optimizers, phases, 0, 400, seen=0)
-    share = optimizers["means"].param_groups[0]["visible_share"]
-    assert share == pytest.approx(0.01 + 0.01 * 0.99**400, rel=1e-6)
+    assert share_of(optimizers) == pytest.approx(0.01 + 0.01 * 0.99**400, rel=1e-6)
 
 
 @pytest.mark.parametrize(("share", "acts"), [(0.32, True), (0.35, False)])
 def test_it_acts_below_a_third(share: float, acts: bool) -> None:
     splats, phases, optimizers = large(2_000, OutOfView())
-    optimizers["means"].param_groups[0]["visible_share"] = share
+    set_share(optimizers, share)
     iterate(splats, optimizers, phases, 0, 1, seen=SEEN)  # the share falls by a hundredth
     least = state_of(optimizers, splats["opacities"])["exp_avg_sq"][-1].item()
     plain = (1 - 0.999) * PULL**2

@@ -24,7 +24,7 @@ def shorten(monkeypatch: Any) -> None:
     from opt3dgs_optim import course
     from opt3dgs_optim.parts import curvature
 
-    monkeypatch.setattr(course, "CHECK_STEPS", CHECK)
+    monkeypatch.setattr(course, "EVIDENCE_INTERVAL", CHECK)
     monkeypatch.setattr(curvature, "PROBE_STEPS", PROBE)
 
 

@@ -15,6 +15,7 @@ def on_a_device(monkeypatch: Any) -> None:
 
     def take(self: Course, energy: Tensor) -> None:
         self.num_observed += 1
+        self.energy_device = energy.device
         self.valid = torch.isfinite(energy)
         for part in self.hooks["observe"]:
             part.observe(energy, self.valid, self)

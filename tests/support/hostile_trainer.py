@@ -16,13 +16,13 @@ from torch.nn import Parameter
 from trainers import everything
 
 from opt3dgs_optim import ConstantMultiplier, Curvature, PhaseScheduler
+from opt3dgs_optim.state import ParameterRecord
 
 TOTAL, SWITCH = 400, 8
 RATES = {"means": 1e-2, "opacities": 5e-2}
 INRIA = {"means": "xyz", "opacities": "opacity"}
 MOMENTS = ("exp_avg", "exp_avg_sq")
 PAIRS = "Curvature.history"
-FRESH = "fresh_since"  # the group's note of what happened at the switch
 
 
 def make_phases() -> PhaseScheduler:
@@ -67,6 +67,11 @@ class Splats:
     def group(self, name: str) -> dict[str, Any]:
         groups = self.optimizer(name).param_groups
         return groups[0 if self.kind == "gsplat" else list(self.params).index(name)]
+
+    def record(self, name: str) -> ParameterRecord:
+        """What its optimizer knows of a parameter, whichever object it is."""
+        number = 0 if self.kind == "gsplat" else list(self.params).index(name)
+        return self.optimizer(name)._records[number][0]
 
     def step(self, weights: Tensor, mask: Tensor | None) -> None:
         """Gradients times `weights` [N] (0 unseen, NaN broken), then every optimizer's step."""
@@ -182,7 +187,10 @@ class HostileTrainer:
     def follow(self, name: str, twin: Splats, *, new: bool, zeroed: bool) -> None:
         """What the edit means for one row: its pairs are gone, and the moments where they are 0."""
         optimizer, param = twin.optimizer(name), twin.params[name]
-        twin.group(name)[FRESH] = self.ours.group(name).get(FRESH)
+        mine, its = self.ours.record(name), twin.record(name)
+        its.last_step = mine.last_step
+        twin.optimizer(name)._open_windows = dict(self.ours.optimizer(name)._open_windows)
+        its.numbers = {key: value.clone() for key, value in mine.numbers.items()}
         ours = self.ours.optimizer(name).state.get(self.ours.params[name])
         if ours is None:
             return

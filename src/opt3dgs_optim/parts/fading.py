@@ -91,8 +91,7 @@ class Fading(Part):
     ) -> Tensor:
         """Fade the moments by the events since this parameter's last step.
 
-        The events of a step that does not count are lost with it: a GPU says too late that it
-        does not.
+        The events of a step that does not count come with the next one.
         """
         # The step of iteration i comes after i + 1 observations.
         now = self.events_before(course.iteration, course.total_steps)

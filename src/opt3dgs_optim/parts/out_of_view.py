@@ -49,7 +49,8 @@ class OutOfView(Part):
             return grad
         if gaussian_of(group) == "means":
             share: Any = state[SEEN_SHARE]
-            some = _has_gradient(grad[:: 1 + len(grad) // MAX_POINTS_LOOKED_AT])
+            stride = 1 + len(grad) // MAX_POINTS_LOOKED_AT
+            some = _has_gradient(grad[::stride] if stride > 1 else grad)
             now = some.mean(dtype=torch.float32).clamp_(min=MIN_SEEN_SHARE)
             share.lerp_(now.to(share.dtype), 1 / NUM_VIEWS_AVERAGED)
             if grad.is_cpu:
@@ -83,4 +84,4 @@ class OutOfView(Part):
 
 def _has_gradient(grad: Tensor) -> Tensor:
     """Which points have a gradient, [N] bool."""
-    return grad.reshape(len(grad), -1).any(1)
+    return (grad if grad.dim() == 2 else grad.reshape(len(grad), -1)).any(1)
