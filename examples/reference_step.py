@@ -49,14 +49,13 @@ def default_step(
     """Fading, OutOfView and Averaging around Adam."""
     num_points = len(params["means"])
     grads = {name: grad.nan_to_num(0.0, 0.0, 0.0) for name, grad in grads.items()}
-    events = range(state.get("events", 0), events_before(iteration + 1, total))
-    state["events"] = events.stop
+    events = range(events_before(iteration, total), events_before(iteration + 1, total))
     # A point is out of view if its position has no gradient. At most 16,384 points are asked, and
     # the share of those in view is a mean over the last 100 views or so.
     in_view = grads["means"].any(1)
-    now = in_view[:: 1 + num_points // 16_384].float().mean().item()
-    share = state.get("share", 1.0)
-    state["share"] = share = share + (max(now, 0.01) - share) * (1 / 100)
+    now = in_view[:: 1 + num_points // 16_384].float().mean().clamp(min=0.01)
+    state["share"] = torch.lerp(state.get("share", torch.tensor(1.0)), now, 1 / 100)
+    share = state["share"].item()
 
     for name, param in params.items():
         grad, own = grads[name], state.setdefault(name, new_moments(param))
@@ -81,16 +80,14 @@ def default_step(
         adam_(param, grad, own, rates[name])
 
         # Averaging: the mean of the iterates of the last thirtieth of the training, which takes the
-        # parameter's place in the last tenth of that. It begins in the second of these iterations.
-        left, window = total - iteration, total * (1 / 30)
+        # parameter's place in the last tenth of that.
+        left, window = total - iteration, int(total * (1 / 30))
         if left <= window:
-            count = own["count"] = own.get("count", -1) + 1
-            if count == 0:
-                own["mean"] = torch.zeros_like(param)
-            else:
-                own["mean"].lerp_(param, 1 / torch.tensor(float(count)))
-                if left <= max(2, window / 10):
-                    param.copy_(torch.where(own["mean"].isfinite(), own["mean"], param))
+            count = own["count"] = own.get("count", 0) + 1
+            mean = own.setdefault("mean", torch.zeros_like(param))
+            mean.lerp_(param, 1 / torch.tensor(float(count)))
+            if left <= max(2, window / 10):
+                param.copy_(mean)
 
 
 def events_before(iteration: int, total: int) -> int:
