@@ -25,6 +25,7 @@ def test_what_a_page_imports_from_the_top_is_there(page: Path) -> None:
 
 def test_the_names_that_must_stay() -> None:
     steps = "AWSGLD LQNAdam PhaseScheduler Phase Part Course two_loop backend_info DEFAULTS"
+    steps += " history_from_pairs"
     parts = "EnergyHistogram Annealing Fading Averaging Curvature ConstantMultiplier FreshMoments"
     parts += " OutOfView SquaredLoss IsotropicNoise PositionNoise"
     needed = [*steps.split(), *parts.split(), "__version__"]

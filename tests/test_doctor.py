@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from typing import Any
 
 import pytest
 import torch
+from kernel_host import compiler, host_kernels
+from torch import Tensor
 
-from opt3dgs_optim import AWSGLD, __version__, cuda, doctor
+from opt3dgs_optim import AWSGLD, EnergyHistogram, __version__, cuda, doctor
 from opt3dgs_optim import __main__ as commands
 
 STEP = AWSGLD.step
+KERNELS_OF = {"lqn_direction": ("lqn_direction",), "two_loop": ("two_loop",)}  # of each comparison
 
 
 @pytest.mark.parametrize("factor", [1 + 1e-6, float("nan")])
@@ -28,7 +32,7 @@ def test_another_step_is_found(
     assert doctor.main(["--device", "cpu"]) == 1
     said = capsys.readouterr().out
     assert "  FAILED  Adam with all off: ArithmeticError: AWSGLD with nothing on differs" in said
-    assert "1 of 2 FAILED" in said
+    assert "1 of 3 FAILED" in said
 
 
 @pytest.mark.cuda
@@ -36,7 +40,53 @@ def test_another_step_is_found(
 def test_the_kernels_agree_with_torch_on_the_gpu(capsys: pytest.CaptureFixture[str]) -> None:
     assert doctor.main(["--device", "cuda"]) == 0
     mark = "ok" if cuda.missing() is None else "--"
-    assert f"  {mark:<7} CUDA kernels" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    for check in ("CUDA kernels", "histogram on CUDA"):
+        assert f"  {mark:<7} {check}" in said
+
+
+@pytest.mark.compiles
+@pytest.mark.skipif(compiler() is None, reason="g++ is not installed")
+@pytest.mark.parametrize("broken", ["", *doctor.KERNELS])
+def test_each_kernel_is_compared(monkeypatch: pytest.MonkeyPatch, broken: str) -> None:
+    """The host plays the GPU, and breaks the result of one kernel."""
+
+    def launch(kernel: str, like: Tensor, threads: int, *arguments: Any, **options: Any) -> None:
+        host_kernels(doctor.HISTORY_SIZE, like.dtype).launch(
+            kernel, like, threads, *arguments, **options
+        )
+        if kernel in KERNELS_OF.get(broken, ()):
+            outputs = [a for a in arguments if isinstance(a, Tensor) and a.shape == like.shape]
+            outputs[-1][-1] = torch.nan
+
+    def there(backend: str, *_: Any) -> str | None:
+        return None if backend == "cuda" else "torch is asked for"
+
+    monkeypatch.setattr(cuda, "launch", launch)
+    monkeypatch.setattr(sys.modules["opt3dgs_optim.lbfgs.two_loop"], "obstacle", there)
+    if broken:
+        with pytest.raises(ArithmeticError, match=f"{broken} differs from torch by nan in"):
+            doctor.kernels_against_torch(torch.device("cpu"))
+        return
+    said = doctor.kernels_against_torch(torch.device("cpu"))
+    for name in doctor.KERNELS:
+        assert len(re.findall(rf"{name} \d\.\de-\d\d", said)) == 2  # two precisions
+
+
+def test_the_histogram_is_compared_with_the_hosts(monkeypatch: pytest.MonkeyPatch) -> None:
+    here = torch.device("cpu")
+    assert "mean multiplier of 400 energies differs by 0.0e+00" in doctor.histogram_kernel(here)
+    doubles = []
+
+    class Other(EnergyHistogram):
+        @property
+        def mean_multiplier(self) -> Tensor:
+            doubles.append(self)
+            return super().mean_multiplier + 0.01 * len(doubles)
+
+    monkeypatch.setattr(doctor, "EnergyHistogram", Other)
+    with pytest.raises(ArithmeticError, match=r"differs by 1\.0e-02 \(limit 1e-03\)"):
+        doctor.histogram_kernel(here)
 
 
 def test_doctor_as_a_command() -> None:
@@ -46,7 +96,8 @@ def test_doctor_as_a_command() -> None:
     for text in (__version__, torch.__version__, "the kernels need a CUDA device"):
         assert text in done.stdout
     assert done.stdout.count("\n  ok ") == 1
-    assert "\n  --      CUDA kernels: not launched: the kernels need" in done.stdout
+    for check in ("CUDA kernels", "histogram on CUDA"):
+        assert f"\n  --      {check}: not launched: the kernels need" in done.stdout
 
 
 def test_what_is_wrong_is_said_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:

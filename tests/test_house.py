@@ -229,7 +229,7 @@ GLOSSARY = {
     "rotations": "quats",
     "opacity": "opacities",
 }
-SHORT = {"lr"}  # torch's
+SHORT = {"lr", "s", "y"}  # torch's; a curvature pair's everywhere
 
 
 def public_signatures() -> dict[str, list[str]]:

@@ -3,7 +3,7 @@
 from opt3dgs_optim.awsgld import AWSGLD
 from opt3dgs_optim.backend import backend_info
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.lbfgs import two_loop
+from opt3dgs_optim.lbfgs import history_from_pairs, two_loop
 from opt3dgs_optim.lqnadam import LQNAdam
 from opt3dgs_optim.part import Kept, Part, Phase
 from opt3dgs_optim.parts.annealing import Annealing
@@ -46,6 +46,7 @@ __all__ = [
     "StepAdam",
     "__version__",
     "backend_info",
+    "history_from_pairs",
     "paper_parts",
     "two_loop",
 ]

@@ -11,14 +11,17 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.awsgld import AWSGLD
-from opt3dgs_optim.backend import backend_info
-from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction
+from opt3dgs_optim.backend import Backend, backend_info
+from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, two_loop
 from opt3dgs_optim.lqnadam import LQNAdam
+from opt3dgs_optim.parts.histogram import EnergyHistogram
 from opt3dgs_optim.version import __version__
 
 ROWS, HISTORY_SIZE = 1000, 5
 # Sums of a few dozen products, in another order.
 LIMITS = {torch.float64: 1e-10, torch.float32: 1e-4}
+ENERGIES = 400  # of them 150 after the warm-up
+HISTOGRAM_LIMIT = 1e-3  # float32 over as many updates, which forget
 
 
 def versions(device: torch.device) -> dict[str, str]:
@@ -73,28 +76,63 @@ def adam_when_all_is_off(device: torch.device) -> str:
     return "AWSGLD with nu and noise off, LQNAdam without pairs: bit for bit"
 
 
+def _curvature_step(device: torch.device, dtype: torch.dtype, backend: Backend) -> Tensor:
+    s, y = (tensor.to(dtype) for tensor in _pairs(device))
+    position, grad = _draw(2, ROWS, 3, device=device, seed=5).to(dtype)
+    given = position, grad, history_from_pairs(s, y), HISTORY_SIZE
+    return lqn_direction(*given, min_cosine=1e-6, graft=True, backend=backend)[0]
+
+
+def _recursion(device: torch.device, dtype: torch.dtype, backend: Backend) -> Tensor:
+    s, y = (tensor.to(dtype) for tensor in _pairs(device))
+    grad = _draw(ROWS, 3, device=device, seed=5).to(dtype)
+    return two_loop(grad, history_from_pairs(s, y), HISTORY_SIZE, backend=backend)
+
+
+# What each kernel is compared in.
+KERNELS: dict[str, Callable[[torch.device, torch.dtype, Backend], Tensor]] = {
+    "lqn_direction": _curvature_step,
+    "two_loop": _recursion,
+}
+
+
 def kernels_against_torch(device: torch.device) -> str:
     """The CUDA kernels against the same in torch; RuntimeError where they cannot run."""
-    said = []
+    found = []
     for dtype, limit in LIMITS.items():
-        s, y = (tensor.to(dtype) for tensor in _pairs(device))
-        position, grad = _draw(2, ROWS, 3, device=device, seed=5).to(dtype)
-        found = []
-        for backend in ("cuda", "torch"):
-            given = position, grad, history_from_pairs(s, y), HISTORY_SIZE
-            fed, *_ = lqn_direction(*given, min_cosine=1e-6, graft=True, backend=backend)
-            found.append(fed)
-        difference = float((found[0] - found[1]).abs().max() / found[1].abs().max())
-        said.append(f"relative difference {difference:.1e} to torch in {dtype} (limit {limit:.0e})")
-        if not difference <= limit:  # NaN too
-            raise ArithmeticError(said[-1])
-    return "; ".join(said)
+        differences = []
+        for name, run in KERNELS.items():
+            ours, theirs = run(device, dtype, "cuda"), run(device, dtype, "torch")
+            difference = float((ours - theirs).abs().max() / theirs.abs().max())
+            differences.append(f"{name} {difference:.1e}")
+            if not difference <= limit:  # NaN too
+                raise ArithmeticError(
+                    f"{name} differs from torch by {difference:.1e} in {dtype} (limit {limit:.0e})"
+                )
+        found.append(f"{', '.join(differences)} in {dtype} (limit {limit:.0e})")
+    return f"relative differences to torch: {'; '.join(found)}"
+
+
+def histogram_kernel(device: torch.device) -> str:
+    """The histogram on the device, a kernel, against the same on the host, which is torch's."""
+    energies = 0.1 + 0.01 * _draw(ENERGIES, device=torch.device("cpu"), seed=6)
+    ours, theirs = EnergyHistogram(), EnergyHistogram()
+    for energy in energies:
+        ours.observe(energy.to(device, torch.float32))
+        theirs.observe(energy.float())
+    difference = float((ours.mean_multiplier.cpu() - theirs.mean_multiplier).abs())
+    found = f"mean multiplier of {ENERGIES} energies differs by {difference:.1e} (limit 1e-03)"
+    if not difference <= HISTOGRAM_LIMIT:
+        raise ArithmeticError(found)
+    return found
 
 
 CHECKS: dict[str, Callable[[torch.device], str]] = {
     "Adam with all off": adam_when_all_is_off,
     "CUDA kernels": kernels_against_torch,
+    "histogram on CUDA": histogram_kernel,
 }
+NEED_KERNELS = (kernels_against_torch, histogram_kernel)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -117,7 +155,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     info, failed = backend_info(device), 0
     for name, check in CHECKS.items():
         mark, detail = "--", f"not launched: {info.reason}"
-        if check is not kernels_against_torch or info.backend == "cuda":
+        if check not in NEED_KERNELS or info.backend == "cuda":
             try:
                 mark, detail = "ok", check(device)
             except Exception as error:  # whatever a broken installation raises is the finding

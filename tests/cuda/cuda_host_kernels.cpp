@@ -6,11 +6,17 @@
 
 #include "histogram.cu"
 #include "lqn.cu"
+#include "two_loop.cu"
 
-extern "C" void run_lqn(unsigned block, const Real* positions, const Real* grads, Real* histories, Real* directions,
-                        unsigned char* accepted, unsigned char* candidates, long long rows, Real min_cosine, int graft) {
+extern "C" void run_lqn_direction(unsigned block, const Real* positions, const Real* grads, Real* histories, Real* directions,
+                                  unsigned char* accepted, unsigned char* candidates, long long rows,
+                                  Real min_cosine, int graft) {
   launch_on_host(block, rows, lqn_direction, positions, grads, histories, directions, accepted, candidates, rows,
                  min_cosine, graft);
+}
+
+extern "C" void run_two_loop(unsigned block, const Real* grads, const Real* histories, Real* results, long long rows) {
+  launch_on_host(block, rows, two_loop, grads, histories, results, rows);
 }
 
 extern "C" void run_take_energy(unsigned block, const Real* energy, const unsigned char* valid, Real* state, Real* nu,

@@ -30,8 +30,11 @@ int main(int, char** arguments) {
     for (size_t i = 0; i < rows * row; ++i) {
       if (reset[i / row] != 0) history[i] = 0;
     }
-    run_lqn(128, position.data(), grad.data(), history.data(), direction.data(), accepted.data(), candidates.data(),
-            static_cast<long long>(rows), 1e-6, 1);
+    const long long n = static_cast<long long>(rows);
+    run_lqn_direction(128, position.data(), grad.data(), history.data(), direction.data(), accepted.data(),
+                      candidates.data(), n, 1e-6, 1);
+    give(out, direction);
+    run_two_loop(128, grad.data(), history.data(), direction.data(), n);
     give(out, direction);
   }
   const Buffer lengths = take(in, 2);

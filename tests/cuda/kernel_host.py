@@ -22,13 +22,13 @@ from torch import Tensor
 import opt3dgs_optim
 from opt3dgs_optim import cuda, partitions
 from opt3dgs_optim.cuda import BLOCK, macros
-from opt3dgs_optim.lbfgs import lqn_direction, new_history
+from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history
 from opt3dgs_optim.partitions import UNLIMITED, MovingPartitions
 
 HERE = Path(__file__).parent
 SOURCES = Path(opt3dgs_optim.__file__).parent / "cuda"
 GUARD_ROWS = 300  # written by nobody: more than one block beyond the last row
-GUARD = 12345.0
+GUARD = 77
 OPTIONS = {"min_cosine": 1e-6, "graft": True}
 BUILDS = Path(tempfile.gettempdir()) / "opt3dgs_optim_host_kernels"
 
@@ -55,7 +55,7 @@ def compile_host(
 @cache
 def host_kernels(size: int, dtype: torch.dtype) -> HostKernels:
     """The kernels for one history size; see `built`."""
-    return HostKernels.load(built(size, dtype), dtype)
+    return HostKernels.load(built(size, dtype), dtype, size)
 
 
 def built(size: int, dtype: torch.dtype, *extra: str) -> Path:
@@ -89,67 +89,75 @@ class HostKernels:
 
     library: ctypes.CDLL
     dtype: torch.dtype
+    history_size: int
 
     @classmethod
-    def load(cls, path: Path, dtype: torch.dtype) -> HostKernels:
-        return cls(ctypes.CDLL(str(path)), dtype)
-
-    def _call(self, name: str, tensors: list[Tensor], rows: int, *scalars: object) -> None:
-        real = ctypes.c_double if self.dtype == torch.float64 else ctypes.c_float
-        values = [real(v) if isinstance(v, float) else v for v in scalars]
-        pointers = [ctypes.c_void_p(t.data_ptr()) for t in tensors]
-        values.insert(0 if name == "run_lqn" else len(values), ctypes.c_longlong(rows))
-        getattr(self.library, name)(ctypes.c_uint(BLOCK), *pointers, *values)
+    def load(cls, path: Path, dtype: torch.dtype, history_size: int) -> HostKernels:
+        return cls(ctypes.CDLL(str(path)), dtype, history_size)
 
     def lqn(
-        self,
-        position: Tensor,
-        grad: Tensor,
-        history: Tensor,
-        *,
-        min_cosine: float,
-        graft: bool,
+        self, position: Tensor, grad: Tensor, history: Tensor, *, min_cosine: float, graft: bool
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """As `lqn_direction`; raises AssertionError if a row beyond the last one was written."""
-        n = grad.shape[0]
-        inputs = [t.to(self.dtype).contiguous() for t in (position, grad)]
-        cells = guarded(history.to(self.dtype))
-        direction = guarded(torch.zeros(n, 3, dtype=self.dtype))
-        flags = [guarded(torch.zeros(n, dtype=torch.uint8)) for _ in range(2)]
-        # The inputs end with the last row: room for what a missing tail guard reads.
-        tensors = [guarded(t) for t in inputs] + [cells, direction, *flags]
-        self._call("run_lqn", tensors, n, float(min_cosine), int(graft))
-        for tensor in tensors:
-            check_guard(tensor, n)
-        history.copy_(cells[:n])
-        return direction[:n], flags[0][:n].bool(), flags[1][:n].bool()
+        """`cuda.lqn_direction` with the kernel run on the host; changes `history` in place."""
+        x, g, cells = (t.to(self.dtype) for t in (position, grad, history))
+        size = self.history_size
+        with self.launched():
+            result = cuda.lqn_direction(x, g, cells, size, min_cosine, graft)
+        history.copy_(cells)
+        return result
 
-    def launch(self, kernel: str, like: Tensor, threads: int, *arguments: Any) -> None:
-        """As `cuda.launch` of a kernel that takes no rows."""
-        assert (like.dtype, threads) == (self.dtype, 1)
-        types = {
-            np.float32: ctypes.c_float,
-            np.float64: ctypes.c_double,
-            np.int64: ctypes.c_longlong,
-        }
+    def two_loop(self, grad: Tensor, history: Tensor) -> Tensor:
+        """`cuda.two_loop` with the kernel run on the host."""
+        with self.launched():
+            return cuda.two_loop(grad.to(self.dtype), history.to(self.dtype), self.history_size)
+
+    def launched(self) -> Any:
+        """A context in which `cuda.launch` runs these kernels on the host."""
+        return mock.patch.object(cuda, "launch", self.launch)
+
+    def launch(
+        self,
+        kernel: str,
+        like: Tensor,
+        threads: int,
+        *arguments: Any,
+        history_size: int | None = None,
+    ) -> None:
+        """As `cuda.launch`; AssertionError if something beyond a tensor's end was written."""
+        assert like.dtype == self.dtype
+        assert history_size in (None, self.history_size)
+        tensors = [a for a in arguments if isinstance(a, Tensor)]
+        assert all(tensor.is_contiguous() for tensor in tensors)
+        # The inputs have room behind them, too, for what a missing tail guard would read.
+        # Each has its own value there, so that a copy from one into another is noticed.
+        buffers = [guarded(t.reshape(-1, *t.shape[1:]), GUARD + i) for i, t in enumerate(tensors)]
+        left = iter(buffers)
         values = [
-            ctypes.c_void_p(a.data_ptr() if isinstance(a, Tensor) else None)
+            ctypes.c_void_p(next(left).data_ptr() if isinstance(a, Tensor) else None)
             if isinstance(a, (Tensor, int))
-            else types[type(a)](a.item())
+            else C_TYPES[type(a)](a.item())
             for a in arguments
         ]
         getattr(self.library, f"run_{kernel}")(ctypes.c_uint(BLOCK), *values)
+        for i, (tensor, buffer) in enumerate(zip(tensors, buffers, strict=True)):
+            written, behind = buffer[:-GUARD_ROWS], buffer[-GUARD_ROWS:]
+            assert bool((behind == GUARD + i).all()), "rows beyond the last one were written"
+            tensor.copy_(written.reshape(tensor.shape))
 
 
-def guarded(tensor: Tensor) -> Tensor:
-    """A contiguous copy with rows behind it that nobody may write."""
-    value = 77 if tensor.dtype == torch.uint8 else GUARD
-    return torch.cat([tensor, tensor.new_full((GUARD_ROWS, *tensor.shape[1:]), value)])
+C_TYPES = {
+    np.float32: ctypes.c_float,
+    np.float64: ctypes.c_double,
+    np.int32: ctypes.c_int,
+    np.int64: ctypes.c_longlong,
+}
 
 
-def check_guard(tensor: Tensor, rows: int) -> None:
-    value = 77 if tensor.dtype == torch.uint8 else GUARD
-    assert bool((tensor[rows:] == value).all()), "rows beyond the last one were written"
+def guarded(tensor: Tensor, guard: float) -> Tensor:
+    """A contiguous copy, booleans as bytes, with rows behind it that nobody may write."""
+    if tensor.dtype == torch.bool:
+        tensor = tensor.view(torch.uint8)
+    return torch.cat([tensor, tensor.new_full((GUARD_ROWS, *tensor.shape[1:]), guard)])
 
 
 # -- what the kernels are run on -------------------------------------------------------------------
@@ -208,6 +216,28 @@ def compare_runs(kernels: HostKernels, n: int, size: int, **changed: object) -> 
     reference = free_run(lambda x, g, h: lqn_direction(x, g, h, size, **options), problem, size)  # pyright: ignore
     result = free_run(lambda x, g, h: kernels.lqn(x, g, h, **options), problem, size)  # pyright: ignore
     return max(map(relative_difference, result, reference), default=0.0)
+
+
+def two_loop_case(rows: int, size: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Gradients [N, 3] and histories of all kinds: full, partly filled, empty; some not finite.
+
+    A tenth of the pairs have little curvature, and a tenth negative curvature, which is left out.
+    """
+    g = torch.Generator().manual_seed(seed)
+    s = torch.randn(size, rows, 3, generator=g, dtype=torch.float64)
+    half = torch.randn(rows, 3, 3, generator=g, dtype=torch.float64)
+    y = torch.einsum("nij,knj->kni", half @ half.mT + 0.1 * torch.eye(3), s)
+    kind = torch.rand(size, rows, generator=g)
+    y[kind < 0.1] *= -1
+    empty = torch.rand(rows, generator=g) < 0.1
+    y[:, empty] = 0.0
+    grad = torch.randn(rows, 3, generator=g, dtype=torch.float64)
+    grad *= 10.0 ** torch.randint(-30, 31, (rows, 1), generator=g)
+    of_row = torch.rand(rows, generator=g)
+    grad[of_row < 0.1] = 0.0
+    grad[of_row > 0.96, 0] = torch.nan
+    grad[of_row > 0.98, 2] = torch.inf
+    return grad, history_from_pairs(s, y)
 
 
 def relative_difference(result: Tensor, reference: Tensor) -> float:
@@ -274,7 +304,7 @@ def take_all(values: Tensor, dtype: torch.dtype, before: Tensor | None = None) -
 def take_all_on_host(kernels: HostKernels, values: Tensor, before: Tensor | None = None) -> Tensor:
     """`take_all` with the kernel in the place of the torch operators."""
     with (
-        mock.patch.object(cuda, "launch", kernels.launch),
+        kernels.launched(),
         mock.patch.object(partitions, "obstacle", return_value=None),
     ):
         return take_all(values, kernels.dtype, before)

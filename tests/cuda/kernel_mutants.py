@@ -15,7 +15,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from kernel_host import SOURCES, HostKernels, compare_energies, compare_runs, compile_host, energies
+from kernel_host import (
+    SOURCES,
+    HostKernels,
+    compare_energies,
+    compare_runs,
+    compile_host,
+    energies,
+    relative_difference,
+    two_loop_case,
+)
+
+from opt3dgs_optim import two_loop
 
 SIZE = 5
 ROWS = 257  # not a multiple of a block: the tail guard has something to do
@@ -41,6 +52,14 @@ MUTANTS = (
     Mutant(
         "length of the grafted step", "two_loop.cuh", "sqrt(dot(unit, unit)) / size", "T(1) / size"
     ),
+    Mutant("tail guard of the recursion", "two_loop.cu", "row >= rows", "row > rows"),
+    Mutant(
+        "scale of the gradient",
+        "two_loop.cuh",
+        "History<T, K>(row)), scale)",
+        "History<T, K>(row)), T(1))",
+    ),
+    Mutant("a gradient of zero", "two_loop.cuh", "size == T(0) ? T(1) : size", "size"),
     Mutant("one thread", "histogram.cu", "if (blockIdx.x > 0 || threadIdx.x > 0) return;", ""),
     Mutant("mean of the slope", "histogram.cu", "slope - state[2]", "slope"),
     Mutant("energies that do not count", "histogram.cu", "(valid && !*valid)", "false"),
@@ -52,11 +71,17 @@ def complaint(kernels: HostKernels) -> str | None:
     """What the comparison with pure torch says of these kernels; None if nothing."""
     try:
         difference = compare_runs(kernels, ROWS, SIZE)
+        grad, history = two_loop_case(ROWS, SIZE)
+        recursion = relative_difference(
+            kernels.two_loop(grad, history), two_loop(grad, history, SIZE)
+        )
         gap = max(compare_energies(kernels, energies(name, 500)) for name in ("spike", "broken"))
     except AssertionError as error:
         return str(error)
     if not difference < 1e-10:
         return f"lqn_direction differs by {difference:.1e}"
+    if not recursion < 1e-10:
+        return f"two_loop differs by {recursion:.1e}"
     return None if gap < 1e-10 else f"take_energy differs by {gap:.1e}"
 
 
@@ -77,9 +102,8 @@ def mutated(mutant: Mutant | None, folder: Path) -> HostKernels:
                 f"{mutant.file}, but exactly once is needed"
             )
         path.write_text(text.replace(mutant.old, mutant.new))
-    return HostKernels.load(
-        compile_host(folder / "kernels.so", SIZE, torch.float64, sources), torch.float64
-    )
+    library = compile_host(folder / "kernels.so", SIZE, torch.float64, sources)
+    return HostKernels.load(library, torch.float64, SIZE)
 
 
 def main() -> int:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from kernel_host import OPTIONS, Problem, free_run, relative_difference
+from kernel_host import OPTIONS, Problem, free_run, relative_difference, two_loop_case
 from torch import Tensor
 from trainers import AveragedThroughout, everything
 
@@ -20,7 +20,7 @@ from opt3dgs_optim import (
     PositionNoise,
     backend_info,
 )
-from opt3dgs_optim.lbfgs import lqn_direction, new_history
+from opt3dgs_optim.lbfgs import lqn_direction, new_history, two_loop
 from opt3dgs_optim.names import GAUSSIAN
 from opt3dgs_optim.parts.noise import covariance_noise
 
@@ -74,6 +74,34 @@ def test_single_step_in_float32(rows: int) -> None:
     same = (result[1].cpu() == expected[1]) & (result[2].cpu() == expected[2])
     assert bool(same.all()) or float((~same).float().mean()) < 1e-3
     assert relative_difference(result[0].cpu()[same], expected[0][same]) < 1e-5
+
+
+@pytest.mark.parametrize("size", [1, 3, 4, 5])
+@pytest.mark.parametrize("rows", ROWS)
+def test_the_recursion_alone(rows: int, size: int) -> None:
+    grad, history = two_loop_case(rows, size)
+    expected = two_loop(grad, history, size)
+    for cells in (history.cuda(), history.contiguous().cuda()):
+        found = two_loop(grad.cuda(), cells, size)
+        insisted = two_loop(grad.cuda(), cells, size, backend="cuda")
+        assert torch.equal(found.nan_to_num(), insisted.nan_to_num())
+        assert relative_difference(found.cpu(), expected) < 1e-10
+
+
+def test_the_recursion_does_not_synchronise_and_can_be_captured() -> None:
+    grad, history = (t.float().cuda() for t in two_loop_case(1000, 5))
+    expected = two_loop(grad, history, 5)  # compiles
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        found = two_loop(grad, history, 5)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert torch.equal(found.nan_to_num(), expected.nan_to_num())
+    given, result = torch.zeros_like(grad), torch.empty_like(grad)
+    graph = capture(lambda: result.copy_(two_loop(given, history, 5)))  # pyright: ignore
+    given.copy_(grad)
+    graph.replay()
+    assert torch.equal(result.nan_to_num(), expected.nan_to_num())
 
 
 def noise_case(n: int, dtype: torch.dtype) -> tuple[Tensor, dict[str, Tensor], Tensor]:

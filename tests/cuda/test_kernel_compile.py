@@ -127,12 +127,15 @@ def test_float32_kernels(tool, arch: str, tmp_path: Path) -> None:
     for size in SIZES if tool is with_nvrtc else (5,):  # nvcc takes a second for each
         compiled = tool("lqn.cu", arch, torch.float32, size, tmp_path)
         check(compiled, torch.float32, 2 * size)
+        check(tool("two_loop.cu", arch, torch.float32, size, tmp_path), torch.float32, 2 * size)
     check(tool("histogram.cu", arch, torch.float32, None, tmp_path), torch.float32, 0)
 
 
 @pytest.mark.parametrize("tool", TOOLS)
 def test_float64_kernels_for_tests(tool, tmp_path: Path) -> None:
     check(tool("lqn.cu", "80", torch.float64, 5, tmp_path), torch.float64, 20)
+    # Of each vector of three coordinates two; the spare lane beside the third is not read.
+    check(tool("two_loop.cu", "80", torch.float64, 5, tmp_path), torch.float64, 10)
     check(tool("histogram.cu", "80", torch.float64, None, tmp_path), torch.float64, 0)
 
 

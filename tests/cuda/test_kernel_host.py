@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +23,13 @@ from kernel_host import (
     host_kernels,
     relative_difference,
     taken,
+    two_loop_case,
 )
 from torch import Tensor
 
 from opt3dgs_optim import cuda
-from opt3dgs_optim.lbfgs import lqn_direction, new_history
+from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
+from opt3dgs_optim.lbfgs.history import laid_out
 from opt3dgs_optim.partitions import LIMIT, MEAN_ABS, MEMORY, MovingPartitions
 
 pytestmark = [
@@ -115,6 +118,71 @@ def test_a_point_without_pairs_keeps_its_gradient_bit_for_bit(kernels: dict, siz
         assert torch.equal(direction, grad)
 
 
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("rows", ROWS)
+def test_the_recursion_in_float64(kernels: dict, rows: int, size: int) -> None:
+    """Rounding is 1e-16; pairs of little curvature amplify it."""
+    grad, history = two_loop_case(rows, size)
+    before = history.clone()
+    found = kernels[size, torch.float64].two_loop(grad, history)
+    expected = two_loop(grad, history, size)
+    assert relative_difference(found, expected) < 1e-10
+    assert torch.equal(history, before)
+    assert rows < 255 or bool(expected.isnan().any(1).any())  # not finite, in both
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_the_recursion_in_float32(kernels: dict, size: int) -> None:
+    """1e-5 is eps times what the recursion amplifies: no pairs of little curvature here."""
+    generator = torch.Generator().manual_seed(1)
+    s = torch.randn(size, 1000, 3, generator=generator)
+    y = s * (0.5 + torch.rand(size, 1000, 3, generator=generator))
+    grad, history = two_loop_case(1000, size)[0].float(), history_from_pairs(s, y)
+    found = kernels[size, torch.float32].two_loop(grad, history)
+    assert relative_difference(found, two_loop(grad, history, size)) < 1e-5
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+@pytest.mark.parametrize("layout", ["of torch", "of the kernel", "anywhere in a buffer"])
+def test_the_recursion_reads_any_layout(kernels: dict, layout: str, dtype: torch.dtype) -> None:
+    """A view that begins between two vectors of 16 bytes would be a fault on a GPU."""
+    grad, history = (t.to(dtype) for t in two_loop_case(300, 5))
+    expected = two_loop(grad, history, 5)
+    history = laid_out(history, contiguous=layout != "of torch")
+    if layout == "anywhere in a buffer":
+        buffer = torch.cat([torch.zeros(1, dtype=dtype), history.flatten()])
+        history = buffer[1:].view(history.shape)
+        assert history.data_ptr() % cuda.ALIGNMENT != 0
+    grad = torch.cat([grad, grad], 1)[:, 3:]  # not contiguous
+    found = kernels[5, dtype].two_loop(grad, history)
+    assert found.is_contiguous()
+    assert relative_difference(found, expected) < (1e-10 if dtype == torch.float64 else 1e-3)
+
+
+def test_a_step_writes_an_unaligned_history_in_place(kernels: dict) -> None:
+    x, grad, history = (t.contiguous() for t in recorded_steps(300, 5)[-1])
+    buffer = torch.cat([torch.zeros(1, dtype=history.dtype), history.flatten()])
+    twin = buffer[1:].view(history.shape)
+    found = kernels[5, torch.float64].lqn(x, grad, twin, **OPTIONS)
+    expected = kernels[5, torch.float64].lqn(x, grad, history, **OPTIONS)
+    assert torch.equal(twin, history)
+    assert all(map(torch.equal, found[1:], expected[1:]))
+    assert relative_difference(found[0], expected[0]) == 0.0
+
+
+def test_a_point_is_told_its_pairs_wherever_two_loop_runs(
+    kernels: dict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The public function and its kernel, from pairs to H g, on a GPU that the host plays."""
+    module = sys.modules["opt3dgs_optim.lbfgs.two_loop"]
+    monkeypatch.setattr(module, "obstacle", lambda *_: None)
+    grad, history = two_loop_case(257, 5)
+    with kernels[5, torch.float64].launched():
+        found = two_loop(grad, history, 5, backend="cuda")
+    assert relative_difference(found, two_loop(grad, history, 5)) < 1e-10
+    assert not torch.equal(found.nan_to_num(), two_loop(grad, history, 5).nan_to_num())
+
+
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
 @pytest.mark.parametrize("name", ["falling", "two levels", "spike", "constant", "broken"])
 def test_energies(kernels: dict, name: str, dtype: torch.dtype) -> None:
@@ -168,7 +236,8 @@ def _quiet() -> dict[str, str]:
 def _write_input(path: Path, rows: int, size: int) -> list[Tensor]:
     """Steps as the program reads them; what it should write.
 
-    That is directions, and what the histogram has learnt.
+    That is directions, as they are fed to Adam and of the recursion alone, and what the histogram
+    has learnt.
     """
     states = recorded_steps(rows, size)
     history = new_history(states[0][0], size, contiguous=True)
@@ -179,6 +248,7 @@ def _write_input(path: Path, rows: int, size: int) -> list[Tensor]:
         parts += [x, grad, reset]
         history[reset.bool()] = 0
         expected.append(lqn_direction(x, grad, history, size, **OPTIONS)[0])  # pyright: ignore
+        expected.append(two_loop(grad, history, size))
     learnt = _add_energies(parts)
     torch.cat([part.flatten() for part in parts]).numpy().tofile(path)
     return [*expected, learnt]

@@ -183,6 +183,44 @@ def test_points_on_a_gpu_are_one_launch(monkeypatch: pytest.MonkeyPatch) -> None
     assert len(asked) == 1  # nobody asks for points on a host
 
 
+def test_the_recursion_on_a_gpu_is_one_launch(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, grad, history = points(7)
+    module = sys.modules["opt3dgs_optim.lbfgs.two_loop"]
+    asked: list[Any] = []
+    monkeypatch.setattr(module, "obstacle", lambda *given: asked.append(given))
+    monkeypatch.setattr(cuda, "two_loop", lambda *_: "launched")
+    assert two_loop(grad.as_subclass(There), history, 5) == "launched"
+    assert asked == [("auto", grad.device, grad.dtype, 3, 5)]
+    # Nobody asks for points on a host, for two dtypes, or where torch.compile traces.
+    assert two_loop(grad, history, 5) != "launched"
+    assert two_loop(grad.half().as_subclass(There), history, 5) != "launched"
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    assert two_loop(grad.as_subclass(There), history, 5) != "launched"
+    assert len(asked) == 1
+    assert two_loop(grad, history, 5, backend="cuda") == "launched"
+
+
+def test_the_recursion_insists_as_it_is_told() -> None:
+    _, grad, history = points(7)
+    assert torch.equal(two_loop(grad, history, 5, backend="torch"), two_loop(grad, history, 5))
+    with pytest.raises(RuntimeError, match=r"backend='cuda' was asked for on cpu"):
+        two_loop(grad, history, 5, backend="cuda")
+    with pytest.raises(ValueError, match=r"two_loop: backend='gpu', but 'auto' or 'cuda' or"):
+        two_loop(grad, history, 5, backend="gpu")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("kernel", [False, True])
+def test_a_history_is_laid_out_for_what_reads_it(
+    kernel: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = sys.modules["opt3dgs_optim.lbfgs.history"]
+    monkeypatch.setattr(module, "obstacle", lambda *_: None if kernel else "no")
+    s = torch.randn(5, 9, 3)
+    history = history_from_pairs(s.as_subclass(There), s.as_subclass(There))
+    assert history.is_contiguous() == kernel
+    assert torch.equal(history, history_from_pairs(s, s))
+
+
 def test_gradients_too_small_for_products() -> None:
     _, grad, history = points(20)
     expected = two_loop(grad.double(), history.double(), 5)

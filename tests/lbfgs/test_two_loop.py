@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -247,3 +249,137 @@ def test_no_points_and_one_point(n: int) -> None:
     visible = torch.ones(n, dtype=torch.bool)
     record(history, 5, g, g, visible, min_cosine=0.0)
     assert direction(g, history, 5, graft=True).shape == (n, 3)
+
+
+# -- which pairs are kept, and what is refused -----------------------------------------------------
+
+
+@settings(max_examples=60, deadline=None)
+@given(SIZES, st.integers(0, 2**31))
+def test_pairs_that_describe_no_curvature_are_left_out(
+    sizes: tuple[int, int, int, int], which: int
+) -> None:
+    """A point has those of its pairs that are left, as if the others had never been given."""
+    k, d, n, seed = sizes
+    s, y, _ = convex_pairs(k, d, n, seed)
+    generator = torch.Generator().manual_seed(which)
+    kind = torch.randint(0, 6, (k, n), generator=generator)
+    y[kind == 0] *= -1
+    y[kind == 1] = 0.0
+    s[kind == 2, 0] = torch.nan
+    y[kind == 3, -1] = torch.inf
+    g = gradients(n, d, seed)
+    history = history_from_pairs(s, y)
+    found = two_loop(g, history, k)
+    for row in range(n):
+        good = kind[:, row] > 3
+        count = int(good.sum())
+        assert float(header(history, k).counter[row]) == count + 1
+        if count == 0:
+            torch.testing.assert_close(found[row], g[row], rtol=1e-15, atol=0)  # one rounding each
+        else:
+            fewer = history_from_pairs(s[good, row, None], y[good, row, None])
+            expected = two_loop(g[row, None], fewer, count)[0]
+            # other SIMD lanes: equal to rounding
+            torch.testing.assert_close(found[row], expected, rtol=1e-12, atol=1e-14)
+
+
+def test_a_gradient_that_is_not_finite_is_nan_and_the_others_are_not() -> None:
+    s, y, _ = convex_pairs(3, 3, 4, 0)
+    g = gradients(4, 3, 0)
+    expected = two_loop(g, history_from_pairs(s, y), 3)
+    g[1, 2], g[2, 0] = torch.nan, -torch.inf
+    found = two_loop(g, history_from_pairs(s, y), 3)
+    assert bool(found[1:3].isnan().all())
+    assert torch.equal(found[[0, 3]], expected[[0, 3]])
+
+
+@pytest.mark.parametrize("grad_dtype", [torch.float16, torch.bfloat16, torch.float32])
+def test_the_result_has_the_gradients_dtype_and_no_graph(grad_dtype: torch.dtype) -> None:
+    s, y, _ = convex_pairs(3, 3, 4, 0)
+    g = gradients(4, 3, 0).to(grad_dtype)
+    history = history_from_pairs(s.to(grad_dtype).requires_grad_(), y.to(grad_dtype))
+    assert history.dtype == torch.float32
+    assert not history.requires_grad
+    before = history.clone()
+    found = two_loop(g.requires_grad_(), history, 3)
+    assert (found.dtype, found.requires_grad) == (grad_dtype, False)
+    assert torch.equal(found, two_loop(g.detach().float(), history, 3).to(grad_dtype))
+    assert torch.equal(history, before)
+
+
+def refused(call: Any, error: type[Exception], message: str, *given: Any) -> None:
+    with pytest.raises(error, match=message) as caught:
+        call(*given)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("grad", "error", "message"),
+    [
+        (None, TypeError, "two_loop: grad is None, but a tensor of real numbers is needed"),
+        (torch.ones(4, 3).long(), TypeError, r"grad is a tensor of torch\.int64"),
+        (torch.ones(4, 3, dtype=torch.complex64), TypeError, r"a tensor of torch\.complex64"),
+        (torch.ones(4), ValueError, r"grad has shape \(4,\), but \[N, D\] with D at least 1"),
+        (torch.ones(4, 3, 1), ValueError, r"grad has shape \(4, 3, 1\), but"),
+        (torch.ones(4, 0), ValueError, r"grad has shape \(4, 0\), but"),
+        (torch.ones(5, 3), ValueError, r"history has shape \(4, 4, 8\), but \[5, 4, 8\] is"),
+        (torch.ones(4, 3, device="meta"), ValueError, "history is on cpu, but meta is needed"),
+    ],
+    ids=lambda value: None if isinstance(value, Tensor) else str(value)[:30],
+)
+def test_a_wrong_gradient_is_named(grad: Any, error: type[Exception], message: str) -> None:
+    history = new_history(torch.ones(4, 3), 4)
+    refused(two_loop, error, message, grad, history, 4)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "error", "message"),
+    [
+        (lambda h: None, TypeError, "two_loop: history is None, but a tensor of real numbers"),
+        (lambda h: h.long(), TypeError, r"history is a tensor of torch\.int64"),
+        (lambda h: h.half(), ValueError, r"history is torch\.float16, but one of \[torch\.float32"),
+        (lambda h: h[:, :4], ValueError, r"history has shape \(4, 4, 8\), but \[4, 5, 8\]"),
+        (lambda h: h[0], ValueError, r"history has shape \(5, 8\), but \[4, 5, 8\]"),
+    ],
+)
+def test_a_wrong_history_is_named(spoil: Any, error: type[Exception], message: str) -> None:
+    history = new_history(torch.ones(4, 3), 5)
+    refused(two_loop, error, message, torch.ones(4, 3), spoil(history), 5)
+
+
+@pytest.mark.parametrize("size", [0, -1, 5.0, "5", True, None])
+def test_a_wrong_number_of_pairs_is_named(size: Any) -> None:
+    history = new_history(torch.ones(4, 3), 5)
+    message = f"two_loop: history_size={size!r}, but an integer at least 1 is needed"
+    refused(two_loop, ValueError, message, torch.ones(4, 3), history, size)
+
+
+@pytest.mark.parametrize(
+    ("s", "y", "error", "message"),
+    [
+        ([1.0], [1.0], TypeError, r"history_from_pairs: s is \[1\.0\], but a tensor of real"),
+        (torch.ones(2, 4, 3), None, TypeError, "y is None, but a tensor of real numbers"),
+        (
+            torch.ones(2, 4, 3).int(),
+            torch.ones(2, 4, 3),
+            TypeError,
+            r"s is a tensor of torch\.int32",
+        ),
+        (torch.ones(4, 3), torch.ones(4, 3), ValueError, r"s has shape \(4, 3\), but \[K, N, D\]"),
+        (torch.ones(0, 4, 3), torch.ones(0, 4, 3), ValueError, r"s has shape \(0, 4, 3\), but"),
+        (torch.ones(2, 4, 0), torch.ones(2, 4, 0), ValueError, r"s has shape \(2, 4, 0\), but"),
+        (torch.ones(2, 4, 3), torch.ones(2, 3, 3), ValueError, r"y is \(2, 3, 3\) torch\.float32"),
+        (torch.ones(2, 4, 3), torch.ones(2, 4, 3).double(), ValueError, r"y is .* torch\.float64"),
+        (torch.ones(1, 1, 1), torch.ones(1, 1, 1, device="meta"), ValueError, "y is .* on meta"),
+    ],
+    ids=lambda value: None if isinstance(value, Tensor) else str(value)[:30],
+)
+def test_wrong_pairs_are_named(s: Any, y: Any, error: type[Exception], message: str) -> None:
+    refused(history_from_pairs, error, message, s, y)
+
+
+def test_no_points_have_a_history() -> None:
+    none = torch.ones(5, 0, 3)
+    assert history_from_pairs(none, none).shape == (0, 5, 8)
+    assert two_loop(none[0], history_from_pairs(none, none), 5).shape == (0, 3)

@@ -474,6 +474,48 @@ def test_a_log_names_the_gpu_and_a_pause_waits_for_it(tmp_path, monkeypatch):
     assert waited == [True, True]  # before the pause and after it
 
 
+NUMPYS = [np.float16, np.float32, np.float64, np.longdouble, np.int8, np.int64, np.uint64, np.bool_]
+
+
+@pytest.mark.parametrize("kind", NUMPYS, ids=lambda kind: kind.__name__)
+def test_numbers_of_numpy_are_numbers_everywhere(tmp_path, kind):
+    path = tmp_path / "run.jsonl"
+    one, about = kind(1), {"seed": kind(1), "each": {"list": [kind(1)], "key": {kind(1): kind(1)}}}
+    with RunLog(path, metadata=about) as log:
+        log.step(np.int64(3), loss=one, array=np.array(one), single=np.array([one]))
+        log.evaluation(np.int32(4), psnr=one)
+        log.event("pruned", np.uint8(5), points=one, about=about)
+    strict_lines(path)
+    run = read_run(path)
+    assert run.steps["iteration"].tolist() == [3]
+    assert [run.steps[name][0] for name in ("loss", "array", "single")] == [1.0] * 3
+    assert run.evaluations["psnr"].tolist() == [1.0]
+    assert run.metadata["seed"] == run.events[0]["points"] == 1
+    assert run.events[0]["about"] == run.metadata
+    assert run.metadata["each"]["list"] == list(run.metadata["each"]["key"].values()) == [1]
+
+
+@pytest.mark.parametrize(
+    ("value", "error"),
+    [
+        (np.complex64(1), TypeError),
+        (np.datetime64("2026-11-25"), TypeError),
+        (np.str_("1"), TypeError),
+        (np.array([1.0, 2.0]), ValueError),
+        (np.array([]), ValueError),
+        (10**400, ValueError),
+        (-(10**400), ValueError),
+        (None, TypeError),
+    ],
+)
+def test_what_no_reader_could_take_as_a_number_is_refused(tmp_path, value, error):
+    with RunLog(tmp_path / "run.jsonl") as log:
+        for write in (log.step, log.evaluation):
+            with pytest.raises(error, match=r"RunLog\.(step|evaluation)\(value="):
+                write(1, value=value)
+    assert len(read_run(log.path).records) == 1
+
+
 # -- mirrors ---------------------------------------------------------------------------------------
 
 

@@ -17,8 +17,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from opt3dgs_optim.runs import read_run, report
-from opt3dgs_optim.runs.stats import compare, higher_is_better
+from opt3dgs_optim.runs import RunLog, read_run, report
+from opt3dgs_optim.runs.metrics import higher_is_better
+from opt3dgs_optim.runs.stats import compare
 
 NAN = "nan"
 
@@ -109,7 +110,179 @@ def test_another_baseline_and_lower_is_better(tmp_path):
     assert comparison.baseline == "b"
     assert arms["mcmc"].numbers["seconds to baseline lpips"] is None
     assert arms["mcmc"].numbers["lpips gain at equal seconds"].mean == pytest.approx(-0.2)
-    assert [higher_is_better(m) for m in ("psnr", "train_ssim", "loss", "LPIPS")] == [1, 1, 0, 0]
+
+
+# -- which way a metric is better ------------------------------------------------------------------
+
+HIGHER = "psnr ssim train_ssim PSNR val1_psnr test/psnr psnr_val eval.psnr.mean valPSNR psnr2 fps"
+HIGHER += " val_1_psnr model1_ssim cc_psnr ms_ssim MS-SSIM mPSNR l1ft_psnr flipped_psnr psnr:test"
+LOWER = (
+    "lpips LPIPS lpips_vgg vgg/lpips loss loss/val val1_loss L1Loss l1 L2 avg_l1 mae rmse energy"
+)
+LOWER += " d-ssim D_SSIM dssim losses_total test_error flip lpips2 rgb_loss"
+UNKNOWN = (
+    "nu accepted points num_points val1_points total metric1 all1 dl1 flipped 1-ssim ssim_loss"
+)
+UNKNOWN += " psnr_std loss_weight l1_lambda grad_norm psnr_gain seconds_to_psnr best_psnr_iteration"
+UNKNOWN += " neg_psnr l 1 \N{SNOWMAN}"
+
+
+@pytest.mark.parametrize(
+    ("names", "direction"), [(HIGHER, True), (LOWER, False), (UNKNOWN, None)], ids=str
+)
+def test_directions_are_known_by_words_and_not_by_substrings(names, direction):
+    assert {name: higher_is_better(name) for name in names.split()} == dict.fromkeys(
+        names.split(), direction
+    )
+    assert higher_is_better("") is None
+    assert higher_is_better("1 - SSIM") is None
+    assert higher_is_better("PSNR (dB)") is True
+
+
+def two_arms_by(folder, metric, ends=(0.3, 0.1), **about):
+    return [
+        write_run(
+            folder / f"{arm}.jsonl",
+            arm,
+            0,
+            [(0, 0.0, 0.5), (10, 100.0, end)],
+            metric=metric,
+            **about,
+        )
+        for arm, end in zip(("mcmc", "b"), ends, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("metric", ["val1_psnr", "test/lpips", "ssim_loss"])
+@pytest.mark.parametrize("told", [None, "higher", "lower"])
+def test_the_caller_may_say_the_direction(tmp_path, capsys, metric, told):
+    runs = two_arms_by(tmp_path / "logs", metric)
+    words = ["--better", told] if told else []
+    assert report.main([str(tmp_path / "logs"), "-o", str(tmp_path / "out"), *words]) == 0
+    told_as = {None: None, "higher": True, "lower": False}[told]
+    better = higher_is_better(metric) if told is None else told_as
+    written = report.write_report(runs, tmp_path / "twin", higher_is_better=told_as)[0]
+    text = (tmp_path / "out/report.md").read_text()
+    assert written.read_text() == text
+    comparison, arms = (each := compare(runs, None, None, told_as)[0]), each.arms
+    assert comparison.higher_is_better is better
+    numbers: dict[str, Any] = dict(arms[1].numbers)
+    gain = numbers[f"{metric} gain at equal seconds"]
+    reached = numbers[f"seconds to baseline {metric}"]
+    if better is None:
+        assert (gain, reached) == (None, None)
+        assert "are better is not known from its name" in text
+        assert "0.1000 |" in text  # the values are shown all the same
+    else:
+        assert gain.mean == pytest.approx(-0.2 if better else 0.2)
+        # 0.3 on the way from 0.5 down to 0.1; from above it is reached at the start.
+        assert reached.mean == pytest.approx(0.0 if better else 50.0)
+        assert "not known" not in text
+
+
+NOT_HIGHER: list[Any] = [False, np.bool_(False)]
+
+
+def test_numpys_truth_is_a_direction_and_a_word_is_none(tmp_path):
+    runs = two_arms_by(tmp_path, "ssim_loss")
+    twins = [
+        report.write_report(runs, tmp_path / type(way).__name__, higher_is_better=way)[
+            0
+        ].read_text()
+        for way in NOT_HIGHER
+    ]
+    assert twins[0] == twins[1]
+    wrong: Any
+    for wrong in ("higher", 1, 0.0):
+        with pytest.raises(ValueError, match=r"write_report: higher_is_better=.* True, False or"):
+            report.write_report(runs, tmp_path / "out", higher_is_better=wrong)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("better", "caption"), [(None, False), (False, True)])
+def test_the_picture_says_a_direction_that_is_known(tmp_path, monkeypatch, better, caption):
+    pytest.importorskip("matplotlib", reason="needs matplotlib")
+    from opt3dgs_optim.runs import plot
+
+    (comparison,) = compare(two_arms_by(tmp_path, "ssim_loss"), None, None, better)
+    figure = plot._figure(comparison, "")
+    assert ("is better" in figure._supxlabel.get_text()) is caption
+
+
+def test_the_metric_that_is_compared_is_one_that_can_be_judged(tmp_path):
+    lines = [
+        {"kind": "evaluation", "iteration": 1, "seconds": 1, "points": 7, "val_psnr": 20.0},
+    ]
+    (tmp_path / "a.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert compare([read_run(tmp_path / "a.jsonl")])[0].metric == "val_psnr"
+    only = write_run(tmp_path / "b.jsonl", "b", 0, [(1, 1.0, 7.0)], metric="points")
+    assert compare([only])[0].metric == "points"
+
+
+def test_means_are_shown_of_what_is_no_loss(tmp_path):
+    names = {"val1_points": True, "l1_weight": True, "train/loss": False, "l1": False, "psnr": True}
+    path = tmp_path / "a.jsonl"
+    line = {"kind": "step", "iteration": 1, "seconds": 1, **dict.fromkeys(names, 2.0)}
+    path.write_text(json.dumps(line) + "\n")
+    numbers = compare([read_run(path)])[0].arms[0].numbers
+    assert {name: f"mean {name}" in numbers for name in names} == names
+
+
+# -- which runs are paired -------------------------------------------------------------------------
+
+
+def seeded(folder, seeds, arm, end):
+    """A run a seed; ABSENT: no such entry."""
+    runs = []
+    for i, seed in enumerate(seeds):
+        about = {} if seed is ABSENT else {"seed": seed}
+        path = folder / f"{arm}{i}.jsonl"
+        with RunLog(path, metadata={"arm": arm, **about}) as log:
+            log.evaluation(0, psnr=20.0)
+            log.evaluation(10, psnr=end + i)
+        lines = [json.loads(line) for line in path.read_text().splitlines()]
+        for line in lines:
+            line["seconds"] = float(line["iteration"])
+        path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+        runs.append(read_run(path))
+    return runs
+
+
+ABSENT = object()
+
+
+@pytest.mark.parametrize(
+    ("baseline", "other", "gains"),
+    [
+        ([ABSENT], [ABSENT], None),  # strangers
+        ([None], [None], None),
+        ([ABSENT, 0], [ABSENT, 1], None),
+        ([""], [""], None),
+        ([0], [0], [5.0]),
+        ([0, 1], [1, ABSENT], [4.0]),
+        (["0"], [0], [5.0]),  # from a command line
+        ([np.int64(3)], [3.0], [5.0]),
+        ([np.float32(2)], ["2 "], [5.0]),
+        ([0.5], [0], None),
+        ([[1, 2]], [[1, 2]], [5.0]),
+        ([True], [1], None),
+        ([0, 0], [0], [4.5]),  # the baseline's twice: both count
+        ([0], [0, 0], [5.0, 6.0]),
+    ],
+)
+def test_runs_are_paired_by_a_seed_that_both_have(tmp_path, baseline, other, gains):
+    runs = [*seeded(tmp_path, baseline, "mcmc", 20.0), *seeded(tmp_path, other, "x", 25.0)]
+    for order in (runs, runs[::-1]):
+        comparison = compare(order)[0]
+        (arm,) = [each for each in comparison.arms if each.name == "x"]
+        found: Any = arm.numbers["psnr gain at equal seconds"]
+        text = report.as_markdown([comparison], order, [])
+        assert ("No gain is shown for x: no run has the `seed`" in text) == (gains is None)
+        assert arm.num_paired == len(gains or [])
+        if gains is None:
+            assert found is None
+        else:
+            assert (found.mean, found.n) == (pytest.approx(np.mean(gains)), len(gains))
 
 
 def test_means_of_nu_and_accepted_share(tmp_path):

@@ -16,7 +16,12 @@ from torch import Tensor
 
 BLOCK = 128  # threads; the .cu files promise it to the compiler
 HEADER = "two_loop.cuh"
-KERNELS = {"lqn_direction": "lqn.cu", "take_energy": "histogram.cu"}  # the kernel: its file
+KERNELS = {  # the kernel: its file
+    "lqn_direction": "lqn.cu",
+    "two_loop": "two_loop.cu",
+    "take_energy": "histogram.cu",
+}
+ALIGNMENT = 16  # bytes; the kernels read and write a history by vectors of so many
 
 
 def source(name: str) -> str:
@@ -46,7 +51,8 @@ def compile_cubin(
 ) -> Any:
     """cuda.core's ObjectCode of a file of `KERNELS`, for an `arch` such as "sm_90"; needs no GPU.
 
-    history_size is K, of "lqn.cu" only; cache, logs and ptxas_options are cuda.core's.
+    history_size is K, of "lqn.cu" and "two_loop.cu" only; cache, logs and ptxas_options are
+    cuda.core's.
     """
     core = importlib.import_module("cuda.core")
     defined = macros(dtype, history_size) or None
@@ -119,24 +125,48 @@ def lqn_direction(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`lbfgs.lqn_direction` on the GPU, for points of three coordinates. Never synchronises."""
     rows = grad.shape[0]
-    # The kernel reads memory by the gradient's dtype and these shapes.
-    needed = {"position": (position, grad.shape), "history": (history, history.shape)}
-    for name, (given, shape) in needed.items():
-        if (given.shape, given.dtype, given.device) != (shape, grad.dtype, grad.device):
-            raise ValueError(
-                f"lqn_direction: {name} is {tuple(given.shape)} {given.dtype} on {given.device}, "
-                f"but {tuple(shape)} {grad.dtype} on {grad.device} is needed"
-            )
+    _check_tensors("lqn_direction", grad, position=(position, grad.shape), history=(history, None))
     fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
     accepted = torch.empty(rows, dtype=torch.bool, device=grad.device)
     candidates = torch.empty_like(accepted)
-    cells = history.contiguous()
+    cells = _cells(history)
     tensors = (position.contiguous(), grad.contiguous(), cells, fed, accepted, candidates)
     numbers = (np.int64(rows), real(grad.dtype)(min_cosine), np.int32(graft))
     launch("lqn_direction", grad, rows, *tensors, *numbers, history_size=history_size)
     if cells is not history:  # laid out for torch, e.g. loaded from a checkpoint of a CPU run
         history.copy_(cells)
     return fed, accepted, candidates
+
+
+def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
+    """`lbfgs.two_loop` on the GPU, for points of three coordinates. Never synchronises."""
+    rows = grad.shape[0]
+    _check_tensors("two_loop", grad, history=(history, None))
+    result = torch.empty_like(grad, memory_format=torch.contiguous_format)
+    tensors = (grad.contiguous(), _cells(history), result)
+    launch("two_loop", grad, rows, *tensors, np.int64(rows), history_size=history_size)
+    return result
+
+
+def _cells(history: Tensor) -> Tensor:
+    """`history` itself, or a copy if it is not as a kernel reads it: contiguous and aligned."""
+    cells = history.contiguous()
+    # A view into a larger buffer may begin anywhere.
+    return cells if cells.data_ptr() % ALIGNMENT == 0 else cells.clone()
+
+
+def _check_tensors(call: str, like: Tensor, **needed: tuple[Tensor, torch.Size | None]) -> None:
+    """ValueError unless tensors have the dtype and device of `like`, and these shapes.
+
+    A kernel reads memory by them. None is any shape.
+    """
+    for name, (given, size) in needed.items():
+        shape = given.shape if size is None else size
+        if (given.shape, given.dtype, given.device) != (shape, like.dtype, like.device):
+            raise ValueError(
+                f"{call}: {name} is {tuple(given.shape)} {given.dtype} on {given.device}, "
+                f"but {tuple(shape)} {like.dtype} on {like.device} is needed"
+            )
 
 
 def take_energy(

@@ -93,12 +93,12 @@ template <typename T, int K> struct History {
   static constexpr int slots = K > 3 ? K : K + 1;
   static constexpr int lanes = 8 * slots;
 
-  T* row;
   Lanes<T> s[slots], y[slots];
   Vec3<T> position, gradient;  // of the last visible step
   T counter;                   // 0: never visible; c: holds c - 1 pairs
 
-  POINT explicit History(T* at) : row(at) {
+  // `row` is the point's row of the history tensor; it has to begin at a multiple of 16 bytes.
+  POINT explicit History(const T* row) {
 #pragma unroll
     for (int j = 0; j < slots; ++j) {
       s[j] = load(row + 8 * j);
@@ -115,8 +115,8 @@ template <typename T, int K> struct History {
     }
   }
 
-  // Put the pair in front, if it is accepted, and write pairs and header back.
-  POINT void write(Pair<T> pair, bool accepted) {
+  // Put the pair in front, if it is accepted, and write pairs and header back to `row`.
+  POINT void write(T* row, Pair<T> pair, bool accepted) {
     if (accepted) {
 #pragma unroll
       for (int j = K - 1; j > 0; --j) {
@@ -171,6 +171,13 @@ template <int K, typename T> POINT Vec3<T> recursion(Vec3<T> q, const History<T,
   return r;
 }
 
+// H g of one point. Divided by its largest component, the gradient keeps s.q in the floating-point range.
+template <int K, typename T> POINT Vec3<T> two_loop_point(Vec3<T> grad, const T* row) {
+  const T size = largest(grad);
+  const T scale = size == T(0) ? T(1) : size;
+  return times(recursion(over(grad, scale), History<T, K>(row)), scale);
+}
+
 struct Flags { bool accepted, candidate; };
 
 // One step of one point: accept a pair, update the header, and say what Adam is fed.
@@ -187,7 +194,7 @@ POINT Flags lqn_point(Vec3<T> position, Vec3<T> grad, T* row, T min_cosine, bool
   history.gradient = grad;
   if (!candidate) history.counter = T(1);
   if (accepted && history.counter < T(K + 1)) history.counter += T(1);
-  history.write(pair, accepted);
+  history.write(row, pair, accepted);
   if (history.counter <= T(1)) return {accepted, candidate};
 
   const Vec3<T> unit = over(grad, scale);

@@ -16,12 +16,13 @@ computes on has the strides of [slots, lanes, N], one of the CUDA kernel is cont
 function here takes both.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.lbfgs.pairs import Pair, columns, normalised_pair, overwrite
+from opt3dgs_optim.backend import obstacle
+from opt3dgs_optim.lbfgs.pairs import BITS, Pair, columns, normalised_pair, overwrite
 
 MAX_HISTORY = 16
 
@@ -68,13 +69,38 @@ def header(history: Tensor, history_size: int) -> Header:
 
 
 def check_history(call: str, grad: Tensor, history: Tensor, history_size: int) -> None:
-    """ValueError unless `history` has the shape that `grad` [N, D] and `history_size` need."""
+    """Whether `history` is one of `history_size` pairs of each of the points of `grad`.
+
+    Raises:
+        TypeError: one of the two is no tensor of real floating-point numbers.
+        ValueError: `grad` is not [N, D], or `history` has another shape, dtype or device than is
+            needed for it.
+    """
+    check_real(call, "grad", grad)
+    check_real(call, "history", history)
+    if grad.dim() != 2 or grad.shape[1] == 0:
+        raise ValueError(
+            f"{call}: grad has shape {tuple(grad.shape)}, but [N, D] with D at least 1 is needed"
+        )
     needed = history_shape(grad, history_size)
     if history.shape != needed:
         raise ValueError(
             f"{call}: history has shape {tuple(history.shape)}, but {list(needed)} is needed for a "
             f"gradient of shape {tuple(grad.shape)} and history_size={history_size}"
         )
+    if history.dtype not in BITS:
+        raise ValueError(f"{call}: history is {history.dtype}, but one of {list(BITS)} is needed")
+    if history.device != grad.device:
+        raise ValueError(
+            f"{call}: history is on {history.device}, but {grad.device} is needed, as the gradient"
+        )
+
+
+def check_real(call: str, name: str, value: Any) -> None:
+    """TypeError unless `value` is a tensor of real floating-point numbers."""
+    if not isinstance(value, Tensor) or not value.is_floating_point():
+        kind = f"a tensor of {value.dtype}" if isinstance(value, Tensor) else repr(value)
+        raise TypeError(f"{call}: {name} is {kind}, but a tensor of real numbers is needed")
 
 
 def stored_pairs(history: Tensor, history_size: int) -> tuple[Tensor, Tensor]:
@@ -121,16 +147,63 @@ def take_pairs(
 
 
 def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:
-    """A history for `two_loop(grad, history, K)` of K given pairs per point, oldest first.
+    """The history of points whose curvature pairs are known, for `two_loop`.
+
+    A pair says how the gradient of a point changes along a displacement of it, y = B s with the
+    Hessian B of the point's own function. A pair with s.y > 0 is kept; for a point without one, as
+    where the function is concave along s, or where a number is not finite, that pair is left out,
+    and the point holds one pair less. H would not be positive definite with it. Both vectors of a
+    pair are stored divided by |y|, which changes nothing: H depends on their ratio.
 
     Args:
-        s, y: [K, N, D] parameter and gradient differences, with s.y > 0.
+        s: [K, N, D] differences of the parameters of N points of D coordinates, in the parameters'
+            units. K is the number of pairs, the oldest first.
+        y: [K, N, D] differences of the gradients between the same two places, in units of the loss
+            per unit of the parameters.
+
+    Returns:
+        The history [N, slots, 2 (D + 1)], of K or K + 1 slots; float64 where the pairs are, else
+        float32. `two_loop(grad, history, K)` reads it, with K the number of pairs that there is
+        room for. It is laid out for the CUDA kernel where that can run, and for torch elsewhere;
+        `two_loop` takes both.
+
+    Raises:
+        TypeError: s or y is no tensor of real floating-point numbers.
+        ValueError: s is not [K, N, D] with K and D at least 1, or y has another shape, dtype or
+            device.
+
+    Examples:
+        Pairs of a quadratic along all axes of its Hessian know that Hessian: H g is then the
+        distance from the minimum.
+
+        >>> import torch
+        >>> from opt3dgs_optim import history_from_pairs, two_loop
+        >>> hessian = torch.tensor([1.0, 10.0, 100.0])  # of x' diag(hessian) x / 2
+        >>> s = torch.eye(3).unsqueeze(1)  # K = 3 pairs of N = 1 point, along the axes
+        >>> history = history_from_pairs(s, hessian * s)
+        >>> x = torch.tensor([[3.0, -2.0, 1.0]])
+        >>> two_loop(hessian * x, history, history_size=3).round(decimals=3)
+        tensor([[ 3., -2.,  1.]])
     """
-    size = s.shape[0]
-    history = new_history(s[0], size)
-    everywhere = torch.ones(s.shape[1], dtype=torch.bool, device=s.device)
+    call = "history_from_pairs"
+    check_real(call, "s", s)
+    check_real(call, "y", y)
+    if s.dim() != 3 or 0 in (s.shape[0], s.shape[2]):
+        raise ValueError(
+            f"{call}: s has shape {tuple(s.shape)}, but [K, N, D] with K and D at least 1 is needed"
+        )
+    if (y.shape, y.dtype, y.device) != (s.shape, s.dtype, s.device):
+        raise ValueError(
+            f"{call}: y is {tuple(y.shape)} {y.dtype} on {y.device}, but {tuple(s.shape)} "
+            f"{s.dtype} on {s.device} is needed, as s is"
+        )
+    s, y, size = s.detach(), y.detach(), s.shape[0]
+    kernel = s.is_cuda and obstacle("auto", s.device, s.dtype, s.shape[2], size) is None
+    history = new_history(s[0], size, contiguous=kernel)
+    counter = header(history, size).counter.fill_(1)
     for k in range(size):
         pair = normalised_pair(columns(s[k], history.dtype), columns(y[k], history.dtype))
-        push(history, size, pair, everywhere)
-    header(history, size).counter.fill_(size + 1)
+        accepted = pair.cosine > 0  # false where it is not finite
+        push(history, size, pair, accepted)
+        counter.add_(accepted)
     return history

@@ -4,36 +4,76 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim import cuda
-from opt3dgs_optim.backend import obstacle
+from opt3dgs_optim.backend import BACKENDS, Backend, obstacle
+from opt3dgs_optim.checks import check_choice, check_count
 from opt3dgs_optim.lbfgs.history import Header, check_history, header, stored_pairs, take_pairs
 from opt3dgs_optim.lbfgs.pairs import columns, dot, largest, length, put, row_chunks
 
 
-def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
+@torch.no_grad()
+def two_loop(
+    grad: Tensor, history: Tensor, history_size: int, *, backend: Backend = "auto"
+) -> Tensor:
     """The pseudo-gradient H g of every point, by the L-BFGS two-loop recursion.
 
-    Nocedal and Wright, Numerical Optimization (2006), algorithm 7.4, on N points at once:
+    H approximates the inverse of the Hessian of a point's own function, and is known only by the
+    point's last K curvature pairs (s_j, y_j) of parameter and gradient differences. The recursion
+    multiplies by it without ever forming it, on N points at once:
 
         q = g;  for j = newest .. oldest:  alpha_j = (s_j . q) / (s_j . y_j);  q -= alpha_j y_j
         r = gamma q;  for j = oldest .. newest:  beta = (y_j . r) / (s_j . y_j);
                                                  r += (alpha_j - beta) s_j
 
-    with gamma = s.y / y.y of the newest pair. H does not change when s and y of a pair are scaled
-    together, so pairs are stored with |y| = 1 and no product leaves the floating-point range.
+    with gamma = s.y / y.y of the newest pair. r is H g.
+
+    Source: Nocedal and Wright, Numerical Optimization (2006), algorithm 7.4, with its equation 7.20
+    for gamma. In Opt3DGS its result is the D of equation 17, -lr * Adam(D): the paper calls D the
+    quasi-Newton direction, but with the minus sign it has to be the pseudo-gradient H g.
+    `Curvature` and `LQNAdam` collect pairs while they train, and use it so.
+
+    On an NVIDIA GPU, points of three coordinates with at most five pairs are one CUDA kernel, where
+    `backend_info` says that kernels run and gradient and history have one dtype. All else, and what
+    `torch.compile` traces, is pure torch. Both have the same numbers up to rounding. Nothing waits
+    for the GPU. The result has no autograd graph.
 
     Args:
-        grad: [N, D] gradients, any finite size.
-        history: [N, slots, 2 (D + 1)], as `history_from_pairs` makes one.
-        history_size: K, the number of pairs there is room for.
+        grad: [N, D] gradients of N points of D coordinates, of any finite size, in units of the
+            loss per unit of the parameters.
+        history: [N, slots, 2 (D + 1)], float32 or float64, as `history_from_pairs` makes it. It is
+            not changed. The arithmetic is in its dtype.
+        history_size: K, the number of pairs that the history has room for, at least 1.
+        backend: `"auto"` takes the CUDA kernel where it can run; `"cuda"` and `"torch"` insist.
 
     Returns:
-        [N, D], in the parameters' units; the search direction is its negative. A point without
-        pairs gets its gradient back.
+        [N, D] of the gradient's dtype and device, in the parameters' units; the search direction is
+        its negative. A point without pairs gets its gradient back, to rounding. A point whose
+        gradient is not finite gets NaN.
 
     Raises:
-        ValueError: the shapes do not fit.
+        TypeError: gradient or history is no tensor of real floating-point numbers.
+        ValueError: shapes, dtype or devices do not fit, or an option is not allowed.
+        RuntimeError: `backend="cuda"`, and the kernel cannot run.
+
+    Examples:
+        The newest pair is always reproduced, H y = s:
+
+        >>> import torch
+        >>> from opt3dgs_optim import history_from_pairs, two_loop
+        >>> s = torch.tensor([[[0.5, 0.0, 1.0]], [[1.0, 2.0, 0.0]]])  # [K=2, N=1, D=3]
+        >>> y = s * torch.tensor([1.0, 4.0, 2.0])
+        >>> history = history_from_pairs(s, y)
+        >>> torch.allclose(two_loop(y[-1], history, history_size=2), s[-1])
+        True
     """
+    check_choice("two_loop", "backend", backend, BACKENDS)
+    check_count("two_loop", "history_size", history_size, 1)
     check_history("two_loop", grad, history, history_size)
+    # torch.compile cannot trace the kernel's launch, and makes kernels of its own.
+    given = grad.is_cuda and history.dtype == grad.dtype and not torch.compiler.is_compiling()
+    if given or backend == "cuda":
+        like = grad.device, grad.dtype, grad.shape[1], history_size
+        if obstacle(backend, *like) is None:
+            return cuda.two_loop(grad, history, history_size)
     result = torch.empty_like(grad)
     for rows in row_chunks(grad):
         g = columns(grad[rows], history.dtype)
@@ -95,6 +135,11 @@ def lqn_direction(
         (fed [N, D], accepted [N] bool, candidates [N] bool): pairs taken, and that could be.
     """
     check_history("lqn_direction", grad, history, history_size)
+    if position.shape != grad.shape or position.device != grad.device:
+        raise ValueError(
+            f"lqn_direction: position is {tuple(position.shape)} on {position.device}, but "
+            f"{tuple(grad.shape)} on {grad.device} is needed, as the gradient is"
+        )
     like = grad.device, grad.dtype, grad.shape[1], history_size
     if (grad.is_cuda or backend == "cuda") and obstacle(backend, *like) is None:
         return cuda.lqn_direction(position, grad, history, history_size, min_cosine, graft)

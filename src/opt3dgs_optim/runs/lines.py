@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+import numbers
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -75,21 +76,45 @@ def encoded(value: Any) -> str:
         return encoded(json.loads(loose, parse_constant=lambda name: str(float(name))))
 
 
+def with_plain_keys(value: Any) -> Any:
+    """`value` with numpy's numbers as keys of mappings made Python's, which JSON turns to text."""
+    if isinstance(value, Mapping):
+        ours = (np.number, np.bool_)
+        return {
+            number("RunLog", "key", key) if isinstance(key, ours) else key: with_plain_keys(item)
+            for key, item in value.items()
+        }
+    if isinstance(value, (list, tuple)):
+        return [with_plain_keys(item) for item in value]
+    return value
+
+
 def _plain(value: Any) -> Any:
-    return os.fspath(value) if isinstance(value, os.PathLike) else number("RunLog", "", value)
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return number("RunLog", "metadata or event", value)
 
 
 def number(call: str, name: str, value: Any) -> float | int:
-    """A number, or that in a tensor or array of one element, on the host."""
-    if hasattr(value, "item"):
+    """A number of Python or numpy, or that in a tensor or array of one element, on the host.
+
+    Raises:
+        TypeError: it is none.
+        ValueError: a tensor of another number of elements, or a number beyond float64.
+    """
+    if hasattr(value, "item") and hasattr(value, "shape"):
         if math.prod(value.shape) != 1:
             raise ValueError(
                 f"{call}({name}=tensor of {tuple(value.shape)}): must have one element"
             )
         value = value.item()
-    if not isinstance(value, (int, float)):
+    if not isinstance(value, numbers.Real):
         raise TypeError(f"{call}({name}={value!r}): must be a number or a one-element tensor")
-    return value
+    try:
+        as_float = float(value)
+    except OverflowError:  # no reader of the log could take it as a number
+        raise ValueError(f"{call}({name}={value!r:.40}...): must be in float64's range") from None
+    return value if isinstance(value, int) else as_float
 
 
 @dataclass(frozen=True)

@@ -19,14 +19,16 @@ from contextlib import AbstractContextManager, contextmanager
 from datetime import datetime, timezone
 from enum import Enum
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsIndex
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from opt3dgs_optim.checks import LOGGER, check_count
-from opt3dgs_optim.runs.lines import LineFile, encoded, number, read_run
+from opt3dgs_optim.runs.lines import LineFile, encoded, number, read_run, with_plain_keys
 
+Number = float | Tensor | np.number | np.bool_ | np.ndarray  # of one element
 RESERVED = ("kind", "iteration", "seconds", "phase", "event")
 
 
@@ -40,31 +42,55 @@ class _Pending(NamedTuple):
 
 
 class RunLog(AbstractContextManager["RunLog"]):
-    """Append the course of one training run to the JSON-lines file `path`.
+    """The course of one training run, appended line by line to the JSON-lines file `path`.
 
-    A killed process loses at most the line it was writing and, on a GPU, the few step lines whose
-    numbers were still on their way. An existing log is continued, its clock too; to go on from a
-    checkpoint use `resume`.
+    Every line has the iteration and the run seconds at which it was logged. The clock runs from
+    here on, and stands still within `paused`, so that evaluations cost no run time. `read_run`
+    reads a log, and `opt3dgs report` compares several.
 
-    A step line costs no host synchronisation: CUDA scalars are copied to pinned memory in stream
-    order and written at a later call. Evaluations, events, `paused` and `close` do wait
-    for the GPU. No autograd graph is kept.
+    A killed process loses at most the line that it was writing and, on a GPU, the few step lines
+    whose numbers were still on their way. An existing log is continued, and so is its clock. To go
+    on from a checkpoint, use `resume`.
+
+    A step line costs no synchronisation with the GPU: CUDA scalars are copied to pinned memory in
+    stream order, and written at a later call. Evaluations, events, `paused` and `close` do wait for
+    the GPU. No autograd graph is kept.
 
     Args:
-        path: the log file; missing parent folders are made.
-        metadata: what describes the run, as JSON can hold it. The report groups by `scene` and
-            `arm` and pairs by `seed`; `command` replaces the command line recorded otherwise.
+        path: the log file. Missing parent folders are made.
+        metadata: what describes the run, as JSON can hold it; numbers may be numpy's. The report
+            groups runs by `scene` and `arm`, and pairs those of two arms by `seed`: a run without a
+            seed is paired with none. `command` replaces the command line, which is recorded
+            otherwise.
 
     Raises:
-        ValueError: `path` is no run log.
+        ValueError: `path` exists and is no run log.
         TypeError: metadata that JSON cannot hold.
         BlockingIOError: another RunLog has the file open (noticed where files can be locked).
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> from opt3dgs_optim import RunLog
+        >>> from opt3dgs_optim.runs import read_run
+        >>> about = {"scene": "garden", "arm": "stock", "seed": 0}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with RunLog(f"{folder}/stock-0.jsonl", metadata=about) as log:
+        ...         for iteration in range(3):
+        ...             loss = torch.tensor(1 / (iteration + 1))  # your training step
+        ...             log.step(iteration, loss=loss)
+        ...         with log.paused():
+        ...             psnr = 25.0  # your evaluation
+        ...         log.evaluation(2, psnr=psnr)
+        ...     run = read_run(log.path)
+        >>> run.metadata["arm"], run.steps["iteration"].tolist(), run.evaluations["psnr"].tolist()
+        ('stock', [0, 1, 2], [25.0])
     """
 
     def __init__(
         self, path: str | os.PathLike[str], *, metadata: Mapping[str, Any] | None = None
     ) -> None:
-        described = json.loads(encoded(dict(metadata or {})))
+        described = json.loads(encoded(with_plain_keys(dict(metadata or {}))))
         self.path = Path(path)
         self._pending: deque[_Pending] = deque()
         self._mirrors: list[Any] = []
@@ -88,10 +114,14 @@ class RunLog(AbstractContextManager["RunLog"]):
         iteration: int,
         metadata: Mapping[str, Any] | None = None,
     ) -> RunLog:
-        """Continue the log, and its clock, from a checkpoint taken at `iteration`.
+        """Continue the log `path`, and its clock, from a checkpoint taken at `iteration`.
 
-        A "resumed" event tells readers to drop what was logged past it. Arguments and errors are
-        those of the class, and FileNotFoundError if there is no log at `path`.
+        What was logged past that iteration stays in the file; a "resumed" event tells readers to
+        drop it. `metadata` is added to the log's, and its entries win.
+
+        Raises:
+            FileNotFoundError: there is no log at `path`.
+            ValueError: `iteration` is negative. Otherwise errors are those of the class.
         """
         if not Path(path).is_file():
             raise FileNotFoundError(f"RunLog.resume: no run log at {os.fspath(path)!r}")
@@ -124,14 +154,17 @@ class RunLog(AbstractContextManager["RunLog"]):
         return self._base + (0.0 if self._since is None else time.perf_counter() - self._since)
 
     def step(
-        self, iteration: int, *, phase: str | Enum | None = None, **columns: float | Tensor
+        self, iteration: SupportsIndex, *, phase: str | Enum | None = None, **columns: Number
     ) -> None:
-        """Log one optimization step; `columns` are numbers or one-element tensors.
+        """Log one optimization step: `log.step(iteration, loss=loss, lr=1e-3)`.
 
-        The report marks where `phase` changes, and shows the means of the columns that are no loss.
+        `columns` are numbers of Python or numpy, or tensors of one element on any device, by a name
+        of your own. Not every step needs the same ones. The report marks where `phase` changes, and
+        shows the means over the run of the columns whose name says no loss.
 
         Raises:
-            ValueError: a negative iteration, a reserved name or a tensor of several elements.
+            ValueError: a negative iteration, a reserved name, a tensor of several elements, or an
+                integer beyond float64's range.
             TypeError: a value that is no number.
         """
         line = self._line("step", iteration)
@@ -140,19 +173,24 @@ class RunLog(AbstractContextManager["RunLog"]):
         self._pending.append(_pack("RunLog.step", line, columns))
         self._drain(wait=False)
 
-    def evaluation(self, iteration: int, **metrics: float | Tensor) -> None:
-        """Log metrics (`psnr` in dB, `ssim`, `points`, ...), a number each; raises as `step`."""
+    def evaluation(self, iteration: SupportsIndex, **metrics: Number) -> None:
+        """Log metrics of a number each: `log.evaluation(7_000, psnr=27.1, ssim=0.83)`.
+
+        Names are free. The report knows of names with `psnr`, `ssim`, `lpips`, `l1` and the like in
+        them whether higher is better; of others it has to be told. Raises as `step`.
+        """
         line = self._line("evaluation", iteration)
         self._pending.append(_pack("RunLog.evaluation", line, metrics))
         self._drain(wait=True)
 
-    def event(self, kind: str, iteration: int, **info: Any) -> None:
-        """Log that something happened: "switch", "interrupted", "finished", ...
+    def event(self, kind: str, iteration: SupportsIndex, **info: Any) -> None:
+        """Log that something happened: `log.event("pruned", iteration, points=1_200)`.
 
         `info` may hold what `metadata` may, and one-element tensors. Raises as `step`.
         """
         _check_names("RunLog.event", info)
-        self._pending.append(_Pending(self._line("event", iteration) | {"event": kind} | info))
+        line = self._line("event", iteration) | {"event": kind} | with_plain_keys(info)
+        self._pending.append(_Pending(line))
         self._drain(wait=True)
 
     @contextmanager
@@ -183,7 +221,7 @@ class RunLog(AbstractContextManager["RunLog"]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _line(self, kind: str, iteration: int) -> dict[str, Any]:
+    def _line(self, kind: str, iteration: SupportsIndex) -> dict[str, Any]:
         if self._file.closed:
             raise ValueError(f"RunLog.{kind}: the log {str(self.path)!r} is closed")
         at = check_count(f"RunLog.{kind}", "iteration", operator.index(iteration), 0, 2**53 - 1)

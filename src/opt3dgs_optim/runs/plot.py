@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from opt3dgs_optim.runs.lines import Run
-from opt3dgs_optim.runs.stats import Arm, Comparison, higher_is_better
+from opt3dgs_optim.runs.stats import Arm, Comparison
 
 # Okabe and Ito's colour-blind-safe palette, without the yellow that white swallows.
 COLOURS = ("#333333", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
@@ -70,8 +70,9 @@ def _figure(comparison: Comparison, footer: str) -> Any:
         title=printable(f"{metric} against run time and iterations{scene}")[:85],
         title_fontproperties={"size": 13, "weight": "bold"},
     )
-    better = "higher" if higher_is_better(comparison.metric) else "lower"
-    caption = f"Lines: mean over seeds; bands: least to greatest; {better} is better. Dashed: "
+    better = {True: "; higher is better", False: "; lower is better", None: ""}
+    caption = "Lines: mean over seeds; bands: least to greatest"
+    caption += f"{better[comparison.higher_is_better]}. Dashed: "
     caption += f"the baseline's final mean. Dotted: next phase. {footer}"
     figure.supxlabel(textwrap.fill(printable(caption)[:520], 175), fontsize=7.5, color="#666666")
     return figure

@@ -12,6 +12,8 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from opt3dgs_optim.runs.lines import Run, read_run
 from opt3dgs_optim.runs.plot import draw, printable
 from opt3dgs_optim.runs.stats import Comparison, Stat, compare
@@ -21,7 +23,8 @@ READING = (
     "Mean ± sample standard deviation over the seeds; (k of n) where not all n runs have the "
     "value. *seconds to baseline*: until the arm first reaches the baseline's mean final value. "
     "*gain*: difference to the baseline's run of the same seed at the smaller of the two final "
-    "times, positive is better. Both interpolate linearly between evaluations."
+    "times, positive is better; runs without a seed are not paired. Both interpolate linearly "
+    "between evaluations."
 )
 
 
@@ -49,6 +52,7 @@ def write_report(
     *,
     metric: str | None = None,
     baseline: str | None = None,
+    higher_is_better: bool | None = None,
 ) -> list[Path]:
     """Write the report on `runs` into the folder `out` and return the files written.
 
@@ -57,16 +61,41 @@ def write_report(
     Args:
         runs: of any number of scenes, arms and seeds.
         out: folder, made if it is missing.
-        metric: to compare by, as the runs log it; None: psnr if there, else the first.
+        metric: to compare by, as the runs log it; None: psnr if there, else the first whose
+            direction is known, else the first.
         baseline: reference arm; None: "mcmc" if there, else the first.
+        higher_is_better: whether higher values of the metric are better. None: as its name says,
+            such as `val1_psnr`, `test/ssim`, `lpips_vgg` or `l1`. Where the name does not say it,
+            the report shows the values, says so, and judges nothing.
 
     Raises:
-        ValueError, OSError: no runs, no log with that metric, no run of that arm, or two scenes
-            whose pictures would have one name; `out` cannot be written. Nothing is written then.
+        ValueError, OSError: no runs, no log with that metric, no run of that arm, a direction that
+            is none, or two scenes whose pictures would have one name; `out` cannot be written.
+            Nothing is written then.
+
+    Examples:
+        >>> import tempfile
+        >>> from opt3dgs_optim import RunLog
+        >>> from opt3dgs_optim.runs import read_run
+        >>> from opt3dgs_optim.runs.report import write_report
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for arm, psnr in (("stock", 24.0), ("defaults", 25.5)):
+        ...         about = {"arm": arm, "seed": 0}
+        ...         with RunLog(f"{folder}/{arm}.jsonl", metadata=about) as log:
+        ...             log.evaluation(7_000, psnr=psnr)
+        ...     runs = [read_run(f"{folder}/{arm}.jsonl") for arm in ("stock", "defaults")]
+        ...     report, *_ = write_report(runs, f"{folder}/report", baseline="stock")
+        ...     "| defaults | 1 | 25.50 |" in report.read_text()
+        True
     """
     if not runs:
         raise ValueError("write_report: no runs; pass at least one")
-    comparisons = compare(runs, metric, baseline)
+    if not isinstance(higher_is_better, (bool, np.bool_, type(None))):
+        raise ValueError(
+            f"write_report: higher_is_better={higher_is_better!r}, but True, False or None is "
+            "needed"
+        )
+    comparisons = compare(runs, metric, baseline, higher_is_better)
     names = _picture_names([comparison.scene for comparison in comparisons])
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -104,7 +133,23 @@ def as_markdown(
             parts.append(f"![{metric} over seconds and iterations]({pictures[i]})")
         if comparison.baseline is None:
             parts.append("The baseline arm did not run on this scene: nothing to compare with.")
+        elif comparison.higher_is_better is None:
+            parts.append(
+                f"Whether higher or lower values of {escaped(comparison.metric)} are better is not "
+                "known from its name, so nothing is judged by it: pass `--better higher` or "
+                "`--better lower`."
+            )
+        elif unpaired := _unpaired(comparison):
+            parts.append(
+                f"No gain is shown for {', '.join(map(escaped, unpaired))}: no run has the `seed` "
+                "of one of the baseline's in its metadata."
+            )
     return "\n\n".join([*parts, READING, escaped(origin(runs))]).rstrip() + "\n"
+
+
+def _unpaired(comparison: Comparison) -> list[str]:
+    others = [arm for arm in comparison.arms if arm.name != comparison.baseline]
+    return [arm.name for arm in others if arm.num_paired == 0]
 
 
 def escaped(text: str) -> str:
@@ -157,7 +202,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("runs", nargs="+", metavar="RUN", help="run log, or folder of *.jsonl")
     add("-o", "--out", default="report", metavar="DIR", help="to write into (default: report)")
-    add("--metric", help="to compare by (default: psnr if logged, else the first)")
+    add("--metric", help="to compare by (default: psnr if logged, else the first that is known)")
+    add("--better", choices=("higher", "lower"), help="direction of the metric (default: its name)")
     add("--baseline", metavar="ARM", help="reference arm (default: mcmc if there, else the first)")
     options = parser.parse_args(arguments)
     try:
@@ -165,7 +211,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Path(options.out).mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=options.out).close()  # before any work is done
         runs = [read_run(path) for path in logs]
-        written = write_report(runs, options.out, metric=options.metric, baseline=options.baseline)
+        better = None if options.better is None else options.better == "higher"
+        written = write_report(
+            runs,
+            options.out,
+            metric=options.metric,
+            baseline=options.baseline,
+            higher_is_better=better,
+        )
     except (OSError, ValueError) as error:
         print("report:", printable(str(error)), file=sys.stderr)  # names from logs in it
         return 2

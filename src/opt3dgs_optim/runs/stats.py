@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from opt3dgs_optim.runs.lines import Run
+from opt3dgs_optim.runs.metrics import higher_is_better
 
 NO_NUMBERS = ("iteration", "seconds", "phase")  # of the columns, not of interest
 KNOWN = ("psnr", "ssim", "train_psnr", "lpips")  # listed first
 _last = operator.itemgetter(-1)
-LOWER_IS_BETTER = ("lpips", "loss", "error", "mse", "mae", "l1", "l2", "energy", "flip")
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ class Arm:
     runs: list[Run]
     colour: int  # the same on every scene; 0 is the baseline's
     numbers: dict[str, Stat | None]
+    num_paired: int  # of the runs, those with a run of the baseline of the same seed
 
 
 @dataclass
@@ -51,18 +52,26 @@ class Comparison:
 
     scene: str | None
     metric: str
+    higher_is_better: bool | None  # None: not known, and nothing is judged by the metric
     baseline: str | None  # None: it did not run on this scene
     target: float  # the baseline's mean final metric; NaN where it has none that is finite
     arms: list[Arm]
 
 
 def compare(
-    runs: Sequence[Run], metric: str | None = None, baseline: str | None = None
+    runs: Sequence[Run],
+    metric: str | None = None,
+    baseline: str | None = None,
+    higher: bool | None = None,
 ) -> list[Comparison]:
     """Group `runs` by the metadata `scene` and `arm` (else the file's name) and compare.
 
-    `metric` None takes psnr, else the first that is logged; `baseline` None takes "mcmc" if there,
-    else the first arm.
+    Args:
+        runs: of any number of scenes, arms and seeds.
+        metric: to compare by; None takes psnr if it is logged, else the first whose direction is
+            known from its name, else the first.
+        baseline: reference arm; None takes "mcmc" if there, else the first.
+        higher: whether higher values of the metric are better; None: by its name.
 
     Raises:
         ValueError: no log has that metric, or no run that arm.
@@ -75,7 +84,8 @@ def compare(
     names = list(dict.fromkeys(name for arms in scenes.values() for name in arms))
     metrics = metric_names(runs)
     if metric is None:
-        metric = metrics[0] if metrics else KNOWN[0]
+        judged = [name for name in metrics if higher_is_better(name) is not None]
+        metric = next(iter([*judged, *metrics]), KNOWN[0])
     elif metric not in metrics:
         there = ", ".join(metrics) or "no metrics at all"
         raise ValueError(f"--metric {metric!r}: in no log; there are {there}")
@@ -84,16 +94,23 @@ def compare(
     elif baseline not in names:
         raise ValueError(f"--baseline {baseline!r}: no such arm; there are {', '.join(names)}")
     order = list(dict.fromkeys([baseline, *names]))
-    return [_compare_scene(scene, arms, order, metric) for scene, arms in scenes.items()]
+    better = higher_is_better(metric) if higher is None else bool(higher)
+    return [_compare_scene(scene, arms, order, metric, better) for scene, arms in scenes.items()]
 
 
 def _compare_scene(
-    scene: str | None, runs: dict[str, list[Run]], order: list[str], metric: str
+    scene: str | None,
+    runs: dict[str, list[Run]],
+    order: list[str],
+    metric: str,
+    better: bool | None,
 ) -> Comparison:
     everything = [run for arm in runs.values() for run in arm]
     metrics = metric_names(everything)
-    found = dict.fromkeys(name for run in everything for name in run.steps)
-    columns = [name for name in found if name not in NO_NUMBERS and higher_is_better(name)]
+    logged = dict.fromkeys(name for run in everything for name in run.steps)
+    # The mean of a loss over a training says nothing.
+    losses = [name for name in logged if higher_is_better(name) is False]
+    columns = [name for name in logged if name not in (*NO_NUMBERS, *losses)]
     references = runs.get(order[0], [])
     final = _stat(references, metric, _last)
     target = final.mean if final and np.isfinite(final.mean) else np.nan
@@ -108,12 +125,17 @@ def _compare_scene(
         numbers |= {"seconds": Stat.of(seconds), "iterations": Stat.of(iterations)}
         numbers |= {"iterations/s": Stat.of(rates)}
         numbers |= {f"mean {c}": _stat(own, c, _finite_mean, "step") for c in columns}
-        reached = [t for run in own if (t := _first_time(run, metric, target)) is not None]
+        pairs = [] if name == order[0] else _pairs(own, references)
+        reached, gains = [], []
+        if better is not None:
+            times = [_first_time(run, metric, target, better) for run in own]
+            reached = [time for time in times if time is not None]
+            found = [_gain(run, partners, metric, better) for run, partners in pairs]
+            gains = [gain for gain in found if gain is not None]
         numbers[f"seconds to baseline {metric}"] = Stat.of(reached)
-        gains = [] if name == order[0] else _gains(own, references, metric)
         numbers[f"{metric} gain at equal seconds"] = Stat.of(gains)
-        arms.append(Arm(name, own, colour, numbers))
-    return Comparison(scene, metric, order[0] if references else None, target, arms)
+        arms.append(Arm(name, own, colour, numbers, len(pairs)))
+    return Comparison(scene, metric, better, order[0] if references else None, target, arms)
 
 
 def metric_names(runs: Sequence[Run]) -> list[str]:
@@ -121,11 +143,6 @@ def metric_names(runs: Sequence[Run]) -> list[str]:
     found = dict.fromkeys(name for run in runs for name in run.evaluations)
     named = dict.fromkeys([*KNOWN, *found])
     return [name for name in named if name in found and name not in NO_NUMBERS]
-
-
-def higher_is_better(metric: str) -> bool:
-    """False for names that say error, loss, lpips and the like."""
-    return not any(word in metric.lower() for word in LOWER_IS_BETTER)
 
 
 def _stat(runs: list[Run], name: str, of: Any, kind: str = "evaluation") -> Stat | None:
@@ -140,16 +157,16 @@ def _finite_mean(values: np.ndarray) -> float:
         return float(values.mean()) if len(values) else float("nan")
 
 
-def _curve(run: Run, metric: str) -> tuple[np.ndarray, np.ndarray]:
+def _curve(run: Run, metric: str, better: bool) -> tuple[np.ndarray, np.ndarray]:
     """(seconds, metric turned so that more is better)."""
     _, seconds, values = run.series(metric)
-    return seconds, values if higher_is_better(metric) else -values
+    return seconds, values if better else -values
 
 
-def _first_time(run: Run, metric: str, target: float) -> float | None:
+def _first_time(run: Run, metric: str, target: float, better: bool) -> float | None:
     """Seconds until the metric first reaches `target`, linear between evaluations."""
-    seconds, values = _curve(run, metric)
-    goal = target if higher_is_better(metric) else -target
+    seconds, values = _curve(run, metric, better)
+    goal = target if better else -target
     reached = np.flatnonzero(values >= goal)
     if len(reached) == 0:
         return None
@@ -159,15 +176,31 @@ def _first_time(run: Run, metric: str, target: float) -> float | None:
     return float(np.interp(goal, values[i - 1 : i + 1], seconds[i - 1 : i + 1]))
 
 
-def _gains(runs: list[Run], references: list[Run], metric: str) -> list[float]:
-    """For every seed that both have: the gain at the smaller of the two final times."""
-    by_seed = {repr(run.metadata.get("seed")): _curve(run, metric) for run in references}
-    gains = []
-    for run in runs:
-        ours, theirs = _curve(run, metric), by_seed.get(repr(run.metadata.get("seed")))
-        if theirs is None or len(ours[0]) == 0 or len(theirs[0]) == 0:
+def _seed(run: Run) -> str | None:
+    """What a run is paired by; None: it has no seed. 0, 0.0 and "0" are one seed."""
+    seed = run.metadata.get("seed")
+    if isinstance(seed, float) and seed.is_integer():
+        seed = int(seed)
+    return None if seed is None or str(seed).strip() == "" else str(seed).strip()
+
+
+def _pairs(runs: list[Run], references: list[Run]) -> list[tuple[Run, list[Run]]]:
+    """Each run that has a seed of the reference's runs, and those of them with that seed."""
+    by_seed: dict[str, list[Run]] = {}
+    for run in references:
+        if (seed := _seed(run)) is not None:
+            by_seed.setdefault(seed, []).append(run)
+    return [(run, by_seed[seed]) for run in runs if (seed := _seed(run)) in by_seed]
+
+
+def _gain(run: Run, partners: list[Run], metric: str, better: bool) -> float | None:
+    """The mean difference to the partners, each at the smaller of the two final times, or None."""
+    ours, gains = _curve(run, metric, better), []
+    for partner in partners:
+        theirs = _curve(partner, metric, better)
+        if len(ours[0]) == 0 or len(theirs[0]) == 0:
             continue
         time = min(ours[0][-1], theirs[0][-1])
         if time >= max(ours[0][0], theirs[0][0]):
             gains.append(float(np.interp(time, *ours) - np.interp(time, *theirs)))
-    return gains
+    return float(np.mean(gains)) if gains else None
