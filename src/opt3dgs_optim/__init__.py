@@ -15,6 +15,7 @@ from opt3dgs_optim.parts.histogram import EnergyHistogram
 from opt3dgs_optim.parts.last_phase import FreshMoments, SquaredLoss
 from opt3dgs_optim.parts.noise import IsotropicNoise, PositionNoise
 from opt3dgs_optim.parts.out_of_view import OutOfView
+from opt3dgs_optim.parts.own_frame import OwnFrame
 from opt3dgs_optim.phases import PhaseScheduler
 from opt3dgs_optim.presets import DEFAULTS, DEFAULTS_ADC, paper_parts
 from opt3dgs_optim.runs import RunLog
@@ -37,6 +38,7 @@ __all__ = [
     "Kept",
     "LQNAdam",
     "OutOfView",
+    "OwnFrame",
     "Part",
     "Phase",
     "PhaseScheduler",

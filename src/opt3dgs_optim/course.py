@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import LOGGER, check_count, check_keys, check_number
+from opt3dgs_optim.checks import LOGGER, check_count, check_keys, check_number, warn_user
 from opt3dgs_optim.names import gaussian_of, set_of
 from opt3dgs_optim.part import Kept, Part, Phase, Window, overrides
 from opt3dgs_optim.state import ADAM_KEYS, key_of
@@ -83,6 +83,7 @@ class Course:
         self.valid: Tensor | bool = True  # whether the last energy was finite
         self.energy_device = torch.device("cpu")
         self.kept_numbers: dict[str, Tensor] = {}  # what parts keep per training
+        self._reported: set[str] = set()  # kinds of mistakes that were said
         self._published: dict[tuple[str, Place], tuple[int, Any]] = {}
         self._places: dict[int, tuple[weakref.ref[Tensor], Place]] = {}  # id of a tensor -> where
         self._followers: list[weakref.ref[StepAdam]] = []
@@ -257,6 +258,12 @@ class Course:
         """What a part has published last under a name, about whichever Gaussians; or None."""
         found = [entry for (key, _), entry in self._published.items() if key == name]
         return max(found, key=lambda entry: entry[0])[1] if found else None
+
+    def warn_once(self, kind: str, message: str) -> None:
+        """Say something to the user, once of each kind."""
+        if kind not in self._reported:
+            self._reported.add(kind)
+            warn_user(message)
 
     # -- energies --------------------------------------------------------------------------------
 

@@ -121,6 +121,10 @@ class Part:
         """
         return course.window_of(self.during)
 
+    def ready(self, group: Group, course: Course) -> bool:
+        """Whether the part can act on a group in this step; asked in every step if overridden."""
+        return True
+
     def observe(self, energy: Tensor, valid: Tensor | bool, course: Course) -> None:
         """Take the loss of an iteration in which the part acts, 0-d, finite where `valid`.
 

@@ -92,7 +92,6 @@ class PhaseScheduler(Course):
             raise ValueError(f"{CALL}: log={log!r}, but a RunLog or None is needed")
         self.log = log
         self._over_ranks = None if process_group is None else RankMean(CALL, process_group)
-        self._reported: set[str] = set()  # kinds of mistakes that were said
         self._iterations_without_step = 1
         self._steps_without_energy = 0
         self._losses_not_finite = 0  # in a row
@@ -212,9 +211,8 @@ class PhaseScheduler(Course):
 
     def _report(self, kind: str, mistake: str) -> None:
         """Say once what keeps the parts from acting as they are meant to."""
-        if self.parts and kind not in self._reported:
-            self._reported.add(kind)
-            warn_user(f"{CALL}: {mistake}")
+        if self.parts:
+            self.warn_once(kind, f"{CALL}: {mistake}")
 
     def _watch_clock(self) -> None:
         """Look for mistakes that an iteration shows; called with each energy."""

@@ -33,7 +33,7 @@ from opt3dgs_optim.overrides import (
     use_fused,
     zero_nonfinite,
 )
-from opt3dgs_optim.part import Group, Part, Window
+from opt3dgs_optim.part import Group, Part, Window, overrides
 from opt3dgs_optim.state import (
     MOMENTS,
     HeldRows,
@@ -260,18 +260,18 @@ class StepAdam(Adam):
             self._follow_windows()
         if mask is not None:
             self._check_mask(mask)
-        with TemporaryOverrides() as overrides:
-            step = StepInProgress(mask, acting, counts, overrides)
+        with TemporaryOverrides() as temporary:
+            step = StepInProgress(mask, acting, counts, temporary)
             for group, records in zip(self.param_groups, self._records, strict=True):
-                parts = self._parts_of(group) if acting else NO_PARTS
+                parts = self._ready(self._parts_of(group), group) if acting else NO_PARTS
                 self._prepare_group(step, group, records, parts)
                 said = [part.factor(group, course) for _, part in parts.factor]
                 factors = [factor for factor in said if factor is not None]
-                scale_learning_rate(overrides, group, factors, counts)
+                scale_learning_rate(temporary, group, factors, counts)
             if counts is not False:
                 if isinstance(counts, Tensor) and self._base is Adam:
                     # As a GradScaler tells torch's fused step not to be made.
-                    overrides.attribute(self, "found_inf", (~counts).to(torch.float32))
+                    temporary.attribute(self, "found_inf", (~counts).to(torch.float32))
                 self._step_base(mask)
         for moving in step.moving:
             self._finish(moving, course)
@@ -293,6 +293,15 @@ class StepAdam(Adam):
                 )
             )
         return known[slot]
+
+    def _ready(self, parts: ActingParts, group: Group) -> ActingParts:
+        """Without the parts that say that they cannot act on the group in this step."""
+        if not any(overrides(part, "ready") for each in parts for _, part in each):
+            return parts
+        course = self.course
+        return ActingParts(
+            *([pair for pair in each if pair[1].ready(group, course)] for each in parts)
+        )
 
     def _step_base(self, mask: Tensor | None) -> None:
         step, takes_number = own_step(self._base)
@@ -533,9 +542,9 @@ class StepAdam(Adam):
             return super().state_dict()
         self._name_groups()
         own = pack_optimizer(self, self._records, self._open_windows)
-        with TemporaryOverrides() as overrides:
+        with TemporaryOverrides() as temporary:
             shared = {**self.course.state_dict(), "optimizer": own}
-            overrides.extra_item(self.param_groups[0], STATE_KEY, shared)
+            temporary.extra_item(self.param_groups[0], STATE_KEY, shared)
             return super().state_dict()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

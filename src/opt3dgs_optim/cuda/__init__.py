@@ -195,3 +195,16 @@ def missing() -> str | None:
     if not torch.cuda.is_available():
         return "torch sees no CUDA device: no NVIDIA driver, or a build of torch without CUDA"
     return None
+
+
+def has_own_frames(quats: Tensor) -> bool:
+    """Whether kernels make the Gaussians' own frames."""
+    return False
+
+
+def own_frame_gradient(grad: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
+    raise NotImplementedError
+
+
+def own_frame_displacement(step: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
+    raise NotImplementedError

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from opt3dgs_optim.checks import check_number, warn_user
 from opt3dgs_optim.course import Course
+from opt3dgs_optim.frames import rotate, unit_quaternion
 from opt3dgs_optim.lbfgs.pairs import columns, put, row_chunks
 from opt3dgs_optim.part import Group, Part, Phase, State
 
@@ -166,24 +167,12 @@ def covariance_noise(scales: Tensor, quats: Tensor, opacities: Tensor, eta: Tens
     """
     noise = torch.empty_like(eta)
     for rows in row_chunks(eta):
-        q = columns(quats[rows], quats.dtype)
-        # clamp: as torch.nn.functional.normalize
-        w, *axis = (q / (q * q).sum(0).sqrt().clamp(min=1e-12)).unbind()
+        w, axis = unit_quaternion(quats[rows], quats.dtype)
         # R^T eta: rotation by the conjugate quaternion; then the variances; then R.
-        local = _rotate(w, [-a for a in axis], list(columns(eta[rows], eta.dtype).unbind()))
+        local = rotate(w, [-a for a in axis], list(columns(eta[rows], eta.dtype).unbind()))
         variance = (2 * columns(scales[rows], scales.dtype)).exp().unbind()
         shaped = [a * b for a, b in zip(variance, local, strict=True)]
         opacity = torch.sigmoid(opacities[rows].reshape(-1))
         gate = torch.sigmoid(-GATE_SHARPNESS * (opacity - GATE_OPACITY))
-        put(noise[rows], [v * gate for v in _rotate(w, axis, shaped)])
+        put(noise[rows], [v * gate for v in rotate(w, axis, shaped)])
     return noise
-
-
-def _rotate(w: Tensor, q: list[Tensor], v: list[Tensor]) -> list[Tensor]:
-    """Rotate v by the unit quaternion (w, q): v + w t + q x t with t = 2 q x v."""
-    t = [2 * component for component in _cross(q, v)]
-    return [a + w * b + c for a, b, c in zip(v, t, _cross(q, t), strict=True)]
-
-
-def _cross(a: list[Tensor], b: list[Tensor]) -> list[Tensor]:
-    return [a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)]

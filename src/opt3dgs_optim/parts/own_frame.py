@@ -1,0 +1,130 @@
+"""Own frame: positions are stepped along each Gaussian's axes, in its standard deviations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim.checks import check_number
+from opt3dgs_optim.course import Course
+from opt3dgs_optim.frames import Frames
+from opt3dgs_optim.part import Group, Part, State
+
+CALL = "OwnFrame"
+FRAMES = "own_frames"  # what it publishes from gradient to step
+
+
+@dataclass(frozen=True, repr=False)
+class OwnFrame(Part):
+    """Step the positions in each Gaussian's own frame, in units of its standard deviations.
+
+        mu <- mu - rate(t) B Adam(B^T g),    B = R diag(s),    Sigma = B B^T
+        rate(t) = rate * final^t,            t = iteration / total_steps in 0..1
+
+    3DGS moves every centre by one learning rate in world units, while the sizes of the Gaussians of
+    one scene differ by a factor of fifty, and the axes of one Gaussian by twenty. A step that a
+    large Gaussian does not notice throws a small one out of its place. Here Adam is fed the
+    gradient in the Gaussian's own frame, and what it answers is a step along the Gaussian's axes: a
+    full step is `rate` standard deviations. It does not depend on the unit of the scene, nor on the
+    positions' learning rate, which counts in one way only: at 0 the positions are held. Position
+    noise and everything else that reads that rate are not changed.
+
+    Adam's moments of the positions then belong to the own frame; everything else stays as it is.
+    Scales and quaternions are looked up in the groups of the upgraded optimizers (gsplat's,
+    INRIA's, nerfstudio's names and others). Where they are not found, it is said once, and the
+    positions are stepped as the trainer would.
+
+    It keeps nothing from step to step. A step takes one buffer of the positions' size, and their
+    frames (28 bytes per point).
+
+    Args:
+        rate: standard deviations of a full step in the first iteration, above 0.
+        final: share of `rate` in the last iteration, above 0; 0.01 is the decay that all 3DGS
+            trainers give the positions' learning rate.
+
+    Raises:
+        ValueError: an option is outside what is allowed.
+
+    Examples:
+        >>> import torch
+        >>> from opt3dgs_optim import OwnFrame, PhaseScheduler
+        >>> splats = {"means": torch.zeros(2, 3), "scales": torch.zeros(2, 3),
+        ...           "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2)}
+        >>> splats["scales"][1] = -3.0  # the second Gaussian is twenty times smaller
+        >>> splats = {name: torch.nn.Parameter(value) for name, value in splats.items()}
+        >>> adams = {name: torch.optim.Adam([param]) for name, param in splats.items()}
+        >>> phases = PhaseScheduler(100, parts=[OwnFrame(rate=0.1)])
+        >>> adams = phases.upgrade(adams)
+        >>> splats["means"].grad = torch.ones(2, 3)
+        >>> phases.observe(0.1)
+        >>> adams["means"].step()
+        >>> [round(x, 4) for x in splats["means"][:, 0].tolist()]
+        [-0.1, -0.005]
+    """
+
+    rate: float = 0.1
+    final: float = 0.01
+
+    names = ("means",)
+
+    def __post_init__(self) -> None:
+        check_number(CALL, "rate", self.rate, 0.0, open_low=True)
+        check_number(CALL, "final", self.final, 0.0, open_low=True)
+
+    def ready(self, group: Group, course: Course) -> bool:
+        """Whether scales and quaternions of the same points are there; says it once if not."""
+        for param in group["params"]:
+            gaussians = course.gaussians_of(param)
+            missing = [name for name in ("scales", "quats") if name not in gaussians]
+            fits = not missing and (
+                param.shape[1:] == (3,)
+                and gaussians["scales"].shape == param.shape
+                and gaussians["quats"].shape == (len(param), 4)
+            )
+            if not fits:
+                shapes = {name: tuple(each.shape) for name, each in gaussians.items()}
+                course.warn_once(
+                    CALL,
+                    f"{CALL}: the positions, of shape {tuple(param.shape)}, need scales [N, 3] and "
+                    f"quats [N, 4] of the same points among the upgraded optimizers, which hold "
+                    f"{shapes}; until then they are stepped as without this part",
+                )
+                return False
+        return True
+
+    def at(self, progress: float) -> float:
+        """Standard deviations of a full step, when that share of the run is over."""
+        return self.rate * self.final ** min(max(progress, 0.0), 1.0)
+
+    def before(
+        self, group: Group, param: Tensor, grad: Tensor, state: State, course: Course
+    ) -> Tensor:
+        """B^T g [N, 3], which is what Adam is fed."""
+        gaussians = course.gaussians_of(param)
+        quats, scales = gaussians["quats"].detach(), gaussians["scales"].detach()
+        # Kept for `displacement`: one optimizer of all groups has moved them by then.
+        frames = Frames(quats, scales, param.dtype)
+        course.publish(FRAMES, param, frames)
+        return frames.gradient(grad)
+
+    def factor(self, group: Group, course: Course) -> float | Tensor:
+        """What makes of the positions' learning rate the one of the own frame."""
+        lr = group["lr"]
+        if isinstance(lr, Tensor):
+            return torch.where(lr == 0, 1.0, self.at(course.progress) / lr)
+        return self.at(course.progress) / lr if lr else 1.0
+
+    def displacement(
+        self, group: Group, param: Tensor, step: Tensor, state: State, course: Course
+    ) -> Tensor:
+        """B z [N, 3], of Adam's step z in standard deviations."""
+        frames: Frames = course.published(FRAMES, param)
+        course.publish(FRAMES, param, None)  # gives their memory back
+        return frames.displacement(step)
+
+    def numbers(self, course: Course) -> Mapping[str, float]:
+        """`own_frame_rate`: standard deviations of a full step."""
+        return {"own_frame_rate": self.at(course.progress)}

@@ -1,0 +1,354 @@
+"""The own frame: equivariance, limits, sizes from 1e-8 to 1e8, and what trainers do around it."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import devices
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.nn import Parameter
+from trainers import (
+    assert_same,
+    edit_rows,
+    gsplat_optimizers,
+    inria_optimizer,
+    make_splats,
+    only,
+    state_of,
+    train,
+    upgraded,
+)
+
+from opt3dgs_optim import Averaging, Fading, OwnFrame, Part, PositionNoise
+from opt3dgs_optim.frames import Frames
+
+TOTAL = 60
+
+
+def rotation(quats: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions wxyz: by the textbook, in float64."""
+    w, x, y, z = torch.nn.functional.normalize(quats.double(), dim=1).unbind(1)
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    return torch.stack(rows, 1).reshape(-1, 3, 3)
+
+
+def frame(quats: Tensor, scales: Tensor) -> Tensor:
+    """B [N, 3, 3]."""
+    return rotation(quats) * scales.double().exp()[:, None, :]
+
+
+@pytest.mark.parametrize("rows", [0, 1, 7, 255, 4097])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_frame_is_that_of_the_covariance(rows: int, dtype: torch.dtype) -> None:
+    draw = torch.Generator().manual_seed(rows)
+    v, quats = (torch.randn(rows, n, generator=draw, dtype=dtype) for n in (3, 4))
+    scales = 3 * torch.randn(rows, 3, generator=draw, dtype=dtype)
+    b, frames = frame(quats, scales), Frames(quats, scales, dtype)
+    tight = (
+        {"rtol": 2e-5, "atol": 1e-5} if dtype == torch.float32 else {"rtol": 1e-12, "atol": 1e-12}
+    )
+    # Rounding is relative to the axis, and in the world to the longest of them.
+    for found, expected, size in (
+        (frames.gradient(v), torch.einsum("nij,ni->nj", b, v.double()), scales.exp()),
+        (frames.displacement(v), torch.einsum("nij,nj->ni", b, v.double()), None),
+    ):
+        unit = scales.exp().amax(1, keepdim=True) if size is None else size
+        torch.testing.assert_close(found / unit, expected.to(dtype) / unit, **tight)
+
+
+def scene(rows: int, seed: int, size: float = 1.0) -> dict[str, Parameter]:
+    """Gaussians whose sizes differ by a factor of fifty, their axes by twenty."""
+    draw = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(rows, *shape, generator=draw, dtype=torch.float64)
+
+    values = {
+        "means": 5.0 * size * normal(3),
+        "scales": torch.log(torch.tensor(size)) + 1.3 * normal(1) + normal(3),
+        "quats": normal(4),
+    }
+    return {name: Parameter(value) for name, value in values.items()}
+
+
+def run(
+    splats: dict[str, Parameter], grad_of: Any, steps: int = 20, lr: float = 1e-3, **options: Any
+) -> None:
+    """Steps of the positions by the own frame; `grad_of(means, i)` is their gradient."""
+    phases = only(TOTAL, OwnFrame(**options))
+    adams = {n: torch.optim.Adam([p], lr=lr, eps=1e-30) for n, p in splats.items()}
+    phases.upgrade(adams)
+    for i in range(steps):
+        splats["means"].grad = grad_of(splats["means"].detach(), i)
+        phases.observe(0.1)
+        adams["means"].step()
+
+
+def pull(goal: Tensor) -> Any:
+    return lambda means, i: means - goal + 0.1 * i
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.integers(1, 20),
+    st.integers(0, 1000),
+    st.floats(-8, 8),
+    st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(
+        lambda q: sum(x * x for x in q) > 0.1
+    ),
+)
+def test_the_training_of_a_rotated_and_scaled_world_is_the_same(
+    rows: int, seed: int, magnitude: float, turn: list[float]
+) -> None:
+    """A scene in millimetres or in kilometres, upright or not: no rate need be changed."""
+    factor, quat = 10.0**magnitude, torch.tensor([turn], dtype=torch.float64)
+    turned = rotation(quat)[0]
+    one, other = scene(rows, seed), scene(rows, seed)
+    other["means"].data = factor * one["means"].detach() @ turned.T
+    other["scales"].data = one["scales"].detach() + torch.log(torch.tensor(factor))
+    w, x, y, z = torch.nn.functional.normalize(quat, dim=1)[0]
+    left = torch.stack([
+        torch.stack([w, -x, -y, -z]), torch.stack([x, w, -z, y]),
+        torch.stack([y, z, w, -x]), torch.stack([z, -y, x, w]),
+    ])  # fmt: skip
+    other["quats"].data = one["quats"].detach() @ left.T
+    goal = torch.ones(3, dtype=torch.float64)
+    run(one, lambda means, i: (means - goal) + 0.1 * i)
+    # The gradient of the same loss in the other world's units.
+    run(other, lambda means, i: ((means @ turned / factor - goal) + 0.1 * i) @ turned.T / factor)
+    back = other["means"].detach() @ turned / factor
+    # Adam divides by the gradient's size, so that rounding of one near zero is seen in its step.
+    torch.testing.assert_close(back, one["means"].detach(), rtol=1e-4, atol=1e-4)
+
+
+def test_a_ball_of_size_one_is_adam() -> None:
+    splats = scene(6, 0)
+    splats["scales"].data.zero_()
+    splats["quats"].data = torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 6, dtype=torch.float64)
+    plain = Parameter(splats["means"].detach().clone())
+    adam, grad_of = torch.optim.Adam([plain], eps=1e-30), pull(torch.ones(6, 3).double())
+    phases_rate = OwnFrame(rate=0.1)
+    for i in range(20):
+        adam.param_groups[0]["lr"] = phases_rate.at(i / TOTAL)
+        plain.grad = grad_of(plain.detach(), i)
+        adam.step()
+    run(splats, grad_of)
+    torch.testing.assert_close(splats["means"].detach(), plain.detach(), rtol=1e-12, atol=1e-12)
+
+
+def test_a_gradient_of_zero_moves_nothing() -> None:
+    splats = scene(6, 1)
+    before = splats["means"].detach().clone()
+    run(splats, lambda means, i: torch.zeros_like(means))
+    assert torch.equal(splats["means"], before)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+@pytest.mark.parametrize("magnitude", [-8, -4, 0, 4, 8])
+def test_a_step_is_a_share_of_a_standard_deviation(magnitude: int, dtype: torch.dtype) -> None:
+    """From 1e-8 to 1e8; in bfloat16, whose positions have two digits, it is at least finite."""
+    size = 10.0**magnitude
+    splats = {
+        "means": Parameter(torch.zeros(4, 3, dtype=dtype)),
+        "scales": Parameter(torch.full((4, 3), size, dtype=torch.float64).log().to(dtype)),
+        "quats": Parameter(torch.tensor([[1.0, 0, 0, 0]] * 4, dtype=dtype)),
+    }
+    run(splats, lambda means, i: torch.full_like(means, 1 / size), steps=1)
+    moved = splats["means"].detach().double()
+    assert bool(moved.isfinite().all())
+    # A bfloat16 of log(1e8) is off by a thirtieth.
+    tolerance = 0.2 if dtype == torch.bfloat16 else 1e-4
+    torch.testing.assert_close(moved, torch.full_like(moved, -0.1 * size), rtol=tolerance, atol=0)
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.3, 3.0, 10.0])
+def test_the_trainers_rate_does_not_count(factor: float) -> None:
+    ends = []
+    for lr in (1e-3, 1e-3 * factor):
+        splats = scene(6, 2)
+        run(splats, pull(torch.ones(6, 3).double()), lr=lr)
+        ends.append(splats["means"].detach())
+    torch.testing.assert_close(ends[0], ends[1], rtol=1e-12, atol=1e-12)
+
+
+def test_positions_with_a_rate_of_zero_are_held() -> None:
+    splats = scene(6, 3)
+    before = splats["means"].detach().clone()
+    run(splats, pull(torch.ones(6, 3).double()), lr=0.0)
+    assert torch.equal(splats["means"], before)
+
+
+def full() -> tuple[Part, ...]:
+    return OwnFrame(), Fading(names=("scales", "opacities"), events=60), Averaging()
+
+
+def test_gsplats_and_inrias_ways_agree() -> None:
+    ends = []
+    for make in (gsplat_optimizers, inria_optimizer):
+        splats, phases, optimizers = upgraded(TOTAL, *full(), make=make)
+        train(splats, optimizers, phases, 0, TOTAL)
+        ends.append(splats)
+    assert_same(ends[0], ends[1])
+
+
+@pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
+@pytest.mark.parametrize("at", [7, 59])
+def test_a_resumed_training_is_the_same_bit_for_bit(make: Any, at: int) -> None:
+    ends = []
+    for cut in (False, True):
+        splats, phases, optimizers = upgraded(TOTAL, *full(), make=make)
+        train(splats, optimizers, phases, 0, at)
+        if cut:
+            every = optimizers if isinstance(optimizers, dict) else {"": optimizers}
+            saved = {name: copy.deepcopy(each.state_dict()) for name, each in every.items()}
+            values = {name: param.detach().clone() for name, param in splats.items()}
+            splats, phases, optimizers = upgraded(TOTAL, *full(), make=make)
+            for name, param in splats.items():
+                param.data.copy_(values[name])
+            every = optimizers if isinstance(optimizers, dict) else {"": optimizers}
+            for name, each in every.items():
+                each.load_state_dict(saved[name])
+        train(splats, optimizers, phases, at, TOTAL)
+        ends.append(splats)
+    assert_same(ends[0], ends[1])
+
+
+def test_density_control_between_steps() -> None:
+    splats, phases, optimizers = upgraded(TOTAL, *full())
+    train(splats, optimizers, phases, 0, 10)
+    edit_rows(splats, optimizers, torch.arange(11, -1, -2), 3)
+    train(splats, optimizers, phases, 10, TOTAL)
+    assert splats["means"].shape == (9, 3)
+    assert all(bool(param.isfinite().all()) for param in splats.values())
+
+
+@pytest.mark.parametrize("options", [{"foreach": False}, {"foreach": True}, {"fused": True}])
+def test_every_path_of_torch_makes_the_same_step(options: dict[str, bool]) -> None:
+    ends = []
+    for path in ({}, options):
+        splats, phases, optimizers = upgraded(TOTAL, OwnFrame(), **path)
+        train(splats, optimizers, phases, 0, 20)
+        ends.append(splats)
+    for name, param in ends[0].items():  # fused Adam rounds otherwise
+        torch.testing.assert_close(param, ends[1][name], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
+def test_rows_that_a_mask_holds_stand_still(make: Any) -> None:
+    splats, phases, optimizers = upgraded(TOTAL, OwnFrame(), make=make)
+    train(splats, optimizers, phases, 0, 5)
+    mask = torch.arange(12) % 3 == 0
+    before = splats["means"].detach().clone()
+    moments = {k: v.clone() for k, v in state_of(optimizers, splats["means"]).items()}
+    for param in splats.values():
+        param.grad = torch.ones_like(param)
+    phases.observe(0.1)
+    for each in optimizers.values() if isinstance(optimizers, dict) else [optimizers]:
+        each.step(mask)
+    assert torch.equal(splats["means"][~mask], before[~mask])
+    assert not bool((splats["means"][mask] == before[mask]).any())
+    after = state_of(optimizers, splats["means"])
+    assert torch.equal(after["exp_avg"][~mask], moments["exp_avg"][~mask])
+
+
+@pytest.mark.parametrize("on_device", [False, True])
+def test_a_dropped_step_moves_nothing(on_device: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if on_device:
+        devices.on_a_device(monkeypatch)
+    splats, phases, optimizers = upgraded(TOTAL, *full(), fused=True)
+    train(splats, optimizers, phases, 0, 5)
+    before = {name: param.detach().clone() for name, param in splats.items()}
+    for name, param in splats.items():
+        param.grad = torch.ones_like(param)
+        phases.observe(float("nan"))
+        optimizers[name].step()
+    assert_same(before, splats)
+
+
+def test_amp_and_maximize_see_the_same_problem() -> None:
+    ends = []
+    for scale, up in ((None, False), (1024.0, False), (None, True)):
+        splats = {n: Parameter(p.detach().float()) for n, p in scene(6, 4).items()}
+        phases = only(TOTAL, OwnFrame())
+        options: dict[str, Any] = {"eps": 1e-30, "maximize": up, "fused": True}
+        adams: Any = phases.upgrade(
+            {n: torch.optim.Adam([p], **options) for n, p in splats.items()}
+        )
+        means = adams["means"]
+        for i in range(10):
+            grad = pull(torch.ones(6, 3))(splats["means"].detach(), i)
+            splats["means"].grad = (-grad if up else grad) * (scale or 1.0)
+            if scale is not None:
+                means.grad_scale, means.found_inf = torch.tensor(scale), torch.tensor(0.0)
+            phases.observe(0.1)
+            means.step()
+        ends.append(splats["means"].detach())
+    for end in ends[1:]:
+        torch.testing.assert_close(end, ends[0], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("decoupled", [False, True])
+def test_weight_decay_is_of_the_positions_themselves(decoupled: bool) -> None:
+    """Not of the buffer that Adam moves: a ball of size one is Adam with its decay."""
+    splats = scene(6, 5)
+    splats["scales"].data.zero_()
+    splats["quats"].data = torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 6, dtype=torch.float64)
+    plain = Parameter(splats["means"].detach().clone())
+    cls = torch.optim.AdamW if decoupled else torch.optim.Adam
+    options: dict[str, Any] = {"lr": 0.1, "weight_decay": 0.2, "eps": 1e-30}
+    phases = only(TOTAL, OwnFrame(rate=0.1, final=1.0))
+    adams: Any = phases.upgrade({n: cls([p], **options) for n, p in splats.items()})
+    theirs = cls([plain], **options)
+    for i in range(5):
+        for param, adam in ((splats["means"], adams["means"]), (plain, theirs)):
+            param.grad = pull(torch.ones(6, 3).double())(param.detach(), i)
+            if param is plain:
+                adam.step()
+            else:
+                phases.observe(0.1)
+                adam.step()
+    torch.testing.assert_close(splats["means"].detach(), plain.detach(), rtol=1e-12, atol=1e-12)
+
+
+def test_where_no_frame_is_found_it_says_so_and_the_step_is_adams() -> None:
+    x, y = Parameter(torch.ones(4, 3)), Parameter(torch.ones(4, 3))
+    phases = only(TOTAL, OwnFrame())
+    ours: Any = phases.upgrade({"means": torch.optim.Adam([x], lr=0.1)})["means"]
+    theirs = torch.optim.Adam([y], lr=0.1)
+    for i in range(3):
+        phases.observe(0.1)
+        for param, adam in ((x, ours), (y, theirs)):
+            param.grad = torch.full((4, 3), 1.0 + i)
+            if i == 0 and adam is ours:
+                with pytest.warns(UserWarning, match=r"need scales \[N, 3\] and quats \[N, 4\]"):
+                    adam.step()
+            else:
+                adam.step()
+    assert torch.equal(x, y)
+
+
+def test_noise_and_the_trainers_schedule_read_the_trainers_rate() -> None:
+    splats = make_splats()
+    phases = only(TOTAL, OwnFrame(), PositionNoise(scale=1.0))
+    optimizers = gsplat_optimizers(splats)
+    phases.upgrade(optimizers)
+    rate = optimizers["means"].param_groups[0]["lr"]
+    train(splats, optimizers, phases, 0, 3)
+    assert optimizers["means"].param_groups[0]["lr"] == rate
+    assert optimizers["means"].param_groups[0]["params"] == [splats["means"]]
+    assert set(optimizers["means"].state) == {splats["means"]}
+
+
+@pytest.mark.parametrize("options", [{"rate": 0.0}, {"rate": float("nan")}, {"final": -1.0}])
+def test_options_are_checked(options: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=f"OwnFrame: {next(iter(options))}="):
+        OwnFrame(**options)
