@@ -38,7 +38,17 @@ SENTENCES += ("RunLog.resume", "RunLog.step", "RunLog.evaluation", "RunLog.event
 SENTENCES += ("PositionNoise.add_to", "Fading.chosen", "Course.phase_of", "Course.part")
 SENTENCES += ("StepAdam.acts_on", "PhaseScheduler.part")
 SENTENCES += tuple(f"{name}.load_state_dict" for name in ("StepAdam", "EnergyHistogram"))
-HOOKS = ("factor", "before", "after", "pixel_loss", "numbers", "load_state_dict")
+HOOKS = (
+    "ready",
+    "window",
+    "displacement",
+    "factor",
+    "before",
+    "after",
+    "pixel_loss",
+    "numbers",
+    "load_state_dict",
+)
 SENTENCES += tuple(f"Part.{hook}" for hook in (*HOOKS, "observe", "evidence", "useless"))
 SENTENCES += ("PhaseScheduler.paper", "PhaseScheduler.pixel_loss", "StepAdam.follow")
 ELSEWHERE = ("Phase", "StepAdam", "BackendInfo")  # nothing to pass; torch's own arguments

@@ -222,7 +222,10 @@ class Course:
 
         They are looked up in the optimizers' groups, because density control replaces them:
         `means, scales, quats, opacities, sh0, shN` as far as optimizers of this course hold them,
-        raw, as the trainer keeps them (see `docs/hosts/other.md`). Empty for any other tensor.
+        raw, as the trainer keeps them. Empty for any other tensor.
+
+        Args:
+            param: a Gaussian parameter, of shape [N, ..].
         """
         place = self.place_of(param)
         if place is None:
@@ -238,15 +241,24 @@ class Course:
                         yield Place(set_of(group), index), name, param
 
     def publish(self, name: str, param: Tensor, value: Any) -> None:
-        """Tell other parts something about the set of Gaussians that a parameter belongs to."""
+        """Tell other parts something about the set of Gaussians that a parameter belongs to.
+
+        Args:
+            name: what it is called among the parts.
+            param: one of their parameters, of shape [N, ..].
+            value: anything; it is replaced by the next one under that name.
+        """
         place = self.place_of(param)
         if place is not None:
             self._published[name, place] = self.current, value
 
     def published(self, name: str, param: Tensor, *, earlier: bool = False) -> Any:
-        """What a part has published about the Gaussians of `param` in this iteration, or None.
+        """What a part has published about a set of Gaussians in this iteration, or None.
 
-        With `earlier`, also what it has published in an iteration before.
+        Args:
+            name: what it is called among the parts.
+            param: one of their parameters, of shape [N, ..].
+            earlier: whether one of an iteration before will do.
         """
         place = self.place_of(param)
         if place is None:

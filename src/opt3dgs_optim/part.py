@@ -35,8 +35,8 @@ class Kept:
         name: how the part's hooks read and write it, `state[name]`.
         per: `"row"` keeps a tensor whose first dimension is the parameter's, one row per point;
             `"parameter"` a number per parameter; `"training"` one number for the whole training.
-        shape: per row, the dimensions after the first, or a function of the parameter that gives
-            them; None: those of the parameter itself.
+        shape: per row, the dimensions after the first, or a function of the parameter [N, ..] that
+            gives them; None: those of the parameter itself.
         dtype: of what is kept. A floating one is never narrower than the parameter's: what belongs
             to float64 positions is kept in float64.
         initial: the value of a number before it is written. Rows begin as zeros, because trainers

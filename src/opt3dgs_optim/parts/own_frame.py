@@ -96,7 +96,11 @@ class OwnFrame(Part):
         return True
 
     def at(self, progress: float) -> float:
-        """Standard deviations of a full step, when that share of the run is over."""
+        """Standard deviations of a full step.
+
+        Args:
+            progress: share of the run that is over; taken as 0..1.
+        """
         return self.rate * self.final ** min(max(progress, 0.0), 1.0)
 
     def before(
