@@ -251,7 +251,9 @@ def test_torchs_own_adam_runs_on_it_and_never_waits(name: str) -> None:
 
 SOME = {"": GPU, "means": "cpu", "sh0": "cpu"}
 TWO = {"": GPU, "means": "cuda:1", "sh0": "cuda:1"}
-FUSED, FOREACH, SINGLE = {"fused": True}, {"foreach": True}, {"foreach": False}
+FUSED: dict[str, Any] = {"fused": True}
+FOREACH: dict[str, Any] = {"foreach": True}
+SINGLE: dict[str, Any] = {"foreach": False}
 NOT_MENDED = {  # what fails today: (where, arms, why)
     "offloaded": "course.valid of the loss's GPU meets tensors of the host",
     "two": "course.valid of the loss's GPU meets tensors of another",
@@ -381,7 +383,7 @@ def mended_later(reason: str) -> Any:
     return pytest.mark.xfail(strict=True, reason=reason)
 
 
-STOCK = {"as it comes": {}, "fused": FUSED, "foreach": FOREACH, "single tensor": SINGLE}
+STOCK: dict[str, dict[str, Any]] = {"as it comes": {}, "fused": FUSED, "foreach": FOREACH, "single tensor": SINGLE}
 STOCK |= {"capturable": {"capturable": True}, "amsgrad": {"amsgrad": True, "weight_decay": 0.01}}
 
 

@@ -101,6 +101,7 @@ class Training:
         scaled: whether a GradScaler scales the loss.
         masked: whether the steps get the views' masks.
         dropped: iterations whose loss is not finite.
+        skips: whether the trainer leaves their steps out itself.
         options: of `PhaseScheduler`; `upgrade=False`: the trainer's own Adam.
     """
 
@@ -115,6 +116,7 @@ class Training:
         scaled: bool = False,
         masked: bool = False,
         dropped: Iterable[int] = (),
+        skips: bool = False,
         upgrade: bool = True,
         total: int | None = None,
         switch: int | None = None,
@@ -140,7 +142,7 @@ class Training:
         if upgrade:
             self.phases.upgrade(self.optimizers)
         self.scaler = torch.amp.GradScaler("cpu", init_scale=1024.0) if scaled else None
-        self.iteration = 0
+        self.iteration, self.skips = 0, skips
         self.waits: dict[int, list[str]] = {}  # iteration -> synchronisations of the package
         self.operators: Counter[str] = Counter()
 
@@ -180,7 +182,11 @@ class Training:
         (loss if self.scaler is None else self.scaler.scale(loss)).backward()
         self.phases.observe(loss)
         view = self.views[self.iteration % VIEWS]
+        left_out = self.skips and self.iteration in self.dropped
         for optimizer in self.every:
+            if left_out:
+                optimizer.zero_grad(set_to_none=True)
+                continue
             first = optimizer.param_groups[0]["name"]
             mask = {"visible": view[first][2]} if self.masked else {}
             if self.scaler is None:
@@ -204,6 +210,16 @@ class Training:
                 self.operators += gpu.operators
             self.iteration += 1
         return self
+
+    def kept(self) -> dict[str, Tensor]:
+        """Copies of all tensors of the optimizers' state on the host, "PARAMETER.KEY"."""
+        found = {}
+        for optimizer in self.every:
+            for group in optimizer.param_groups:
+                state = optimizer.state.get(group["params"][0], {})
+                tensors = {key: each for key, each in state.items() if isinstance(each, Tensor)}
+                found |= {f"{group['name']}.{key}": on_host(v) for key, v in tensors.items()}
+        return found
 
     def values(self) -> dict[str, Tensor]:
         """Copies of the parameters on the host."""
