@@ -139,6 +139,7 @@ class Training:
         made = ARMS[arm] if isinstance(arm, str) else arm
         self.phases = PhaseScheduler(total, switch, list(made(self)), **options)
         self.optimizers: Any = self._optimizers(layout, {"eps": 1e-15, **(adam or {})})
+        self.upgraded = upgrade
         if upgrade:
             self.phases.upgrade(self.optimizers)
         self.scaler = torch.amp.GradScaler("cpu", init_scale=1024.0) if scaled else None
@@ -180,7 +181,8 @@ class Training:
     def step(self) -> None:
         loss = self.loss()
         (loss if self.scaler is None else self.scaler.scale(loss)).backward()
-        self.phases.observe(loss)
+        if self.upgraded:
+            self.phases.observe(loss)
         view = self.views[self.iteration % VIEWS]
         left_out = self.skips and self.iteration in self.dropped
         for optimizer in self.every:
