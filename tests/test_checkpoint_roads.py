@@ -17,7 +17,7 @@ from typing import Any
 import landed_checkpoints
 import pytest
 import torch
-from placed_training import ROWS, Training, distance
+from placed_training import ROWS, Training, distance, mended_later
 from ranks import free_port
 from torch import Tensor
 from torch.distributed.checkpoint import state_dict as dcp_state
@@ -34,10 +34,6 @@ TORCHS = {"step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq"}
 
 
 pytestmark = pytest.mark.filterwarnings(f"ignore:{SINGLE}")
-
-
-def mended_later(reason: str) -> Any:
-    return pytest.mark.xfail(strict=True, reason=reason)
 
 
 def reread(value: Any) -> Any:

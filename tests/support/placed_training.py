@@ -6,11 +6,14 @@ be compared, whatever is mixed: layouts of optimizers, masks, GradScaler, droppe
 
 from __future__ import annotations
 
+import copy
 import inspect
+import io
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+import pytest
 import simulated_device
 import torch
 from simulated_device import on_host
@@ -42,6 +45,7 @@ LONG, LATE = 90, 60  # of presets, whose averaging acts in the last thirtieth
 SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3)}
 RATES = {"means": 1e-2, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3}
 GPU = "cuda:0"
+ADAMS = ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq")
 
 Arm = Callable[[Any], Iterable[Part]]
 ARMS: dict[str, Arm] = {
@@ -89,6 +93,16 @@ EVERYTHING = (
 ARMS["everything"] = _everything
 
 
+def mended_later(reason: str) -> Any:
+    """What fails today, and is to be mended: strict, so that the mending is noticed."""
+    return pytest.mark.xfail(strict=True, reason=reason)
+
+
+def marked(names: Iterable[Any], failing: Mapping[Any, str]) -> list[Any]:
+    """Parameters of a test, those that fail today marked with the reason."""
+    return [pytest.param(n, marks=mended_later(failing[n])) if n in failing else n for n in names]
+
+
 class Training:
     """Gaussians drawn to a target of each view; every third of them is out of every view.
 
@@ -102,6 +116,7 @@ class Training:
         masked: whether the steps get the views' masks.
         dropped: iterations whose loss is not finite.
         skips: whether the trainer leaves their steps out itself.
+        counts: whether the trainer says its own iteration.
         options: of `PhaseScheduler`; `upgrade=False`: the trainer's own Adam.
     """
 
@@ -117,6 +132,7 @@ class Training:
         masked: bool = False,
         dropped: Iterable[int] = (),
         skips: bool = False,
+        counts: bool = False,
         upgrade: bool = True,
         total: int | None = None,
         switch: int | None = None,
@@ -131,11 +147,12 @@ class Training:
         given = {"": places} if isinstance(places, str) else places
         self.places = {name: given.get(name, given.get("", "cpu")) for name in SHAPES}
         self.loss_on, self.masked, self.dropped = torch.device(loss_on), masked, set(dropped)
-        starts = {n: torch.randn(ROWS, *shape, generator=draw) for n, shape in SHAPES.items()}
+        self.like: dict[str, Any] = {"generator": draw, "dtype": torch.float32}
+        starts = {n: torch.randn(ROWS, *shape, **self.like) for n, shape in SHAPES.items()}
         self.splats = {
             name: Parameter(value.to(dtype).to(self.places[name])) for name, value in starts.items()
         }
-        self.views = [self._view(view, draw, dtype) for view in range(VIEWS)]
+        self.views = [self._view(view, dtype) for view in range(VIEWS)]
         made = ARMS[arm] if isinstance(arm, str) else arm
         self.phases = PhaseScheduler(total, switch, list(made(self)), **options)
         self.optimizers: Any = self._optimizers(layout, {"eps": 1e-15, **(adam or {})})
@@ -143,16 +160,16 @@ class Training:
         if upgrade:
             self.phases.upgrade(self.optimizers)
         self.scaler = torch.amp.GradScaler("cpu", init_scale=1024.0) if scaled else None
-        self.iteration, self.skips = 0, skips
+        self.iteration, self.skips, self.counts = 0, skips, counts
         self.waits: dict[int, list[str]] = {}  # iteration -> synchronisations of the package
         self.operators: Counter[str] = Counter()
 
-    def _view(self, view: int, draw: torch.Generator, dtype: torch.dtype) -> dict[str, Any]:
+    def _view(self, view: int, dtype: torch.dtype) -> dict[str, Any]:
         seen = torch.arange(ROWS) % 3 != view % 3
         found: dict[str, Any] = {}
         for name, shape in SHAPES.items():
-            weight = (torch.rand(ROWS, *shape, generator=draw) + 0.5) * shaped(seen, len(shape))
-            target = torch.randn(ROWS, *shape, generator=draw)
+            weight = (torch.rand(ROWS, *shape, **self.like) + 0.5) * shaped(seen, len(shape))
+            target = torch.randn(ROWS, *shape, **self.like)
             on_loss = (weight.to(dtype).to(self.loss_on), target.to(dtype).to(self.loss_on))
             found[name] = *on_loss, seen.to(self.places[name])
         return found
@@ -169,7 +186,7 @@ class Training:
 
     def loss(self) -> Tensor:
         """A smooth loss, and a little of the photometric term that a part may replace."""
-        total = torch.zeros((), device=self.loss_on)
+        total = torch.zeros((), device=self.loss_on, dtype=torch.float32)
         for name, param in self.splats.items():
             weight, target, _ = self.views[self.iteration % VIEWS][name]
             here = param if param.device == self.loss_on else param.to(self.loss_on)
@@ -182,7 +199,8 @@ class Training:
         loss = self.loss()
         (loss if self.scaler is None else self.scaler.scale(loss)).backward()
         if self.upgraded:
-            self.phases.observe(loss)
+            said = {"iteration": self.iteration} if self.counts else {}
+            self.phases.observe(loss, **said)
         view = self.views[self.iteration % VIEWS]
         left_out = self.skips and self.iteration in self.dropped
         for optimizer in self.every:
@@ -222,6 +240,38 @@ class Training:
                 tensors = {key: each for key, each in state.items() if isinstance(each, Tensor)}
                 found |= {f"{group['name']}.{key}": on_host(v) for key, v in tensors.items()}
         return found
+
+    def follow(self, first: Training) -> Training:
+        """Go on from another's parameters and iteration; without its optimizers' state."""
+        with torch.no_grad():
+            for name, value in first.values().items():
+                self.splats[name].copy_(value)
+        self.iteration = first.iteration
+        return self
+
+    def resume(self, first: Training) -> Training:
+        """Go on from all of another's, through its checkpoint."""
+        self.follow(first)
+        for ours, theirs in zip(self.every, first.every, strict=True):
+            buffer = io.BytesIO()
+            torch.save(theirs.state_dict(), buffer)
+            buffer.seek(0)
+            ours.load_state_dict(torch.load(buffer, weights_only=True))
+        return self
+
+    def resume_moments(self, first: Training) -> Training:
+        """Go on from another's parameters and Adam's own state, as from the stock trainer's."""
+        self.follow(first)
+        for ours, theirs in zip(self.every, first.every, strict=True):
+            groups = copy.deepcopy(ours.state_dict()["param_groups"])
+            for group in groups:
+                group.pop("opt3dgs", None)
+            moments = {
+                i: {key: value for key, value in state.items() if key in ADAMS}
+                for i, state in theirs.state_dict()["state"].items()
+            }
+            ours.load_state_dict(copy.deepcopy({"state": moments, "param_groups": groups}))
+        return self
 
     def values(self) -> dict[str, Tensor]:
         """Copies of the parameters on the host."""

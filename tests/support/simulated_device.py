@@ -170,9 +170,9 @@ def placed(device: Any) -> torch.device:
 
 
 def on_host(value: Any) -> Any:
-    """Tensors of simulated GPUs, in any nesting, as copies on the CPU; nothing is counted."""
-    copied = lambda each: each.held.clone() if isinstance(each, DeviceTensor) else each  # noqa: E731
-    return tree_map(copied, value)
+    """Tensors, in any nesting, as copies on the CPU; nothing is counted."""
+    with _silence():
+        return tree_map(lambda e: _inner(e).clone() if isinstance(e, Tensor) else e, value)
 
 
 def on_device(value: Any, device: Any = "cuda:0") -> Any:
