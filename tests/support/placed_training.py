@@ -285,6 +285,6 @@ def shaped(rows: Tensor, dims: int) -> Tensor:
 
 def distance(ours: Mapping[str, Tensor], theirs: Mapping[str, Tensor]) -> float:
     """The largest difference of two sets of parameters; infinite where one has a NaN alone."""
-    pairs = [(ours[name].double(), theirs[name].double()) for name in ours]
+    pairs = [(ours[n].detach().double(), theirs[n].detach().double()) for n in ours]
     unlike = [float((a - b).abs().max().nan_to_num(float("inf"))) for a, b in pairs]
     return max(unlike)
