@@ -1,0 +1,89 @@
+"""Trainers that copy or pickle their model with its optimizer (MonoGS), logs and all."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import io
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from placed_training import ARMS, distance, marked
+from torch.nn import Parameter
+
+from opt3dgs_optim import PhaseScheduler, RunLog
+
+
+def through_torch(value: Any) -> Any:
+    torch.save(value, buffer := io.BytesIO())
+    buffer.seek(0)
+    return torch.load(buffer, weights_only=False)
+
+
+WAYS: dict[str, Callable[[Any], Any]] = {
+    "deepcopy": copy.deepcopy,
+    "pickle": lambda value: pickle.loads(pickle.dumps(value)),
+    "torch.save": through_torch,
+}
+QUIET = [arm for arm in ARMS if "Noise" not in arm and arm != "everything"]
+
+
+class Trainer:
+    """A model and its optimizer, copied as one."""
+
+    def __init__(self, arm: str, log: RunLog | None = None) -> None:
+        draw = torch.Generator().manual_seed(0)
+        self.splats = {
+            "means": Parameter(torch.randn(8, 3, generator=draw)),
+            "opacities": Parameter(torch.randn(8, generator=draw)),
+        }
+        groups = [{"params": [p], "name": n} for n, p in self.splats.items()]
+        self.phases = PhaseScheduler(90, 60, list(ARMS[arm](None)), log=log)
+        self.adam: Any = self.phases.upgrade(torch.optim.Adam(groups, lr=0.01, eps=1e-15))
+
+    def run(self, first: int, last: int) -> Trainer:
+        for i in range(first, last):
+            for name, param in self.splats.items():
+                seen = (torch.arange(8) % 3 != i % 3).reshape(-1, *[1] * (param.dim() - 1))
+                goal = 1.0 if name == "means" else -1.0
+                param.grad = torch.where(seen, param.detach() - goal, 0.0)
+            self.phases.observe(0.1 + 0.01 * (i % 7))
+            self.adam.step()
+        return self
+
+
+HELD = "a log's file is not copied, and nothing says what to do"
+LOGGED = [(way, logged) for way in WAYS for logged in (False, True)]
+
+
+@pytest.mark.parametrize("case", marked(LOGGED, {(way, True): HELD for way in WAYS}))
+@pytest.mark.parametrize("arm", QUIET)
+def test_a_copy_goes_on_alike(arm: str, case: tuple[str, bool], tmp_path: Path) -> None:
+    """And each on its own: the first is not changed by the other's steps."""
+    way, logged = case
+    with contextlib.ExitStack() as opened:
+        log = opened.enter_context(RunLog(tmp_path / "run.jsonl")) if logged else None
+        _goes_on_alike(way, Trainer(arm, log))
+
+
+def _goes_on_alike(way: str, first: Trainer) -> None:
+    second = WAYS[way](first.run(0, 70))
+    before = {name: param.detach().clone() for name, param in first.splats.items()}
+    second.run(70, 90)
+    assert distance(first.splats, before) == 0.0
+    first.run(70, 90)
+    assert distance(second.splats, first.splats) == 0.0
+
+
+@pytest.mark.parametrize("way", marked(WAYS, dict.fromkeys(WAYS, HELD)))
+def test_the_optimizer_alone_is_copied(way: str, tmp_path: Path) -> None:
+    """Its scheduler comes with it; what is logged afterwards is one file's, whole lines."""
+    with RunLog(tmp_path / "run.jsonl") as log:
+        first = Trainer("DEFAULTS", log).run(0, 10)
+        WAYS[way](first.adam)
+        first.run(10, 20)
+    assert len((tmp_path / "run.jsonl").read_text().splitlines()) >= 10

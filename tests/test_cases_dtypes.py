@@ -1,0 +1,108 @@
+"""Parameters of other dtypes than float32, and torch's default dtype at another value."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import pytest
+import torch
+from placed_training import ADAMS, ARMS, PRESETS, Training, distance, marked, mended_later
+from torch.nn import Parameter
+
+from opt3dgs_optim import DEFAULTS, PhaseScheduler
+
+DTYPES = {"bfloat16": torch.bfloat16, "float16": torch.float16, "float64": torch.float64}
+EPS: dict[str, Any] = {"adam": {"eps": 1e-4}}  # 1e-15 is 0 in float16
+QUIET = [arm for arm in ARMS if "Noise" not in arm and arm != "everything"]  # draw nothing
+
+
+def stop_of(arm: str) -> int:
+    """Where an arm keeps most."""
+    return 88 if arm in PRESETS else 40
+
+
+CAST = "torch's load has cast what a part keeps to the parameter's dtype"
+LOST = {(arm, dtype): CAST for arm in ("Averaging", "DEFAULTS", "DEFAULTS_ADC") for dtype in DTYPES}
+LOST |= {(arm, dtype): CAST for arm in ("Curvature", "paper") for dtype in ("bfloat16", "float16")}
+
+
+@pytest.mark.parametrize("case", marked(itertools.product(QUIET, DTYPES), LOST))
+def test_a_training_is_resumed(case: tuple[str, str]) -> None:
+    """torch's load casts all floating state to the parameter's dtype; ours is cast back."""
+    arm, dtype = case
+    options: dict[str, Any] = {**EPS, "dtype": DTYPES[dtype]}
+    first = Training(arm, **options).run(stop_of(arm))
+    second = Training(arm, **options).resume(first)
+    kept = {key: each for key, each in second.kept().items() if key.split(".", 1)[1] not in ADAMS}
+    expected = first.kept()
+    for key, each in kept.items():
+        assert each.dtype == expected[key].dtype, key
+        assert torch.equal(each, expected[key]), key
+    second.run()
+    assert distance(second.values(), first.run().values()) == 0.0
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("arm", ARMS)
+def test_parameters_keep_their_dtype_and_stay_finite(arm: str, dtype: str) -> None:
+    training = Training(arm, **EPS, dtype=DTYPES[dtype]).run()
+    for value in training.values().values():
+        assert value.dtype == DTYPES[dtype]
+        assert bool(value.isfinite().all())
+
+
+@pytest.fixture(scope="module")
+def plain() -> dict[str, Training]:
+    """Trainings with float32 as the default, which torch has."""
+    return {arm: Training(arm).run() for arm in ARMS}
+
+
+FOLLOWS = "what is drawn or kept follows torch's default dtype"
+FOLLOWING = ("Fading", "Averaging", "DEFAULTS", "DEFAULTS_ADC", "everything")
+
+
+@pytest.mark.parametrize("arm", marked(ARMS, dict.fromkeys(FOLLOWING, FOLLOWS)))
+def test_nothing_follows_the_default_dtype(arm: str, plain: dict[str, Training]) -> None:
+    expected = plain[arm]
+    torch.set_default_dtype(torch.float64)
+    try:
+        training = Training(arm).run()
+    finally:
+        torch.set_default_dtype(torch.float32)
+    kept = training.kept()
+    for key, each in expected.kept().items():
+        if not key.endswith(".step"):  # torch's own follows it
+            assert kept[key].dtype == each.dtype, key
+    assert distance(training.values(), expected.values()) == 0.0
+
+
+ROUNDS = dict.fromkeys(("Averaging", "DEFAULTS", "DEFAULTS_ADC"), "the mean is float32")
+
+
+@pytest.mark.parametrize("arm", marked(QUIET, ROUNDS))
+def test_with_a_learning_rate_of_zero_nothing_moves(arm: str) -> None:
+    """Georeferenced positions (sparkjsdev/spark #356) have more digits than float32 has."""
+    training = Training(arm, dtype=torch.float64)
+    start = torch.tensor([500000.123456789, 4500000.987654321, 12.3], dtype=torch.float64)
+    with torch.no_grad():
+        training.splats["means"].copy_(start.expand(12, 3))
+    for optimizer in training.every:
+        for group in optimizer.param_groups:
+            group["lr"] = 0.0
+    before = training.values()
+    training.run()
+    assert distance(training.values(), before) == 0.0
+
+
+@mended_later("the mean is float32")
+def test_the_mean_of_float64_positions_has_their_digits() -> None:
+    p = Parameter(torch.full((4, 3), 4500000.987654321, dtype=torch.float64))
+    phases = PhaseScheduler(300, parts=DEFAULTS)
+    adam = phases.upgrade(torch.optim.Adam([{"params": [p], "name": "xyz"}], lr=1e-6, eps=1e-15))
+    for _ in range(300):
+        p.grad = torch.ones_like(p)
+        phases.observe(0.1)
+        adam.step()
+    # 300 steps of 1e-6, the last of which are averaged.
+    assert float((p.detach() - 4500000.987654321).abs().max()) < 301e-6 + 1e-8

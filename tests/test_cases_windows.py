@@ -1,0 +1,137 @@
+"""What parts keep is about a window of iterations: another run, or another pass, begins anew.
+
+From people who train on (graphdeco-inria/gaussian-splatting #379, #459), and who run a notebook's
+cell twice. What a part has kept in one window must not be in another: a training that goes on, from
+a finished one's checkpoint or on the same objects, ends where it would with Adam's own state alone.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import pytest
+import torch
+from placed_training import ADAMS, Training, distance, marked, mended_later
+from torch.nn import Parameter
+from trainers import AveragedThroughout
+
+from opt3dgs_optim import Averaging, Curvature, Fading, FreshMoments, PhaseScheduler
+from opt3dgs_optim.names import GAUSSIAN
+
+pytestmark = pytest.mark.filterwarnings("ignore:PhaseScheduler")
+SHORT, LONGER = 60, 150
+KEEPERS: dict[str, Any] = {  # whose memory is of a window, not of the run's energies or views
+    "Averaging": lambda training: [Averaging()],
+    "averaging throughout": lambda training: [AveragedThroughout()],
+    "Curvature": lambda training: [Curvature()],
+    "curvature of all": lambda training: [Curvature(3, names=GAUSSIAN)],
+    "FreshMoments": lambda training: [FreshMoments()],
+    "Fading": lambda training: [Fading(start=0.0, stop=1.0)],
+    "late fading": lambda training: [Fading(start=0.5, stop=1.0)],
+    "all": lambda training: [
+        Fading(start=0.0, stop=1.0),
+        FreshMoments(),
+        Curvature(),
+        Averaging(),
+    ],
+}
+MEANS, PAIRS = "the mean holds iterates of the old run", "pairs of the old exploitation"
+NOTE = "the group's note is of the old run"
+OLD = {"Averaging": MEANS, "averaging throughout": MEANS, "all": MEANS, "FreshMoments": NOTE}
+OLD |= {"Curvature": PAIRS, "curvature of all": PAIRS}
+STOPPED = (SHORT, SHORT - 1, SHORT * 2 // 3 + 5)
+# A switch that has been is another one in a longer run; a mean of the last thirtieth has not begun.
+FINE = {("FreshMoments", at) for at in STOPPED} | {("Averaging", STOPPED[2])}
+
+
+def begun(keeper: str, total: int, **options: Any) -> Training:
+    return Training(KEEPERS[keeper], total=total, switch=total * 2 // 3, **options)
+
+
+@pytest.mark.parametrize(
+    "case",
+    marked(
+        cases := list(itertools.product(KEEPERS, STOPPED)),
+        {case: OLD[case[0]] for case in cases if case[0] in OLD and case not in FINE},
+    ),
+)
+def test_a_training_that_goes_on_longer(case: tuple[str, int]) -> None:
+    """A finished one, or one that is stopped within its windows, loaded into a longer one."""
+    keeper, at = case
+    first = begun(keeper, SHORT).run(at)
+    resumed = begun(keeper, LONGER).resume(first).run()
+    anew = begun(keeper, LONGER, counts=True).resume_moments(first).run()
+    assert distance(resumed.values(), anew.values()) == 0.0
+
+
+@pytest.mark.parametrize("keeper", marked(KEEPERS, OLD))
+def test_a_clock_that_starts_again_on_the_same_objects(keeper: str) -> None:
+    first = begun(keeper, SHORT, counts=True).run()
+    anew = begun(keeper, SHORT, counts=True).resume_moments(first)
+    for training in (first, anew):
+        training.iteration = 0
+        training.run()
+    assert distance(first.values(), anew.values()) == 0.0
+
+
+BACK = (30, 10, 3)
+
+
+@pytest.mark.parametrize(
+    "case",
+    marked(
+        backs := list(itertools.product(KEEPERS, BACK)),
+        {(keeper, 30): why for keeper, why in OLD.items() if keeper != "Averaging"},
+    ),
+)
+def test_a_clock_that_goes_back_within_a_training(case: tuple[str, int]) -> None:
+    """A trainer that goes back to an older state of its own, without a checkpoint."""
+    keeper, back = case
+    first = begun(keeper, SHORT, counts=True).run(SHORT - 2)
+    anew = begun(keeper, SHORT, counts=True).resume_moments(first)
+    for training in (first, anew):
+        training.iteration = SHORT - 2 - back
+        training.run()
+    assert bool(torch.isfinite(first.splats["means"]).all())
+    if back > SHORT // 3:  # before the windows: nothing of theirs is left
+        assert distance(first.values(), anew.values()) == 0.0
+
+
+def kept_keys(training: Training) -> set[str]:
+    return {key for key in training.kept() if key.split(".", 1)[1] not in ADAMS}
+
+
+@mended_later("nothing is dropped when a window ends")
+@pytest.mark.parametrize("keeper", ["Averaging", "Curvature"])
+def test_memory_is_given_back_when_a_window_is_over(keeper: str) -> None:
+    training = begun(keeper, SHORT, counts=True).run(SHORT - 1)
+    assert kept_keys(training)
+    training.iteration = 0
+    training.run(2)
+    assert kept_keys(training) == set()
+
+
+@mended_later(MEANS)
+def test_a_new_end_is_the_mean_of_the_new_run_alone() -> None:
+    """From 0 to 1 in 300 iterations; then on to 3 until 900."""
+    ends = []
+    for load in (True, False):
+        p = Parameter(torch.zeros(4, 3))
+        phases = PhaseScheduler(300)
+        adam = phases.upgrade({"means": torch.optim.Adam([p], lr=0.01)})["means"]
+        go(phases, adam, p, range(300), 1.0)
+        longer = PhaseScheduler(900)
+        again = longer.upgrade({"means": torch.optim.Adam([p], lr=0.01)})["means"]
+        if load:
+            again.load_state_dict(adam.state_dict())
+        go(longer, again, p, range(300, 900), 3.0)
+        ends.append(p[0, 0].item())
+    assert ends == pytest.approx([3.0, 3.0], abs=0.05)
+
+
+def go(phases: Any, adam: Any, p: Parameter, iterations: range, goal: float) -> None:
+    for i in iterations:
+        p.grad = p.detach() - goal
+        phases.observe(0.1, iteration=i)
+        adam.step()
