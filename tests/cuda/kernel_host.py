@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import hashlib
 import os
@@ -238,6 +239,67 @@ def two_loop_case(rows: int, size: int, seed: int = 0) -> tuple[Tensor, Tensor]:
     grad[of_row > 0.96, 0] = torch.nan
     grad[of_row > 0.98, 2] = torch.inf
     return grad, history_from_pairs(s, y)
+
+
+def frame_case(rows: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, ...]:
+    """Means, vectors [N, 3], quats [N, 4] of any length (one is zero) and log scales [N, 3]."""
+    g = torch.Generator().manual_seed(rows)
+    draw = torch.randn(rows, 13, generator=g, dtype=torch.float64)
+    means, vectors, scales, quats = draw.split([3, 3, 3, 4], 1)
+    quats = quats * 10.0 ** torch.randint(-3, 4, (rows, 1), generator=g)
+    quats[2:3] = 0.0
+    return tuple(each.to(dtype).contiguous() for each in (means, vectors, quats, 2 * scales - 3))
+
+
+def frames(quats: Tensor, scales: Tensor) -> Tensor:
+    """B = R diag(exp(scales)) as matrices [N, 3, 3], in float64: slow and obvious."""
+    w, x, y, z = torch.nn.functional.normalize(quats.double(), dim=1).unbind(1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    rotation = torch.stack([torch.stack(row, 1) for row in rows], 1)
+    return rotation * scales.double().exp()[:, None, :]
+
+
+class There(Tensor):
+    """On a GPU, as far as it says."""
+
+    is_cuda = True  # pyright: ignore[reportAssignmentType]
+
+
+@contextlib.contextmanager
+def playing_gpu(kernels: HostKernels) -> Iterator[None]:
+    """The kernels run on the host, and say that they can."""
+    with kernels.launched(), mock.patch.object(cuda, "missing", return_value=None):
+        yield
+
+
+def compare_frames(kernels: HostKernels, rows: int) -> float:
+    """The largest difference of the own frame's three kernels from matrices of float64.
+
+    Relative to the vector times the largest deviation: in a component they may cancel.
+    """
+    case = frame_case(rows, kernels.dtype)
+    means, vectors, quats, scales = (each.as_subclass(There) for each in case)
+    moved = means.clone()
+    with playing_gpu(kernels):
+        gradient = cuda.own_frame_gradient(vectors, quats, scales)
+        displacement = cuda.own_frame_displacement(vectors, quats, scales)
+        assert cuda.own_frame_move_(moved, vectors, quats, scales)
+    means, vectors, quats, scales = (each.double() for each in case)
+    matrices = frames(quats, scales)
+    out_of = torch.einsum("nij,nj->ni", matrices, vectors)
+    expected = torch.einsum("nij,ni->nj", matrices, vectors), out_of, means + out_of
+    size = vectors.norm(dim=1) * scales.exp().amax(1)
+    sizes = size, size, size + means.norm(dim=1)
+    gaps = [0.0]
+    for found, oracle, unit in zip((gradient, displacement, moved), expected, sizes, strict=True):
+        assert found is not None
+        gap = (found.as_subclass(Tensor).double() - oracle) / unit[:, None]
+        gaps += gap.abs().nan_to_num(nan=torch.inf).flatten().tolist()
+    return max(gaps)
 
 
 def relative_difference(result: Tensor, reference: Tensor) -> float:

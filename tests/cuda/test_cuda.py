@@ -6,7 +6,15 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from kernel_host import OPTIONS, Problem, free_run, relative_difference, two_loop_case
+from kernel_host import (
+    OPTIONS,
+    Problem,
+    frame_case,
+    frames,
+    free_run,
+    relative_difference,
+    two_loop_case,
+)
 from torch import Tensor
 from trainers import AveragedThroughout, everything
 
@@ -19,6 +27,7 @@ from opt3dgs_optim import (
     LQNAdam,
     PositionNoise,
     backend_info,
+    cuda,
 )
 from opt3dgs_optim.lbfgs import lqn_direction, new_history, two_loop
 from opt3dgs_optim.names import GAUSSIAN
@@ -102,6 +111,36 @@ def test_the_recursion_does_not_synchronise_and_can_be_captured() -> None:
     given.copy_(grad)
     graph.replay()
     assert torch.equal(result.nan_to_num(), expected.nan_to_num())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("rows", [0, 1, 7, 255, 256, 257, 1000, 4096])
+def test_the_own_frame(rows: int, dtype: torch.dtype) -> None:
+    means, vectors, quats, scales = frame_case(rows, dtype)
+    matrices = frames(quats, scales)
+    out_of = torch.einsum("nij,nj->ni", matrices, vectors.double())
+    expected = torch.einsum("nij,ni->nj", matrices, vectors.double()), out_of, means + out_of
+    moved, *given = (each.cuda() for each in (means, vectors, quats, scales))
+    into, displacement = cuda.own_frame_gradient(*given), cuda.own_frame_displacement(*given)
+    assert cuda.own_frame_move_(moved, *given)
+    # In a component they may cancel.
+    size = means.norm(dim=1) + vectors.norm(dim=1) * scales.exp().amax(1)
+    for found, oracle in zip((into, displacement, moved), expected, strict=True):
+        assert found is not None
+        gap = (found.cpu().double() - oracle) / size[:, None]
+        assert bool((gap.abs() < (2e-15 if dtype == torch.float64 else 1e-6)).all())
+
+
+def test_the_own_frame_does_not_synchronise() -> None:
+    means, *given = (each.cuda() for each in frame_case(1000, torch.float32))
+    assert cuda.own_frame_move_(means, *given)  # compiles
+    assert cuda.own_frame_gradient(*given) is not None
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        assert cuda.own_frame_move_(means, *given)
+        assert cuda.own_frame_gradient(*given) is not None
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
 
 
 def noise_case(n: int, dtype: torch.dtype) -> tuple[Tensor, dict[str, Tensor], Tensor]:

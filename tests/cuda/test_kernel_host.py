@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -15,12 +16,17 @@ from kernel_host import (
     OPTIONS,
     HostKernels,
     Problem,
+    There,
     built,
     compare_energies,
+    compare_frames,
     compare_runs,
     compiler,
     energies,
+    frame_case,
+    frames,
     host_kernels,
+    playing_gpu,
     relative_difference,
     taken,
     two_loop_case,
@@ -184,6 +190,78 @@ def test_a_point_is_told_its_pairs_wherever_two_loop_runs(
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
+@pytest.mark.parametrize("rows", [0, 1, 7, 255, 256, 257, 1000, 4096])
+def test_the_own_frame(kernels: dict, rows: int, dtype: torch.dtype) -> None:
+    """A dozen roundings, of 1e-16 and of 6e-8."""
+    assert compare_frames(kernels[5, dtype], rows) < (2e-15 if dtype == torch.float64 else 1e-6)
+
+
+@pytest.mark.parametrize("how", ["columns", "buffer", "parameters"])
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+def test_the_own_frame_of_any_layout(kernels: dict, dtype: torch.dtype, how: str) -> None:
+    def lay(each: Tensor) -> Tensor:
+        if how == "columns":
+            each = each.T.contiguous().T
+        elif how == "buffer":  # begins between two vectors of 16 bytes
+            each = torch.cat([each.new_zeros(1), each.flatten()])[1:].view(each.shape)
+            assert each.data_ptr() % cuda.ALIGNMENT != 0
+        return each.as_subclass(There).requires_grad_(how == "parameters")
+
+    plain = [each.as_subclass(There) for each in frame_case(300, dtype)]
+    laid = [lay(each) for each in frame_case(300, dtype)]
+    version = laid[0]._version
+    with playing_gpu(kernels[5, dtype]):
+        for means, vectors, quats, scales in (plain, laid):
+            assert cuda.own_frame_move_(means, vectors, quats, scales)
+        for function in (cuda.own_frame_gradient, cuda.own_frame_displacement):
+            found, expected = function(*laid[1:]), function(*plain[1:])
+            assert found is not None
+            assert expected is not None
+            assert torch.equal(found, expected)
+            assert found.is_contiguous()
+            assert not found.requires_grad
+    assert torch.equal(laid[0], plain[0])
+    assert laid[0]._version > version  # autograd knows that it was written
+
+
+def test_where_the_own_frame_has_no_kernel(kernels: dict) -> None:
+    """Nothing is changed and nothing is launched; the part goes on in pure torch."""
+    case = frame_case(9, torch.float32)
+    there = tuple(each.as_subclass(There) for each in case)
+    functions = cuda.own_frame_gradient, cuda.own_frame_displacement
+    others = {
+        "a host": case,
+        "half precision": tuple(each.half() for each in there),
+        "two dtypes": (*there[:2], there[2].double(), there[3]),
+        "two devices": (*there[:2], there[2], torch.empty(9, 3, device="meta")),
+    }
+    before = case[0].clone()
+    with playing_gpu(kernels[5, torch.float32]), mock.patch.object(cuda, "launch", None):
+        for name, (means, *frame) in others.items():
+            assert [function(*frame) for function in functions] == [None, None], name
+            assert cuda.own_frame_move_(means, *frame) is False, name
+    if cuda.missing() is not None:
+        assert cuda.own_frame_move_(*there) is False
+    assert torch.equal(case[0], before)
+
+
+@pytest.mark.parametrize("wrong", ["vectors", "quats", "scales", "step"])
+def test_shapes_of_the_own_frame_are_checked_first(kernels: dict, wrong: str) -> None:
+    """The kernels read by them: one row less would be read beyond its end."""
+    names = "vectors", "step", "quats", "scales"
+    case: dict[str, Tensor] = dict(zip(names, frame_case(9), strict=True))
+    for bad in (case[wrong][:8], case[wrong][:, :2], case[wrong][0], case[wrong][0, 0]):
+        given = [each.as_subclass(There) for each in {**case, wrong: bad}.values()]
+        with playing_gpu(kernels[5, torch.float64]), mock.patch.object(cuda, "launch", None):
+            with pytest.raises(ValueError, match=r"own_frame_move_: .* has shape .* is needed"):
+                cuda.own_frame_move_(*given)
+            if wrong != "step":
+                for function in (cuda.own_frame_gradient, cuda.own_frame_displacement):
+                    with pytest.raises(ValueError, match=f"{function.__name__}: .* has shape"):
+                        function(given[0], *given[2:])
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
 @pytest.mark.parametrize("name", ["falling", "two levels", "spike", "constant", "broken"])
 def test_energies(kernels: dict, name: str, dtype: torch.dtype) -> None:
     """Free-running in float64; in float32 each step from the same state.
@@ -249,9 +327,19 @@ def _write_input(path: Path, rows: int, size: int) -> list[Tensor]:
         history[reset.bool()] = 0
         expected.append(lqn_direction(x, grad, history, size, **OPTIONS)[0])  # pyright: ignore
         expected.append(two_loop(grad, history, size))
+    expected += _add_frames(parts, rows)
     learnt = _add_energies(parts)
     torch.cat([part.flatten() for part in parts]).numpy().tofile(path)
     return [*expected, learnt]
+
+
+def _add_frames(parts: list[Tensor], rows: int) -> list[Tensor]:
+    """Put Gaussians into the program's input; B^T g, B B^T g, and the means moved by that."""
+    means, grad, quats, scales = frame_case(rows)
+    parts += [quats, scales, grad, means]
+    turned = torch.einsum("nij,ni->nj", frames(quats, scales), grad)
+    moved = torch.einsum("nij,nj->ni", frames(quats, scales), turned)
+    return [turned, moved, means + moved]
 
 
 def _add_energies(parts: list[Tensor], m: int = 24) -> Tensor:

@@ -2,7 +2,8 @@
 
 Importing this module compiles nothing and touches no driver. A kernel is compiled by NVRTC for the
 device it is launched on, once per machine (cuda.core's disk cache) and loaded once per process.
-Only the float32 and float64 tensors of one CUDA device get here; see `opt3dgs_optim.backend`.
+Only the float32 and float64 tensors of one CUDA device get here; see `opt3dgs_optim.backend`. The
+functions of the own frame ask for themselves, and do nothing where the kernels cannot run.
 """
 
 import functools
@@ -20,8 +21,12 @@ KERNELS = {  # the kernel: its file
     "lqn_direction": "lqn.cu",
     "two_loop": "two_loop.cu",
     "take_energy": "histogram.cu",
+    "own_frame_gradient": "own_frame.cu",
+    "own_frame_displacement": "own_frame.cu",
+    "own_frame_move": "own_frame.cu",
 }
-ALIGNMENT = 16  # bytes; the kernels read and write a history by vectors of so many
+DTYPES = (torch.float32, torch.float64)
+ALIGNMENT = 16  # bytes; the kernels read and write histories and quaternions by vectors of so many
 
 
 def source(name: str) -> str:
@@ -129,7 +134,7 @@ def lqn_direction(
     fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
     accepted = torch.empty(rows, dtype=torch.bool, device=grad.device)
     candidates = torch.empty_like(accepted)
-    cells = _cells(history)
+    cells = _aligned(history)
     tensors = (position.contiguous(), grad.contiguous(), cells, fed, accepted, candidates)
     numbers = (np.int64(rows), real(grad.dtype)(min_cosine), np.int32(graft))
     launch("lqn_direction", grad, rows, *tensors, *numbers, history_size=history_size)
@@ -143,16 +148,100 @@ def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
     rows = grad.shape[0]
     _check_tensors("two_loop", grad, history=(history, None))
     result = torch.empty_like(grad, memory_format=torch.contiguous_format)
-    tensors = (grad.contiguous(), _cells(history), result)
+    tensors = (grad.contiguous(), _aligned(history), result)
     launch("two_loop", grad, rows, *tensors, np.int64(rows), history_size=history_size)
     return result
 
 
-def _cells(history: Tensor) -> Tensor:
-    """`history` itself, or a copy if it is not as a kernel reads it: contiguous and aligned."""
-    cells = history.contiguous()
+def own_frame_gradient(grad: Tensor, quats: Tensor, scales: Tensor) -> Tensor | None:
+    """Gradients in each Gaussian's own frame, B^T g with B = R diag(exp(scales)).
+
+    Args:
+        grad: [N, 3] of the positions, in units of the loss per world unit.
+        quats: [N, 4] rotations, wxyz, need not be normalised.
+        scales: [N, 3] log of the standard deviations, world units.
+
+    Returns:
+        [N, 3] contiguous, in units of the loss per standard deviation; None where the kernel cannot
+        run: elsewhere than on one CUDA device that cuda.core can use, or in other or several
+        dtypes. Never synchronises, and has no autograd graph.
+
+    Raises:
+        ValueError: the shapes do not fit.
+    """
+    if not _take_frames("own_frame_gradient", grad, quats, scales):
+        return None
+    result = torch.empty_like(grad, memory_format=torch.contiguous_format)
+    _launch_rows("own_frame_gradient", grad.detach().contiguous(), *_frames(quats, scales), result)
+    return result
+
+
+def own_frame_displacement(step: Tensor, quats: Tensor, scales: Tensor) -> Tensor | None:
+    """Steps that were taken in each Gaussian's own frame, in world units: B z.
+
+    Args:
+        step: [N, 3] in standard deviations along the Gaussians' own axes.
+        quats, scales: [N, 4] and [N, 3], as in `own_frame_gradient`; so are errors and the return
+            value, but for the units.
+    """
+    if not _take_frames("own_frame_displacement", step, quats, scales):
+        return None
+    result = torch.empty_like(step, memory_format=torch.contiguous_format)
+    _launch_rows(
+        "own_frame_displacement", step.detach().contiguous(), *_frames(quats, scales), result
+    )
+    return result
+
+
+def own_frame_move_(means: Tensor, step: Tensor, quats: Tensor, scales: Tensor) -> bool:
+    """Add B z to positions in place; whether it was done: see `own_frame_gradient`.
+
+    Args:
+        means: [N, 3] positions, world units.
+        step: [N, 3] in standard deviations along the Gaussians' own axes.
+        quats, scales: [N, 4] and [N, 3], as in `own_frame_gradient`; so are errors.
+    """
+    if not _take_frames("own_frame_move_", means, quats, scales, step=step):
+        return False
+    moved = means.detach().contiguous()
+    _launch_rows("own_frame_move", moved, step.detach().contiguous(), *_frames(quats, scales))
+    if moved.data_ptr() != means.data_ptr():
+        means.detach().copy_(moved)
+    else:  # torch does not see what a kernel writes
+        torch.autograd.graph.increment_version(means)
+    return True
+
+
+def _take_frames(
+    call: str, vectors: Tensor, quats: Tensor, scales: Tensor, **others: Tensor
+) -> bool:
+    """Whether the kernels can run on these tensors of the own frame; ValueError for a shape."""
+    tensors = {"vectors": vectors, "scales": scales, "quats": quats, **others}
+    for name, tensor in tensors.items():
+        shape = (vectors.shape[0] if vectors.dim() else 0, 4 if name == "quats" else 3)
+        if tuple(tensor.shape) != shape:
+            given = "the positions' tensor" if name == "vectors" else name
+            raise ValueError(
+                f"{call}: {given} has shape {tuple(tensor.shape)}, but {shape} is needed"
+            )
+    kinds = {(tensor.device, tensor.dtype) for tensor in tensors.values()}
+    return len(kinds) == 1 and vectors.is_cuda and vectors.dtype in DTYPES and missing() is None
+
+
+def _frames(quats: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
+    return _aligned(quats.detach()), scales.detach().contiguous()
+
+
+def _launch_rows(kernel: str, first: Tensor, *tensors: Tensor) -> None:
+    rows = first.shape[0]
+    launch(kernel, first, rows, first, *tensors, np.int64(rows))
+
+
+def _aligned(tensor: Tensor) -> Tensor:
+    """`tensor` itself, or a copy if it is not as a kernel reads it: contiguous and aligned."""
+    tensor = tensor.contiguous()
     # A view into a larger buffer may begin anywhere.
-    return cells if cells.data_ptr() % ALIGNMENT == 0 else cells.clone()
+    return tensor if tensor.data_ptr() % ALIGNMENT == 0 else tensor.clone()
 
 
 def _check_tensors(call: str, like: Tensor, **needed: tuple[Tensor, torch.Size | None]) -> None:
