@@ -49,7 +49,9 @@ def default_step(
     """Fading, OutOfView and Averaging around Adam."""
     num_points = len(params["means"])
     grads = {name: grad.nan_to_num(0.0, 0.0, 0.0) for name, grad in grads.items()}
-    events = range(events_before(iteration, total), events_before(iteration + 1, total))
+    # Those of dropped iterations come with the next one.
+    events = range(state.get("events", 0), events_before(iteration + 1, total))
+    state["events"] = events.stop
     # A point is out of view if its position has no gradient. At most 16,384 points are asked, and
     # the share of those in view is a mean over the last 100 views or so.
     in_view = grads["means"].any(1)

@@ -163,6 +163,7 @@ def test_the_default_step(num_points: int, share: float, total: int) -> None:
     start = scene.gaussians()
     theirs, state = with_the_reference(scene, start, total, default_step, l1)
     check_same(with_the_package(scene, start, total, PhaseScheduler(total)), theirs)
+    assert state["events"] == int(min(300, 0.47 * total / 4))
     assert (state["share"] < 1 / 3) == (share < 1 / 3 and total == 300)
 
 
