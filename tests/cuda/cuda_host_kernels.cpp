@@ -36,8 +36,3 @@ extern "C" void run_own_frame_displacement(unsigned block, const Real* steps, co
                                            Real* results, long long rows) {
   launch_on_host(block, rows, own_frame_displacement, steps, quats, scales, results, rows);
 }
-
-extern "C" void run_own_frame_move(unsigned block, Real* means, const Real* steps, const Real* quats,
-                                   const Real* scales, long long rows) {
-  launch_on_host(block, rows, own_frame_move, means, steps, quats, scales, rows);
-}

@@ -64,12 +64,6 @@ MUTANTS = (
     Mutant("the frame's quaternion", "own_frame.cu", "{q.v.y, q.v.z, q.spare}", "q.v"),
     Mutant("the inverse rotation", "own_frame.cu", "rotated(v, -w)", "rotated(v, w)"),
     Mutant("a quaternion of zero", "own_frame.cu", "norm > T(1e-12) ? norm : T(1e-12)", "norm"),
-    Mutant(
-        "positions that are moved",
-        "own_frame.cu",
-        "along(read_row(means, row), Real(1), moved)",
-        "moved",
-    ),
     Mutant("one thread", "histogram.cu", "if (blockIdx.x > 0 || threadIdx.x > 0) return;", ""),
     Mutant("mean of the slope", "histogram.cu", "slope - state[2]", "slope"),
     Mutant("energies that do not count", "histogram.cu", "(valid && !*valid)", "false"),

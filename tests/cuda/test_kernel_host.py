@@ -6,8 +6,8 @@ import math
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -26,7 +26,6 @@ from kernel_host import (
     frame_case,
     frames,
     host_kernels,
-    playing_gpu,
     relative_difference,
     taken,
     two_loop_case,
@@ -34,6 +33,7 @@ from kernel_host import (
 from torch import Tensor
 
 from opt3dgs_optim import cuda
+from opt3dgs_optim.frames import Frames
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
 from opt3dgs_optim.lbfgs.history import laid_out
 from opt3dgs_optim.partitions import LIMIT, MEAN_ABS, MEMORY, MovingPartitions
@@ -196,69 +196,92 @@ def test_the_own_frame(kernels: dict, rows: int, dtype: torch.dtype) -> None:
     assert compare_frames(kernels[5, dtype], rows) < (2e-15 if dtype == torch.float64 else 1e-6)
 
 
+@pytest.mark.parametrize("function", [cuda.own_frame_gradient, cuda.own_frame_displacement])
 @pytest.mark.parametrize("how", ["columns", "buffer", "parameters"])
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
-def test_the_own_frame_of_any_layout(kernels: dict, dtype: torch.dtype, how: str) -> None:
+def test_the_own_frame_of_any_layout(
+    kernels: dict, dtype: torch.dtype, how: str, function: Callable[..., Tensor]
+) -> None:
     def lay(each: Tensor) -> Tensor:
         if how == "columns":
-            each = each.T.contiguous().T
-        elif how == "buffer":  # begins between two vectors of 16 bytes
-            each = torch.cat([each.new_zeros(1), each.flatten()])[1:].view(each.shape)
-            assert each.data_ptr() % cuda.ALIGNMENT != 0
-        return each.as_subclass(There).requires_grad_(how == "parameters")
+            return each.T.contiguous().T
+        if how == "parameters":
+            return torch.nn.Parameter(each)
+        return torch.cat([each.new_zeros(1), each.flatten()])[1:].view(each.shape)
 
-    plain = [each.as_subclass(There) for each in frame_case(300, dtype)]
-    laid = [lay(each) for each in frame_case(300, dtype)]
-    version = laid[0]._version
-    with playing_gpu(kernels[5, dtype]):
-        for means, vectors, quats, scales in (plain, laid):
-            assert cuda.own_frame_move_(means, vectors, quats, scales)
-        for function in (cuda.own_frame_gradient, cuda.own_frame_displacement):
-            found, expected = function(*laid[1:]), function(*plain[1:])
-            assert found is not None
-            assert expected is not None
-            assert torch.equal(found, expected)
-            assert found.is_contiguous()
-            assert not found.requires_grad
-    assert torch.equal(laid[0], plain[0])
-    assert laid[0]._version > version  # autograd knows that it was written
+    case = frame_case(300, dtype)
+    laid = [lay(each) for each in case]
+    # Begins between two vectors of 16 bytes.
+    assert (laid[1].data_ptr() % cuda.ALIGNMENT != 0) == (how == "buffer")
+    with kernels[5, dtype].launched():
+        found, expected = function(*laid), function(*case)
+    assert torch.equal(found, expected)
+    assert found.is_contiguous()
+    assert not found.requires_grad
 
 
-def test_where_the_own_frame_has_no_kernel(kernels: dict) -> None:
-    """Nothing is changed and nothing is launched; the part goes on in pure torch."""
-    case = frame_case(9, torch.float32)
-    there = tuple(each.as_subclass(There) for each in case)
-    functions = cuda.own_frame_gradient, cuda.own_frame_displacement
-    others = {
-        "a host": case,
-        "half precision": tuple(each.half() for each in there),
-        "two dtypes": (*there[:2], there[2].double(), there[3]),
-        "two devices": (*there[:2], there[2], torch.empty(9, 3, device="meta")),
-    }
-    before = case[0].clone()
-    with playing_gpu(kernels[5, torch.float32]), mock.patch.object(cuda, "launch", None):
-        for name, (means, *frame) in others.items():
-            assert [function(*frame) for function in functions] == [None, None], name
-            assert cuda.own_frame_move_(means, *frame) is False, name
-    if cuda.missing() is not None:
-        assert cuda.own_frame_move_(*there) is False
-    assert torch.equal(case[0], before)
+@pytest.mark.parametrize("of_vectors", [torch.float16, torch.bfloat16, *DTYPES], ids=str)
+@pytest.mark.parametrize("of_frames", [torch.float16, torch.bfloat16, *DTYPES], ids=str)
+def test_the_own_frame_of_several_dtypes(
+    kernels: dict, of_vectors: torch.dtype, of_frames: torch.dtype
+) -> None:
+    """The arithmetic is float32, or float64 where one of them is; the result is the vectors'."""
+    vectors, quats, scales = frame_case(300)
+    given = vectors.to(of_vectors), quats.to(of_frames), scales.to(of_frames)
+    wide = torch.float64 if torch.float64 in (of_vectors, of_frames) else torch.float32
+    with kernels[5, wide].launched():
+        found = cuda.own_frame_gradient(*given)
+        expected = cuda.own_frame_gradient(*(each.to(wide) for each in given))
+    assert found.dtype == of_vectors
+    assert torch.equal(found, expected.to(of_vectors))
 
 
-@pytest.mark.parametrize("wrong", ["vectors", "quats", "scales", "step"])
-def test_shapes_of_the_own_frame_are_checked_first(kernels: dict, wrong: str) -> None:
+def test_which_gaussians_have_frames_by_a_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, quats, _ = frame_case(9, torch.float32)
+    assert not cuda.has_own_frames(quats)
+    assert cuda.has_own_frames(quats.as_subclass(There)) == (cuda.missing() is None)
+    monkeypatch.setattr(cuda, "missing", lambda: None)
+    assert cuda.has_own_frames(quats.as_subclass(There))
+    assert cuda.has_own_frames(quats.half().as_subclass(There))
+    assert not cuda.has_own_frames(quats.long().as_subclass(There))
+    assert not cuda.has_own_frames(quats)
+
+
+@pytest.mark.parametrize("wrong", ["vectors", "quats", "scales"])
+def test_shapes_of_the_own_frame_are_checked_first(
+    wrong: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The kernels read by them: one row less would be read beyond its end."""
-    names = "vectors", "step", "quats", "scales"
-    case: dict[str, Tensor] = dict(zip(names, frame_case(9), strict=True))
-    for bad in (case[wrong][:8], case[wrong][:, :2], case[wrong][0], case[wrong][0, 0]):
-        given = [each.as_subclass(There) for each in {**case, wrong: bad}.values()]
-        with playing_gpu(kernels[5, torch.float64]), mock.patch.object(cuda, "launch", None):
-            with pytest.raises(ValueError, match=r"own_frame_move_: .* has shape .* is needed"):
-                cuda.own_frame_move_(*given)
-            if wrong != "step":
-                for function in (cuda.own_frame_gradient, cuda.own_frame_displacement):
-                    with pytest.raises(ValueError, match=f"{function.__name__}: .* has shape"):
-                        function(given[0], *given[2:])
+    monkeypatch.setattr(cuda, "launch", None)
+    case: dict[str, Tensor] = dict(zip(("vectors", "quats", "scales"), frame_case(9), strict=True))
+    own = case[wrong]
+    for bad in (own[:8], own[:, :2], own[0], own[0, 0], own[:, :, None], own.to("meta")):
+        for function in (cuda.own_frame_gradient, cuda.own_frame_displacement):
+            message = rf"{function.__name__}: \w+ of shape .* on .* is needed"
+            with pytest.raises(ValueError, match=message):
+                function(*{**case, wrong: bad}.values())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16], ids=str)
+def test_a_part_has_the_same_frames_from_kernels_and_from_torch(
+    kernels: dict, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vectors, quats, scales = (each.to(dtype) for each in frame_case(300))
+    plain = Frames(quats, scales, dtype)
+    monkeypatch.setattr(cuda, "has_own_frames", lambda _: True)
+    by_kernel = Frames(quats, scales, dtype)
+    quats += 1  # as one optimizer of all groups moves them before the step is asked for
+    unit = vectors.double().norm(dim=1, keepdim=True) * scales.double().exp().amax(1, keepdim=True)
+    wide = torch.float64 if dtype == torch.float64 else torch.float32
+    with kernels[5, wide].launched():
+        pairs = [
+            (by_kernel.gradient(vectors), plain.gradient(vectors)),
+            (by_kernel.displacement(vectors), plain.displacement(vectors)),
+        ]
+    for found, expected in pairs:
+        assert found.dtype == expected.dtype == dtype
+        gap = ((found.double() - expected.double()) / unit).abs().max()
+        assert float(gap) < 10 * torch.finfo(dtype).eps  # two dozen roundings
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
@@ -334,12 +357,11 @@ def _write_input(path: Path, rows: int, size: int) -> list[Tensor]:
 
 
 def _add_frames(parts: list[Tensor], rows: int) -> list[Tensor]:
-    """Put Gaussians into the program's input; B^T g, B B^T g, and the means moved by that."""
-    means, grad, quats, scales = frame_case(rows)
-    parts += [quats, scales, grad, means]
+    """Put Gaussians into the program's input; B^T g, and B B^T g."""
+    grad, quats, scales = frame_case(rows)
+    parts += [quats, scales, grad]
     turned = torch.einsum("nij,ni->nj", frames(quats, scales), grad)
-    moved = torch.einsum("nij,nj->ni", frames(quats, scales), turned)
-    return [turned, moved, means + moved]
+    return [turned, torch.einsum("nij,nj->ni", frames(quats, scales), turned)]
 
 
 def _add_energies(parts: list[Tensor], m: int = 24) -> Tensor:

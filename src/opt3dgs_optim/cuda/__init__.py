@@ -2,8 +2,7 @@
 
 Importing this module compiles nothing and touches no driver. A kernel is compiled by NVRTC for the
 device it is launched on, once per machine (cuda.core's disk cache) and loaded once per process.
-Only the float32 and float64 tensors of one CUDA device get here; see `opt3dgs_optim.backend`. The
-functions of the own frame ask for themselves, and do nothing where the kernels cannot run.
+Only the tensors of one CUDA device get here; see `opt3dgs_optim.backend` and `has_own_frames`.
 """
 
 import functools
@@ -23,9 +22,8 @@ KERNELS = {  # the kernel: its file
     "take_energy": "histogram.cu",
     "own_frame_gradient": "own_frame.cu",
     "own_frame_displacement": "own_frame.cu",
-    "own_frame_move": "own_frame.cu",
 }
-DTYPES = (torch.float32, torch.float64)
+DTYPES = (torch.float32, torch.float64)  # of the kernels
 ALIGNMENT = 16  # bytes; the kernels read and write histories and quaternions by vectors of so many
 
 
@@ -153,88 +151,58 @@ def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
     return result
 
 
-def own_frame_gradient(grad: Tensor, quats: Tensor, scales: Tensor) -> Tensor | None:
+def has_own_frames(quats: Tensor) -> bool:
+    """Whether the kernels of the own frame run where these rotations lie."""
+    return quats.is_cuda and quats.is_floating_point() and missing() is None
+
+
+def own_frame_gradient(grad: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
     """Gradients in each Gaussian's own frame, B^T g with B = R diag(exp(scales)).
+
+    One launch where all are float32 or all float64. Half precision is cast to float32, and float32
+    beside float64 to that. Never synchronises.
 
     Args:
         grad: [N, 3] of the positions, in units of the loss per world unit.
-        quats: [N, 4] rotations, wxyz, need not be normalised.
+        quats: [N, 4] rotations, wxyz, need not be normalised, where `has_own_frames` says so.
         scales: [N, 3] log of the standard deviations, world units.
 
     Returns:
-        [N, 3] contiguous, in units of the loss per standard deviation; None where the kernel cannot
-        run: elsewhere than on one CUDA device that cuda.core can use, or in other or several
-        dtypes. Never synchronises, and has no autograd graph.
+        [N, 3] of the gradient's dtype, in units of the loss per standard deviation. It has no
+        autograd graph.
 
     Raises:
-        ValueError: the shapes do not fit.
+        ValueError: shapes or devices do not fit.
     """
-    if not _take_frames("own_frame_gradient", grad, quats, scales):
-        return None
-    result = torch.empty_like(grad, memory_format=torch.contiguous_format)
-    _launch_rows("own_frame_gradient", grad.detach().contiguous(), *_frames(quats, scales), result)
-    return result
+    return _in_frames("own_frame_gradient", grad, quats, scales)
 
 
-def own_frame_displacement(step: Tensor, quats: Tensor, scales: Tensor) -> Tensor | None:
+def own_frame_displacement(step: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
     """Steps that were taken in each Gaussian's own frame, in world units: B z.
 
     Args:
         step: [N, 3] in standard deviations along the Gaussians' own axes.
-        quats, scales: [N, 4] and [N, 3], as in `own_frame_gradient`; so are errors and the return
-            value, but for the units.
+        quats, scales: [N, 4] and [N, 3], as in `own_frame_gradient`; so are dtypes and errors.
     """
-    if not _take_frames("own_frame_displacement", step, quats, scales):
-        return None
-    result = torch.empty_like(step, memory_format=torch.contiguous_format)
-    _launch_rows(
-        "own_frame_displacement", step.detach().contiguous(), *_frames(quats, scales), result
-    )
-    return result
+    return _in_frames("own_frame_displacement", step, quats, scales)
 
 
-def own_frame_move_(means: Tensor, step: Tensor, quats: Tensor, scales: Tensor) -> bool:
-    """Add B z to positions in place; whether it was done: see `own_frame_gradient`.
-
-    Args:
-        means: [N, 3] positions, world units.
-        step: [N, 3] in standard deviations along the Gaussians' own axes.
-        quats, scales: [N, 4] and [N, 3], as in `own_frame_gradient`; so are errors.
-    """
-    if not _take_frames("own_frame_move_", means, quats, scales, step=step):
-        return False
-    moved = means.detach().contiguous()
-    _launch_rows("own_frame_move", moved, step.detach().contiguous(), *_frames(quats, scales))
-    if moved.data_ptr() != means.data_ptr():
-        means.detach().copy_(moved)
-    else:  # torch does not see what a kernel writes
-        torch.autograd.graph.increment_version(means)
-    return True
-
-
-def _take_frames(
-    call: str, vectors: Tensor, quats: Tensor, scales: Tensor, **others: Tensor
-) -> bool:
-    """Whether the kernels can run on these tensors of the own frame; ValueError for a shape."""
-    tensors = {"vectors": vectors, "scales": scales, "quats": quats, **others}
-    for name, tensor in tensors.items():
-        shape = (vectors.shape[0] if vectors.dim() else 0, 4 if name == "quats" else 3)
-        if tuple(tensor.shape) != shape:
-            given = "the positions' tensor" if name == "vectors" else name
+def _in_frames(kernel: str, vectors: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
+    rows = vectors.shape[0] if vectors.dim() else 0
+    given = {"vectors": (vectors, 3), "quats": (quats, 4), "scales": (scales, 3)}
+    for name, (tensor, width) in given.items():
+        # The kernel reads memory by them.
+        if (tuple(tensor.shape), tensor.device) != ((rows, width), vectors.device):
             raise ValueError(
-                f"{call}: {given} has shape {tuple(tensor.shape)}, but {shape} is needed"
+                f"{kernel}: {name} of shape {tuple(tensor.shape)} on {tensor.device}, but "
+                f"{(rows, width)} on {vectors.device} is needed"
             )
-    kinds = {(tensor.device, tensor.dtype) for tensor in tensors.values()}
-    return len(kinds) == 1 and vectors.is_cuda and vectors.dtype in DTYPES and missing() is None
-
-
-def _frames(quats: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
-    return _aligned(quats.detach()), scales.detach().contiguous()
-
-
-def _launch_rows(kernel: str, first: Tensor, *tensors: Tensor) -> None:
-    rows = first.shape[0]
-    launch(kernel, first, rows, first, *tensors, np.int64(rows))
+    wide = any(tensor.dtype == torch.float64 for tensor, _ in given.values())
+    dtype = torch.float64 if wide else torch.float32
+    v, q, s = (each.detach().to(dtype).contiguous() for each in (vectors, quats, scales))
+    result = torch.empty_like(v)
+    launch(kernel, v, rows, v, _aligned(q), s, result, np.int64(rows))
+    return result.to(vectors.dtype)
 
 
 def _aligned(tensor: Tensor) -> Tensor:
@@ -284,16 +252,3 @@ def missing() -> str | None:
     if not torch.cuda.is_available():
         return "torch sees no CUDA device: no NVIDIA driver, or a build of torch without CUDA"
     return None
-
-
-def has_own_frames(quats: Tensor) -> bool:
-    """Whether kernels make the Gaussians' own frames."""
-    return False
-
-
-def own_frame_gradient(grad: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
-    raise NotImplementedError
-
-
-def own_frame_displacement(step: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
-    raise NotImplementedError

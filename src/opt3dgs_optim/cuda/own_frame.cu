@@ -53,13 +53,3 @@ extern "C" __global__ void __launch_bounds__(128)
   if (row >= rows) return;
   write_row(results, row, Frame<Real>(quats, scales, row).out_of(read_row(steps, row)));
 }
-
-// means += B steps
-extern "C" __global__ void __launch_bounds__(128)
-    own_frame_move(Real* __restrict__ means, const Real* __restrict__ steps, const Real* __restrict__ quats,
-                   const Real* __restrict__ scales, long long rows) {
-  const long long row = this_row();
-  if (row >= rows) return;
-  const Vec3<Real> moved = Frame<Real>(quats, scales, row).out_of(read_row(steps, row));
-  write_row(means, row, along(read_row(means, row), Real(1), moved));
-}
