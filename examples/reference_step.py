@@ -44,12 +44,21 @@ def new_moments(param: Tensor) -> dict:
 
 
 def default_step(
-    params: Tensors, grads: Tensors, state: dict, rates: dict, iteration: int, total: int
+    params: Tensors,
+    grads: Tensors,
+    state: dict,
+    rates: dict,
+    iteration: int,
+    total: int,
+    *,
+    own_frame: bool = False,
 ) -> None:
-    """Fading, OutOfView and Averaging around Adam."""
+    """Fading, OutOfView and Averaging around Adam; with `own_frame`, OwnFrame too."""
     num_points = len(params["means"])
     grads = {name: grad.nan_to_num(0.0, 0.0, 0.0) for name, grad in grads.items()}
-    events = range(events_before(iteration, total), events_before(iteration + 1, total))
+    # Those of dropped iterations come with the next one.
+    events = range(state.get("events", 0), events_before(iteration + 1, total))
+    state["events"] = events.stop
     # A point is out of view if its position has no gradient. At most 16,384 points are asked, and
     # the share of those in view is a mean over the last 100 views or so.
     in_view = grads["means"].any(1)
@@ -77,7 +86,15 @@ def default_step(
             larger = torch.maximum(own["exp_avg_sq"], least)
             own["exp_avg_sq"][~in_view] = larger[~in_view]
 
-        adam_(param, grad, own, rates[name])
+        # OwnFrame: a position is stepped by B z, with Adam's step z in the Gaussian's own frame, in
+        # standard deviations. A full step has 0.1 of them at the start and 0.001 at the end.
+        if own_frame and name == "means":
+            axes, z = own_axes(params["quats"], params["scales"]), torch.zeros_like(param)
+            rate = rates[name] * (0.1 * 0.01 ** (iteration / total) / rates[name])
+            adam_(z, products(axes, grad), own, rate)  # B^T g
+            param.add_(products(axes.transpose(0, 1), z))  # B z
+        else:
+            adam_(param, grad, own, rates[name])
 
         # Averaging: the mean of the iterates of the last thirtieth of the training, which takes the
         # parameter's place in the last tenth of that.
@@ -95,6 +112,25 @@ def events_before(iteration: int, total: int) -> int:
     length = 0.5 - 0.03
     share = min(max((iteration / total - 0.03) / length, 0.0), 1.0)
     return int(share * min(300, length * total / 4))
+
+
+def own_axes(quats: Tensor, scales: Tensor) -> Tensor:
+    """B = R diag(s) of every Gaussian, [3, 3, N]: s its standard deviations, R its rotation."""
+    q = quats.T.contiguous()
+    # Of length sqrt(2), so that products of two components are doubled.
+    w, x, y, z = q * (2**0.5 / (q * q).sum(0).sqrt().clamp(min=1e-12))
+    rotation = [
+        [1 - (y * y + z * z), x * y - w * z, x * z + w * y],
+        [x * y + w * z, 1 - (x * x + z * z), y * z - w * x],
+        [x * z - w * y, y * z + w * x, 1 - (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row) for row in rotation]) * scales.T.exp()
+
+
+def products(matrices: Tensor, vectors: Tensor) -> Tensor:
+    """The sums over i of matrices[i, j] times component i of the vectors [N, 3], [N, 3]."""
+    x, y, z = vectors.T
+    return torch.addcmul(torch.addcmul(matrices[0] * x, matrices[1], y), matrices[2], z).T
 
 
 # -- the paper's step ------------------------------------------------------------------------------

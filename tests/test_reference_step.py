@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import copy
 import math
 from collections.abc import Callable
 from functools import partial
@@ -15,7 +16,7 @@ import torch
 from reference_step import adam_, default_step, new_moments, paper_pixel_loss, paper_step
 from torch import Tensor
 
-from opt3dgs_optim import DEFAULTS, PhaseScheduler, paper_parts
+from opt3dgs_optim import DEFAULTS, OwnFrame, Part, PhaseScheduler, paper_parts
 
 SHAPES = {
     "means": (3,),
@@ -154,15 +155,27 @@ def l1(error: Tensor, iteration: int) -> Tensor:
 
 
 @pytest.mark.parametrize(
-    ("num_points", "share", "total"),
-    [(60, 0.8, 300), (57, 0.15, 300), (20_001, 0.2, 60), (1, 1.0, 90)],
+    ("num_points", "share", "total", "own_frame"),
+    [
+        (60, 0.8, 150, False),
+        (57, 0.15, 300, False),
+        (57, 0.15, 300, True),
+        (20_001, 0.2, 60, False),
+        (20_001, 0.2, 60, True),
+        (1, 1.0, 90, False),
+    ],
 )
-def test_the_default_step(num_points: int, share: float, total: int) -> None:
+def test_the_default_step(num_points: int, share: float, total: int, own_frame: bool) -> None:
     """Many points and few; views that see much and little; of 20,001 points some events happen."""
     scene = Scene(num_points, share)
     start = scene.gaussians()
-    theirs, state = with_the_reference(scene, start, total, default_step, l1)
-    check_same(with_the_package(scene, start, total, PhaseScheduler(total)), theirs)
+    phases = PhaseScheduler(total)
+    if own_frame:
+        phases = PhaseScheduler(total, parts=[OwnFrame(), *DEFAULTS])
+    step = partial(default_step, own_frame=own_frame)
+    theirs, state = with_the_reference(scene, start, total, step, l1)
+    check_same(with_the_package(scene, start, total, phases), theirs)
+    assert state["events"] == int(min(300, 0.47 * total / 4))
     assert (state["share"] < 1 / 3) == (share < 1 / 3 and total == 300)
 
 
@@ -184,23 +197,29 @@ def test_the_papers_step(num_points: int, share: float) -> None:
     assert num_points == 1 or (filled[0] > 0.5 and filled[4] > 0.0)  # all five slots
 
 
-@pytest.mark.parametrize("left_out", range(7))
-def test_every_part_is_at_work_in_these_trainings(left_out: int) -> None:
+@pytest.mark.parametrize(
+    ("step", "parts"),
+    [(default_step, [*DEFAULTS]), (paper_step, paper_parts(300))],
+    ids=["default", "paper"],
+)
+def test_every_part_is_at_work_in_these_trainings(
+    step: Callable[..., None], parts: list[Part]
+) -> None:
     """Else the tests above would hold whatever that part does."""
     total = 300
     scene = Scene(57, 0.15)
     start = scene.gaussians()
-    presets = [(default_step, [*DEFAULTS]), (paper_step, paper_parts(total))]
-    step, parts = presets[0] if left_out < 3 else presets[1]
-    del parts[left_out % 3 if left_out < 3 else left_out - 3]
-    ours = with_the_package(scene, start, total, PhaseScheduler(total, parts=parts))
 
     def pixel_loss(error: Tensor, iteration: int) -> Tensor:
         return paper_pixel_loss(error, iteration, total) if step is paper_step else l1(error, 0)
 
     theirs, _ = with_the_reference(scene, start, total, step, pixel_loss)
-    with pytest.raises(AssertionError, match="iteration"):
-        check_same(ours, theirs)
+    assert len(parts) >= 3
+    for left_out in range(len(parts)):
+        others = [copy.deepcopy(part) for i, part in enumerate(parts) if i != left_out]
+        ours = with_the_package(scene, start, total, PhaseScheduler(total, parts=others))
+        with pytest.raises(AssertionError, match="iteration"):
+            check_same(ours, theirs)
 
 
 def test_one_adam_is_torchs() -> None:

@@ -113,7 +113,14 @@ def test_wheel_is_small_and_holds_the_package_alone(wheel: Path) -> None:
     assert wheel.name == f"opt3dgs_optim-{version_of(wheel)}-py3-none-any.whl"
     assert wheel.stat().st_size < MOST_BYTES
     names = set(contents(wheel))
-    for name in ("two_loop.cuh", "two_loop.cu", "histogram.cu", "lqn.cu", "__init__.py"):
+    for name in (
+        "two_loop.cuh",
+        "two_loop.cu",
+        "histogram.cu",
+        "lqn.cu",
+        "own_frame.cu",
+        "__init__.py",
+    ):
         assert f"opt3dgs_optim/cuda/{name}" in names
     for name in ("py.typed", "__main__.py", "doctor.py", "runs/report.py"):
         assert f"opt3dgs_optim/{name}" in names

@@ -10,7 +10,6 @@ from opt3dgs_optim.checks import check_choice
 
 Backend = Literal["auto", "cuda", "torch"]
 BACKENDS = ("auto", "cuda", "torch")
-KERNEL_DTYPES = (torch.float32, torch.float64)
 KERNEL_HISTORY = 5  # curvature pairs that fit into a thread's registers
 
 
@@ -71,7 +70,7 @@ def obstacle(
         )
     elif device.type != "cuda":
         found = "the kernels need a CUDA device"
-    elif dtype not in KERNEL_DTYPES:
+    elif dtype not in cuda.DTYPES:
         kind = str(dtype).removeprefix("torch.")
         found = f"the kernels take float32 and float64, not {kind}"
     else:

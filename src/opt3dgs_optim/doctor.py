@@ -10,8 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from opt3dgs_optim import cuda
 from opt3dgs_optim.awsgld import AWSGLD
 from opt3dgs_optim.backend import Backend, backend_info
+from opt3dgs_optim.frames import axes_of
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, two_loop
 from opt3dgs_optim.lqnadam import LQNAdam
 from opt3dgs_optim.parts.histogram import EnergyHistogram
@@ -89,10 +91,23 @@ def _recursion(device: torch.device, dtype: torch.dtype, backend: Backend) -> Te
     return two_loop(grad, history_from_pairs(s, y), HISTORY_SIZE, backend=backend)
 
 
+def _own_frame(device: torch.device, dtype: torch.dtype, backend: Backend) -> Tensor:
+    """B^T v and B v of the frames B = R diag(exp(scales))."""
+    vectors, scales = _draw(2, ROWS, 3, device=device, seed=7).to(dtype)
+    quats = _draw(ROWS, 4, device=device, seed=8).to(dtype)
+    if backend == "cuda":
+        given = vectors, quats, scales
+        return torch.cat([cuda.own_frame_gradient(*given), cuda.own_frame_displacement(*given)])
+    axes = axes_of(quats, scales, dtype)  # [3, 3, N]
+    sums = ("ijn,ni->nj", "ijn,nj->ni")
+    return torch.cat([torch.einsum(each, axes, vectors) for each in sums])
+
+
 # What each kernel is compared in.
 KERNELS: dict[str, Callable[[torch.device, torch.dtype, Backend], Tensor]] = {
     "lqn_direction": _curvature_step,
     "two_loop": _recursion,
+    "own_frame": _own_frame,
 }
 
 

@@ -6,6 +6,7 @@
 
 #include "histogram.cu"
 #include "lqn.cu"
+#include "own_frame.cu"
 #include "two_loop.cu"
 
 extern "C" void run_lqn_direction(unsigned block, const Real* positions, const Real* grads, Real* histories, Real* directions,
@@ -24,4 +25,14 @@ extern "C" void run_take_energy(unsigned block, const Real* energy, const unsign
                                 Real bandwidth, Real even, Real mean_abs, Real resolution, Real tiny) {
   launch_on_host(block, 1, take_energy, energy, valid, state, nu, partitions, rate, limit, low, high, reach,
                  bandwidth, even, mean_abs, resolution, tiny);
+}
+
+extern "C" void run_own_frame_gradient(unsigned block, const Real* grads, const Real* quats, const Real* scales,
+                                       Real* results, long long rows) {
+  launch_on_host(block, rows, own_frame_gradient, grads, quats, scales, results, rows);
+}
+
+extern "C" void run_own_frame_displacement(unsigned block, const Real* steps, const Real* quats, const Real* scales,
+                                           Real* results, long long rows) {
+  launch_on_host(block, rows, own_frame_displacement, steps, quats, scales, results, rows);
 }

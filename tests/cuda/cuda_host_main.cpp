@@ -37,6 +37,13 @@ int main(int, char** arguments) {
     run_two_loop(128, grad.data(), history.data(), direction.data(), n);
     give(out, direction);
   }
+  const Buffer quats = take(in, 4 * rows), scales = take(in, 3 * rows), grads = take(in, 3 * rows);
+  Buffer turned(3 * rows), moved(3 * rows);
+  const long long gaussians = static_cast<long long>(rows);
+  run_own_frame_gradient(128, grads.data(), quats.data(), scales.data(), turned.data(), gaussians);
+  give(out, turned);
+  run_own_frame_displacement(128, turned.data(), quats.data(), scales.data(), moved.data(), gaussians);
+  give(out, moved);
   const Buffer lengths = take(in, 2);
   Buffer state = take(in, static_cast<size_t>(lengths[1]) + 3), nu(1);
   for (int step = 0; step < lengths[0]; ++step) {

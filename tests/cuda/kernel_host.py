@@ -240,6 +240,50 @@ def two_loop_case(rows: int, size: int, seed: int = 0) -> tuple[Tensor, Tensor]:
     return grad, history_from_pairs(s, y)
 
 
+def frame_case(rows: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, ...]:
+    """Vectors [N, 3], quats [N, 4] of any length (one is zero) and log scales [N, 3]."""
+    g = torch.Generator().manual_seed(rows)
+    draw = torch.randn(rows, 10, generator=g, dtype=torch.float64)
+    vectors, scales, quats = draw.split([3, 3, 4], 1)
+    quats = quats * 10.0 ** torch.randint(-3, 4, (rows, 1), generator=g)
+    quats[2:3] = 0.0
+    return tuple(each.to(dtype).contiguous() for each in (vectors, quats, 2 * scales - 3))
+
+
+def frames(quats: Tensor, scales: Tensor) -> Tensor:
+    """B = R diag(exp(scales)) as matrices [N, 3, 3], in float64: slow and obvious."""
+    w, x, y, z = torch.nn.functional.normalize(quats.double(), dim=1).unbind(1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    rotation = torch.stack([torch.stack(row, 1) for row in rows], 1)
+    return rotation * scales.double().exp()[:, None, :]
+
+
+class There(Tensor):
+    """On a GPU, as far as it says."""
+
+    is_cuda = True  # pyright: ignore[reportAssignmentType]
+
+
+def compare_frames(kernels: HostKernels, rows: int) -> float:
+    """The largest difference of the own frame's two kernels from matrices of float64.
+
+    Relative to the vector times the largest deviation: in a component they may cancel.
+    """
+    case = frame_case(rows, kernels.dtype)
+    with kernels.launched():
+        found = cuda.own_frame_gradient(*case), cuda.own_frame_displacement(*case)
+    vectors, quats, scales = (each.double() for each in case)
+    sums = ("nij,ni->nj", "nij,nj->ni")
+    expected = [torch.einsum(each, frames(quats, scales), vectors) for each in sums]
+    size = vectors.norm(dim=1, keepdim=True) * scales.exp().amax(1, keepdim=True)
+    gaps = torch.cat([(a.double() - b) / size for a, b in zip(found, expected, strict=True)])
+    return float(gaps.abs().nan_to_num(nan=torch.inf).max()) if rows else 0.0
+
+
 def relative_difference(result: Tensor, reference: Tensor) -> float:
     """Largest difference over the reference's row size; infinite where only one is NaN."""
     if reference.numel() == 0:

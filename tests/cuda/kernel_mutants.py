@@ -19,6 +19,7 @@ from kernel_host import (
     SOURCES,
     HostKernels,
     compare_energies,
+    compare_frames,
     compare_runs,
     compile_host,
     energies,
@@ -60,6 +61,9 @@ MUTANTS = (
         "History<T, K>(row)), T(1))",
     ),
     Mutant("a gradient of zero", "two_loop.cuh", "size == T(0) ? T(1) : size", "size"),
+    Mutant("the frame's quaternion", "own_frame.cu", "{q.v.y, q.v.z, q.spare}", "q.v"),
+    Mutant("the inverse rotation", "own_frame.cu", "rotated(v, -w)", "rotated(v, w)"),
+    Mutant("a quaternion of zero", "own_frame.cu", "norm > T(1e-12) ? norm : T(1e-12)", "norm"),
     Mutant("one thread", "histogram.cu", "if (blockIdx.x > 0 || threadIdx.x > 0) return;", ""),
     Mutant("mean of the slope", "histogram.cu", "slope - state[2]", "slope"),
     Mutant("energies that do not count", "histogram.cu", "(valid && !*valid)", "false"),
@@ -75,6 +79,7 @@ def complaint(kernels: HostKernels) -> str | None:
         recursion = relative_difference(
             kernels.two_loop(grad, history), two_loop(grad, history, SIZE)
         )
+        turned = compare_frames(kernels, ROWS)
         gap = max(compare_energies(kernels, energies(name, 500)) for name in ("spike", "broken"))
     except AssertionError as error:
         return str(error)
@@ -82,6 +87,8 @@ def complaint(kernels: HostKernels) -> str | None:
         return f"lqn_direction differs by {difference:.1e}"
     if not recursion < 1e-10:
         return f"two_loop differs by {recursion:.1e}"
+    if not turned < 1e-12:
+        return f"the own frame differs by {turned:.1e}"
     return None if gap < 1e-10 else f"take_energy differs by {gap:.1e}"
 
 

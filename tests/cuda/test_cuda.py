@@ -6,7 +6,15 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from kernel_host import OPTIONS, Problem, free_run, relative_difference, two_loop_case
+from kernel_host import (
+    OPTIONS,
+    Problem,
+    frame_case,
+    frames,
+    free_run,
+    relative_difference,
+    two_loop_case,
+)
 from torch import Tensor
 from trainers import AveragedThroughout, everything
 
@@ -19,6 +27,7 @@ from opt3dgs_optim import (
     LQNAdam,
     PositionNoise,
     backend_info,
+    cuda,
 )
 from opt3dgs_optim.lbfgs import lqn_direction, new_history, two_loop
 from opt3dgs_optim.names import GAUSSIAN
@@ -102,6 +111,34 @@ def test_the_recursion_does_not_synchronise_and_can_be_captured() -> None:
     given.copy_(grad)
     graph.replay()
     assert torch.equal(result.nan_to_num(), expected.nan_to_num())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("rows", [0, 1, 7, 255, 256, 257, 1000, 4096])
+def test_the_own_frame(rows: int, dtype: torch.dtype) -> None:
+    case = frame_case(rows, dtype)
+    vectors, quats, scales = (each.double() for each in case)
+    size = vectors.norm(dim=1, keepdim=True) * scales.exp().amax(1, keepdim=True)
+    given = [each.cuda() for each in case]
+    assert cuda.has_own_frames(given[1])
+    for function, sums in (
+        (cuda.own_frame_gradient, "nij,ni->nj"),
+        (cuda.own_frame_displacement, "nij,nj->ni"),
+    ):
+        gap = function(*given).cpu().double() - torch.einsum(sums, frames(quats, scales), vectors)
+        # In a component they may cancel.
+        assert bool((gap.abs() <= size * (2e-15 if dtype == torch.float64 else 1e-6)).all())
+
+
+def test_the_own_frame_does_not_synchronise() -> None:
+    given = [each.cuda() for each in frame_case(1000, torch.float32)]
+    expected = cuda.own_frame_displacement(*given)  # compiles
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        found = cuda.own_frame_displacement(*given)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert torch.equal(found, expected)
 
 
 def noise_case(n: int, dtype: torch.dtype) -> tuple[Tensor, dict[str, Tensor], Tensor]:

@@ -129,6 +129,7 @@ def test_float32_kernels(tool, arch: str, tmp_path: Path) -> None:
         check(compiled, torch.float32, 2 * size)
         check(tool("two_loop.cu", arch, torch.float32, size, tmp_path), torch.float32, 2 * size)
     check(tool("histogram.cu", arch, torch.float32, None, tmp_path), torch.float32, 0)
+    check(tool("own_frame.cu", arch, torch.float32, None, tmp_path), torch.float32, 1)  # the quats
 
 
 @pytest.mark.parametrize("tool", TOOLS)
@@ -137,6 +138,7 @@ def test_float64_kernels_for_tests(tool, tmp_path: Path) -> None:
     # Of each vector of three coordinates two; the spare lane beside the third is not read.
     check(tool("two_loop.cu", "80", torch.float64, 5, tmp_path), torch.float64, 10)
     check(tool("histogram.cu", "80", torch.float64, None, tmp_path), torch.float64, 0)
+    check(tool("own_frame.cu", "80", torch.float64, None, tmp_path), torch.float64, 2)
 
 
 @pytest.mark.skipif(not has_cuda_core(), reason="cuda.core is not installed (extra 'cuda')")

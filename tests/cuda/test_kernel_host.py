@@ -6,6 +6,7 @@ import math
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,15 @@ from kernel_host import (
     OPTIONS,
     HostKernels,
     Problem,
+    There,
     built,
     compare_energies,
+    compare_frames,
     compare_runs,
     compiler,
     energies,
+    frame_case,
+    frames,
     host_kernels,
     relative_difference,
     taken,
@@ -28,6 +33,7 @@ from kernel_host import (
 from torch import Tensor
 
 from opt3dgs_optim import cuda
+from opt3dgs_optim.frames import Frames
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
 from opt3dgs_optim.lbfgs.history import laid_out
 from opt3dgs_optim.partitions import LIMIT, MEAN_ABS, MEMORY, MovingPartitions
@@ -184,6 +190,101 @@ def test_a_point_is_told_its_pairs_wherever_two_loop_runs(
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
+@pytest.mark.parametrize("rows", [0, 1, 7, 255, 256, 257, 1000, 4096])
+def test_the_own_frame(kernels: dict, rows: int, dtype: torch.dtype) -> None:
+    """A dozen roundings, of 1e-16 and of 6e-8."""
+    assert compare_frames(kernels[5, dtype], rows) < (2e-15 if dtype == torch.float64 else 1e-6)
+
+
+@pytest.mark.parametrize("function", [cuda.own_frame_gradient, cuda.own_frame_displacement])
+@pytest.mark.parametrize("how", ["columns", "buffer", "parameters"])
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+def test_the_own_frame_of_any_layout(
+    kernels: dict, dtype: torch.dtype, how: str, function: Callable[..., Tensor]
+) -> None:
+    def lay(each: Tensor) -> Tensor:
+        if how == "columns":
+            return each.T.contiguous().T
+        if how == "parameters":
+            return torch.nn.Parameter(each)
+        return torch.cat([each.new_zeros(1), each.flatten()])[1:].view(each.shape)
+
+    case = frame_case(300, dtype)
+    laid = [lay(each) for each in case]
+    # Begins between two vectors of 16 bytes.
+    assert (laid[1].data_ptr() % cuda.ALIGNMENT != 0) == (how == "buffer")
+    with kernels[5, dtype].launched():
+        found, expected = function(*laid), function(*case)
+    assert torch.equal(found, expected)
+    assert found.is_contiguous()
+    assert not found.requires_grad
+
+
+@pytest.mark.parametrize("of_vectors", [torch.float16, torch.bfloat16, *DTYPES], ids=str)
+@pytest.mark.parametrize("of_frames", [torch.float16, torch.bfloat16, *DTYPES], ids=str)
+def test_the_own_frame_of_several_dtypes(
+    kernels: dict, of_vectors: torch.dtype, of_frames: torch.dtype
+) -> None:
+    """The arithmetic is float32, or float64 where one of them is; the result is the vectors'."""
+    vectors, quats, scales = frame_case(300)
+    given = vectors.to(of_vectors), quats.to(of_frames), scales.to(of_frames)
+    wide = torch.float64 if torch.float64 in (of_vectors, of_frames) else torch.float32
+    with kernels[5, wide].launched():
+        found = cuda.own_frame_gradient(*given)
+        expected = cuda.own_frame_gradient(*(each.to(wide) for each in given))
+    assert found.dtype == of_vectors
+    assert torch.equal(found, expected.to(of_vectors))
+
+
+def test_which_gaussians_have_frames_by_a_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, quats, _ = frame_case(9, torch.float32)
+    assert not cuda.has_own_frames(quats)
+    assert cuda.has_own_frames(quats.as_subclass(There)) == (cuda.missing() is None)
+    monkeypatch.setattr(cuda, "missing", lambda: None)
+    assert cuda.has_own_frames(quats.as_subclass(There))
+    assert cuda.has_own_frames(quats.half().as_subclass(There))
+    assert not cuda.has_own_frames(quats.long().as_subclass(There))
+    assert not cuda.has_own_frames(quats)
+
+
+@pytest.mark.parametrize("wrong", ["vectors", "quats", "scales"])
+def test_shapes_of_the_own_frame_are_checked_first(
+    wrong: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The kernels read by them: one row less would be read beyond its end."""
+    monkeypatch.setattr(cuda, "launch", None)
+    case: dict[str, Tensor] = dict(zip(("vectors", "quats", "scales"), frame_case(9), strict=True))
+    own = case[wrong]
+    for bad in (own[:8], own[:, :2], own[0], own[0, 0], own[:, :, None], own.to("meta")):
+        for function in (cuda.own_frame_gradient, cuda.own_frame_displacement):
+            message = rf"{function.__name__}: \w+ of shape .* on .* is needed"
+            with pytest.raises(ValueError, match=message):
+                function(*{**case, wrong: bad}.values())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16], ids=str)
+def test_a_part_has_the_same_frames_from_kernels_and_from_torch(
+    kernels: dict, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vectors, quats, scales = (each.to(dtype) for each in frame_case(300))
+    plain = Frames(quats, scales, dtype)
+    monkeypatch.setattr(cuda, "has_own_frames", lambda _: True)
+    by_kernel = Frames(quats, scales, dtype)
+    quats += 1  # as one optimizer of all groups moves them before the step is asked for
+    unit = vectors.double().norm(dim=1, keepdim=True) * scales.double().exp().amax(1, keepdim=True)
+    wide = torch.float64 if dtype == torch.float64 else torch.float32
+    with kernels[5, wide].launched():
+        pairs = [
+            (by_kernel.gradient(vectors), plain.gradient(vectors)),
+            (by_kernel.displacement(vectors), plain.displacement(vectors)),
+        ]
+    for found, expected in pairs:
+        assert found.dtype == expected.dtype == dtype
+        gap = ((found.double() - expected.double()) / unit).abs().max()
+        assert float(gap) < 10 * torch.finfo(dtype).eps  # two dozen roundings
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
 @pytest.mark.parametrize("name", ["falling", "two levels", "spike", "constant", "broken"])
 def test_energies(kernels: dict, name: str, dtype: torch.dtype) -> None:
     """Free-running in float64; in float32 each step from the same state.
@@ -249,9 +350,18 @@ def _write_input(path: Path, rows: int, size: int) -> list[Tensor]:
         history[reset.bool()] = 0
         expected.append(lqn_direction(x, grad, history, size, **OPTIONS)[0])  # pyright: ignore
         expected.append(two_loop(grad, history, size))
+    expected += _add_frames(parts, rows)
     learnt = _add_energies(parts)
     torch.cat([part.flatten() for part in parts]).numpy().tofile(path)
     return [*expected, learnt]
+
+
+def _add_frames(parts: list[Tensor], rows: int) -> list[Tensor]:
+    """Put Gaussians into the program's input; B^T g, and B B^T g."""
+    grad, quats, scales = frame_case(rows)
+    parts += [quats, scales, grad]
+    turned = torch.einsum("nij,ni->nj", frames(quats, scales), grad)
+    return [turned, torch.einsum("nij,nj->ni", frames(quats, scales), turned)]
 
 
 def _add_energies(parts: list[Tensor], m: int = 24) -> Tensor:

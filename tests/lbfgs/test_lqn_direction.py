@@ -222,10 +222,13 @@ def test_a_history_is_laid_out_for_what_reads_it(
 
 
 def test_gradients_too_small_for_products() -> None:
-    _, grad, history = points(20)
-    expected = two_loop(grad.double(), history.double(), 5)
-    found = two_loop(grad * 1e-36, history, 5).double() * 1e36
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+    """Pairs of much curvature are short: their product with the gradient has no digits left."""
+    s = torch.tensor([[[0.0, 1e-9, 0.0]], [[1.0, 0.0, 0.0]]])
+    y = torch.tensor([[[0.0, 1.0, 0.5]], [[1.0, 0.0, 0.0]]])
+    grad, history = torch.ones(1, 3), history_from_pairs(s, y)
+    expected = two_loop(grad.double(), history_from_pairs(s.double(), y.double()), 2)
+    found = two_loop(1e-36 * grad, history, 2).double() * 1e36
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_a_direction_beyond_float32_leaves_the_gradient() -> None:

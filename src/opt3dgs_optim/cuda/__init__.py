@@ -2,7 +2,7 @@
 
 Importing this module compiles nothing and touches no driver. A kernel is compiled by NVRTC for the
 device it is launched on, once per machine (cuda.core's disk cache) and loaded once per process.
-Only the float32 and float64 tensors of one CUDA device get here; see `opt3dgs_optim.backend`.
+Only the tensors of one CUDA device get here; see `opt3dgs_optim.backend` and `has_own_frames`.
 """
 
 import functools
@@ -20,8 +20,11 @@ KERNELS = {  # the kernel: its file
     "lqn_direction": "lqn.cu",
     "two_loop": "two_loop.cu",
     "take_energy": "histogram.cu",
+    "own_frame_gradient": "own_frame.cu",
+    "own_frame_displacement": "own_frame.cu",
 }
-ALIGNMENT = 16  # bytes; the kernels read and write a history by vectors of so many
+DTYPES = (torch.float32, torch.float64)  # of the kernels
+ALIGNMENT = 16  # bytes; the kernels read and write histories and quaternions by vectors of so many
 
 
 def source(name: str) -> str:
@@ -129,7 +132,7 @@ def lqn_direction(
     fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
     accepted = torch.empty(rows, dtype=torch.bool, device=grad.device)
     candidates = torch.empty_like(accepted)
-    cells = _cells(history)
+    cells = _aligned(history)
     tensors = (position.contiguous(), grad.contiguous(), cells, fed, accepted, candidates)
     numbers = (np.int64(rows), real(grad.dtype)(min_cosine), np.int32(graft))
     launch("lqn_direction", grad, rows, *tensors, *numbers, history_size=history_size)
@@ -143,16 +146,70 @@ def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
     rows = grad.shape[0]
     _check_tensors("two_loop", grad, history=(history, None))
     result = torch.empty_like(grad, memory_format=torch.contiguous_format)
-    tensors = (grad.contiguous(), _cells(history), result)
+    tensors = (grad.contiguous(), _aligned(history), result)
     launch("two_loop", grad, rows, *tensors, np.int64(rows), history_size=history_size)
     return result
 
 
-def _cells(history: Tensor) -> Tensor:
-    """`history` itself, or a copy if it is not as a kernel reads it: contiguous and aligned."""
-    cells = history.contiguous()
+def has_own_frames(quats: Tensor) -> bool:
+    """Whether the kernels of the own frame run where these rotations lie."""
+    return quats.is_cuda and quats.is_floating_point() and missing() is None
+
+
+def own_frame_gradient(grad: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
+    """Gradients in each Gaussian's own frame, B^T g with B = R diag(exp(scales)).
+
+    One launch where all are float32 or all float64. Half precision is cast to float32, and float32
+    beside float64 to that. Never synchronises.
+
+    Args:
+        grad: [N, 3] of the positions, in units of the loss per world unit.
+        quats: [N, 4] rotations, wxyz, need not be normalised, where `has_own_frames` says so.
+        scales: [N, 3] log of the standard deviations, world units.
+
+    Returns:
+        [N, 3] of the gradient's dtype, in units of the loss per standard deviation. It has no
+        autograd graph.
+
+    Raises:
+        ValueError: shapes or devices do not fit.
+    """
+    return _in_frames("own_frame_gradient", grad, quats, scales)
+
+
+def own_frame_displacement(step: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
+    """Steps that were taken in each Gaussian's own frame, in world units: B z.
+
+    Args:
+        step: [N, 3] in standard deviations along the Gaussians' own axes.
+        quats, scales: [N, 4] and [N, 3], as in `own_frame_gradient`; so are dtypes and errors.
+    """
+    return _in_frames("own_frame_displacement", step, quats, scales)
+
+
+def _in_frames(kernel: str, vectors: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
+    rows = vectors.shape[0] if vectors.dim() else 0
+    given = {"vectors": (vectors, 3), "quats": (quats, 4), "scales": (scales, 3)}
+    for name, (tensor, width) in given.items():
+        # The kernel reads memory by them.
+        if (tuple(tensor.shape), tensor.device) != ((rows, width), vectors.device):
+            raise ValueError(
+                f"{kernel}: {name} of shape {tuple(tensor.shape)} on {tensor.device}, but "
+                f"{(rows, width)} on {vectors.device} is needed"
+            )
+    wide = any(tensor.dtype == torch.float64 for tensor, _ in given.values())
+    dtype = torch.float64 if wide else torch.float32
+    v, q, s = (each.detach().to(dtype).contiguous() for each in (vectors, quats, scales))
+    result = torch.empty_like(v)
+    launch(kernel, v, rows, v, _aligned(q), s, result, np.int64(rows))
+    return result.to(vectors.dtype)
+
+
+def _aligned(tensor: Tensor) -> Tensor:
+    """`tensor` itself, or a copy if it is not as a kernel reads it: contiguous and aligned."""
+    tensor = tensor.contiguous()
     # A view into a larger buffer may begin anywhere.
-    return cells if cells.data_ptr() % ALIGNMENT == 0 else cells.clone()
+    return tensor if tensor.data_ptr() % ALIGNMENT == 0 else tensor.clone()
 
 
 def _check_tensors(call: str, like: Tensor, **needed: tuple[Tensor, torch.Size | None]) -> None:
@@ -195,16 +252,3 @@ def missing() -> str | None:
     if not torch.cuda.is_available():
         return "torch sees no CUDA device: no NVIDIA driver, or a build of torch without CUDA"
     return None
-
-
-def has_own_frames(quats: Tensor) -> bool:
-    """Whether kernels make the Gaussians' own frames."""
-    return False
-
-
-def own_frame_gradient(grad: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
-    raise NotImplementedError
-
-
-def own_frame_displacement(step: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
-    raise NotImplementedError
