@@ -6,10 +6,12 @@ smoothed density of the recent visits. Equation numbers are those of the Opt3DGS
 displayed equation counted; 7 partition, 13 index, 14 multiplier, 16 update of the weights).
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -48,7 +50,8 @@ class Tally:
         """Take the nu of an energy that has been counted; in the warm-up it becomes 1, in place."""
         in_warmup = self.count <= self.warmup
         nu.masked_fill_(in_warmup, 1.0)
-        self.sums.addcmul_(torch.pow(nu, self._powers), valid & ~in_warmup)
+        # Of two booleans, `>` is "and not".
+        self.sums.addcmul_(torch.pow(nu, self._powers), valid > in_warmup)
 
 
 class Partitions:
@@ -168,6 +171,21 @@ class FixedPartitions(Partitions):
         self._scalars.copy_(torch.tensor(state["scalars"], dtype=torch.float64))
 
 
+class Pace(NamedTuple):
+    """What differs between the first hundred energies."""
+
+    rate: float  # the share of an energy in all means
+    low: float  # an energy further away than these counts as one at this distance, as t
+    high: float
+    has_mean: float  # 0 for the first energy, which is the mean itself, else 1
+
+    @classmethod
+    def of(cls, count: int) -> Pace:
+        """That of the `count`-th energy."""
+        limit = LIMIT / MEAN_ABS if count > UNLIMITED else math.inf
+        return cls(max(1 / max(count, 1), 1 / MEMORY), -limit, limit, float(count > 1))
+
+
 class MovingPartitions(Partitions):
     """Partitions of z = (energy - recent mean) / recent deviation, over -6 to 6 deviations.
 
@@ -217,6 +235,8 @@ class MovingPartitions(Partitions):
         self.nu = torch.ones((), **like)
         tiny = 1e-150 if dtype.itemsize == 8 else 1e-30
         self._tiny = torch.full((), tiny, **like)
+        paces = [Pace.of(count) for count in range(MEMORY + 1)]
+        self._paces = torch.tensor(paces, dtype=torch.float64).to(**like)
         self._constants = (REACH, BANDWIDTH, EVEN, MEAN_ABS, RESOLUTION, tiny)
         # Views are made once: a view is an operator too.
         self._mean, self._deviation, self._mean_slope = self._state[:3].unbind()
@@ -241,18 +261,18 @@ class MovingPartitions(Partitions):
         """Nu from the present density, then its update with an energy, 0-d, the `count`-th."""
         if isinstance(count, Tensor):
             # An energy that does not count becomes the mean, and moves nothing.
-            energy = torch.where(valid, energy, self._mean)
-            self._mean.copy_(torch.where(count == 1, energy, self._mean))
-            rate = torch.as_tensor(valid).to(energy.dtype) / count.clamp(1, MEMORY)
+            energy = torch.where(torch.as_tensor(valid), energy, self._mean)
+            pace: Any = torch.nn.functional.embedding(count.clamp(max=MEMORY), self._paces).unbind()
+            mean = torch.lerp(energy, self._mean, pace[-1])
         else:
-            rate = max(1 / count, 1 / MEMORY)
-            if count == 1:
-                self._mean.copy_(energy)
+            pace = Pace.of(count)
+            mean = energy if count == 1 else self._mean
+        rate, low, high, _ = pace
         # t = z / MEAN_ABS: distance from the mean in mean absolute deviations. Where those have
         # vanished, as after a constant loss, they grow again by the second term.
-        distance = torch.sub(energy, self._mean)
+        distance = torch.sub(energy, mean)
         unit = torch.add(self._deviation, distance.abs(), alpha=RESOLUTION)
-        t = self._limited(torch.div(distance, unit), count)
+        t = torch.clamp(torch.div(distance, unit), low, high, out=self._t)
         log_kernel = torch.addcmul(self._log_kernel, self._log_kernel_slope, t)
         torch.softmax(log_kernel, 0, out=self._kernel)
         torch.mul(self._kernel, self._q, out=self._kq)
@@ -270,17 +290,9 @@ class MovingPartitions(Partitions):
             nu if valid is True else torch.where(valid, nu, self.nu), *self.clamp, out=self.nu
         )
         step = torch.mul(t, unit)
-        torch.add(self._mean, step, out=self._to_mean)
+        torch.add(mean, step, out=self._to_mean)
         torch.hypot(step, self._tiny, out=self._to_deviation)
-        self._state.lerp_(self._target, rate)
-
-    def _limited(self, t: Tensor, count: int | Tensor) -> Tensor:
-        """`t`, within the limit from the fifth energy on: before, no deviation is known."""
-        limit = LIMIT / MEAN_ABS
-        if isinstance(count, Tensor):
-            return torch.where(count > UNLIMITED, t.clamp(-limit, limit), t)
-        limit = limit if count > UNLIMITED else math.inf
-        return torch.clamp(t, -limit, limit, out=self._t)
+        self._state.lerp_(self._target, rate if valid is True else rate * valid)
 
     @property
     def weights(self) -> Tensor:
@@ -308,4 +320,6 @@ class MovingPartitions(Partitions):
     def load(self, state: Mapping[str, Any]) -> None:
         """Restore `state()`."""
         self._state.copy_(torch.tensor(state["recent"], dtype=torch.float64))
+        # The smallest deviation of float64 is zero in float32, and zero over zero is not a number.
+        self._deviation.clamp_(min=self._constants[-1])
         self.nu.fill_(state["nu"])

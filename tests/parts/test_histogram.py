@@ -22,6 +22,7 @@ from opt3dgs_optim import Course, EnergyHistogram, cuda, partitions
 from opt3dgs_optim.parts import histogram as module
 
 FIXED: dict[str, Any] = {"energy_range": (0.0, 1.0), "temperature": 0.05, "warmup": 0}
+MOVING: dict[str, Any] = {"warmup": 8}
 ENERGIES = st.one_of(
     st.floats(-2.0, 3.0),
     st.integers(0, 8).map(lambda i: i / 8),  # exactly on the edges
@@ -46,7 +47,8 @@ class NothingIsReadBack(TorchDispatchMode):
         name = str(func)
         waiting = ("_local_scalar_dense", "is_nonzero", "nonzero", "equal.", "masked_select")
         assert not any(word in name for word in waiting), name
-        assert name != "aten.index.Tensor", "a mask is counted on the host"
+        if name == "aten.index.Tensor":  # the host counts a mask
+            assert all(index.dtype == torch.int64 for index in args[1])
         return func(*args, **(kwargs or {}))
 
 
@@ -351,15 +353,16 @@ def same(there: dict[str, Any], here: dict[str, Any]) -> None:
     up to 1 / 0.4^2 deviations times the largest distance of the first four energies, 1e6, in eps.
     """
     assert set(there) == set(here)
-    for name in here:
+    for name, expected in here.items():
+        found = there[name]
         if name == "recent":
-            assert there[name][:2] == here[name][:2]
-            assert there[name][2] == pytest.approx(here[name][2], abs=1e-9)
-            assert there[name][3:] == here[name][3:]
+            assert found[:2] == expected[:2]
+            assert found[2] == pytest.approx(expected[2], abs=1e-9)
+            assert found[3:] == expected[3:]
         elif name in ("nu", "sums"):
-            assert there[name] == pytest.approx(here[name], rel=1e-9, abs=1e-9)
+            assert found == pytest.approx(expected, rel=1e-9, abs=1e-9)
         else:
-            assert there[name] == here[name]
+            assert found == expected
 
 
 @settings(max_examples=60, deadline=None)
@@ -403,7 +406,7 @@ def test_the_warm_up_is_so_many_finite_energies(broken: tuple[int, ...], warmup:
             assert there.state_dict()["num_taken"] == finite
             if finite <= warmup:
                 assert nus == [1.0, 1.0]
-            if finite == 1 and not options:
+            if finite == 1 and options is MOVING:
                 low, high = there.coordinates[:2]
                 assert (low + high) / 2 == float(torch.tensor(stream(60)[k]))
         assert there.state_dict()["sums"][0] == 60 - len(broken) - warmup
@@ -413,7 +416,7 @@ def test_the_warm_up_is_so_many_finite_energies(broken: tuple[int, ...], warmup:
 
 def test_what_is_not_valid_changes_nothing_to_the_last_bit() -> None:
     """Whatever number it is."""
-    for options in ({"warmup": 8}, FIXED):
+    for options in (MOVING, FIXED):
         there = OnDevice(**options)
         for k, energy in enumerate(stream(200)):
             there.observe(torch.tensor(energy))
@@ -440,18 +443,18 @@ def test_an_energy_beyond_float32_counts_as_one_that_is_not_finite() -> None:
     """On a device that computes in float32, of a loss in float64."""
     with mock.patch.object(torch, "float64", torch.float32):
         there = OnDevice(warmup=4)
-    for energy in [*stream(20), 1e300, -1e300]:
-        if abs(energy) > 1:
-            before = there.state_dict()
-        there.observe(torch.tensor(energy, dtype=torch.double))
+    nus_of(there, stream(20))
+    before = there.state_dict()
     assert there.multiplier.dtype == torch.float32
-    assert {**there.state_dict(), "num_observed": 21} == {**before, "num_observed": 21}
+    for far in (1e300, -1e300):
+        there.observe(torch.tensor(far, dtype=torch.double))
+    assert there.state_dict() == {**before, "num_observed": 22}
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.int32], ids=str)
 def test_energies_of_few_digits(dtype: torch.dtype) -> None:
     """They are taken as the numbers that they are, by all kinds."""
-    for options in ({"warmup": 8}, FIXED):
+    for options in (MOVING, FIXED):
         exact, here, there = (
             EnergyHistogram(**options),
             EnergyHistogram(**options),
@@ -468,9 +471,16 @@ def test_energies_of_few_digits(dtype: torch.dtype) -> None:
 
 @pytest.mark.parametrize("value", [0.0, 0.25, -3.0])
 def test_a_constant_energy_gives_one_on_a_device(value: float) -> None:
-    there = OnDevice(warmup=4)
-    nus = nus_of(there, [torch.tensor(value)] * 300)
-    np.testing.assert_allclose(nus, 1.0, rtol=0, atol=1e-12)
+    """A resume there too, which finds a deviation of float64 that is zero in float32."""
+    here = EnergyHistogram(warmup=4)
+    nus_of(here, [value] * 10)
+    with mock.patch.object(torch, "float64", torch.float32):
+        begun, resumed = OnDevice(warmup=4), OnDevice(warmup=4)
+    assert torch.tensor(here.state_dict()["recent"][1], dtype=torch.float32) == 0
+    resumed.load_state_dict(here.state_dict())
+    for there in (begun, resumed):
+        nus = nus_of(there, [torch.tensor(value)] * 300)
+        np.testing.assert_allclose(nus, 1.0, rtol=0, atol=1e-6)  # digits of float32
 
 
 def test_a_part_on_a_device_waits_for_nothing() -> None:
@@ -497,7 +507,7 @@ def test_few_operators_on_a_device() -> None:
     energy, valid = torch.tensor(0.4, dtype=torch.float64), torch.tensor(True)
     with Operators() as operators:
         histogram.observe(energy, valid, course)
-    assert operators.count <= 37
+    assert operators.count <= 32
 
 
 def test_what_is_one_all_the_time_is_left_out() -> None:
