@@ -68,7 +68,7 @@ MUTANTS = (
     Mutant("count of the energies", "histogram.cu", "*counted = taken;", "++*counted; ++*counted;"),
     Mutant("mean of the first energy", "histogram.cu", "taken > 1 ? state[0]", "true ? state[0]"),
     Mutant("pace of the means", "histogram.cu", "taken < memory ? taken", "taken < 9 ? taken"),
-    Mutant("end of the warm-up", "histogram.cu", "= taken > warmup ?", "= taken >= warmup ?"),
+    Mutant("end of the warm-up", "histogram.cu", "= taken > warmup ?", "= taken > 3 ?"),
     Mutant("begin of the sums", "histogram.cu", "if (taken > warmup)", "if (taken > 0)"),
     Mutant("sum of squares", "histogram.cu", "multiplier * multiplier", "multiplier"),
 )
