@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from typing import Any
+from unittest import mock
 
+import numpy as np
 import pytest
 import torch
 
 from opt3dgs_optim import EnergyHistogram
-from opt3dgs_optim.partitions import FLOOR, FixedPartitions, MovingPartitions
+from opt3dgs_optim.partitions import FLOOR, FixedPartitions, MovingPartitions, Tally
 
 CPU = torch.device("cpu")
 
@@ -96,6 +98,38 @@ def test_a_density_may_be_zero_and_so_may_the_deviation() -> None:
     state = law.state()
     state["recent"][1], state["recent"][3], state["recent"][4] = 0.0, 0.0, 2 / 48
     law.check("test", state)
+
+
+SEED = np.random.default_rng(2)
+SCRIPTS = {
+    "stationary": SEED.normal(0.5, 0.1, 400),
+    "falling": np.exp(-np.arange(400) / 100 + 0.1 * SEED.normal(size=400)),
+    "negative": SEED.normal(-5, 0.3, 400),
+    "few digits": np.round(SEED.normal(0.5, 0.1, 400), 2),
+    "spike at once": np.r_[300, 1, SEED.normal(0.5, 0.1, 398)],
+}
+
+
+@pytest.mark.parametrize("device", [False, True], ids=["host", "device"])
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_nu_has_the_digits_of_its_dtype_from_the_second_energy_on(name: str, device: bool) -> None:
+    """The second is 1e6 deviations from the mean: sums that cancel there were off by 0.25."""
+    nus = []
+    for dtype in (torch.float32, torch.float64):
+        law = MovingPartitions(48, 0.75, None)
+        with mock.patch.object(torch, "float64", dtype):
+            law.allocate(CPU)
+        assert law.nu.dtype == dtype
+        tally, found = Tally(0, law.nu), []
+        for count, energy in enumerate(torch.tensor(SCRIPTS[name], dtype=torch.float32), 1):
+            if device:
+                law.take_on_device(energy, torch.tensor(True), tally)
+            else:
+                law.take(energy, True, count)
+            found.append(float(law.nu))
+        nus.append(found)
+    # Exponents of up to 100 in float32, before softmax takes the largest away: 6e-6.
+    assert np.abs(np.subtract(*nus)).max() < 1e-5
 
 
 def test_every_energy_counts_once() -> None:

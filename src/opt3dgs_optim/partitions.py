@@ -6,10 +6,12 @@ smoothed density of the recent visits. Equation numbers are those of the Opt3DGS
 displayed equation counted; 7 partition, 13 index, 14 multiplier, 16 update of the weights).
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,8 +31,57 @@ MEAN_ABS = math.sqrt(2 / math.pi)  # mean absolute deviation of a Gaussian of de
 RESOLUTION = 1e-6  # smallest deviation, as a share of the present distance from the mean
 
 
+class Tally:
+    """How many energies have counted, where only the device knows which of them are finite.
+
+    Attributes:
+        warmup: number of energies during which nu is 1.
+        count: number of finite energies so far, 0-d, int64.
+        sums: powers 0, 1 and 2 of nu, summed over the finite energies after the warm-up, [3].
+    """
+
+    def __init__(self, warmup: int, nu: Tensor) -> None:
+        self.warmup = warmup
+        self.count = torch.zeros((), dtype=torch.int64, device=nu.device)
+        self.sums = nu.new_zeros(3)
+        self._powers = torch.arange(3).to(nu)
+
+    def add(self, nu: Tensor, valid: Tensor) -> None:
+        """Take the nu of an energy that has been counted; in the warm-up it becomes 1, in place."""
+        in_warmup = self.count <= self.warmup
+        nu.masked_fill_(in_warmup, 1.0)
+        # Of two booleans, `>` is "and not".
+        self.sums.addcmul_(torch.pow(nu, self._powers), valid > in_warmup)
+
+
 class Partitions:
-    """Pickled by its numbers: a pickle of its tensors gives every view memory of its own."""
+    """What both kinds share. `take` is the update, `nu` what it finds, 0-d.
+
+    Pickled by its numbers: a pickle of its tensors gives every view memory of its own.
+    """
+
+    nu: Tensor
+
+    def take_on_device(self, energy: Tensor, valid: Tensor | Literal[True], tally: Tally) -> None:
+        """`take`, warm-up and sums, where only the device knows whether the energy is finite.
+
+        Args:
+            energy: 0-d, on the partitions' device.
+            valid: whether it is finite, 0-d, bool. One that is not changes nothing.
+            tally: of the energies before it; this one is added. Never synchronises.
+        """
+        if valid is True:
+            valid = torch.ones_like(tally.count, dtype=torch.bool)
+        tally.count.add_(valid)
+        self.take(energy, valid, tally.count)
+        tally.add(self.nu, valid)
+
+    def take(self, energy: Tensor, valid: Tensor | Literal[True], count: int | Tensor) -> None:
+        """Nu from the present weights, then their update with an energy, the `count`-th finite one.
+
+        `valid` is whether it is finite. Where that is a tensor, `count` is one too.
+        """
+        raise NotImplementedError
 
     def __getstate__(self: Any) -> Any:
         plain = {key: value for key, value in vars(self).items() if not isinstance(value, Tensor)}
@@ -65,8 +116,8 @@ class FixedPartitions(Partitions):
         self._low, self._width, self._tau, self._count, self.nu = self._scalars.unbind()
         self.weights = torch.full((m,), 1.0 / m, dtype=dtype, device=device)
 
-    def take(self, energy: Tensor, valid: Tensor | bool, count: int) -> None:
-        """Nu from the present weights, then their update."""
+    def take(self, energy: Tensor, valid: Tensor | bool, count: int | Tensor) -> None:
+        """Nu from the present weights, then their update. They have a count of their own."""
         valid = torch.as_tensor(valid, device=energy.device)
         value = torch.where(valid, energy.to(self.weights.dtype), self._low)
         # J of eq. 13, counted from 0: u[J-1] < energy <= u[J], the end partitions open.
@@ -120,6 +171,21 @@ class FixedPartitions(Partitions):
         self._scalars.copy_(torch.tensor(state["scalars"], dtype=torch.float64))
 
 
+class Pace(NamedTuple):
+    """What differs between the first hundred energies."""
+
+    rate: float  # the share of an energy in all means
+    low: float  # an energy further away than these counts as one at this distance, as t
+    high: float
+    has_mean: float  # 0 for the first energy, which is the mean itself, else 1
+
+    @classmethod
+    def of(cls, count: int) -> Pace:
+        """That of the `count`-th energy."""
+        limit = LIMIT / MEAN_ABS if count > UNLIMITED else math.inf
+        return cls(max(1 / max(count, 1), 1 / MEMORY), -limit, limit, float(count > 1))
+
+
 class MovingPartitions(Partitions):
     """Partitions of z = (energy - recent mean) / recent deviation, over -6 to 6 deviations.
 
@@ -158,6 +224,9 @@ class MovingPartitions(Partitions):
         rows[0, :m], rows[1, :m] = slope * center, 1.0
         rows[0, m], rows[2, m] = slope * even * MEAN_ABS, -slope * MEAN_ABS
         self._rows = rows.to(**like)
+        # Rows of slope * sum k q c, sum k q + even, -slope * MEAN_ABS * sum k q, with V = k q.
+        direct = torch.stack([rows[0, :m], rows[1, :m], rows[2, m].expand(m)])
+        self._direct_rows = direct.to(**like)
         self._products, self._sums = torch.zeros(m + 1, **like), torch.zeros(3, **like)
         self._offsets = torch.zeros_like(self._sums)
         self._offsets[1] = even
@@ -166,6 +235,8 @@ class MovingPartitions(Partitions):
         self.nu = torch.ones((), **like)
         tiny = 1e-150 if dtype.itemsize == 8 else 1e-30
         self._tiny = torch.full((), tiny, **like)
+        paces = [Pace.of(count) for count in range(MEMORY + 1)]
+        self._paces = torch.tensor(paces, dtype=torch.float64).to(**like)
         self._constants = (REACH, BANDWIDTH, EVEN, MEAN_ABS, RESOLUTION, tiny)
         # Views are made once: a view is an operator too.
         self._mean, self._deviation, self._mean_slope = self._state[:3].unbind()
@@ -174,37 +245,54 @@ class MovingPartitions(Partitions):
         self._t = self._products[-1]
         self._up, self._below, self._base = self._sums.unbind()
 
-    def take(self, energy: Tensor, valid: Tensor | Literal[True], count: int) -> None:
-        """Nu from the present density, then its update with an energy, 0-d, the `count`-th.
-
-        `valid` is whether it is finite.
-        """
-        limit = LIMIT / MEAN_ABS if count > UNLIMITED else math.inf
-        rate = max(1 / count, 1 / MEMORY)
+    def take_on_device(self, energy: Tensor, valid: Tensor | Literal[True], tally: Tally) -> None:
+        """As in `Partitions`; one launch where the CUDA kernels run."""
         if obstacle("auto", self._state.device, self._state.dtype) is None:
-            numbers = (rate, limit, *self.clamp, *self._constants)
-            cuda.take_energy(energy, valid, self._state, self.nu, *numbers)
+            counts, limit = (tally.warmup, MEMORY, UNLIMITED), LIMIT / MEAN_ABS
+            learnt = (self._state, self.nu, tally.count, tally.sums)
+            cuda.take_energy(energy, valid, *learnt, counts, limit, *self.clamp, *self._constants)
             return
-        known = valid is True
-        value = energy if known else torch.where(valid, energy, self._mean)
-        if count == 1:
-            self._mean.copy_(value)
+        if energy.dtype != self.nu.dtype:
+            energy = energy.to(self.nu.dtype)
+            valid = valid & torch.isfinite(energy)  # a large number of float64 is not, in float32
+        super().take_on_device(energy, valid, tally)
+
+    def take(self, energy: Tensor, valid: Tensor | Literal[True], count: int | Tensor) -> None:
+        """Nu from the present density, then its update with an energy, 0-d, the `count`-th."""
+        if isinstance(count, Tensor):
+            # An energy that does not count becomes the mean, and moves nothing.
+            energy = torch.where(torch.as_tensor(valid), energy, self._mean)
+            pace: Any = torch.nn.functional.embedding(count.clamp(max=MEMORY), self._paces).unbind()
+            mean = torch.lerp(energy, self._mean, pace[-1])
+        else:
+            pace = Pace.of(count)
+            mean = energy if count == 1 else self._mean
+        rate, low, high, _ = pace
         # t = z / MEAN_ABS: distance from the mean in mean absolute deviations. Where those have
         # vanished, as after a constant loss, they grow again by the second term.
-        distance = torch.sub(value, self._mean)
+        distance = torch.sub(energy, mean)
         unit = torch.add(self._deviation, distance.abs(), alpha=RESOLUTION)
-        t = torch.clamp(torch.div(distance, unit), -limit, limit, out=self._t)
+        t = torch.clamp(torch.div(distance, unit), low, high, out=self._t)
         log_kernel = torch.addcmul(self._log_kernel, self._log_kernel_slope, t)
         torch.softmax(log_kernel, 0, out=self._kernel)
         torch.mul(self._kernel, self._q, out=self._kq)
-        torch.addmv(self._offsets, self._rows, self._products, out=self._sums)
-        slope = torch.addcdiv(self._base, self._up, self._below, out=self._slope)
+        if isinstance(count, int) and count > UNLIMITED:
+            torch.addmv(self._offsets, self._rows, self._products, out=self._sums)
+            slope = torch.addcdiv(self._base, self._up, self._below, out=self._slope)
+        else:
+            # The same with one operator more. At up to 1e6 deviations from the mean, the sum of two
+            # numbers above would be the difference of two that are nearly alike.
+            sums = torch.addmv(self._offsets, self._direct_rows, self._kq)
+            up, below, per_t = sums.unbind()
+            slope = torch.div(torch.addcmul(up, per_t, t), below, out=self._slope)
         nu = torch.sub(slope, self._mean_slope).add_(1.0)
-        torch.clamp(nu if known else torch.where(valid, nu, self.nu), *self.clamp, out=self.nu)
+        torch.clamp(
+            nu if valid is True else torch.where(valid, nu, self.nu), *self.clamp, out=self.nu
+        )
         step = torch.mul(t, unit)
-        torch.add(self._mean, step, out=self._to_mean)
+        torch.add(mean, step, out=self._to_mean)
         torch.hypot(step, self._tiny, out=self._to_deviation)
-        self._state.lerp_(self._target, rate if known else rate * valid.to(self._state.dtype))
+        self._state.lerp_(self._target, rate if valid is True else rate * valid)
 
     @property
     def weights(self) -> Tensor:
@@ -232,4 +320,6 @@ class MovingPartitions(Partitions):
     def load(self, state: Mapping[str, Any]) -> None:
         """Restore `state()`."""
         self._state.copy_(torch.tensor(state["recent"], dtype=torch.float64))
+        # The smallest deviation of float64 is zero in float32, and zero over zero is not a number.
+        self._deviation.clamp_(min=self._constants[-1])
         self.nu.fill_(state["nu"])

@@ -21,10 +21,11 @@ extern "C" void run_two_loop(unsigned block, const Real* grads, const Real* hist
 }
 
 extern "C" void run_take_energy(unsigned block, const Real* energy, const unsigned char* valid, Real* state, Real* nu,
-                                long long partitions, Real rate, Real limit, Real low, Real high, Real reach,
+                                long long* counted, Real* sums, long long partitions, long long warmup,
+                                long long memory, long long unlimited, Real limit, Real low, Real high, Real reach,
                                 Real bandwidth, Real even, Real mean_abs, Real resolution, Real tiny) {
-  launch_on_host(block, 1, take_energy, energy, valid, state, nu, partitions, rate, limit, low, high, reach,
-                 bandwidth, even, mean_abs, resolution, tiny);
+  launch_on_host(block, 1, take_energy, energy, valid, state, nu, counted, sums, partitions, warmup, memory,
+                 unlimited, limit, low, high, reach, bandwidth, even, mean_abs, resolution, tiny);
 }
 
 extern "C" void run_own_frame_gradient(unsigned block, const Real* grads, const Real* quats, const Real* scales,

@@ -68,6 +68,13 @@ MUTANTS = (
     Mutant("mean of the slope", "histogram.cu", "slope - state[2]", "slope"),
     Mutant("energies that do not count", "histogram.cu", "(valid && !*valid)", "false"),
     Mutant("limit of an energy", "histogram.cu", "-limit, limit)", "-limit, Real(9))"),
+    Mutant("when the limit begins", "histogram.cu", "taken > unlimited", "taken > 3"),
+    Mutant("count of the energies", "histogram.cu", "*counted = taken;", "++*counted; ++*counted;"),
+    Mutant("mean of the first energy", "histogram.cu", "taken > 1 ? state[0]", "true ? state[0]"),
+    Mutant("pace of the means", "histogram.cu", "taken < memory ? taken", "taken < 9 ? taken"),
+    Mutant("end of the warm-up", "histogram.cu", "= taken > warmup ?", "= taken > 3 ?"),
+    Mutant("begin of the sums", "histogram.cu", "if (taken > warmup)", "if (taken > 0)"),
+    Mutant("sum of squares", "histogram.cu", "multiplier * multiplier", "multiplier"),
 )
 
 

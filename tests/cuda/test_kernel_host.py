@@ -36,7 +36,7 @@ from opt3dgs_optim import cuda
 from opt3dgs_optim.frames import Frames
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
 from opt3dgs_optim.lbfgs.history import laid_out
-from opt3dgs_optim.partitions import LIMIT, MEAN_ABS, MEMORY, MovingPartitions
+from opt3dgs_optim.partitions import LIMIT, MEAN_ABS, MEMORY, UNLIMITED, MovingPartitions, Tally
 
 pytestmark = [
     pytest.mark.skipif(compiler() is None, reason="g++ is not installed"),
@@ -302,11 +302,15 @@ def test_an_energy_that_is_not_finite_changes_nothing(
     kernels: dict, value: float, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever is said of it: it may be a large one of float64, in float32."""
-    state, nu = (torch.full((n,), 0.25, dtype=dtype) for n in (51, 1))
-    numbers = (0.01, 5.0, -1.0, 3.0, 6.0, 0.4, 0.05, 0.8, 1e-6, 1e-30)
+    state, nu, sums = (torch.full((n,), 0.25, dtype=dtype) for n in (51, 1, 3))
+    numbers = (5.0, -1.0, 3.0, 6.0, 0.4, 0.05, 0.8, 1e-6, 1e-30)
     monkeypatch.setattr(cuda, "launch", kernels[5, dtype].launch)
-    cuda.take_energy(torch.tensor(value), True, state, nu, *numbers)
-    assert bool((torch.cat([state, nu]) == 0.25).all())
+    for before in (0, 1, 500):
+        count = torch.tensor(before)
+        given = (torch.tensor(value), True, state, nu, count, sums, (0, MEMORY, UNLIMITED))
+        cuda.take_energy(*given, *numbers)
+        assert int(count) == before
+        assert bool((torch.cat([state, nu, sums]) == 0.25).all())
 
 
 # -- the same under the sanitizers -----------------------------------------------------------------
@@ -368,12 +372,11 @@ def _add_energies(parts: list[Tensor], m: int = 24) -> Tensor:
     """Put 100 energies into the program's input; the state and nu after them."""
     law = MovingPartitions(m, 0.75, (-1.0, 3.0))
     law.allocate(torch.device("cpu"))
-    values = energies("broken", 104)[4:]  # from the fifth on they have a limit
-    parts += [torch.tensor([100, m], dtype=torch.float64), law._state.clone()]
+    tally, values = Tally(7, law.nu), energies("broken", 100)
+    numbers = (tally.warmup, MEMORY, UNLIMITED, LIMIT / MEAN_ABS, *law.clamp, *law._constants)
+    parts += [torch.tensor([100, m, *numbers], dtype=torch.float64), law._state.clone()]
     for k, (energy, valid) in enumerate(zip(values, taken(values), strict=True)):
         known = 1 + k % 3 % 2 if valid else 0  # 2: a null pointer
-        numbers = (max(1 / (k + 5), 1 / MEMORY), LIMIT / MEAN_ABS, *law.clamp, *law._constants)
-        parts.append(torch.tensor([energy, known, *numbers], dtype=torch.float64))
-        if valid:
-            law.take(energy, True, k + 5)
-    return torch.cat([law._state, law.nu.reshape(1)])
+        parts.append(torch.tensor([energy, known], dtype=torch.float64))
+        law.take_on_device(energy, valid, tally)
+    return torch.hstack([law._state, law.nu, tally.sums, tally.count])

@@ -227,14 +227,24 @@ def _check_tensors(call: str, like: Tensor, **needed: tuple[Tensor, torch.Size |
 
 
 def take_energy(
-    energy: Tensor, valid: Tensor | bool, state: Tensor, nu: Tensor, *numbers: float
+    energy: Tensor,
+    valid: Tensor | bool,
+    state: Tensor,
+    nu: Tensor,
+    count: Tensor,
+    sums: Tensor,
+    sizes: tuple[int, int, int],
+    *numbers: float,
 ) -> None:
-    """`MovingPartitions.take` on the GPU; `numbers` as in the kernel. Never synchronises."""
+    """`MovingPartitions.take_on_device` on the GPU. Never synchronises.
+
+    `count` and `sums` are those of its `Tally`; `sizes` and `numbers` as in the kernel.
+    """
     # A 0 is a null pointer.
     known = 0 if valid is True else torch.as_tensor(valid, dtype=torch.bool, device=state.device)
-    reals = map(real(state.dtype), numbers)
-    tensors = (energy.to(state), known, state, nu)
-    launch("take_energy", state, 1, *tensors, np.int64(len(state) - 3), *reals)
+    tensors = (energy.to(state), known, state, nu, count, sums)
+    integers = map(np.int64, (len(state) - 3, *sizes))
+    launch("take_energy", state, 1, *tensors, *integers, *map(real(state.dtype), numbers))
 
 
 @functools.cache

@@ -12,7 +12,7 @@ from torch import Tensor
 from opt3dgs_optim.checks import check_count, check_interval, check_keys, check_number
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Group, Part, Phase
-from opt3dgs_optim.partitions import FixedPartitions, MovingPartitions
+from opt3dgs_optim.partitions import FixedPartitions, MovingPartitions, Tally
 
 # The temperature is not given in the paper; zeta * tau / du = 1.5 at its zeta and du.
 PAPER: dict[str, Any] = {"energy_range": (0.0, 0.2), "temperature": 2e-3, "warmup": 2500}
@@ -93,14 +93,15 @@ class EnergyHistogram(Part):
         return cls(**(PAPER | overrides))
 
     def _allocate(self, device: torch.device) -> None:
-        self._device, self._on_host = device, device.type == "cpu"
+        self._device, self._on_host = device, _is_host(device)
         self._law.allocate(device)
         self.num_observed = 0  # calls of observe(): says whether anybody calls
-        self._taken = 0  # of them, those that count: on a GPU all, on a CPU the finite ones
         self.last_finite: Tensor | bool = True  # whether the last energy was
-        # Powers 0, 1 and 2 of nu, summed over the energies after the warm-up; on a CPU as numbers.
-        self._sums: Any = [0.0] * 3 if self._on_host else self._law.nu.new_zeros(3)
-        self._powers = torch.arange(3).to(self._law.nu)
+        # How many of them were finite, and powers 0, 1 and 2 of nu, summed over those after the
+        # warm-up: numbers on a CPU, and on a device, which alone knows which are finite, tensors.
+        self._taken = 0
+        self._sums = [0.0] * 3
+        self._tally = None if self._on_host else Tally(self.warmup, self._law.nu)
         self._factor: float | Tensor = 1.0
 
     @torch.no_grad()
@@ -131,15 +132,17 @@ class EnergyHistogram(Part):
 
     def _take(self, value: Tensor, valid: Tensor | Literal[True]) -> None:
         law = self._law
+        if self._tally is not None:
+            law.take_on_device(value, valid, self._tally)
+            self._factor = law.nu
+            return
         self._taken += 1
-        law.take(value, valid, self._taken)
+        law.take(value, True, self._taken)
         if self._taken <= self.warmup:
             law.nu.fill_(1.0)
-        self._factor = nu = law.nu.item() if self._on_host else law.nu
-        if self._taken > self.warmup and isinstance(nu, float):
+        self._factor = nu = law.nu.item()
+        if self._taken > self.warmup:
             self._sums = [a + b for a, b in zip(self._sums, (1.0, nu, nu * nu), strict=True)]
-        elif self._taken > self.warmup:
-            self._sums.addcmul_(torch.pow(nu, self._powers), torch.as_tensor(valid))
 
     def _on_device(self, energy: Tensor | float) -> Tensor:
         if not isinstance(energy, Tensor):
@@ -168,7 +171,12 @@ class EnergyHistogram(Part):
         return self._law.weights.clone()
 
     def _moments(self) -> Tensor:
-        return torch.as_tensor(self._sums, dtype=self._law.nu.dtype)
+        sums = self._sums if self._tally is None else self._tally.sums
+        return torch.as_tensor(sums, dtype=self._law.nu.dtype)
+
+    def _num_taken(self) -> int:
+        """Number of finite energies. Synchronises."""
+        return self._taken if self._tally is None else int(self._tally.count)
 
     @property
     def mean_multiplier(self) -> Tensor:
@@ -188,8 +196,8 @@ class EnergyHistogram(Part):
         return self._law.coordinates()
 
     def numbers(self, course: Course | None = None) -> dict[str, float | Tensor]:
-        """`nu`, after the warm-up."""
-        return {"nu": self._law.nu.clone()} if self._taken > self.warmup else {}
+        """`nu`, after as many energies as the warm-up has; one that is not finite is one here."""
+        return {"nu": self._law.nu.clone()} if self.num_observed > self.warmup else {}
 
     def evidence(self, course: Course) -> Tensor | None:
         """[4]: sums of nu's powers 0, 1 and 2; Theta's share in the open partition at the top."""
@@ -210,7 +218,7 @@ class EnergyHistogram(Part):
         """All that `observe` has learnt, as plain numbers and lists. Synchronises."""
         return {
             "num_observed": self.num_observed,
-            "num_taken": self._taken,
+            "num_taken": self._num_taken(),
             "sums": self._moments().tolist(),
             **self._law.state(),
         }
@@ -237,19 +245,30 @@ class EnergyHistogram(Part):
     def _restore(self, device: torch.device, state: Mapping[str, Any]) -> None:
         self._allocate(device)
         self._law.load(state)
-        self._sums[:] = state["sums"] if self._on_host else torch.tensor(state["sums"])
-        self.num_observed, self._taken = int(state["num_observed"]), int(state["num_taken"])
-        self._factor = self._law.nu.item() if self._on_host else self._law.nu
+        self.num_observed = int(state["num_observed"])
+        if self._tally is None:
+            self._taken, self._sums = int(state["num_taken"]), list(state["sums"])
+            self._factor = self._law.nu.item()
+        else:
+            self._tally.count.fill_(int(state["num_taken"]))
+            self._tally.sums.copy_(torch.tensor(state["sums"], dtype=torch.float64))
+            self._factor = self._law.nu
 
     def __repr__(self) -> str:
         line = f"{CALL}("
         if self.energy_range != "auto":
             line += f"energy_range={self.energy_range!r}, temperature={self.temperature!r}, "
         line += f"zeta={self.zeta:g}, clamp={self.clamp}): nu "
-        if self._taken <= self.warmup:
-            return f"{line}1, warm-up: {self._taken} of {self.warmup} energies"
+        taken = self._num_taken()
+        if taken <= self.warmup:
+            return f"{line}1, warm-up: {taken} of {self.warmup} energies"
         mean, deviation = float(self.mean_multiplier), float(self.multiplier_std)
         return f"{line}{float(self.multiplier):.4g}, mean {mean:.4g} +- {deviation:.2g}"
+
+
+def _is_host(device: torch.device) -> bool:
+    """Whether the host knows at once if an energy there is finite."""
+    return device.type == "cpu"
 
 
 def _are_automatic(energy_range: Any, temperature: Any) -> bool:
