@@ -32,7 +32,6 @@ from splatting.scenes import load_scene
 
 from opt3dgs_optim import EnergyHistogram, Part
 from studies import pages
-from studies.scenes.analysis import falls
 from studies.scenes.training import BACKGROUNDS
 
 OUT = Path(__file__).resolve().parents[2] / "docs" / "results" / "histogram"
@@ -97,7 +96,7 @@ def train(folder: str, arm: str, seed: int, iterations: int, points: int) -> dic
         if fit.iteration % (iterations // LOOKS) == 0:
             curve.append(fit.evaluate())
     psnr = np.array([look["train_psnr"] for look in curve])
-    fallen = falls(psnr)
+    fallen = np.maximum.accumulate(psnr) - psnr  # below the best so far
     record: dict[str, Any] = {
         "scene": name,
         "arm": arm,

@@ -23,8 +23,8 @@ import torch
 from splatting.fit import Fit
 from splatting.stopping import command
 
-from studies.scenes.arms import BASELINE, STUDY_ARMS, find_study_arm
-from studies.scenes.records import COSTED, COSTS, costed
+from studies.scenes.arms import BASELINE, arm_of, find_study_arm
+from studies.scenes.records import COSTED, COSTS, FOLDER, costed
 from studies.scenes.training import Spec, fit_of, machine, scene_of
 
 ROUNDS, STEPS, FIRST = 7, 10, 5  # rounds of so many iterations in turns, after the first few
@@ -66,8 +66,8 @@ def measure_all(runs: Path, iterations: Sequence[int]) -> list[dict[str, Any]]:
     for path in sorted(runs.rglob("record.json")):
         record = json.loads(path.read_text(encoding="utf-8"))
         plain = not record.get("views") and record.get("rates", 1.0) == 1.0
-        arm = STUDY_ARMS.get(record["arm"])
-        whole = arm is not None and not arm.retired and arm.trunk is None and arm.needs is None
+        arm = arm_of(record["arm"])
+        whole = not arm.archived and arm.trunk is None and arm.needs is None
         if plain and whole and record.get("finished") and record["iterations"] in iterations:
             found[(*costed(record), record["seed"])][record["arm"]] = path.parent
     first: dict[tuple[Any, ...], dict[str, Path]] = {}
@@ -108,7 +108,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     made = measure_all(args.runs, args.iterations)
     if not made:
         raise ValueError(f"--runs {args.runs}: holds no scene with {BASELINE} and another arm")
-    old = json.loads(COSTS.read_text(encoding="utf-8")) if COSTS.exists() else []
+    path = FOLDER / COSTS
+    old = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
     entries = {costed(entry): entry for entry in old}
     for entry in made:  # what other arms cost stays
         known = entries.get(costed(entry), {}).get("shares", {})
@@ -117,8 +118,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "shares": dict(sorted({**known, **entry["shares"]}.items())),
         }
     text = json.dumps([entries[key] for key in sorted(entries)], indent=1)
-    COSTS.write_text(text + "\n", encoding="utf-8")
-    print(COSTS)
+    path.write_text(text + "\n", encoding="utf-8")
+    print(path)
     return 0
 
 

@@ -18,13 +18,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 from splatting.stopping import command
 
-from studies.scenes.arms import BASELINE, FADED, HELD, label
+from studies.scenes.arms import BASELINE
 from studies.scenes.plan import folder_of
 from studies.scenes.records import FOLDER
 from studies.scenes.training import Spec, scene_of
 
 SCENES = {"bonsai": 10_000, "plush": 4_000}  # and their Gaussians
-ARMS = (BASELINE, FADED, f"{HELD}+averaged")
+ARMS = (BASELINE, "faded", "faded+out-of-view+averaged")
 PIECES, SEED, VIEW = 9, 0, 4
 DPI = 150
 
@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             found = json.loads((folder / "record.json").read_text(encoding="utf-8"))
             images = np.load(folder / "renders.npz")
             axis.imshow(images[images.files[VIEW]], interpolation="nearest")
-            axis.set_title(f"{label(arm)}, {found['curve'][-1]['psnr']:.1f} dB", fontsize=8)
+            axis.set_title(f"{arm}, {found['curve'][-1]['psnr']:.1f} dB", fontsize=8)
         call = json.loads((folder_of(like, args.runs) / "call.json").read_text(encoding="utf-8"))
         view = scene_of(Spec(**call["spec"])).test[VIEW]
         row[0].imshow(view.image.numpy(), interpolation="nearest")
