@@ -117,21 +117,29 @@ def gsplat_noise_alone(case: Case) -> Callable[[], None]:
 
 
 def upgraded(
-    case: Case, parts: list[Part], *, exploit: bool = False, seen: float = 1.0, at: float = 0.25
+    case: Case,
+    parts: list[Part],
+    *,
+    exploit: bool = False,
+    seen: float = 1.0,
+    at: float = 0.25,
+    masked: bool = False,
 ) -> Callable[[], None]:
     """Six upgraded optimizers with these parts, and `observe`; views see that share of points.
 
-    At a quarter of the run events of fading are as frequent as they get.
+    At a quarter of the run events of fading are as frequent as they get. `masked`: every step is
+    one of the visible points alone.
     """
     splats, steps = case.splats(), 1_000_000
     phases = PhaseScheduler(steps, 0 if exploit else steps, parts)
-    optimizers = phases.upgrade(case.adams(splats))
+    optimizers: Any = phases.upgrade(case.adams(splats))
     losses = list(torch.rand(64, device=case.device).mul(0.2).unbind())
     grads = [1e-4 * torch.randn_like(splats["means"]) for _ in range(8)]
     if seen < 1.0:
         optimizers["means"].param_groups[0][SHARE] = seen
         for grad in grads:
             grad.mul_(torch.rand(case.points, 1, device=case.device) < seen)
+    visible = torch.rand(case.points, device=case.device) < seen if masked else None
     count = round(at * steps)  # a call is one iteration
 
     def step() -> None:
@@ -141,7 +149,10 @@ def upgraded(
         splats["means"].grad = grads[count % 8]
         phases.observe(losses[count % 64], iteration=count)
         for optimizer in optimizers.values():
-            optimizer.step()
+            if visible is None:
+                optimizer.step()
+            else:
+                optimizer.step(visible=visible)
 
     return step
 
@@ -193,6 +204,7 @@ SUBJECTS: dict[str, Callable[[Case], Callable[[], Any]]] = {
     "six Adams again": six_adams,  # other tensors, elsewhere in memory: how exact a ratio is
     "defaults": lambda case: upgraded(case, [*DEFAULTS]),
     "defaults, a tenth in view": lambda case: upgraded(case, [*DEFAULTS], seen=0.1),
+    "defaults, steps of a tenth": lambda case: upgraded(case, [*DEFAULTS], seen=0.1, masked=True),
     "defaults, last thirtieth": lambda case: upgraded(case, [*DEFAULTS], at=0.975),
     "defaults + histogram": lambda case: upgraded(case, [*DEFAULTS, EnergyHistogram(warmup=4)]),
     "the paper's exploration": lambda case: upgraded(case, [EnergyHistogram.paper(warmup=4)]),
