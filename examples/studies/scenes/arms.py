@@ -109,12 +109,6 @@ LIST = (
     ),
     StudyArm("paper-constant", "a constant multiplier, `paper`'s mean", constant, needs="paper"),
     StudyArm("faded", "moments of random points faded", of(FADING)),
-    StudyArm(
-        "faded+out-of-view",
-        "the same, and points out of view held: `faded`, bit for bit, where views see much",
-        of(FADING, OutOfView()),
-        control="faded",
-    ),
     *(
         StudyArm(f"frame-{rate:g}", f"own frame, {rate:g} of a deviation a step", own_frame(rate))
         for rate in (0.05, 0.1, 0.2, 0.4)

@@ -13,6 +13,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any
@@ -54,7 +55,8 @@ def fits_at(folders: dict[str, Path], mark: str) -> dict[str, Fit]:
     fits = {}
     for name, folder in folders.items():
         call = json.loads((folder / "call.json").read_text(encoding="utf-8"))
-        spec, arm = Spec(**call["spec"]), find_study_arm(name)
+        known = {f.name: call["spec"][f.name] for f in fields(Spec) if f.name in call["spec"]}
+        spec, arm = Spec(**known), find_study_arm(name)
         fits[name] = fit_of(arm)(scene_of(spec), arm, spec.options(), call["mean_nu"])
         fits[name].load(folder / mark)
     return fits

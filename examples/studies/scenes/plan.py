@@ -26,7 +26,6 @@ TODAY = (*STOCK, "faded", DEFAULTS)
 FRAMES = tuple(arm.name for arm in LIST if arm.name.startswith("frame-"))
 RATES = tuple(arm.name for arm in LIST if arm.name.startswith(("rates-", "positions-")))
 ADAPTIVE_ARMS = (ADAPTIVE, ADAPTIVE_DEFAULTS)
-HELD = "faded+out-of-view"
 
 
 @dataclass(frozen=True)
@@ -141,12 +140,6 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
             for rates in (0.1, 0.3, 1.0, 3.0, 10.0)
             for spec in rotated(("plush",), TODAY, 1, 7_500, rates=rates)
         ],
-        "cut-up": [  # views that see little of the scene
-            *rotated(("bonsai",), (BASELINE, "faded", HELD), 1, 7_500, tiled=20),
-            *rotated(MANY_VIEWS_SCENES, (*STOCK, "faded", f"{HELD}{AVERAGED}"), 2, 30_000, tiled=9),
-            *rotated(("bonsai",), STOCK, 1, 7_500, tiled=4),
-            *rotated(MANY_VIEWS_SCENES, STOCK, 2, 7_500, tiled=9),
-        ],
     }
 
 
@@ -200,7 +193,6 @@ def folder_of(spec: Spec, out: Path) -> Path:
     kind += f"-{spec.size}" * (spec.size != "images_4")
     kind += "-rotated" * spec.rotated
     kind += f"-{spec.views}-views" * (spec.views > 0)
-    kind += f"-tiled-{spec.tiled}" * (spec.tiled > 0)
     kind += f"-rates-{spec.rates:g}" * (spec.rates != 1.0)
     arm = spec.arm.replace("/", "_")
     return out / Path(spec.scene).name / kind / arm / f"seed-{spec.seed}"

@@ -72,8 +72,9 @@ def the_study() -> Study:
 
 
 def is_open(record: Plain) -> bool:
-    """Whether a record belongs to an open question: an arm of today's list, rotating views."""
-    return record["rotated"] and not arm_of(record["arm"]).archived
+    """Whether a record is of an open question: an arm of today's list, whole rotating views."""
+    archived = record["tiled"] or not record["rotated"] or arm_of(record["arm"]).archived
+    return not archived
 
 
 def tables(study: Study) -> dict[str, str]:

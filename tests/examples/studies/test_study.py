@@ -82,7 +82,7 @@ def test_every_open_record_is_of_the_plan() -> None:
     trunks = {replace(s, arm=str(find_study_arm(s.arm).trunk)) for s in planned}
     for entry in load(report.FOLDER):
         if report.is_open(entry):
-            kind = {name: entry[name] for name in ("rotated", "size", "views", "tiled", "rates")}
+            kind = {name: entry[name] for name in ("rotated", "size", "views", "rates")}
             kind |= {"sh_degree": entry["sh_degree"], "init": entry["init"]}
             spec = Spec(
                 entry["scene"], entry["arm"], 0, entry["iterations"], entry["points"], **kind
