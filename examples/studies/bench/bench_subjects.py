@@ -22,10 +22,10 @@ from opt3dgs_optim import (
 )
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history
 from opt3dgs_optim.lbfgs.history import laid_out
-from opt3dgs_optim.parts.out_of_view import SHARE
 
 HISTORY_SIZE = 5
 NOISE_LR = 5e5
+SEEN = "seen_share"  # what `OutOfView` keeps: the mean share of the points that a view sees
 LEARNING_RATES = {
     "means": 1.6e-4,
     "scales": 5e-3,
@@ -136,7 +136,6 @@ def upgraded(
     losses = list(torch.rand(64, device=case.device).mul(0.2).unbind())
     grads = [1e-4 * torch.randn_like(splats["means"]) for _ in range(8)]
     if seen < 1.0:
-        optimizers["means"].param_groups[0][SHARE] = seen
         for grad in grads:
             grad.mul_(torch.rand(case.points, 1, device=case.device) < seen)
     visible = torch.rand(case.points, device=case.device) < seen if masked else None
@@ -154,6 +153,13 @@ def upgraded(
             else:
                 optimizer.step(visible=visible)
 
+    if seen < 1.0:  # as after a hundred steps
+        step()
+        saved = optimizers["means"].state_dict()
+        for key, value in saved["state"][0].items():
+            if key.endswith(SEEN):
+                value.fill_(seen)
+        optimizers["means"].load_state_dict(saved)
     return step
 
 

@@ -25,11 +25,11 @@ import torch
 from splatting.fit import Fit, FitOptions
 from splatting.scenes import Background, Scene, Size, load_scene
 
-from opt3dgs_optim.parts.out_of_view import SHARE
 from studies.scenes.arms import StudyArm, find_study_arm
 from studies.scenes.perceptual import NET, load_tool, mean_lpips
 
 DIGITS = {"median_scale": 6}
+SEEN = "visible_share"  # what `OutOfView` calls the mean share of the points that a view sees
 BACKGROUNDS: dict[str, Background] = {"lego": "white"}
 BRANCH_SHARES = (0.5, 0.75, 0.9, 29 / 30)  # where the arms of the last phase branch off
 
@@ -136,8 +136,8 @@ def _population(fit: Fit) -> dict[str, float]:
     And the mean share of them that a view sees, where a part keeps it.
     """
     scales, logits = fit.gaussians["scales"].detach(), fit.gaussians["opacities"].detach()
-    group = fit.optimizers["means"].param_groups[0]
-    seen = {SHARE: float(group[SHARE])} if SHARE in group else {}
+    numbers = {} if fit.phases is None else fit.phases.numbers()
+    seen = {SEEN: float(numbers[SEEN])} if SEEN in numbers else {}
     return seen | {
         "relocated": float(fit.relocated),
         "median_scale": float(scales.amax(1).median().exp()) / fit.scene.extent,
