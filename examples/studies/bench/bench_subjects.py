@@ -25,7 +25,7 @@ from opt3dgs_optim.lbfgs.history import laid_out
 
 HISTORY_SIZE = 5
 NOISE_LR = 5e5
-SEEN = "seen_share"  # what `OutOfView` keeps: the mean share of the points that a view sees
+SETTLING = 200  # steps after which `OutOfView` knows that views see a tenth
 LEARNING_RATES = {
     "means": 1.6e-4,
     "scales": 5e-3,
@@ -141,25 +141,25 @@ def upgraded(
     visible = torch.rand(case.points, device=case.device) < seen if masked else None
     count = round(at * steps)  # a call is one iteration
 
-    def step() -> None:
+    def advance() -> None:
         nonlocal count
         count += 1
         # New gradients, as in a training: a pair is a difference of two of them.
         splats["means"].grad = grads[count % 8]
         phases.observe(losses[count % 64], iteration=count)
+
+    def step() -> None:
+        advance()
         for optimizer in optimizers.values():
             if visible is None:
                 optimizer.step()
             else:
                 optimizer.step(visible=visible)
 
-    if seen < 1.0:  # as after a hundred steps
-        step()
-        saved = optimizers["means"].state_dict()
-        for key, value in saved["state"][0].items():
-            if key.endswith(SEEN):
-                value.fill_(seen)
-        optimizers["means"].load_state_dict(saved)
+    if seen < 1.0:  # the mean share is of the last hundred views, and begins at 1
+        for _ in range(SETTLING):
+            advance()
+            optimizers["means"].step()
     return step
 
 

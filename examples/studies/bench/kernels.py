@@ -144,20 +144,15 @@ def total(counts: dict[int, int], least: int = 0) -> int:
 
 def roofline(found: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Bytes per point of what a step does, and the least microseconds of a million points."""
-    (direction,) = (
-        row
-        for row in found
-        if (row["kernel"], row["arch"], row["history_size"]) == ("lqn_direction", "sm_90", 5)
-    )
     work = {
         "six fused Adams: 4 numbers read, 3 written of each of 59": ADAM_BYTES,
         "averaging, in the last thirtieth: the mean read and written, the parameter read": 12
         * NUMBERS,
-        "`lqn_direction`, five pairs: its loads and stores, all pairs accepted": total(
-            direction["loads"]
-        )
-        + total(direction["stores"]),
     }
+    for row in found:
+        if (row["arch"], row["history_size"]) == ("sm_90", SIZES[-1]):
+            name = f"`{row['kernel']}`, {SIZES[-1]} pairs: its loads and stores, all taken"
+            work[name] = total(row["loads"]) + total(row["stores"])
     return [
         {
             "what": what,
