@@ -144,6 +144,8 @@ def report(result: dict[str, Any]) -> str:
         counts = ", ".join(f"{tests[k]} {k}" for k in ("passed", "failed", "error", "skipped"))
         lines.append(f"Tests marked `cuda`: {counts}, in {tests['seconds']} s.")
         lines += [f"Skipped: {reason}." for reason in tests["reasons"]]
+        if "output" in tests:
+            lines += ["", "```text", tests["output"].rstrip(), "```"]
     lines += ["", "## A step", "", "Medians and quartiles, in turn with six torch Adams.", ""]
     for points, rows in result["steps"].items():
         lines += [steps_table(int(points), rows), ""]

@@ -25,11 +25,11 @@ from opt3dgs_optim import (
     ConstantMultiplier,
     Fading,
     OutOfView,
+    OwnFrame,
     Part,
     PhaseScheduler,
     paper_parts,
 )
-from studies.scenes.parts.own_frame import OwnFrame
 from studies.scenes.records import FOLDER
 
 BASELINE, ADAPTIVE = "mcmc", "adc"
@@ -64,21 +64,12 @@ class StudyArm(Arm):
         self, iterations: int, switch: float, nu: float | None, gaussians: Mapping[str, Tensor]
     ) -> PhaseScheduler:
         """As `Arm.make`; the switch is the arm's own: trunk and branches share `FitOptions`."""
-        made = super().make(iterations, self.switch, nu, gaussians)
-        for part in made.parts:
-            if isinstance(part, OwnFrame):
-                part.gaussians = gaussians
-        return made
+        return super().make(iterations, self.switch, nu, gaussians)
 
 
 def of(*parts: Part) -> MakeParts:
     """These parts, which learn nothing and may serve several trainings."""
     return lambda _iterations, _nu: [*parts]
-
-
-def own_frame(rate: float, *others: Part) -> MakeParts:
-    """Positions stepped in each Gaussian's own frame, and other parts beside it."""
-    return lambda _iterations, _nu: [OwnFrame(rate), *others]
 
 
 def on_positions(factor: float) -> Part:
@@ -110,14 +101,16 @@ LIST = (
     StudyArm("paper-constant", "a constant multiplier, `paper`'s mean", constant, needs="paper"),
     StudyArm("faded", "moments of random points faded", of(FADING)),
     *(
-        StudyArm(f"frame-{rate:g}", f"own frame, {rate:g} of a deviation a step", own_frame(rate))
+        StudyArm(
+            f"frame-{rate:g}", f"own frame, {rate:g} of a deviation a step", of(OwnFrame(rate))
+        )
         for rate in (0.05, 0.1, 0.2, 0.4)
     ),
     *(
         StudyArm(
             f"frame-{rate:g}+faded",
             "the same, all but the positions faded, points out of view held",
-            own_frame(rate, FADING_OTHERS, OutOfView()),
+            of(OwnFrame(rate), FADING_OTHERS, OutOfView()),
             control=f"frame-{rate:g}",
         )
         for rate in (0.05, 0.1, 0.2)
@@ -128,11 +121,11 @@ LIST = (
         "annealed and faded, the positions not annealed, the scales left alone",
         of(ANNEALING_BUT_SCALES, FADING_BUT_SCALES, OutOfView()),
     ),
-    *(adaptive(f"adc+frame-{rate:g}", "own frame", own_frame(rate)) for rate in (0.1, 0.2)),
+    *(adaptive(f"adc+frame-{rate:g}", "own frame", of(OwnFrame(rate))) for rate in (0.1, 0.2)),
     adaptive(
         "adc+frame-0.1+faded",
         "the same, faded, scales and positions left alone",
-        own_frame(0.1, replace(FADING, names=BUT_SCALES), OutOfView()),
+        of(OwnFrame(0.1), replace(FADING, names=BUT_SCALES), OutOfView()),
     ),
 )
 ADAPTIVE_DEFAULTS = f"adc+annealed+faded-but-scales{AVERAGED}"  # what `DEFAULTS_ADC` is
