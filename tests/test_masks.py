@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from studies.scenes.parts.pooling import Pooling
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
@@ -36,6 +35,7 @@ from opt3dgs_optim import (
     Fading,
     IsotropicNoise,
     LQNAdam,
+    Part,
     PositionNoise,
 )
 from opt3dgs_optim.names import GAUSSIAN
@@ -387,10 +387,18 @@ def test_an_optimizer_with_masked_steps_keeps_its_arithmetic(
     assert mine.param_groups[0]["lr"] == pytest.approx(0.1 * 0.99 ** (step + 1 - before))
 
 
+class PooledMoments(Part):
+    """One second moment for the coordinates of a point: a part that writes into all rows."""
+
+    def after(self, group: Any, param: Tensor, state: dict[str, Any], course: Any) -> None:
+        moment = state["exp_avg_sq"]
+        moment.copy_(moment.mean(1, keepdim=True).expand_as(moment))
+
+
 def test_an_optimizer_with_masked_steps_and_parts_after_the_step() -> None:
-    """Pooling writes into moments: those of invisible rows are put back."""
+    """A part writes into all moments: those of invisible rows are put back."""
     x = points()
-    phases = only(STEPS, Pooling(), Annealing(names=GAUSSIAN))
+    phases = only(STEPS, PooledMoments(), Annealing(names=GAUSSIAN))
     optimizer: Any = phases.upgrade(SelectiveAdam([{"params": [x], "lr": 0.1, "name": "means"}]))
     for step, mask in enumerate(masks()):
         x.grad = gradients(x, step)

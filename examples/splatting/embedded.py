@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -17,7 +18,7 @@ _POINTS = 2000
 _POINT_NOISE = 0.01  # world units, about what a good reconstruction of this size leaves
 # Width, height and rays a side of each pixel: 16 and 4 rays, averaged, keep the edges smooth.
 _SIZES = {"images": (256, 192, 2), "images_2": (128, 96, 4), "images_4": (96, 72, 4)}
-_SUN = np.array([0.45, -0.35, 0.82]) / np.linalg.norm([0.45, -0.35, 0.82])
+SUN = np.array([0.45, -0.35, 0.82]) / np.linalg.norm([0.45, -0.35, 0.82])
 
 
 def embedded_scene(size: Size = "images_4", seed: int = 0, held_out: int | None = None) -> Scene:
@@ -39,13 +40,14 @@ def embedded_scene(size: Size = "images_4", seed: int = 0, held_out: int | None 
     width, height, rays_a_side = _SIZES[size]
     cameras = [_orbit_camera(index, width, height) for index in range(_VIEWS)]
     views = [
-        View(f"view_{index:02d}", camera, _photo(solids, camera, rays_a_side))
+        View(f"view_{index:02d}", camera, photo(solids, camera, rays_a_side))
         for index, camera in enumerate(cameras)
     ]
     first = _FIRST_TEST if held_out is None else held_out % _TEST_EVERY
     train = [view for i, view in enumerate(views) if i % _TEST_EVERY != first]
     test = [view for i, view in enumerate(views) if i % _TEST_EVERY == first]
-    points, colors = _sparse_points(solids, [view.camera for view in train], rng)
+    seen = [(solids, view.camera) for view in train]
+    points, colors = sparse_points(seen, _POINTS, rng)
     extent = scene_extent([view.camera for view in train])
     return Scene("embedded", train, test, points, colors, extent)
 
@@ -85,17 +87,19 @@ def _orbit_camera(index: int, width: int, height: int) -> Camera:
     )
 
 
-def _look(solids: list[Solid], camera: Camera, columns: Array, rows: Array) -> tuple[Array, Array]:
+def _look(
+    solids: Sequence[Solid], camera: Camera, columns: Array, rows: Array
+) -> tuple[Array, Array]:
     """Colours and points [3, n] seen at the pixel coordinates `columns` and `rows`, [n]."""
     x = (columns - camera.cx) / camera.fx
     y = (rows - camera.cy) / camera.fy
     directions = np.stack((x, y, np.ones_like(x))).astype(np.float32)
     directions /= np.linalg.norm(directions, axis=0)
     rotation = camera.viewmat[:3, :3].numpy()
-    return trace(solids, _SUN, camera.position.numpy()[:, None], rotation.T @ directions)
+    return trace(solids, SUN, camera.position.numpy()[:, None], rotation.T @ directions)
 
 
-def _photo(solids: list[Solid], camera: Camera, rays_a_side: int) -> torch.Tensor:
+def photo(solids: Sequence[Solid], camera: Camera, rays_a_side: int) -> torch.Tensor:
     """Render with a box filter over `rays_a_side` squared rays a pixel, [H, W, 3]."""
     columns = (np.arange(camera.width * rays_a_side) + 0.5) / rays_a_side
     rows = (np.arange(camera.height * rays_a_side) + 0.5) / rays_a_side
@@ -105,15 +109,20 @@ def _photo(solids: list[Solid], camera: Camera, rays_a_side: int) -> torch.Tenso
     return torch.from_numpy(np.ascontiguousarray(fine.mean(axis=(2, 4)).transpose(1, 2, 0)))
 
 
-def _sparse_points(
-    solids: list[Solid], cameras: list[Camera], rng: np.random.Generator
+def sparse_points(
+    views: Sequence[tuple[Sequence[Solid], Camera]], total: int, rng: np.random.Generator
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Points on what the train cameras see, displaced a little, as from structure from motion."""
-    counts = np.full(len(cameras), _POINTS // len(cameras))
-    counts[: _POINTS % len(cameras)] += 1
+    """Points on what the cameras see, displaced a little, as from structure from motion.
+
+    Args:
+        views: what there is to see, and the camera that sees it.
+        total: number of points.
+    """
+    counts = np.full(len(views), total // len(views))
+    counts[: total % len(views)] += 1
     seen = [
         _look(solids, camera, rng.uniform(0, camera.width, n), rng.uniform(0, camera.height, n))
-        for camera, n in zip(cameras, counts, strict=True)
+        for (solids, camera), n in zip(views, counts, strict=True)
     ]
     colors, points = (np.concatenate(part, axis=1).T for part in zip(*seen, strict=True))
     points = points + _POINT_NOISE * rng.standard_normal(points.shape)

@@ -38,6 +38,8 @@ from studies.bench.bench_subjects import (
 COMMAND = "python examples/studies/bench/bench_step.py"
 BASELINE = "six Adams"
 MAKES = 5  # times that the subjects are made
+# What a step of the defaults may cost on a CPU: points -> ratio to six Adams in the same round.
+GOALS = {1_000: 1.40, 10_000: 1.15, 100_000: 1.05, 1_000_000: 1.03}
 Rounds = dict[str, list[float]]
 
 
@@ -125,6 +127,17 @@ def table(results: dict[int, dict[str, dict[str, float]]]) -> str:
     return "\n".join(lines)
 
 
+def goals_line(results: dict[int, dict[str, dict[str, float]]]) -> str:
+    """What the defaults cost beside what they may cost."""
+    said = [
+        f"{n:,} points x{rows['defaults']['per_adam']:.2f} of x{GOALS[n]:.2f}"
+        + ("" if rows["defaults"]["per_adam"] <= GOALS[n] else " (missed)")
+        for n, rows in results.items()
+        if n in GOALS
+    ]
+    return f"The defaults, of what they may cost on a CPU: {', '.join(said)}." if said else ""
+
+
 def plot(results: dict[int, dict[str, dict[str, float]]], path: Path, title: str) -> None:
     """Nanoseconds per point over the number of points, one line per subject."""
     import matplotlib
@@ -205,7 +218,9 @@ def write(record: dict[str, Any], results: dict[int, Any], stem: Path) -> None:
         f"Median of {record['repeats']} rounds, and of the ratio to "
         f'"{record["baseline"]}" in the same round. The JSON beside this has the quartiles.'
     )
-    text = "\n".join(["# Cost of a step", "", *lines, "", note, "", table(results), ""])
+    goals = goals_line(results) if stem.name.endswith("cpu") else ""
+    parts = ["# Cost of a step", "", *lines, "", note, "", *([goals, ""] if goals else [])]
+    text = "\n".join([*parts, table(results), ""])
     print(text)
     stem.with_suffix(".md").write_text(text)
     stem.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n")

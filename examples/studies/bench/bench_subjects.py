@@ -22,10 +22,10 @@ from opt3dgs_optim import (
 )
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history
 from opt3dgs_optim.lbfgs.history import laid_out
-from opt3dgs_optim.parts.out_of_view import SHARE
 
 HISTORY_SIZE = 5
 NOISE_LR = 5e5
+SETTLING = 200  # steps after which `OutOfView` knows that views see a tenth
 LEARNING_RATES = {
     "means": 1.6e-4,
     "scales": 5e-3,
@@ -117,32 +117,49 @@ def gsplat_noise_alone(case: Case) -> Callable[[], None]:
 
 
 def upgraded(
-    case: Case, parts: list[Part], *, exploit: bool = False, seen: float = 1.0, at: float = 0.25
+    case: Case,
+    parts: list[Part],
+    *,
+    exploit: bool = False,
+    seen: float = 1.0,
+    at: float = 0.25,
+    masked: bool = False,
 ) -> Callable[[], None]:
     """Six upgraded optimizers with these parts, and `observe`; views see that share of points.
 
-    At a quarter of the run events of fading are as frequent as they get.
+    At a quarter of the run events of fading are as frequent as they get. `masked`: every step is
+    one of the visible points alone.
     """
     splats, steps = case.splats(), 1_000_000
     phases = PhaseScheduler(steps, 0 if exploit else steps, parts)
-    optimizers = phases.upgrade(case.adams(splats))
+    optimizers: Any = phases.upgrade(case.adams(splats))
     losses = list(torch.rand(64, device=case.device).mul(0.2).unbind())
     grads = [1e-4 * torch.randn_like(splats["means"]) for _ in range(8)]
     if seen < 1.0:
-        optimizers["means"].param_groups[0][SHARE] = seen
         for grad in grads:
             grad.mul_(torch.rand(case.points, 1, device=case.device) < seen)
+    visible = torch.rand(case.points, device=case.device) < seen if masked else None
     count = round(at * steps)  # a call is one iteration
 
-    def step() -> None:
+    def advance() -> None:
         nonlocal count
         count += 1
         # New gradients, as in a training: a pair is a difference of two of them.
         splats["means"].grad = grads[count % 8]
         phases.observe(losses[count % 64], iteration=count)
-        for optimizer in optimizers.values():
-            optimizer.step()
 
+    def step() -> None:
+        advance()
+        for optimizer in optimizers.values():
+            if visible is None:
+                optimizer.step()
+            else:
+                optimizer.step(visible=visible)
+
+    if seen < 1.0:  # the mean share is of the last hundred views, and begins at 1
+        for _ in range(SETTLING):
+            advance()
+            optimizers["means"].step()
     return step
 
 
@@ -193,6 +210,7 @@ SUBJECTS: dict[str, Callable[[Case], Callable[[], Any]]] = {
     "six Adams again": six_adams,  # other tensors, elsewhere in memory: how exact a ratio is
     "defaults": lambda case: upgraded(case, [*DEFAULTS]),
     "defaults, a tenth in view": lambda case: upgraded(case, [*DEFAULTS], seen=0.1),
+    "defaults, steps of a tenth": lambda case: upgraded(case, [*DEFAULTS], seen=0.1, masked=True),
     "defaults, last thirtieth": lambda case: upgraded(case, [*DEFAULTS], at=0.975),
     "defaults + histogram": lambda case: upgraded(case, [*DEFAULTS, EnergyHistogram(warmup=4)]),
     "the paper's exploration": lambda case: upgraded(case, [EnergyHistogram.paper(warmup=4)]),

@@ -13,6 +13,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any
@@ -23,8 +24,8 @@ import torch
 from splatting.fit import Fit
 from splatting.stopping import command
 
-from studies.scenes.arms import BASELINE, STUDY_ARMS, find_study_arm
-from studies.scenes.records import COSTED, COSTS, costed
+from studies.scenes.arms import BASELINE, arm_of, find_study_arm
+from studies.scenes.records import COSTED, COSTS, FOLDER, costed
 from studies.scenes.training import Spec, fit_of, machine, scene_of
 
 ROUNDS, STEPS, FIRST = 7, 10, 5  # rounds of so many iterations in turns, after the first few
@@ -54,7 +55,8 @@ def fits_at(folders: dict[str, Path], mark: str) -> dict[str, Fit]:
     fits = {}
     for name, folder in folders.items():
         call = json.loads((folder / "call.json").read_text(encoding="utf-8"))
-        spec, arm = Spec(**call["spec"]), find_study_arm(name)
+        known = {f.name: call["spec"][f.name] for f in fields(Spec) if f.name in call["spec"]}
+        spec, arm = Spec(**known), find_study_arm(name)
         fits[name] = fit_of(arm)(scene_of(spec), arm, spec.options(), call["mean_nu"])
         fits[name].load(folder / mark)
     return fits
@@ -66,8 +68,8 @@ def measure_all(runs: Path, iterations: Sequence[int]) -> list[dict[str, Any]]:
     for path in sorted(runs.rglob("record.json")):
         record = json.loads(path.read_text(encoding="utf-8"))
         plain = not record.get("views") and record.get("rates", 1.0) == 1.0
-        arm = STUDY_ARMS.get(record["arm"])
-        whole = arm is not None and not arm.retired and arm.trunk is None and arm.needs is None
+        arm = arm_of(record["arm"])
+        whole = not arm.archived and arm.trunk is None and arm.needs is None
         if plain and whole and record.get("finished") and record["iterations"] in iterations:
             found[(*costed(record), record["seed"])][record["arm"]] = path.parent
     first: dict[tuple[Any, ...], dict[str, Path]] = {}
@@ -108,7 +110,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     made = measure_all(args.runs, args.iterations)
     if not made:
         raise ValueError(f"--runs {args.runs}: holds no scene with {BASELINE} and another arm")
-    old = json.loads(COSTS.read_text(encoding="utf-8")) if COSTS.exists() else []
+    path = FOLDER / COSTS
+    old = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
     entries = {costed(entry): entry for entry in old}
     for entry in made:  # what other arms cost stays
         known = entries.get(costed(entry), {}).get("shares", {})
@@ -117,8 +120,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "shares": dict(sorted({**known, **entry["shares"]}.items())),
         }
     text = json.dumps([entries[key] for key in sorted(entries)], indent=1)
-    COSTS.write_text(text + "\n", encoding="utf-8")
-    print(COSTS)
+    path.write_text(text + "\n", encoding="utf-8")
+    print(path)
     return 0
 
 

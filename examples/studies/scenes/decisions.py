@@ -4,19 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from studies.scenes.analysis import Study
-from studies.scenes.arms import (
-    ANNEALED,
-    BASELINE,
-    BOTH,
-    BOTH_AVERAGED,
-    DEFAULTS,
-    FADED,
-    HELD,
-    POOLED_AVERAGED,
-    STABLE,
-)
-from studies.scenes.long_tables import Difference, difference
+from studies.scenes.analysis import Difference, Study, difference
+from studies.scenes.arms import BASELINE, DEFAULTS
 from studies.scenes.records import Setting
 
 LENGTHS = (30_000, 7_500)
@@ -27,16 +16,16 @@ MANY_VIEWS_SCENES = ("bonsai", "lego", "plush")  # forty training views or more
 MIN_SCENES, MIN_SEEDS = 3, 2
 # part -> (the arm with it, the arm without it)
 COMPARISONS = {
-    "Fading": (FADED, BASELINE),
-    "Averaging": (DEFAULTS, FADED),
-    "Annealing": (BOTH_AVERAGED, DEFAULTS),
-    "Annealing of the positions": (ANNEALED, BOTH),
-    "Pooling": (POOLED_AVERAGED, DEFAULTS),
-    "EnergyHistogram": (STABLE, f"{STABLE}-constant"),
+    "Fading": ("faded", BASELINE),
+    "Averaging": (DEFAULTS, "faded"),
+    "Annealing": ("annealed+averaged", DEFAULTS),
+    "Annealing of the positions": ("annealed-all", "annealed"),
+    "Pooling": ("faded+pooled+averaged", DEFAULTS),
+    "EnergyHistogram": ("awsgld-stable", "awsgld-stable-constant"),
     "SquaredLoss": ("l2@1/30", BASELINE),
     "FreshMoments": ("l1+reset@1/30", BASELINE),
     "Curvature": ("l2+reset+lqn@1/30", "l2+reset@1/30"),
-    "OutOfView": (HELD, FADED),
+    "OutOfView": ("faded+out-of-view", "faded"),
 }
 # Parts that change no bit of an ordinary training are judged where they act: with every view cut
 # into so many.
@@ -85,7 +74,7 @@ def every_scene(study: Study, iterations: int, **others: int) -> list[Setting]:
     """
     return [
         s
-        for s in study.all_settings()
+        for s in study.settings()
         if s == Setting(s.scene, s.points, iterations, "sfm", rotated=True, size=s.size, **others)
     ]
 

@@ -9,51 +9,23 @@ from pathlib import Path
 from typing import Any
 
 from studies.scenes.arms import (
-    ANNEALED,
-    BOTH,
-    BOTH_AVERAGED,
+    ADAPTIVE,
+    ADAPTIVE_DEFAULTS,
+    AVERAGED,
+    BASELINE,
     DEFAULTS,
-    EARLY,
-    FADED,
-    GROUPS,
-    HELD,
-    MORE_AT_ONCE,
-    OFTEN_FADED,
-    OWN_STEP,
-    POOLED,
-    POOLED_AVERAGED,
-    SCALES_ALONE,
-    SELDOM_FADED,
-    SHARE_KEPT,
-    STABLE,
-    STOCK_AVERAGED,
-    STUDY_ARMS,
-    UNFADED,
-    UNHELD,
+    LIST,
+    find_study_arm,
 )
 from studies.scenes.decisions import MANY_VIEWS_SCENES, points_of
 from studies.scenes.training import Spec
 
-SCENES = ("plush", "banana", "lund_door", "brighton_beach", "embedded")
 FEW_VIEWS_SCENES = ("embedded", "banana", "lund_door", "brighton_beach")
-ROTATED_ARMS = (
-    *("mcmc", FADED, BOTH, ANNEALED, "paper", "paper-constant"),
-    *(SELDOM_FADED, *UNFADED.values(), "rates-x2", "own-step"),
-    *(STABLE, f"{STABLE}-constant"),
-    *(BOTH_AVERAGED, DEFAULTS, STOCK_AVERAGED, POOLED, POOLED_AVERAGED),
-    *("l2@1/30", "l1+reset@1/30", "l2+reset@1/30", "l2+reset+lqn@1/30"),
-    *(f"l1+reset{x}@1/{k}" for k in (4, 2) for x in ("", "+lqn", "+lqn-all")),
-)
-BRIEF_ARMS = ("mcmc", FADED, BOTH, ANNEALED, *EARLY)
-HALF_ARMS = (  # with 50,000 Gaussians
-    *("mcmc", BOTH, BOTH_AVERAGED, STOCK_AVERAGED, SHARE_KEPT, SELDOM_FADED, *UNFADED.values()),
-    *(FADED, DEFAULTS, "paper", "paper-constant"),
-)
-SIZE_ARMS = ("mcmc", BOTH, FADED, DEFAULTS)
-RATES_ARMS = ("mcmc", OWN_STEP, BOTH, FADED, DEFAULTS)
-UNSEEN_ARMS = ("mcmc", "out-of-view", UNHELD, BOTH)
-UNSEEN_LONG_ARMS = ("mcmc", UNHELD, BOTH, FADED, HELD, f"{HELD}+averaged")
-CROWDED_ARMS = (*SIZE_ARMS, SHARE_KEPT, UNFADED["means"])
+STOCK = (BASELINE, f"{BASELINE}{AVERAGED}")
+TODAY = (*STOCK, "faded", DEFAULTS)
+FRAMES = tuple(arm.name for arm in LIST if arm.name.startswith("frame-"))
+RATES = tuple(arm.name for arm in LIST if arm.name.startswith(("rates-", "positions-")))
+ADAPTIVE_ARMS = (ADAPTIVE, ADAPTIVE_DEFAULTS)
 
 
 @dataclass(frozen=True)
@@ -84,99 +56,127 @@ def cross(
     ]
 
 
+def with_averaging(arms: Sequence[str]) -> list[str]:
+    """The arms' branches that average; the arms themselves are their trunks."""
+    return [f"{arm}{AVERAGED}" for arm in arms]
+
+
 def stages(seeds: int = 3) -> dict[str, list[Spec]]:
-    """The trainings of every stage; their scenes are names, not yet folders."""
-    arms = {
-        group: [arm.name for arm in found if not arm.retired] for group, found in GROUPS.items()
-    }
-    two, rotated = ["mcmc", ANNEALED], partial(cross, rotated=True)
-    half_size = partial(rotated, iterations=30_000, size="images_2")
+    """The trainings of every stage; their scenes are names, not yet folders.
+
+    A quarter of the photos' width with 4,000 or 10,000 Gaussians, half of it with 50,000, and the
+    whole with 200,000 and harmonics of degree 3.
+    """
+    rotated = partial(cross, rotated=True)
+    at_half = partial(rotated, iterations=30_000, size="images_2")
+    frames = with_averaging(FRAMES)
+    adaptive_frames = with_averaging([a.name for a in LIST if a.name.startswith("adc+frame-")])
+    half_sizes = ((("bonsai",), 5), (("plush",), 12.5), (("lego",), 5))
     return {
-        "rotated": [
+        "embedded": rotated(("embedded",), TODAY, 1, 1_500),  # needs no download
+        "quarter": [
             spec
-            for seed in range(seeds)
             for scenes in (MANY_VIEWS_SCENES, FEW_VIEWS_SCENES)
-            for arm in ROTATED_ARMS
+            for arm in (*TODAY, "paper", "paper-constant")
             for spec in rotated(scenes, [arm], seeds, 30_000)
-            if spec.seed == seed
         ],
-        "rotated-brief": [
-            *rotated(MANY_VIEWS_SCENES, BRIEF_ARMS, seeds, 7_500),
-            *rotated(MANY_VIEWS_SCENES, [BOTH_AVERAGED, DEFAULTS], seeds, 7_500),
-            *rotated(("bonsai",), [SELDOM_FADED], 1, 7_500),
-            *rotated(MANY_VIEWS_SCENES, [BOTH, FADED, DEFAULTS], seeds, 10_000),
-        ],
-        "crowded": [  # 40,000 Gaussians on images of a quarter of their size
-            *rotated(("bonsai",), CROWDED_ARMS, 1, 7_500, 4),
-            *rotated(("plush",), CROWDED_ARMS, 1, 7_500, 10),
-        ],
-        "half-size": [
+        "quarter-brief": rotated(MANY_VIEWS_SCENES, TODAY, seeds, 7_500),
+        "quarter-10,000": rotated(MANY_VIEWS_SCENES, ["faded", DEFAULTS], seeds, 10_000),
+        "half": [
             spec
-            for chosen, count in ((HALF_ARMS, 1), (("mcmc", STOCK_AVERAGED, DEFAULTS), seeds))
-            for scenes, share in ((("bonsai", "lego"), 5), (("plush",), 12.5))
-            for spec in half_size(scenes, chosen, count, share=share)
+            for arms, count in ((("paper", "paper-constant"), 1), (TODAY, seeds))
+            for scenes, share in half_sizes
+            for spec in at_half(scenes, arms, count, share=share)
         ],
-        "sh3": rotated(MANY_VIEWS_SCENES, SIZE_ARMS, 1, 30_000, sh_degree=3),
-        "adaptive": rotated(MANY_VIEWS_SCENES, arms["adaptive"], 1, 30_000),
+        "adaptive": rotated(MANY_VIEWS_SCENES, [*ADAPTIVE_ARMS, "adc+averaged"], seeds, 30_000),
+        "sh3": rotated(MANY_VIEWS_SCENES, TODAY, 1, 30_000, sh_degree=3),
+        # The positions in their own frame: half size decides, then its rate and what is beside it.
+        "own-frame": [
+            spec
+            for rate in (0.1, 0.2)
+            for arm in (f"frame-{rate}{AVERAGED}", f"frame-{rate}+faded{AVERAGED}")
+            for scenes, share in half_sizes
+            for spec in at_half(scenes, [arm], seeds, share=share)
+        ],
+        "own-frame-brief": rotated(MANY_VIEWS_SCENES, frames, 1, 7_500),
+        "own-frame-quarter": rotated(MANY_VIEWS_SCENES, frames, seeds, 30_000),
+        "own-frame-adaptive": rotated(MANY_VIEWS_SCENES, adaptive_frames, 1, 30_000),
+        # Stock with other constant rates: what a longer step is to be compared with.
+        "rates-tuned": [
+            *rotated(MANY_VIEWS_SCENES, RATES, 1, 7_500),
+            *(s for x, share in half_sizes for s in at_half(x, RATES, 1, share=share)),
+        ],
+        "half-adaptive": [
+            spec
+            for scenes, share in half_sizes
+            for spec in at_half(scenes, [*ADAPTIVE_ARMS, *adaptive_frames], 1, share=share)
+        ],
+        "whole": rotated(  # 800x800 and 800x532
+            ("lego", "bonsai"),
+            [*STOCK, DEFAULTS, *with_averaging(["frame-0.1", "frame-0.1+faded"])],
+            1,
+            30_000,
+            20,
+            size="images",
+            sh_degree=3,
+        ),
+        # One size of a training after the other.
+        "crowded": [  # 40,000 Gaussians on images of a quarter of their size
+            *rotated(("bonsai",), TODAY, 1, 7_500, 4),
+            *rotated(("plush",), TODAY, 1, 7_500, 10),
+        ],
         "sizes": [  # fewer Gaussians, iterations and views
-            *rotated(("bonsai",), SIZE_ARMS, 1, 7_500, 0.1),
-            *rotated(("bonsai",), SIZE_ARMS, 1, 7_500, 0.4),
-            *rotated(("bonsai",), SIZE_ARMS, 1, 3_000),
+            *rotated(("bonsai",), TODAY, 1, 7_500, 0.1),
+            *rotated(("bonsai",), TODAY, 1, 7_500, 0.4),
+            *rotated(("bonsai",), TODAY, 1, 3_000),
             *(
                 spec
                 for views in (14, 28, 55, 110)
-                for spec in rotated(("bonsai",), SIZE_ARMS, 1, 7_500, views=views)
+                for spec in rotated(("bonsai",), TODAY, 1, 7_500, views=views)
             ),
         ],
         "rates": [  # the trainer's own, all of them times a factor
             spec
             for rates in (0.1, 0.3, 1.0, 3.0, 10.0)
-            for spec in rotated(("plush",), RATES_ARMS, 1, 7_500, rates=rates)
+            for spec in rotated(("plush",), TODAY, 1, 7_500, rates=rates)
         ],
-        "unseen": [  # views that see little of the scene
-            *rotated(("bonsai",), (FADED, *UNSEEN_ARMS), 1, 7_500, tiled=20),
-            *rotated(("bonsai",), UNSEEN_ARMS, 1, 7_500, tiled=4),
-            *rotated(MANY_VIEWS_SCENES, UNSEEN_ARMS, 2, 7_500, tiled=9),
-            *rotated(MANY_VIEWS_SCENES, UNSEEN_LONG_ARMS, 2, 30_000, tiled=9),
-        ],
-        "explorations": [
-            *rotated(("plush",), [STABLE, *arms["explorations"]], 1, 7_500),
-            *rotated(("plush", "embedded"), arms["explorations"], 1, 30_000),
-            *rotated(("plush",), (OFTEN_FADED, MORE_AT_ONCE, SCALES_ALONE), 1, 30_000),
-        ],
-        # Short trainings of small scenes, whose held-out views are the same for every seed.
-        "core": cross(SCENES, arms["core"], seeds, 3_000),
-        "tails": cross(SCENES, arms["tails"], seeds, 3_000),
-        "long": cross(SCENES, [*two, FADED, "annealed-8-0.4"], seeds, 7_500),
-        "full": cross(SCENES, two, 1, 30_000),
-        "random": cross(SCENES, two, seeds, 3_000, init="random"),
-        "small": cross(SCENES, two, seeds, 3_000, share=0.25),
-        "harmonics": cross(SCENES, two, 1, 3_000, sh_degree=3),
     }
 
 
-def plan(root: Path, out: Path, only: list[str] | None = None, seeds: int = 3) -> list[Training]:
+def plan(
+    root: Path,
+    out: Path,
+    only: Sequence[str] = (),
+    seeds: int = 3,
+    arms: Sequence[str] = (),
+) -> list[Training]:
     """The trainings of the named stages, or of all.
 
     Args:
         root: folder that holds the scenes' folders.
         out: folder for the trainings.
+        only: stages; all where there are none.
+        arms: these in the place of the stages' own, wherever those are trained.
+
+    Raises:
+        ValueError: a stage or an arm is unknown.
     """
     chosen = stages(seeds)
-    unknown = set(only or ()) - set(chosen)
+    unknown = set(only) - set(chosen)
     if unknown:
         raise ValueError(f"--stages {sorted(unknown)}: unknown; there are {', '.join(chosen)}")
     trainings: dict[Path, Training] = {}
-    for stage in only or list(chosen):
+    for stage in only or chosen:
         for spec in chosen[stage]:
             source = spec.scene if spec.scene == "embedded" else str(root / spec.scene)
-            for training in _with_needs(replace(spec, scene=source), out):
-                trainings.setdefault(training.folder, training)
+            for arm in arms or [spec.arm]:
+                for training in _with_needs(replace(spec, scene=source, arm=arm), out):
+                    trainings.setdefault(training.folder, training)
     return list(trainings.values())
 
 
 def _with_needs(spec: Spec, out: Path) -> list[Training]:
-    arm, needed = STUDY_ARMS[spec.arm], []
+    arm, needed = find_study_arm(spec.arm), []
     folders: dict[str | None, Path] = {}
     for name in filter(None, (arm.trunk, arm.needs)):
         other = replace(spec, arm=name)
@@ -193,7 +193,6 @@ def folder_of(spec: Spec, out: Path) -> Path:
     kind += f"-{spec.size}" * (spec.size != "images_4")
     kind += "-rotated" * spec.rotated
     kind += f"-{spec.views}-views" * (spec.views > 0)
-    kind += f"-tiled-{spec.tiled}" * (spec.tiled > 0)
     kind += f"-rates-{spec.rates:g}" * (spec.rates != 1.0)
     arm = spec.arm.replace("/", "_")
     return out / Path(spec.scene).name / kind / arm / f"seed-{spec.seed}"

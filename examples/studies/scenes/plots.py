@@ -12,27 +12,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from studies.scenes.analysis import Gain, Study
-from studies.scenes.arms import ANNEALED, BASELINE, DEFAULTS, FADED, label
+from studies.scenes.analysis import Study, difference
+from studies.scenes.arms import BASELINE, DEFAULTS
 from studies.scenes.decisions import points_of
-from studies.scenes.long_tables import difference
-from studies.scenes.records import Record, Setting
+from studies.scenes.records import Setting
 
 # Okabe and Ito's colours: told apart with any kind of colour vision.
-COLOURS = {
-    BASELINE: "#000000",
-    "awsgld": "#d55e00",
-    "constant": "#e69f00",
-    "rates-x2": "#f0e442",
-    "annealed-8-0.4": "#999999",
-    ANNEALED: "#56b4e9",
-    DEFAULTS: "#0072b2",
-    "paper": "#d55e00",
-    FADED: "#cc79a7",
-    f"{ANNEALED}+pooled": "#009e73",
-}
-SHOWN_FROM = 0.25  # of an arm's seconds: what it falls to before may be out of the picture
-VERDICT_COLOURS = {"pays": "#009e73", "does not pay": "#999999", "undecided": "#e69f00"}
+COLOURS = {BASELINE: "#000000", DEFAULTS: "#0072b2", "paper": "#d55e00"}
 VIEWS = {"bonsai": 220, "lego": 87, "plush": 84}  # to train on, of the scenes with many
 SCENE_COLOURS = {"bonsai": "#0072b2", "lego": "#d55e00", "plush": "#009e73"}
 SIZE_AXES = {  # of `plot_sizes`, and what else is to know of the trainings there
@@ -42,48 +28,6 @@ SIZE_AXES = {  # of `plot_sizes`, and what else is to know of the trainings ther
     "share of the full width": "(30,000; half has 50,000 Gaussians)",
 }
 DPI = 150
-
-
-def plot_curves(study: Study, settings: Sequence[Setting], arms: Sequence[str], path: Path) -> None:
-    """Test PSNR over CPU seconds, one panel per scene: mean over seeds, band from least to most."""
-    columns = min(3, len(settings))
-    rows = -(-len(settings) // columns)
-    figure, axes = plt.subplots(
-        rows, columns, figsize=(4.2 * columns, 3.2 * rows), squeeze=False, layout="constrained"
-    )
-    handles: dict[str, object] = {}
-    for axis, setting in zip(axes.flat, settings, strict=False):
-        shown: list[float] = []
-        for arm in arms:
-            records = list(study.runs(setting, arm).values())
-            if not records:
-                continue
-            seconds, table = _curves(records)
-            low, high, colour = table.min(0), table.max(0), COLOURS[arm]
-            (line,) = axis.plot(seconds, table.mean(0), color=colour, linewidth=1.6)
-            axis.fill_between(seconds, low, high, color=colour, alpha=0.15, lw=0)
-            handles.setdefault(label(arm), line)
-            late = seconds >= SHOWN_FROM * seconds[-1]
-            shown += [*low[late], high.max()]
-        axis.set_title(f"{setting.scene}, {setting.points:,} points", fontsize=10)
-        margin = 0.05 * (max(shown) - min(shown))
-        axis.set_ylim(min(shown) - margin, max(shown) + margin)
-        axis.grid(alpha=0.3)
-    for axis in axes.flat[len(settings) :]:
-        axis.axis("off")
-    for axis in axes[-1]:
-        axis.set_xlabel("CPU seconds")
-    for row in axes:
-        row[0].set_ylabel("test PSNR (dB)")
-    figure.legend(
-        list(handles.values()),  # pyright: ignore[reportArgumentType]
-        list(handles),
-        loc="outside lower center",
-        ncols=min(len(handles), 4),
-        frameon=False,
-    )
-    figure.savefig(path, dpi=DPI)
-    plt.close(figure)
 
 
 def plot_metrics(
@@ -113,7 +57,7 @@ def plot_metrics(
             for axis, metric in zip(column, ("psnr", "lpips"), strict=True):
                 mean = np.mean([record.curve[metric] for record in records], axis=0)
                 # The first looks are off the scale of what is compared.
-                axis.plot(shares[2:], mean[2:], color=COLOURS[arm], label=label(arm))
+                axis.plot(shares[2:], mean[2:], color=COLOURS[arm], label=arm)
                 axis.grid(alpha=0.3)
         for arm, count in itertools.product(arms if shared else (), shorter):
             found = study.runs(replace(setting, iterations=count), arm)
@@ -136,7 +80,7 @@ def plot_sizes(study: Study, path: Path) -> None:
     A column per size, the other three the scene's own; scenes with two of it, means over the seeds.
     """
     lines: dict[str, dict[str, dict[float, Sequence[float]]]] = {name: {} for name in SIZE_AXES}
-    for setting in study.all_settings():
+    for setting in study.settings():
         found = difference(study, [setting], DEFAULTS, BASELINE)
         for axis, place in _places(setting).items() if found.count else ():
             pairs = found.pairs[setting.scene]
@@ -192,38 +136,3 @@ def _places(setting: Setting) -> dict[str, float]:
     if setting in (replace(own, iterations=30_000), half):
         places["share of the full width"] = 0.5 if setting == half else 0.25
     return places
-
-
-def _curves(records: Sequence[Record]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean seconds and every seed's PSNR, at the same evaluations."""
-    seconds = np.mean([record.curve["seconds"] for record in records], axis=0)
-    return seconds, np.array([record.curve["psnr"] for record in records])
-
-
-def plot_gains(gains: Sequence[Gain], path: Path, title: str) -> None:
-    """Gain at equal seconds of every arm over its control, with twice the deviation."""
-    height = 0.9 + 0.32 * len(gains)
-    figure, axis = plt.subplots(figsize=(8.4, height), layout="constrained")
-    places = np.arange(len(gains))[::-1]
-    for place, gain in zip(places, gains, strict=True):
-        axis.errorbar(
-            gain.equal_seconds,
-            place,
-            xerr=2 * gain.spread,
-            fmt="o",
-            color=VERDICT_COLOURS[gain.verdict],
-            capsize=3,
-        )
-    axis.axvline(0.0, color="black", linewidth=0.8)
-    labels = [f"{label(g.arm)}  (vs {label(g.control)})" for g in gains]
-    axis.set_yticks(places, labels, fontsize=8)
-    axis.set_ylim(-0.7, len(gains) - 0.3)
-    axis.set_xlabel("gain at equal seconds (dB), ± 2 deviations over seeds")
-    axis.grid(axis="x", alpha=0.3)
-    axis.set_title(title, fontsize=10)
-    for verdict, colour in VERDICT_COLOURS.items():
-        if any(gain.verdict == verdict for gain in gains):
-            axis.plot([], [], "o", color=colour, label=verdict)
-    axis.legend(fontsize=8, loc="best")
-    figure.savefig(path, dpi=DPI)
-    plt.close(figure)

@@ -1,8 +1,8 @@
 """Train what the study compares: python examples/studies/scenes/run.py --scenes DIR --jobs 2
 
 Resumable: Ctrl-C loses at most a twentieth of the trainings in progress, and the same command
-goes on. `--stages core,tails` trains a part. `report.py` turns the records into tables, plots and
-the page.
+goes on. `--stages quarter,half` trains a part of the plan, `--arms NAME,NAME` these arms in the
+place of the plan's. `report.py` turns the records into tables, plots and the page.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from splatting.processes import side_by_side, start
 from splatting.stopping import command, stop_at_once
 from tqdm import tqdm
 
-from studies.scenes.arms import STUDY_ARMS
+from studies.scenes.arms import find_study_arm
 from studies.scenes.plan import Training, plan
 
 
@@ -38,15 +38,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; 1 where a training has failed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     add = parser.add_argument
-    add("--scenes", type=Path, required=True, metavar="DIR", help="folder of the scenes' folders")
+    add(
+        "--scenes",
+        type=Path,
+        default=Path("scenes"),
+        metavar="DIR",
+        help="folder of the scenes' folders; the stage `embedded` needs none",
+    )
     add("--stages", help="comma-separated; all where not given")
+    add("--arms", help="comma-separated; those of the stages where not given")
     add("--seeds", type=int, default=3)
     add("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="trainings at a time")
     add("--lpips", nargs=2, metavar=("FILE.py", "WEIGHTS"), help="see perceptual.py")
     add("-o", "--out", type=Path, default=Path("runs/study"), metavar="DIR")
     args = parser.parse_args(arguments)
-    stages = args.stages.split(",") if args.stages else None
-    trainings = plan(args.scenes, args.out, stages, args.seeds)
+    stages, arms = (words.split(",") if words else () for words in (args.stages, args.arms))
+    trainings = plan(args.scenes, args.out, stages, args.seeds, arms)
     stop_at_once()
     failed = _train_all(trainings, args.jobs, args.lpips)
     for folder in failed:
@@ -77,7 +84,7 @@ def _train_all(trainings: list[Training], jobs: int, lpips: list[str] | None = N
 
 def _iterations(training: Training) -> int:
     """What a training costs: a branch runs from its switch on."""
-    arm, total = STUDY_ARMS[training.spec.arm], training.spec.iterations
+    arm, total = find_study_arm(training.spec.arm), training.spec.iterations
     return total if arm.trunk is None else total - round(arm.switch * total)
 
 

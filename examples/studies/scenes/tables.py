@@ -1,14 +1,27 @@
-"""The study's tables, as Markdown."""
+"""The study's tables, as Markdown: PSNR, SSIM and LPIPS side by side."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from statistics import fmean, stdev
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from statistics import fmean
 
 from studies.pages import table
-from studies.scenes.analysis import Gain, Study
-from studies.scenes.arms import STUDY_ARMS, label
+from studies.scenes.analysis import METRICS, Difference, Study, difference
+from studies.scenes.arms import BASELINE, DEFAULTS, arm_of
+from studies.scenes.decisions import MANY_VIEWS_SCENES, PIECES, decide, settings_of
 from studies.scenes.records import Record, Setting
+
+SIZES = {"images_4": "quarter", "images_2": "half", "images": "full"}
+PAPER = (  # what the pages say of the paper's parts: what, arm, control
+    ("AW-SGLD as here, less a constant of its mean", "awsgld-stable", "awsgld-stable-constant"),
+    ("AW-SGLD as in the paper, likewise", "paper", "paper-constant"),
+    ("L2 in the last thirtieth", "l2@1/30", BASELINE),
+    ("fresh moments there", "l1+reset@1/30", BASELINE),
+    ("L-BFGS directions with both", "l2+reset+lqn@1/30", "l2+reset@1/30"),
+    ("the whole preset", "paper", BASELINE),
+)
 
 
 def machines_line(records: Sequence[Record]) -> str:
@@ -25,89 +38,192 @@ def machines_line(records: Sequence[Record]) -> str:
     return "\n".join(said)
 
 
-def gains_table(gains: Sequence[Gain]) -> str:
-    """One line per arm: what it gains over its control, and the rule's verdict."""
-    heads = ["arm", "what it is", "against", "scenes, seeds", "dB at equal iterations"]
-    heads += ["dB at equal seconds", "dB on training views", "seconds", "verdict"]
-    rows = [
-        (
-            *(f"`{label(g.arm)}`", STUDY_ARMS[g.arm].what, f"`{label(g.control)}`"),
-            *(f"{len(g.scenes)}, {g.seeds}", f"{g.equal_iterations:+.2f}", _gain_and_spread(g)),
-            *(f"{g.train:+.2f}", f"x{g.seconds:.2f}", g.verdict),
-        )
-        for g in gains
-    ]
-    return table(heads, "llllrrrrl", rows)
-
-
-def scenes_table(study: Study, settings: Sequence[Setting], arms: Sequence[str]) -> str:
-    """Test PSNR of every arm on every scene; the last columns are means over the scenes."""
+def arms_table(study: Study, settings: Sequence[Setting]) -> str:
+    """One line per arm: what it is, against what it is measured, and in how many trainings."""
     rows = []
-    for arm in arms:
-        runs = [list(study.runs(setting, arm).values()) for setting in settings]
-        if not any(runs):
-            continue
-        cells = [_mean_and_spread([r.final for r in of_scene]) for of_scene in runs]
-        every = [record for of_scene in runs for record in of_scene]
-        complete = all(runs)
-        ssim = f"{fmean(r.curve['ssim'][-1] for r in every):.4f}" if complete else "-"
-        lpips = [r.lpips for r in every if r.lpips is not None]
-        shown = f"{fmean(lpips):.4f}" if complete and len(lpips) == len(every) else "-"
-        state = fmean(r.state_bytes / r.curve["num_points"][-1] for r in every)
-        peak = f"{fmean(r.peak_rss_bytes for r in every) / 1e6:.0f}"
-        rows.append((f"`{label(arm)}`", *cells, ssim, shown, f"{state:.0f}", peak))
-    names = (setting.scene for setting in settings)
-    more = ("SSIM", "LPIPS", "state, bytes per point", "peak memory, MB")
-    return table(["arm", *names, *more], "lr", rows)
+    for name in study.arms(settings):
+        arm, count = arm_of(name), sum(len(study.runs(setting, name)) for setting in settings)
+        rows.append((f"`{name}`", arm.what, f"`{arm.control}`", count))
+    return table(("arm", "what it is", "against", "trainings"), "lllr", rows)
 
 
-def goals_table(study: Study, kinds: dict[str, list[Setting]], arm: str, control: str) -> str:
-    """The gain in long trainings, and when the control's last PSNR is reached."""
+def differences_table(study: Study, settings: Sequence[Setting], arms: Iterable[str]) -> str:
+    """One line per arm that has been trained: what it gains over its control."""
     rows = []
-    for name, settings in kinds.items():
-        gain = study.gain(settings, arm, control)
-        if gain is None:
-            continue
-        reach = "not on every scene" if gain.reach is None else f"x{gain.reach:.2f}"
-        before = f"{gain.psnr - gain.equal_iterations:.2f}"
-        gains = f"{gain.equal_iterations:+.2f}", _gain_and_spread(gain)
-        rows.append((name, f"{', '.join(gain.scenes)}; {gain.seeds}", before, *gains, reach))
-    heads = ["training", "scenes, seeds", "control, dB", "gain at equal iterations"]
-    heads += ["gain at equal seconds", "seconds until the control's last PSNR"]
-    return table(heads, "llr", rows)
+    for found in (difference(study, settings, arm) for arm in arms):
+        if found.count and found.arm != found.control:
+            names = f"`{found.arm}`", f"`{found.control}`"
+            counts = f"{len(found.pairs)}, {found.count}"
+            rows.append((*names, counts, *cells_of(found), f"x{found.cost:.2f}", found.verdict))
+    heads = ("arm", "against", "scenes, trainings", "PSNR", "SSIM", "LPIPS", "cost", "by the rule")
+    return table(heads, "lllrrrrl", rows)
 
 
-def front_table(
-    study: Study, kinds: dict[int, list[Setting]], rows: Sequence[tuple[str, str, str]]
+def cells_of(found: Difference) -> list[str]:
+    """What is gained in the three metrics when the first of the two has finished."""
+    return [_signed(*found.of(metric), digits) for metric, (_, digits) in METRICS.items()]
+
+
+def metrics_table(
+    study: Study,
+    settings: Sequence[Setting],
+    arms: Iterable[str],
+    *,
+    head: Callable[[Setting], str] = lambda setting: setting.scene,
+    seed: int | None = None,
 ) -> str:
-    """Gains at equal seconds by length of the training, and scenes below the control.
+    """PSNR / SSIM / LPIPS of every arm in every setting.
 
     Args:
-        kinds: the settings of each length, by its iterations.
-        rows: (what it is, arm, control); the first one's scenes are counted.
+        head: what stands above a setting's column.
+        seed: of this one, with the last number of Gaussians, which differs; None: means over all.
     """
-    made = []
-    for what, arm, control in rows:
-        gains = [study.gain(settings, arm, control) for settings in kinds.values()]
-        made.append((what, *("-" if g is None else f"{_gain_and_spread(g)} dB" for g in gains)))
-    _, arm, control = rows[0]
-    shares = [[study.gain([s], arm, control) for s in settings] for settings in kinds.values()]
-    behind = [
-        f"{sum(g.equal_seconds < 0 for g in found if g)} of {sum(g is not None for g in found)}"
-        for found in shares
-    ]
-    made.insert(1, ("scenes on which they end below stock", *behind))
-    return table(["iterations", *(f"{n:,}" for n in kinds)], "lr", made)
+    rows = []
+    for arm in arms:
+        runs = [study.runs(setting, arm) for setting in settings]
+        found = [[r for key, r in by_seed.items() if seed in (None, key)] for by_seed in runs]
+        if any(found):
+            cells = [_cell(records, gaussians=seed is not None) for records in found]
+            rows.append((f"`{arm}`", *cells))
+    return table(["arm", *map(head, settings)], "l", rows)
 
 
-def _gain_and_spread(gain: Gain) -> str:
-    """At equal seconds; one seed has no spread."""
-    spread = f" ± {gain.spread:.2f}" if gain.seeds > 1 else ""
-    return f"{gain.equal_seconds:+.2f}{spread}"
+def headline_table(study: Study, long: Sequence[Setting], short: int) -> str:
+    """Stock beside the defaults at both lengths: what a reader sees first.
+
+    Means over the seeds that all of a scene's trainings have, since a seed has held-out views of
+    its own.
+    """
+    lengths = (long[0].iterations, short) if long else ()
+    whats = {"stock": BASELINE, "**defaults**": DEFAULTS}
+    columns: list[list[str]] = []
+    for setting in long:
+        of = [
+            study.runs(replace(setting, iterations=count), arm)
+            for count in lengths
+            for arm in whats.values()
+        ]
+        shared = set.intersection(*map(set, of))
+        columns.append([_cell([runs[seed] for seed in shared], seeds=False) for runs in of])
+    heads = [f"{what}, {count:,}" for count in lengths for what in whats]
+    rows = list(zip(heads, *columns, strict=True))
+    return table(["iterations", *(setting.scene for setting in long)], "l", rows)
 
 
-def _mean_and_spread(values: Sequence[float]) -> str:
-    if not values:
+def scenes_gain_table(study: Study, settings: Sequence[Setting], arm: str, control: str) -> str:
+    """One line per scene and size: control and arm at their ends, and the gain at equal seconds.
+
+    All over the seeds that both have.
+    """
+    rows = []
+    for setting in settings:
+        found = difference(study, [setting], arm, control)
+        for pairs in found.pairs.values():
+            stock, ours = _cell([b for _, b, _ in pairs]), _cell([a for a, _, _ in pairs])
+            rows.append((setting.scene, crowd(setting), stock, ours, cells_of(found)[0]))
+    names = f"`{control}`", f"`{arm}`"
+    return table(("scene", "Gaussians, images", *names, "gain, dB"), "llllr", rows)
+
+
+def reach_table(study: Study, long: Sequence[Setting], arm: str, shorter: Sequence[int]) -> str:
+    """When an arm has the PSNR that stock has after its last iteration, as a share of its seconds.
+
+    Args:
+        shorter: lengths of trainings that were that long from their start, whose last PSNR stands
+            beside; all at the first length's cost of an iteration.
+    """
+    total, rows = long[0].iterations if long else 0, []
+    for setting in long:
+        stock, runs = study.runs(setting, BASELINE), study.runs(setting, arm)
+        found = difference(study, [setting], arm, BASELINE)
+        for pairs in found.pairs.values():
+            # The iterates, of an arm that ends at their mean.
+            reached = [runs[ours.seed].reached(theirs.final) for ours, theirs, _ in pairs]
+            known = [iteration for iteration in reached if iteration is not None]
+            said, beside = "never", []
+            if len(known) == len(reached):
+                said = f"x{fmean(known) * found.cost / total:.2f} of its seconds"
+            cost = study.cost(replace(setting, iterations=shorter[0]), arm)
+            for count in shorter:
+                quick = study.runs(replace(setting, iterations=count), arm)
+                gains = [quick[s].final - stock[s].final for s in quick.keys() & stock.keys()]
+                share = count / total * cost
+                beside.append(f"{fmean(gains):+.2f} dB in x{share:.2f}" if gains else "-")
+            ends = f"{fmean(theirs.final for _, theirs, _ in pairs):.2f} dB ({len(pairs)})"
+            rows.append((setting.scene, ends, said, *beside))
+    heads = ["scene", f"stock, {total:,} iterations", f"`{arm}` has that PSNR after"]
+    return table([*heads, *(f"trained for {n:,} iterations only" for n in shorter)], "l", rows)
+
+
+def decisions_table(study: Study, beside: int) -> str:
+    """One line per part: what it was judged by, whether it is on; the PSNR of shorter trainings.
+
+    Args:
+        beside: length of these.
+    """
+    rows = []
+    for part, decision in decide(study).items():
+        by = f"`{decision.arm}` against `{decision.control}`"
+        found, shown = decision.found, ["-"] * 5
+        if found is not None:
+            count = f"{len(found.pairs)}, {found.count}"
+            shown = [f"{decision.iterations:,}", count, *cells_of(found)]
+        on = "on" if decision.on else "off"
+        brief = settings_of(study, beside, PIECES.get(part, 0))
+        shorter = difference(study, brief, decision.arm, decision.control)
+        short = cells_of(shorter)[0] if len(shorter.pairs) == len(MANY_VIEWS_SCENES) else "-"
+        rows.append((part, by, *shown, f"{on} ({decision.verdict})", short))
+    heads = (
+        "part",
+        "decided by",
+        "iterations",
+        "scenes, trainings",
+        "PSNR",
+        "SSIM",
+        "LPIPS",
+        "default",
+        f"PSNR at {beside:,}",
+    )
+    return table(heads, "llrlrrrlr", rows)
+
+
+def paper_table(study: Study, settings: Sequence[Setting], *, brief: bool = False) -> str:
+    """One line per part of the paper: what it gains over the same training without it.
+
+    Args:
+        brief: the PSNR alone, for the README.
+    """
+    rows = []
+    for what, arm, control in PAPER:
+        found = difference(study, settings, arm, control)
+        if found.count:
+            psnr, *others = cells_of(found)
+            counts = f"{len(found.pairs)}, {found.count}"
+            rows.append((what, psnr) if brief else (what, counts, psnr, *others))
+    if brief:
+        return table(("part", "PSNR, dB"), "lr", rows)
+    return table(("part", "scenes, trainings", "PSNR, dB", "SSIM", "LPIPS"), "llr", rows)
+
+
+def _cell(records: Sequence[Record], *, gaussians: bool = False, seeds: bool = True) -> str:
+    if not records:
         return "-"
-    spread = f" ± {stdev(values):.2f}" if len(values) > 1 else ""
-    return f"{fmean(values):.2f}{spread}"
+    values = [fmean(float(r.curve[m][-1]) for r in records) for m in METRICS]
+    psnr, ssim, lpips = values
+    of = f" ({len(records)} seeds)" if seeds and len(records) > 1 else ""
+    count = fmean(float(r.curve["num_points"][-1]) for r in records)
+    beside = f", {count:,.0f} Gaussians" if gaussians else ""
+    return f"{psnr:.2f} / {ssim:.3f} / {lpips:.3f}{beside}{of}"
+
+
+def crowd(setting: Setting) -> str:
+    """The most Gaussians, the images' size, and the harmonics' degree."""
+    degree = f", degree {setting.sh_degree}" * (setting.sh_degree > 0)
+    return f"{setting.points:,}, {SIZES.get(setting.size, setting.size)}{degree}"
+
+
+def _signed(mean: float, spread: float, digits: int) -> str:
+    if math.isnan(mean):
+        return "-"
+    around = "" if math.isnan(spread) else f" ± {spread:.{digits}f}"
+    return f"{mean:+.{digits}f}{around}"

@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +23,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import numpy as np
 import torch
 from splatting.fit import Fit, FitOptions
-from splatting.scenes import Background, Scene, Size, View, load_scene
+from splatting.scenes import Background, Scene, Size, load_scene
 
-from opt3dgs_optim.parts.out_of_view import SHARE
 from studies.scenes.arms import StudyArm, find_study_arm
 from studies.scenes.perceptual import NET, load_tool, mean_lpips
 
-TILES = {4: (2, 2), 9: (3, 3), 20: (5, 4)}  # columns and rows of so many pieces
 DIGITS = {"median_scale": 6}
+SEEN = "visible_share"  # what `OutOfView` calls the mean share of the points that a view sees
 BACKGROUNDS: dict[str, Background] = {"lego": "white"}
 BRANCH_SHARES = (0.5, 0.75, 0.9, 29 / 30)  # where the arms of the last phase branch off
 
@@ -51,7 +49,6 @@ class Spec:
     rotated: bool = False  # the seed says which views are held out: index = seed modulo 8
     views: int = 0  # evenly spaced ones of those to train on; 0: all
     rates: float = 1.0  # factor on all learning rates of the trainer
-    tiled: int = 0  # every view to train on is cut into so many; 0: it is not
 
     def options(self) -> FitOptions:
         """For `Fit`; a trunk and its branches share them."""
@@ -139,8 +136,8 @@ def _population(fit: Fit) -> dict[str, float]:
     And the mean share of them that a view sees, where a part keeps it.
     """
     scales, logits = fit.gaussians["scales"].detach(), fit.gaussians["opacities"].detach()
-    group = fit.optimizers["means"].param_groups[0]
-    seen = {SHARE: float(group[SHARE])} if SHARE in group else {}
+    numbers = {} if fit.phases is None else fit.phases.numbers()
+    seen = {SEEN: float(numbers[SEEN])} if SEEN in numbers else {}
     return seen | {
         "relocated": float(fit.relocated),
         "median_scale": float(scales.amax(1).median().exp()) / fit.scene.extent,
@@ -174,32 +171,7 @@ def scene_of(spec: Spec) -> Scene:
         if not 2 <= spec.views <= count:
             raise ValueError(f"views={spec.views}, but 2 to {count} are allowed, or 0 for all")
         train = [train[i * count // spec.views] for i in range(spec.views)]
-    if spec.tiled:
-        train = [tile for view in train for tile in tiles(view, spec.tiled)]
     return replace(scene, train=train)
-
-
-def tiles(view: View, pieces: int) -> list[View]:
-    """The view cut into pieces, each a view of its own: each sees little of the scene."""
-    if pieces not in TILES:
-        raise ValueError(
-            f"tiled={pieces}, but one of {list(TILES)} is needed, or 0 for whole views"
-        )
-    (columns, rows), camera = TILES[pieces], view.camera
-    across = [camera.width * i // columns for i in range(columns + 1)]
-    down = [camera.height * i // rows for i in range(rows + 1)]
-    return [
-        View(
-            f"{view.name}, tile {left} {top}",
-            replace(
-                camera, cx=camera.cx - left, cy=camera.cy - top,
-                width=right - left, height=bottom - top,
-            ),
-            view.image[top:bottom, left:right],
-        )
-        for top, bottom in pairwise(down)
-        for left, right in pairwise(across)
-    ]  # fmt: skip
 
 
 @cache

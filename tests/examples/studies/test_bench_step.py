@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from studies.bench.bench_step import main
+from studies.bench.bench_step import goals_line, main
 from studies.bench.bench_subjects import SUBJECTS
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
@@ -24,6 +24,14 @@ def test_every_subject_is_timed(tmp_path: Path, capsys: pytest.CaptureFixture[st
     table = (tmp_path / "step_cpu.md").read_text(encoding="utf-8")
     assert all(f"| {name} |" in table for name in SUBJECTS)
     assert table in capsys.readouterr().out
+
+
+def test_what_the_defaults_may_cost_stands_beside_what_they_do() -> None:
+    rows = {n: {"defaults": {"per_adam": ratio}} for n, ratio in ((1_000, 1.41), (10_000, 1.15))}
+    said = goals_line({**rows, 64: {"defaults": {"per_adam": 9.0}}})
+    assert "1,000 points x1.41 of x1.40 (missed), 10,000 points x1.15 of x1.15." in said
+    assert "64" not in said
+    assert goals_line({64: {"defaults": {"per_adam": 9.0}}}) == ""
 
 
 def test_the_committed_figures_have_the_rows_that_the_page_shows() -> None:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import math
 import re
-import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,45 +12,43 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from splatting.arms import Arm
 from splatting.fit import Fit, FitOptions
 from splatting.scenes import load_scene
+from studies import collapse
 from studies.pages import filled
-from studies.scenes import plots, report, steps
-from studies.scenes.analysis import Study
+from studies.scenes import arms, plots, report
+from studies.scenes.analysis import Study, difference, same_start
 from studies.scenes.arms import (
+    ADAPTIVE_DEFAULTS,
     BASELINE,
-    BOTH,
-    FADED,
-    STOCK_AVERAGED,
-    STUDY_ARMS,
-    adaptive,
+    LIST,
+    TRAINED,
+    StudyArm,
+    archive,
+    arm_of,
     find_study_arm,
-    last_phases,
-    whole_trainings,
 )
 from studies.scenes.arms import DEFAULTS as DEFAULT_ARM
 from studies.scenes.decisions import COMPARISONS, MANY_VIEWS_SCENES, decide, every_scene, points_of
-from studies.scenes.long_tables import (
-    difference,
-    headline_table,
-    reach_table,
-    same_start,
-    scenes_gain_table,
-    sizes_table,
-)
-from studies.scenes.parts.own_step import OwnStep
-from studies.scenes.parts.step_lengths import StepLengths
 from studies.scenes.plan import plan, stages
-from studies.scenes.records import COLUMNS, Record, Setting, gather, merge, read, write
+from studies.scenes.records import (
+    ARCHIVE,
+    COLUMNS,
+    Record,
+    Setting,
+    gather,
+    load,
+    merge,
+    read,
+    write,
+)
 from studies.scenes.run import main as run_study
-from studies.scenes.tables import machines_line
-from studies.scenes.training import Spec, machine, train
-from studies.scenes.view_angles import nearest_angles
+from studies.scenes.tables import headline_table, machines_line, reach_table, scenes_gain_table
+from studies.scenes.training import Spec, fit_of, machine, train
 
 from opt3dgs_optim import DEFAULTS, DEFAULTS_ADC
 
-RECORDS = report.FOLDER / "records.json"
+STUDY = cache(report.the_study)
 
 
 def record(arm: str, scene: str, seed: int, psnr: float, seconds: float = 10.0) -> Record:
@@ -62,24 +58,11 @@ def record(arm: str, scene: str, seed: int, psnr: float, seconds: float = 10.0) 
     curve["seconds"] = np.array([0.0, seconds])
     curve["psnr"] = np.array([10.0, psnr])
     setting = Setting(scene, 100, 3000, "sfm")
-    return Record(setting, arm, seed, curve, None, 1, 1, None, "a machine", f"2026-01-0{seed + 1}")
-
-
-def test_the_pages_are_made_from_the_records() -> None:
-    made = report.tables(Study(read(RECORDS)))
-    made |= report.rotated_tables(report.rotating_study())
-    for path in report.PAGES:
-        page = path.read_text(encoding="utf-8")
-        assert "<!-- study:" in page
-        assert filled(page, made, report.MARK, every=False) == page, path
-
-
-def test_the_page_is_short() -> None:
-    assert len(report.PAGE.read_text(encoding="utf-8").split()) <= 2_800
+    return Record(setting, arm, seed, curve, None, 1, 1, "a machine", f"2026-01-0{seed + 1}")
 
 
 def test_the_defaults_are_what_the_page_concludes() -> None:
-    decided = {part: decision.on for part, decision in decide(report.rotating_study()).items()}
+    decided = {part: decision.on for part, decision in decide(STUDY()).items()}
     committed = json.loads((report.FOLDER / "decisions.json").read_text(encoding="utf-8"))
     assert committed == decided
     assert {type(part).__name__ for part in DEFAULTS} == {
@@ -87,23 +70,32 @@ def test_the_defaults_are_what_the_page_concludes() -> None:
     }
 
 
-def test_every_rotated_training_is_of_a_stage() -> None:
+def test_the_pages_are_made_from_the_records() -> None:
+    made = report.tables(STUDY())
+    for path in report.PAGES:
+        page = path.read_text(encoding="utf-8")
+        assert "<!-- study:" in page
+        assert filled(page, made, report.MARK, every=False) == page, path
+
+
+def test_every_open_record_is_of_the_plan() -> None:
     planned = {replace(spec, seed=0) for specs in stages().values() for spec in specs}
-    for setting, arm in report.rotating_study()._of:
-        if STUDY_ARMS[arm].retired:
-            continue
-        kind = {name: getattr(setting, name) for name in ("rotated", "size", "views", "tiled")}
-        spec = Spec(setting.scene, arm, 0, setting.iterations, setting.points, **kind)
-        assert spec in planned, spec
+    trunks = {replace(s, arm=str(find_study_arm(s.arm).trunk)) for s in planned}
+    for entry in load(report.FOLDER):
+        if report.is_open(entry):
+            kind = {name: entry[name] for name in ("rotated", "size", "views", "rates")}
+            kind |= {"sh_degree": entry["sh_degree"], "init": entry["init"]}
+            spec = Spec(
+                entry["scene"], entry["arm"], 0, entry["iterations"], entry["points"], **kind
+            )
+            assert spec in planned | trunks, spec
 
 
-def test_the_defaults_are_the_measured_arm() -> None:
-    measured = find_study_arm(DEFAULT_ARM).parts
-    assert measured is not None
-    assert measured(300, None) == list(DEFAULTS)
-    cloning = find_study_arm("adc+defaults-but-scales+averaged").parts
-    assert cloning is not None
-    assert cloning(300, None) == list(DEFAULTS_ADC)
+def test_the_defaults_are_the_measured_arms() -> None:
+    for name, defaults in ((DEFAULT_ARM, DEFAULTS), (ADAPTIVE_DEFAULTS, DEFAULTS_ADC)):
+        measured = find_study_arm(name).parts
+        assert measured is not None
+        assert measured(300, None) == list(defaults)
 
 
 def rotated_record(arm: str, scene: str, seed: int, **metrics: float) -> Record:
@@ -175,17 +167,17 @@ def test_a_cost_that_was_not_measured_is_the_controls() -> None:
     study = Study([], {("plush", "images_4", 7_500, 0, 0, "faded"): 1.25})
     assert study.cost(setting, "faded") == 1.25
     assert study.cost(replace(setting, sh_degree=3), "faded") == 1.0
-    assert study.cost(setting, BOTH, "faded") == 1.0
-    assert study.cost(setting, BOTH) == 1.0
+    assert study.cost(setting, "annealed", "faded") == 1.0
+    assert study.cost(setting, "annealed") == 1.0
 
 
 def test_what_averaging_adds_in_the_end_counts_at_equal_seconds() -> None:
     """At 4/5 of the iterations, where its own curve is that of the iterates yet."""
-    arms = {"faded": 22.0, DEFAULT_ARM: 22.4, BASELINE: 20.0, STOCK_AVERAGED: 20.1}
+    arms = {"faded": 22.0, DEFAULT_ARM: 22.4, BASELINE: 20.0, "mcmc+averaged": 20.1}
     records = [rotated_record(arm, "plush", 0, psnr=psnr) for arm, psnr in arms.items()]
     setting = records[0].setting
     study = Study(records, {("plush", "images_4", 7_500, 0, 0, "faded"): 1.25})
-    found = difference(study, [setting], DEFAULT_ARM, STOCK_AVERAGED)
+    found = difference(study, [setting], DEFAULT_ARM, "mcmc+averaged")
     assert found.cost == 1.25
     assert found.of("psnr")[0] == pytest.approx(0.2 * 10.0 + 0.8 * 22.0 + 0.4 - 20.1)
     found = difference(study, [setting], DEFAULT_ARM, "faded")
@@ -200,9 +192,9 @@ def test_a_branch_is_not_compared_with_a_trunk_that_was_trained_again() -> None:
 
 
 def test_means_of_iterates_are_of_the_trunks_in_the_records() -> None:
-    study = report.rotating_study()
+    study = STUDY()
     for ours in study.records():
-        if trunk := STUDY_ARMS[ours.arm].averages:
+        if trunk := arm_of(ours.arm).averages:
             assert same_start(ours, study.runs(ours.setting, trunk)[ours.seed]), ours
 
 
@@ -221,13 +213,13 @@ def test_the_longest_trainings_decide() -> None:
 
 
 def test_every_scene_and_size_has_its_line() -> None:
-    arms = ((BASELINE, 20.0), (BOTH, 20.5))
+    arms = ((BASELINE, 20.0), ("annealed", 20.5))
     quarter = [rotated_record(arm, "banana", 0, psnr=psnr) for arm, psnr in arms]
     half = [replace(r, setting=replace(r.setting, size="images_2", points=5_000)) for r in quarter]
     other = rotated_record(BASELINE, "plush", 0)  # has no pair
-    unpaired = rotated_record(BOTH, "banana", 1, psnr=30.0)
+    unpaired = rotated_record("annealed", "banana", 1, psnr=30.0)
     study = Study([*quarter, *half, other, unpaired])
-    table = scenes_gain_table(study, every_scene(study, 7_500), BOTH, BASELINE)
+    table = scenes_gain_table(study, every_scene(study, 7_500), "annealed", BASELINE)
     ends = "20.00 / 0.700 / 0.200 | 20.50 / 0.700 / 0.200 | +0.50"
     assert table.splitlines()[2:] == [
         f"| banana | 4,000, quarter | {ends} |",
@@ -235,27 +227,16 @@ def test_every_scene_and_size_has_its_line() -> None:
     ]
 
 
-def test_a_line_compares_arms_of_one_seed() -> None:
-    arms = (BASELINE, "faded", BOTH)
-    records = [rotated_record(arm, "banana", seed) for arm in arms for seed in (0, 1)]
-    others = [rotated_record(arm, "plush", 0) for arm in arms[:2]]
-    study = Study([*records, *others])
-    table = sizes_table(study, study.all_settings(), [*arms, "own-step"])
-    cell = "20.00 / 0.700 / 0.200"
-    line = f"| banana | 4,000, quarter, 7,500 | {cell} | {cell} | {cell} | - |"
-    assert table.splitlines()[2:] == [line]
-
-
 def test_when_stocks_quality_is_reached_over_the_seeds_of_both() -> None:
-    runs = (BASELINE, 0, 20.0), (BOTH, 0, 30.0), (BASELINE, 1, 28.0)
+    runs = (BASELINE, 0, 20.0), ("annealed", 0, 30.0), (BASELINE, 1, 28.0)
     study = Study([rotated_record(arm, "a", seed, psnr=psnr) for arm, seed, psnr in runs])
-    said = reach_table(study, study.all_settings(), BOTH, [3_000, 5_000])
+    said = reach_table(study, study.settings(), "annealed", [3_000, 5_000])
     assert "| 20.00 dB (1) | x0.50 of its seconds | - | - |" in said
-    shorter = rotated_record(BOTH, "a", 0, psnr=21.0)
+    shorter = rotated_record("annealed", "a", 0, psnr=21.0)
     shorter = replace(shorter, setting=replace(shorter.setting, iterations=5_000))
-    costs = {("a", "images_4", 3_000, 0, 0, BOTH): 1.2}
+    costs = {("a", "images_4", 3_000, 0, 0, "annealed"): 1.2}
     both = Study([*study.records(), shorter], costs)
-    said = reach_table(both, study.all_settings(), BOTH, [3_000, 5_000])
+    said = reach_table(both, study.settings(), "annealed", [3_000, 5_000])
     assert "| x0.50 of its seconds | - | +1.00 dB in x0.80 |" in said
 
 
@@ -283,7 +264,7 @@ def test_dots_are_the_ends_of_shorter_trainings_of_every_seed(
     ]
     panels: list[Any] = []
     monkeypatch.setattr(plots, "_finish", lambda _figure, axis, _path: panels.append(axis))
-    costs = {("a", "images_4", 3_000, 0, 0, FADED): 1.5}
+    costs = {("a", "images_4", 3_000, 0, 0, "faded"): 1.5}
     for known in (others, others[:1]):  # the second without one of the seeds
         study = Study([*long, *known], costs)
         plots.plot_metrics(study, [long[0].setting], (BASELINE, DEFAULT_ARM), tmp_path, [3_000])
@@ -294,77 +275,38 @@ def test_dots_are_the_ends_of_shorter_trainings_of_every_seed(
     assert dots[1] == []
 
 
-def test_gain_at_equal_seconds_and_its_spread() -> None:
-    records = [
-        record(arm, scene, seed, psnr + 0.1 * seed * (arm != BASELINE), seconds)
-        for scene in "abcde"
-        for seed in range(3)
-        for arm, psnr, seconds in ((BASELINE, 20.0, 10.0), ("faded", 22.0, 20.0))
-    ]
-    study = Study(records)
-    gain = study.gain(study.settings(3000), "faded")
-    assert gain is not None
-    # At 10 s the slower arm is half-way: 10 + 12 / 2 = 16 dB, 0.05 more for each seed.
-    assert gain.equal_seconds == pytest.approx(-4.0 + 0.05)
-    assert gain.spread == pytest.approx(0.05)
-    assert gain.equal_iterations == pytest.approx(2.1)
-    assert gain.seconds == pytest.approx(2.0)
-    assert gain.reach == pytest.approx(np.mean([20 * 10 / (12 + 0.1 * s) / 10 for s in range(3)]))
-    assert gain.verdict == "does not pay"
-
-
-@pytest.mark.parametrize(
-    ("seeds", "gains", "verdict"),
-    [
-        (3, (0.5, 0.6, 0.7), "pays"),
-        (3, (0.1, 0.9, -0.3), "does not pay"),
-        (2, (5.0, 5.0), "undecided"),
-    ],
-)
-def test_the_rule(seeds: int, gains: tuple[float, ...], verdict: str) -> None:
-    records = [
-        record(arm, scene, seed, 20.0 + (gains[seed] if arm != BASELINE else 0.0))
-        for scene in "abcde"
-        for seed in range(seeds)
-        for arm in (BASELINE, "faded")
-    ]
-    study = Study(records)
-    gain = study.gain(study.settings(3000), "faded")
-    assert gain is not None
-    assert gain.verdict == verdict
-
-
 def test_the_plan_names_known_arms_and_puts_what_is_needed_first() -> None:
     trainings = plan(Path("scenes"), Path("runs"))
     seen: set[Path] = set()
     for training in trainings:
-        assert training.spec.arm in STUDY_ARMS
+        assert not find_study_arm(training.spec.arm).archived
         assert set(training.needs) <= seen, training
         seen.add(training.folder)
     assert len(seen) == len(trainings)
-    assert all(arm.control in STUDY_ARMS for arm in STUDY_ARMS.values())
+    known = {*TRAINED, *archive(), DEFAULT_ARM}
+    assert all(arm.control in known for arm in (*LIST, *archive().values()))
     with pytest.raises(ValueError, match="nonsense"):
         plan(Path("scenes"), Path("runs"), ["nonsense"])
 
 
 def test_a_training_resumes_and_branches(tmp_path: Path) -> None:
-    spec = Spec("embedded", BASELINE, 0, 40, 120)
+    spec = Spec("embedded", BASELINE, 0, 120, 120)
     whole = train(spec, _made(tmp_path / "whole"), None, None)
-    # Stopped after the evaluation at 20: the record is ahead of the checkpoint, as when killed.
+    # Stopped after a later evaluation: the record is ahead of the checkpoint, as when killed.
     stopped = _made(tmp_path / "stopped")
     train(spec, stopped, None, None)
     cut = json.loads((stopped / "record.json").read_text(encoding="utf-8"))
     del cut["finished"]
     (stopped / "record.json").write_text(json.dumps(cut), encoding="utf-8")
-    (tmp_path / "whole" / "at-30.pt").rename(stopped / "checkpoint.pt")
+    (tmp_path / "whole" / "at-90.pt").rename(stopped / "checkpoint.pt")
     again = train(spec, stopped, None, None)
     assert _psnr(again) == _psnr(whole)
 
-    branch = Spec("embedded", "l2@1/4", 0, 40, 120)
+    branch = Spec("embedded", "mcmc+averaged", 0, 120, 120)
     tail = train(branch, _made(tmp_path / "branch"), stopped_trunk(tmp_path, spec), None)
     assert (
-        _psnr(tail)[: _iterations(tail).index(30) + 1]
-        == (_psnr(whole)[: _iterations(whole).index(30) + 1])
+        _psnr(tail)[: _iterations(tail).index(116) + 1]
+        == (_psnr(whole)[: _iterations(whole).index(116) + 1])
     )
     assert _psnr(tail)[-1] != _psnr(whole)[-1]
 
@@ -395,53 +337,6 @@ def _iterations(made: dict[str, object]) -> list[int]:
 _embedded = cache(lambda: load_scene("embedded"))  # seconds to make
 
 
-def _fit(arm: str, iterations: int = 3000) -> Fit:
-    return Fit(_embedded(), find_study_arm(arm), FitOptions(iterations, 120))
-
-
-def test_records_survive_writing(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-    train(Spec("embedded", "faded", 1, 20, 80), tmp_path / "a", None, None)
-    train(Spec("embedded", "faded", 1, 20, 80, sh_degree=1), tmp_path / "b", None, None)
-    path = tmp_path / "records.json"
-    write(merge(gather(tmp_path / "a"), gather(tmp_path / "b")), path)
-    one, other = read(path)
-    assert (one.arm, one.seed, one.setting.iterations) == ("faded", 1, 20)
-    assert one.seconds > 0
-    assert other.state_bytes > one.state_bytes
-    assert other.setting == replace(one.setting, sh_degree=1)
-    assert one.machine == machine()
-    assert torch.__version__ in one.machine
-    assert re.fullmatch(r"\d{4}-\d\d-\d\d", one.date)
-    assert Study([one, other]).settings(20) == [one.setting]
-    assert Study([one, other]).settings(20, sh_degree=1) == [other.setting]
-
-
-def test_the_picture_of_the_steps_is_drawn_from_its_file(tmp_path: Path) -> None:
-    committed = report.FOLDER / "steps.json"
-    data = json.loads(committed.read_text(encoding="utf-8"))
-    assert re.fullmatch(r"\d{4}-\d\d-\d\d", data["date"])
-    assert "torch" in data["machine"]
-    shutil.copy(committed, tmp_path)
-    assert steps.main(["--redraw", "-o", str(tmp_path)]) == 0
-    assert (tmp_path / "steps.png").stat().st_size > 10_000
-
-
-def test_angles_between_views() -> None:
-    scene = _embedded()
-    first, second = scene.train[:2]
-    directions = [
-        np.asarray(v.camera.position - scene.points.median(0).values) for v in (first, second)
-    ]
-    lengths = [np.linalg.norm(d) for d in directions]
-    between = math.degrees(math.acos(directions[0] @ directions[1] / math.prod(lengths)))
-    assert nearest_angles(replace(scene, train=[first], test=[second])) == pytest.approx(
-        [between], rel=1e-3
-    )
-    assert nearest_angles(replace(scene, test=[first])) == pytest.approx([0.0], abs=0.1)
-
-
 def test_machines_and_days_are_said() -> None:
     records = [record("mcmc", "a", seed, 20.0) for seed in (2, 0, 1)]
     other = replace(records[0], machine="another", date="2026-02-01")
@@ -452,9 +347,9 @@ def test_machines_and_days_are_said() -> None:
 
 
 def test_new_records_take_the_place_of_old_ones() -> None:
-    def one(seed: int, seconds: float) -> dict[str, object]:
-        key = {"scene": "a", "points": 1, "iterations": 2, "init": "sfm", "arm": "mcmc"}
-        return {**key, "sh_degree": 0, "seed": seed, "seconds": seconds}
+    def one(seed: int, seconds: float) -> dict[str, Any]:
+        setting = asdict(Setting("a", 1, 2, "sfm"))
+        return {**setting, "arm": "mcmc", "seed": seed, "seconds": seconds}
 
     merged = merge([one(0, 1.0), one(1, 1.0)], [one(2, 2.0), one(1, 2.0)])
     assert merged == [one(0, 1.0), one(1, 2.0), one(2, 2.0)]
@@ -469,55 +364,119 @@ def test_bad_calls_say_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixtu
         find_study_arm("nonsense")
 
 
-def _own_step_lengths(times: float) -> dict[str, list[float]]:
-    """Root mean square of every parameter's first steps, with the trainer's rates so changed."""
-    lengths, own = StepLengths(every=1), OwnStep()
-    arm = Arm("own", "", lambda _iterations, _nu: [own, lengths])
-    fit = Fit(_embedded(), arm, FitOptions(40, 120))
-    found: dict[str, list[float]] = {name: [] for name in fit.gaussians}
-    fit.rates = {name: times * rate for name, rate in fit.rates.items()}
-    for optimizer in fit.optimizers.values():
-        optimizer.param_groups[0]["lr"] *= times
-    for iteration in range(12):
-        rates = {name: o.param_groups[0]["lr"] for name, o in fit.optimizers.items()}
-        fit.step()
-        # The Gaussians begin round: nothing turns them in the first step.
-        for name, rows in lengths.rows.items() if iteration > 2 else []:
-            length = rows[-1] * rates[name]
-            # Points that no view has seen yet stand still, and do not count as steps.
-            assert 0.3 < length / own.wanted(name, iteration / 40) < 1.5, (name, iteration)
-            found[name].append(length)
-    return found
+def test_records_survive_writing(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    train(Spec("embedded", "faded", 1, 20, 80), tmp_path / "a", None, None)
+    train(Spec("embedded", "faded", 1, 20, 80, sh_degree=1), tmp_path / "b", None, None)
+    found = merge(gather(tmp_path / "a"), gather(tmp_path / "b"))
+    for is_open in (lambda _: True, lambda r: r["sh_degree"] > 0, lambda _: False):
+        write(found, tmp_path, is_open)
+        assert merge([], load(tmp_path)) == found
+    packed = (tmp_path / ARCHIVE).stat().st_mtime_ns
+    write(found, tmp_path, lambda _: False)
+    assert (tmp_path / ARCHIVE).stat().st_mtime_ns == packed
+    one, other = read(tmp_path)
+    assert (one.arm, one.seed, one.setting.iterations) == ("faded", 1, 20)
+    assert one.seconds > 0
+    assert other.state_bytes > one.state_bytes
+    assert other.setting == replace(one.setting, sh_degree=1)
+    assert one.machine == machine()
+    assert torch.__version__ in one.machine
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", one.date)
+    (tmp_path / ARCHIVE).unlink()
+    (tmp_path / "records.jsonl").write_text('{"columns": ["psnr"]}\n', encoding="utf-8")
+    with pytest.raises(ValueError, match="columns \\['psnr'\\], but"):
+        read(tmp_path)
 
 
-def test_own_steps_have_the_wanted_size_whatever_the_rates() -> None:
-    usual = _own_step_lengths(1.0)
-    for times in (0.1, 0.3, 3.0, 10.0):
-        for name, lengths in _own_step_lengths(times).items():
-            # Lengths are rounded to 1e-5 of a rate.
-            assert lengths == pytest.approx(usual[name], rel=1e-2), (name, times)
+def test_records_of_before_the_arms_were_renamed_are_gathered(tmp_path: Path) -> None:
+    """And those of arms of another list, such as a study that runs on elsewhere."""
+    for arm in ("averaged@1/30", "adc+defaults-but-scales+averaged", "frame-0.4-capped+averaged"):
+        row = dict.fromkeys(COLUMNS, 1.0)
+        record = {"scene": "lego", "arm": arm, "seed": 0, "iterations": 30_000, "points": 200_000}
+        record |= {"init": "sfm", "size": "images", "rotated": True, "tiled": 0, "sh_degree": 3}
+        record |= {"mean_nu": None, "state_bytes": 1, "peak_rss_bytes": 1, "machine": "m"}
+        record |= {"date": "2026-11-25", "finished": True, "curve": [row, row]}
+        folder = tmp_path / arm.replace("/", "_")
+        folder.mkdir()
+        (folder / "record.json").write_text(json.dumps(record), encoding="utf-8")
+    found = gather(tmp_path)
+    names = {"mcmc+averaged", ADAPTIVE_DEFAULTS, "frame-0.4-capped+averaged"}
+    assert {record["arm"] for record in found} == names
+    assert [report.is_open(r) for r in found] == [
+        r["arm"] in names - {"frame-0.4-capped+averaged"} for r in found
+    ]
+    write(merge([], found), tmp_path, report.is_open)
+    made = report.tables(Study([*STUDY().records(), *read(tmp_path)]))
+    assert "200,000, full, degree 3" not in made["every-scene"]  # there is no pair
+    assert "`frame-0.4-capped+averaged`" in made["arms"]
 
 
-def test_own_steps_resume(tmp_path: Path) -> None:
-    whole, resumed = _fit("own-step", 60), _fit("own-step", 60)
-    for _ in range(25):
-        whole.step()
-    whole.save(tmp_path / "at.pt")
-    resumed.load(tmp_path / "at.pt")
-    for fit in (whole, resumed):
-        for _ in range(10):
-            fit.step()
-    assert all(torch.equal(p, resumed.gaussians[n]) for n, p in whole.gaussians.items())
-
-
-def test_a_retired_arm_is_drawn_but_not_trained() -> None:
-    assert STUDY_ARMS["matrix"].retired
-    with pytest.raises(ValueError, match="'matrix' is retired: its records are kept"):
+def test_an_archived_arm_keeps_its_lines_and_is_not_trained() -> None:
+    assert archive()["matrix"].archived
+    with pytest.raises(ValueError, match="'matrix' is archived: its records are kept"):
         find_study_arm("matrix")
-    study = Study(read(RECORDS))
-    assert study.gains(study.settings(report.SHORT), ["matrix"])
+    assert difference(STUDY(), STUDY().settings(), "matrix").count
+    assert not archive().keys() & TRAINED.keys()
+    made = report.tables(STUDY())
+    for name in (*archive(), *TRAINED):
+        trained = any(r.arm == name for r in STUDY().records())
+        assert (f"| `{name}` |" in made["arms"]) == trained
 
 
-def test_every_arm_with_code_is_listed() -> None:
-    coded = [*whole_trainings(), *(arm.name for arm in (*last_phases(), *adaptive()))]
-    assert not [name for name in coded if name not in STUDY_ARMS or STUDY_ARMS[name].retired]
+@pytest.mark.parametrize(
+    "name", ["nonsense", "paper+averaged", "nonsense+averaged", "matrix+averaged"]
+)
+def test_an_arm_that_cannot_be_trained_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=r"is unknown; there are mcmc, rates-x1\.5"):
+        find_study_arm(name)
+
+
+@pytest.mark.parametrize("arm", LIST, ids=lambda arm: arm.name)
+def test_every_arm_trains(arm: StudyArm) -> None:
+    if arm.adaptive:
+        pytest.importorskip("gsplat")
+    fit = fit_of(arm)(_embedded(), arm, FitOptions(60, 120), 1.1)
+    for _ in range(4):
+        fit.step()
+    assert all(p.isfinite().all() for p in fit.gaussians.values())
+
+
+def test_a_factor_on_the_positions_is_on_them_alone() -> None:
+    stock, doubled = (
+        Fit(_embedded(), replace(find_study_arm(name), mcmc=False), FitOptions(60, 120))
+        for name in (BASELINE, "positions-x2")
+    )
+    starts = {name: p.detach().clone() for name, p in stock.gaussians.items()}
+    for fit in (stock, doubled):
+        fit.step()
+    for name, start in starts.items():
+        one, other = (fit.gaussians[name].detach() - start for fit in (stock, doubled))
+        factor = 2.0 if name == "means" else 1.0
+        assert torch.allclose(other, factor * one, rtol=1e-3, atol=1e-6), name
+
+
+def test_the_readmes_arm_is_all_that_a_new_one_takes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = Path(report.__file__).with_name("README.md").read_text(encoding="utf-8")
+    entry = text.split("```python\n")[1].split("```")[0]
+    assert len(entry.splitlines()) == 5
+    (made,) = eval(f"({entry})", {**vars(arms)})
+    monkeypatch.setitem(TRAINED, made.name, made)
+    trained = ["mcmc", made.name, f"{made.name}+averaged"]
+    found = plan(tmp_path, tmp_path, ["embedded"], arms=trained)
+    assert [t.spec.arm for t in found] == trained
+    assert found[-1].trunk == found[1].folder
+    fit = Fit(_embedded(), find_study_arm(f"{made.name}+averaged"), FitOptions(60, 120))
+    assert fit.phases is not None
+    assert [type(part).__name__ for part in fit.phases.parts][:2] == ["Fading", "Averaging"]
+    with pytest.raises(ValueError, match="'nonsense' is unknown"):
+        plan(tmp_path, tmp_path, ["embedded"], arms=["nonsense"])
+
+
+def test_the_table_of_falls_is_made_from_its_records() -> None:
+    folder = collapse.OUT
+    records = json.loads((folder / "collapse.json").read_text(encoding="utf-8"))
+    assert collapse.table(records) == (folder / "collapse.md").read_text(encoding="utf-8")

@@ -14,18 +14,8 @@ from splatting.fit import Fit, FitOptions
 from splatting.scenes import Scene, load_scene
 from studies.scenes import costs
 from studies.scenes.arms import find_study_arm
-from studies.scenes.parts.exploring import (
-    CLAMP,
-    RESTART,
-    NuOfNoise,
-    RestartedHistogram,
-    ViewHistogram,
-    nu_per_point,
-)
 from studies.scenes.records import read_costs
-from studies.scenes.training import TILES, Spec, scene_of, tiles, train
-
-from opt3dgs_optim import EnergyHistogram, PhaseScheduler, PositionNoise
+from studies.scenes.training import Spec, scene_of, train
 
 
 @cache
@@ -52,106 +42,6 @@ def same_after_resuming(make: Any, path: Path, before: int, after: int) -> bool:
     return all(torch.equal(p, resumed.gaussians[n]) for n, p in whole.gaussians.items())
 
 
-@pytest.mark.parametrize("arm", ["nu-per-view", "nu-per-point", "nu-restarted", "nu-of-noise"])
-def test_a_study_part_resumes(tmp_path: Path, arm: str) -> None:
-    assert same_after_resuming(lambda: fit_with(arm), tmp_path / "at.pt", 35, 8)
-
-
-class Steps:
-    """A training of one parameter: what the parts do to it shows in themselves."""
-
-    def __init__(self, *parts: Any) -> None:
-        self.param = torch.nn.Parameter(torch.zeros(4, 3))
-        self.optimizer = torch.optim.Adam([{"params": [self.param], "name": "shN"}])
-        self.phases = PhaseScheduler(10_000, 1.0, list(parts))
-        self.phases.upgrade({"shN": self.optimizer})
-
-    def step(self, energy: float) -> None:
-        self.param.grad = torch.ones_like(self.param)
-        self.phases.observe(torch.tensor(energy))
-        self.optimizer.step()
-
-
-def test_a_views_energy_is_relative_to_its_own_mean() -> None:
-    part = ViewHistogram(warmup=50)
-    steps, draw = Steps(part), torch.Generator().manual_seed(0)
-    plain, seen, own = EnergyHistogram(warmup=50), [], []
-    for i in range(1_500):
-        part.view = i % 10
-        # A view's level is ten times its noise: the plain histogram sees nothing else.
-        noise = float(torch.randn((), generator=draw))
-        energy = 0.1 + 0.01 * part.view + 1e-3 * noise
-        steps.step(energy)
-        plain.observe(energy)
-        if i > 500:
-            seen.append((noise, float(part.histogram.multiplier)))
-            own.append(float(plain.multiplier))
-    noise, nu = torch.tensor(seen).T
-    assert torch.corrcoef(torch.stack([noise, nu]))[0, 1] < -0.5
-    assert abs(torch.corrcoef(torch.stack([noise, torch.tensor(own)]))[0, 1]) < 0.2
-
-
-def test_theta_starts_anew_and_the_mean_goes_on() -> None:
-    part = RestartedHistogram(warmup=50)
-    steps, draw = Steps(part), torch.Generator().manual_seed(0)
-    for _ in range(RESTART + 1):
-        steps.step(0.1 + 0.01 * float(torch.randn((), generator=draw)))
-    assert part.histogram.num_observed == 1
-    assert part.mean_multiplier != 1.0
-
-
-def test_nu_is_on_the_noise() -> None:
-    noise = PositionNoise({}, 5e5)
-    part = NuOfNoise(warmup=50)
-    steps = Steps(part, noise)
-    draw = torch.Generator().manual_seed(0)
-    scales = []
-    for _ in range(300):
-        steps.step(0.1 + 0.01 * float(torch.randn((), generator=draw)))
-        assert noise.scale == pytest.approx(5e5 * max(float(part.histogram.multiplier), 0.0))
-        scales.append(noise.scale)
-    assert len(set(scales[100:])) > 100
-    assert part.factor({}, steps.phases) is None
-
-
-def test_nu_per_point_has_mean_one_and_falls_with_the_gradient() -> None:
-    draw = torch.Generator().manual_seed(0)
-    grad = torch.randn(5_000, 3, generator=draw) * torch.randn(5_000, 1, generator=draw).exp()
-    grad[:1_000] = 0
-    nu = nu_per_point(grad)
-    assert (nu[:1_000] == 1).all()
-    seen, logs = nu[1_000:], grad[1_000:].norm(dim=1).log()
-    assert float(seen.mean()) == pytest.approx(1.0, abs=0.05)
-    assert float(torch.corrcoef(torch.stack([seen, logs]))[0, 1]) < -0.8
-    assert CLAMP[0] <= float(nu.min()) < float(nu.max()) <= CLAMP[1]
-    assert (nu_per_point(grad[:50]) == 1).all()
-
-
-@pytest.mark.parametrize("pieces", TILES)
-def test_tiles_make_up_the_view(pieces: int) -> None:
-    view, across = embedded().train[0], TILES[pieces][0]
-    made = tiles(view, pieces)
-    assert len(made) == pieces
-    rows = [
-        torch.cat([tile.image for tile in made[i : i + across]], 1)
-        for i in range(0, pieces, across)
-    ]
-    assert torch.equal(torch.cat(rows, 0), view.image)
-    fit = fit_with("mcmc")
-    whole = fit.image(view)
-    parts = [
-        torch.cat([fit.image(tile) for tile in made[i : i + across]], 1)
-        for i in range(0, pieces, across)
-    ]
-    # Beside the image the projection is linearised at other places, as in every rasterizer.
-    assert float((torch.cat(parts, 0) - whole).abs().mean()) < 0.01 * float(whole.mean())
-
-
-def test_other_pieces_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"tiled=5, but one of \[4, 9, 20\] is needed"):
-        scene_of(Spec("embedded", "mcmc", 0, 10, 10, tiled=5))
-
-
 def test_fewer_views_are_evenly_spaced() -> None:
     every = scene_of(Spec("embedded", "mcmc", 0, 10, 10)).train
     few = scene_of(Spec("embedded", "mcmc", 0, 10, 10, views=4)).train
@@ -165,7 +55,7 @@ def test_adaptive_density_control_grows_and_resumes(tmp_path: Path) -> None:
     from studies.scenes.adaptive import AdaptiveFit
 
     def make() -> Fit:
-        fit = fit_with("adc+defaults", AdaptiveFit, 120)
+        fit = fit_with("adc+annealed+faded-but-scales", AdaptiveFit, 120)
         strategy: Any = vars(fit.density)["strategy"]
         strategy.refine_start_iter, strategy.refine_every = 20, 30
         return fit
@@ -230,7 +120,7 @@ def test_costs_are_measured_in_turns(tmp_path: Path, monkeypatch: pytest.MonkeyP
         folder = tmp_path / arm
         folder.mkdir()
         spec = Spec("embedded", arm, 0, 20, 60, rotated=True)
-        call = {"spec": asdict(spec), "mean_nu": None}
+        call = {"spec": {**asdict(spec), "tiled": 0}, "mean_nu": None}  # as of before 2026-11-25
         (folder / "call.json").write_text(json.dumps(call), encoding="utf-8")
         train(spec, folder, None, None)
     (made,) = costs.measure_all(tmp_path, [20])
