@@ -437,6 +437,7 @@ def test_real_clock_runs(tmp_path):
     [
         ({"metadata": {"a": object()}}, TypeError),
         ({"path": None}, TypeError),
+        ({"clock": 3}, TypeError),
     ],
     ids=["metadata", "path", "clock"],
 )
