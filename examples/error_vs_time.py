@@ -5,13 +5,13 @@ python examples/error_vs_time.py --scene DIR --points 20000 --iterations 7500 -o
 
 The ways of training are called arms here. `mcmc` is 3DGS-MCMC as its authors publish it, with which
 all others are compared. `adam` is the same trainer without density control. `awsgld` adds AW-SGLD's
-multiplier to 3DGS-MCMC, and `constant`, its control, a constant of that multiplier's mean. `paper` is
-the paper's preset, `defaults` are the package's. Seconds are those of the training's own process.
+multiplier to 3DGS-MCMC, and `constant`, its control, a constant of that multiplier's mean. `paper`
+is the paper's preset, `defaults` are the package's. Seconds are those of its own process.
 
 The embedded scene gives 2,000 points to start from, and the trainings grow to 4,000 Gaussians in
 3,000 iterations. Both matter. 3DGS-MCMC starts from Gaussians a tenth as wide as INRIA's trainer,
-which a short training does not make up for; and what it does better, to grow and to relocate what has
-become transparent, shows only where there is something to grow.
+which a short training does not make up for; and what it does better, to grow and to relocate what
+has become transparent, shows only where there is something to grow.
 
 Every arm and seed is a training of its own process and folder. Ctrl-C stops them all with a
 checkpoint each; the same command goes on from there, and repeats nothing that is finished.

@@ -1,7 +1,7 @@
 """The README's first picture: photo, 3DGS-MCMC, ours, and their PSNR over seconds.
 
-    python examples/studies/scenes/front_picture.py                   (trains the embedded scene)
-    python examples/studies/scenes/front_picture.py STOCK OURS        (of two trainings of the study)
+    python examples/studies/scenes/front_picture.py               (trains the embedded scene)
+    python examples/studies/scenes/front_picture.py STOCK OURS    (of two trainings of the study)
 
 STOCK and OURS are folders that `run.py` has written: one scene, one setting, one seed, the arm
 `mcmc` and another. Their scene's photos must lie where they were trained from. The numbers of the
