@@ -45,12 +45,15 @@ def test_python_blocks_run_and_print_what_is_shown(
     """The blocks of a page run one after the other, in one namespace and an empty folder."""
     monkeypatch.chdir(tmp_path)
     namespace: dict[str, Any] = {"__name__": "docs"}
-    printed = None
+    printed, given = None, {}
     try:
         for block in blocks(page):
             if block.language == "python" and not is_excerpt(block):
                 printed = io.StringIO()
-                namespace |= trainer_names()  # a block for another trainer finds that one
+                # A block for another trainer finds that one; what a page defines stays.
+                kept = [name for name, value in given.items() if namespace[name] is not value]
+                given = {n: v for n, v in trainer_names().items() if n not in kept}
+                namespace |= given
                 code = compile("\n" * block.line + block.text, name(page), "exec")
                 with contextlib.redirect_stdout(printed):
                     exec(code, namespace)
