@@ -121,7 +121,8 @@ def stability() -> str:
     """Digits reached on the test functions, of docs/results/stability/stability.json."""
     path = DOCS / "results" / "stability" / "stability.json"
     results = json.loads(path.read_text(encoding="utf-8"))
-    text = ["| problem | " + " | ".join(PROBLEMS.values()) + " |", "|---|" + "---:|" * len(PROBLEMS)]
+    text = ["| problem | " + " | ".join(PROBLEMS.values()) + " |"]
+    text += ["|---|" + "---:|" * len(PROBLEMS)]
     for kind in ("problems", "quadratics"):
         for name, courses in results[kind].items():
             digits = (-math.log10(max(courses[arm][-1][2], 1e-40)) for arm in PROBLEMS)
@@ -129,6 +130,7 @@ def stability() -> str:
             what = name if kind == "problems" else f"quadratic, {name}"
             text.append(f"| {what} | " + " | ".join(cells) + " |")
     about = results["about"]
-    text += ["", f"Digits: -log10 of what is left of the error after {about['steps']:,} steps (line"]
-    text += [f"searches: up to 150), median of {about['rows']} rows. {about['machine']}, {about['date']}."]
+    text += ["", f"Digits: -log10 of what is left of the error after {about['steps']:,} steps"]
+    text += [f"(line searches: up to 150), median of {about['rows']} rows."]
+    text += [f"{about['machine']}, {about['date']}."]
     return "\n".join(text)

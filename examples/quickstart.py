@@ -85,8 +85,8 @@ def draw(photo: Tensor, trainings: Sequence[Training], path: Path, unit: str = "
     pictures = 7.2 / 3 * height / width  # inches
     size = (7.2, pictures + 3.4)
     figure = Figure(figsize=size, dpi=150, layout="constrained", facecolor="white")
-    rows = [["photo", "0", "1"], ["psnr"] * 3]
-    axes = figure.subplot_mosaic(rows, height_ratios=[pictures + 0.6, 2.8])
+    ratios = [pictures + 0.6, 2.8]
+    axes = figure.subplot_mosaic([["photo", "0", "1"], ["psnr"] * 3], height_ratios=ratios)
     shown = [("photo", "photo, held out", photo, "black")]
     for i, (training, colour) in enumerate(zip(trainings, COLOURS, strict=True)):
         title = f"{training.name}\n{training.psnr[-1]:.1f} dB"

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ def folder_of(path: Path, spec: Spec, psnr: float) -> Path:
 
 def test_it_is_made_of_two_folders(tmp_path: Path) -> None:
     stock = folder_of(tmp_path / "stock", SPEC, 20.0)
-    ours = folder_of(tmp_path / "ours", Spec(**(asdict(SPEC) | {"arm": "faded"})), 22.0)
+    ours = folder_of(tmp_path / "ours", replace(SPEC, arm="faded"), 22.0)
     picture = tmp_path / "front.png"
     assert front_picture.main([str(stock), str(ours), "--view", "1", "--out", str(picture)]) == 0
     assert picture.read_bytes().startswith(b"\x89PNG")
@@ -49,15 +50,15 @@ def test_it_is_made_of_two_folders(tmp_path: Path) -> None:
     ],
 )
 def test_what_does_not_belong_together_is_refused(
-    change: dict[str, int] | None,
+    change: dict[str, Any] | None,
     words: list[str],
     message: str,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     stock = folder_of(tmp_path / "stock", SPEC, 20.0)
-    other = asdict(SPEC) | {"arm": "faded"} | (change or {})
-    ours = folder_of(tmp_path / "ours", Spec(**other), 22.0)
+    other = replace(SPEC, arm="faded", **(change or {}))
+    ours = folder_of(tmp_path / "ours", other, 22.0)
     if change is None:
         (ours / "renders.npz").unlink()
     out = tmp_path / "front.png"
