@@ -1,15 +1,16 @@
 """What mkdocs does to these pages besides Markdown; see `hooks` in mkdocs.yml.
 
-Formulas become MathML (no script, no font), `<!-- step costs -->` becomes a table of the committed
-JSON, the cells of tables get their column's name, so that a phone can show a row as a card, and a
-page with a wide table gives it the room of its table of contents. A built page that would fetch
-anything from the net fails the build.
+Formulas become MathML (no script, no font), `<!-- step costs -->` and `<!-- stability -->` become
+tables of the committed JSON, and the cells of tables get their column's name, so that a phone can
+show a row as a card. Every page has the version at its foot. A built page that would fetch anything
+from the net fails the build.
 """
 
 from __future__ import annotations
 
 import html
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,7 @@ from typing import Any
 DOCS = Path(__file__).resolve().parent
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.+?)\\[)\]]</\1>', re.S)
 TABLE = re.compile(r"<table>\n<thead>.*?</table>", re.S)
-RULE = re.compile(r"^ *\|[-: |]+\|$", re.M)  # below a table's header
-COLUMNS = 5  # that have room beside a table of contents
+COLUMNS = 10  # beyond which cells are narrow
 PICTURE = re.compile(r'<img [^>]*\bsrc="([^":]+)"[^>]*>')
 FETCHES = (
     re.compile(r"<(?:script|img|iframe|source|video|embed)\b[^>]*\bsrc=[\"']?(?:https?:)?//", re.I),
@@ -28,16 +28,17 @@ FETCHES = (
 )  # fmt: skip
 
 
-def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Fill in the table of step costs; make room for wide tables."""
-    if widest(markdown) > COLUMNS:
-        page.meta["hide"] = [*page.meta.get("hide", []), "toc"]
-    return markdown.replace("<!-- step costs -->", step_costs())
+def on_config(config: Any, **_: Any) -> None:
+    """Say at the foot of every page which version it describes."""
+    from importlib.metadata import version
+
+    config.copyright = f"opt3dgs_optim {version('opt3dgs_optim')}. Apache License 2.0."
 
 
-def widest(markdown: str) -> int:
-    """The most columns that a table of the page has."""
-    return max((line.count("|") - 1 for line in RULE.findall(markdown)), default=0)
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Fill in the tables that are made from committed JSON."""
+    markdown = markdown.replace("<!-- step costs -->", step_costs())
+    return markdown.replace("<!-- stability -->", stability())
 
 
 def on_page_content(html: str, **_: Any) -> str:
@@ -58,7 +59,7 @@ def labelled(table: str) -> str:
         put = r'<td data-label="{}"\1><span>\2</span></td>'
         return re.sub(cell, lambda m: m.expand(put.format(next(left, ""))), match[0], flags=re.S)
 
-    if len(names) > 2 * COLUMNS:
+    if len(names) > COLUMNS:
         head = head.replace("<table>", "<table data-wide>")
     return f"{head}</thead>{re.sub(r'<tr>.*?</tr>', row, body, flags=re.S)}"
 
@@ -105,4 +106,31 @@ def step_costs() -> str:
             shown = ["–" if c is None else f"{c['ns_per_point']:.0f}" for c in cells]
             text.append(f"| {step} | " + " | ".join(shown) + " |")
         text += ["", f"Made by `{bench['command']}`.", ""]
+    return "\n".join(text)
+
+
+PROBLEMS = {
+    "Adam": "Adam",
+    "LQNAdam": "LQNAdam",
+    "two-loop + line search": "the recursion with a line search",
+    "LBFGS (torch)": "`torch.optim.LBFGS`",
+}
+
+
+def stability() -> str:
+    """Digits reached on the test functions, of docs/results/stability/stability.json."""
+    path = DOCS / "results" / "stability" / "stability.json"
+    results = json.loads(path.read_text(encoding="utf-8"))
+    text = ["| problem | " + " | ".join(PROBLEMS.values()) + " |"]
+    text += ["|---|" + "---:|" * len(PROBLEMS)]
+    for kind in ("problems", "quadratics"):
+        for name, courses in results[kind].items():
+            digits = (-math.log10(max(courses[arm][-1][2], 1e-40)) for arm in PROBLEMS)
+            cells = ("over 30" if d > 30 else f"{abs(d):.1f}" for d in digits)
+            what = name if kind == "problems" else f"quadratic, {name}"
+            text.append(f"| {what} | " + " | ".join(cells) + " |")
+    about = results["about"]
+    text += ["", f"Digits: -log10 of what is left of the error after {about['steps']:,} steps"]
+    text += [f"(line searches: up to 150), median of {about['rows']} rows."]
+    text += [f"{about['machine']}, {about['date']}."]
     return "\n".join(text)

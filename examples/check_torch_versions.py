@@ -4,7 +4,7 @@
     python examples/check_torch_versions.py --torch 2.6.0 --keep build/torch-versions
 
 Every version gets a virtual environment of its own with torch, numpy, pytest and hypothesis, and
-the package from this folder. Writes `docs/torch_versions.json` and a table beside it.
+the package from this folder. Writes `torch_versions.json` and a table beside it into `build/`.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--keep", type=Path, metavar="DIR", help="keep the environments, or use them"
     )
-    parser.add_argument("--out", type=Path, default=ROOT / "docs", metavar="DIR")
+    parser.add_argument("--out", type=Path, default=ROOT / "build", metavar="DIR")
     options = parser.parse_args(arguments)
     kept = nullcontext(options.keep) if options.keep else tempfile.TemporaryDirectory()
     with kept as folder:
@@ -152,6 +152,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "left_out": LEFT_OUT,
         "results": results,
     }
+    options.out.mkdir(parents=True, exist_ok=True)
     text = table(record)
     (options.out / "torch_versions.json").write_text(json.dumps(record, indent=1) + "\n")
     (options.out / "torch_versions.md").write_text(text)

@@ -28,10 +28,10 @@ SHARED_OPTIONS = (
 
 def add_fit_options(parser: argparse.ArgumentParser) -> None:
     """Options that train.py and error_vs_time.py share."""
-    defaults = FitOptions()
+    defaults = FitOptions(iterations=3_000, points=4_000)
     add = parser.add_argument
     add("--scene", default="embedded", metavar="DIR", help="scene folder, or 'embedded'")
-    add("--size", default="images_4", choices=get_args(Size), help="folder of the photos")
+    add("--size", default="images_2", choices=get_args(Size), help="folder of the photos")
     add("--background", default="black", choices=get_args(Background), help="behind the scene")
     add("--points", type=int, default=defaults.points, help="the most Gaussians")
     add("--iterations", type=int, default=defaults.iterations, help="length of a training")
@@ -79,7 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     arms = "; ".join(f"{arm.name}: {arm.what}" for arm in ARMS.values())
     parser.add_argument("--arm", default=DEFAULT_ARM, choices=ARMS, metavar="ARM", help=arms)
     parser.add_argument("--seed", type=int, default=0, help="of the training")
-    parser.add_argument("--mean-nu", type=float, help="for mcmc+constant-multiplier")
+    parser.add_argument("--mean-nu", type=float, help="for the arm constant")
     parser.add_argument(
         "-o", "--out", type=Path, default=Path("runs/train"), metavar="DIR", help="folder"
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import functools
 import html
@@ -10,7 +11,6 @@ import io
 import re
 import shlex
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -44,12 +44,16 @@ def test_python_blocks_run_and_print_what_is_shown(
 ) -> None:
     """The blocks of a page run one after the other, in one namespace and an empty folder."""
     monkeypatch.chdir(tmp_path)
-    namespace: dict[str, Any] = {**trainer_names(), "__name__": "docs"}
-    printed = None
+    namespace: dict[str, Any] = {"__name__": "docs"}
+    printed, given = None, {}
     try:
         for block in blocks(page):
             if block.language == "python" and not is_excerpt(block):
                 printed = io.StringIO()
+                # A block for another trainer finds that one; what a page defines stays.
+                kept = [name for name, value in given.items() if namespace[name] is not value]
+                given = {n: v for n, v in trainer_names().items() if n not in kept}
+                namespace |= given
                 code = compile("\n" * block.line + block.text, name(page), "exec")
                 with contextlib.redirect_stdout(printed):
                     exec(code, namespace)
@@ -117,6 +121,57 @@ def test_host_pages_show_no_other_lines(tmp_path: Path) -> None:
         assert statements(DOCS / "hosts" / f"{page}.md") == lines
 
 
+README = ROOT / "README.md"
+
+
+def test_the_readme_shows_what_the_command_prints(tmp_path: Path) -> None:
+    """The lines that change; the lines around them are those of the real file."""
+    (shown,) = blocks(README, "diff")
+    trainer = tmp_path / "train.py"
+    trainer.write_text(SYNTHETIC["3dgs-mcmc"])
+    printed = hosts.diff(trainer).diff
+
+    def changed(diff: str) -> list[str]:
+        lines = [line for line in diff.splitlines() if re.match(r"[+-](?![+-])", line)]
+        return [line.rstrip() for line in lines]
+
+    assert changed(shown.text) == changed(printed)
+
+
+@pytest.mark.parametrize(
+    ("title", "kind", "parts"),
+    [
+        ("**3dgs-mcmc**", "3dgs-mcmc", None),
+        ("**INRIA's gaussian-splatting**", "inria", "DEFAULTS_ADC"),
+        ("**gsplat**, `simple_trainer.py mcmc`", "gsplat", None),
+        ("**gsplat**, `simple_trainer.py default`", "gsplat", "DEFAULTS_ADC"),
+    ],
+)
+def test_the_readme_has_the_lines_of_each_trainer(
+    title: str, kind: str, parts: str | None, tmp_path: Path
+) -> None:
+    """What the command writes there: calls, and which parts."""
+    text = README.read_text(encoding="utf-8")
+    block = re.search(re.escape(title) + r".*?^```python\n(.*?)^```", text, re.M | re.S)
+    assert block is not None
+    tree = ast.parse(block[1])
+    calls = {ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Call)}
+    trainer = tmp_path / "train.py"
+    trainer.write_text(SYNTHETIC[kind])
+    written = " ".join(added(hosts.diff(trainer).diff))
+    for call in calls:
+        if not call.startswith("PhaseScheduler"):
+            assert call in written, f"{call} is not in {written}"
+    (made,) = [call for call in calls if call.startswith("PhaseScheduler")]
+    assert ("parts=DEFAULTS_ADC" in made) == (parts is not None)
+    total = re.search(r"PhaseScheduler\((?:total_steps=)?([\w.]+)", made)
+    assert total is not None
+    assert f"PhaseScheduler({total[1]}" in written
+    names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    imported = {a.name for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) for a in n.names}
+    assert names & set(opt3dgs_optim.__all__) <= imported
+
+
 # -- commands --------------------------------------------------------------------------------------
 
 
@@ -150,6 +205,7 @@ def test_every_block_is_checked_by_something() -> None:
     for page in PAGES:
         for block in blocks(page):
             known = block.language in ("python", *SHELL) or block.title == "prints"
+            known |= page == README and block.language in ("diff", "bibtex")
             assert known, f"{name(page)}, line {block.line}: nothing checks a {block.language!r}"
 
 
@@ -248,14 +304,6 @@ def test_formulas_become_mathml() -> None:
     made = build_hooks().on_page_content('<p><span class="arithmatex">\\(a &lt; b\\)</span></p>')
     assert made.startswith("<p><math")
     assert "<mo><</mo>" in html.unescape(made)
-
-
-@pytest.mark.parametrize(("columns", "hidden"), [(3, []), (9, ["toc"])])
-def test_a_wide_table_gets_the_room_of_the_contents(columns: int, hidden: list[str]) -> None:
-    page = SimpleNamespace(meta={})
-    table = "| a " * columns + "|\n" + "|---:" * columns + "|\n"
-    build_hooks().on_page_markdown(f"Text.\n\n{table}", page=page)
-    assert page.meta.get("hide", []) == hidden
 
 
 def test_cells_of_tables_name_their_column() -> None:

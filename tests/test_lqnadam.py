@@ -121,7 +121,7 @@ def test_pairs_of_another_history_size_are_refused() -> None:
 
 
 def test_complex_parameters_are_refused() -> None:
-    x = torch.nn.Parameter(torch.ones(2, dtype=torch.complex64))
+    x = torch.nn.Parameter(torch.ones(2, 1, dtype=torch.complex64))
     x.grad = torch.ones_like(x)
     with pytest.raises(ValueError, match="complex"):
         LQNAdam([x]).step()

@@ -53,8 +53,11 @@ print(backend_info("cpu"))
 
 pytestmark = [
     pytest.mark.skipif(
-        any(importlib.util.find_spec(name) is None for name in ("hatchling", "hatch_vcs")),
-        reason="hatchling or hatch-vcs is not installed",
+        any(
+            importlib.util.find_spec(name) is None
+            for name in ("hatchling", "hatch_vcs", "hatch_fancy_pypi_readme")
+        ),
+        reason="hatchling or a plugin of it is not installed",
     ),
     pytest.mark.processes,
 ]
@@ -142,6 +145,41 @@ def test_wheel_needs_torch_and_numpy_alone(wheel: Path) -> None:
         assert any(line.startswith(field) for line in lines), field
 
 
+def metadata_of(wheel: Path) -> str:
+    (found,) = (text for name, text in contents(wheel).items() if name.endswith("/METADATA"))
+    return found.decode()
+
+
+def test_an_extra_of_linux_keeps_its_marker(wheel: Path) -> None:
+    """Else the test command asks macOS for NVRTC, which has none."""
+    lines = [line for line in metadata_of(wheel).splitlines() if "extra == 'test'" in line]
+    (cuda,) = [line for line in lines if "cuda" in line]
+    assert "platform_system == 'Linux'" in cuda
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    asked = re.search(r'^cuda = \["(.+)"\]', project, re.M)
+    assert asked is not None
+    assert asked[1] in cuda  # what the extra `cuda` has
+
+
+def test_what_an_index_shows_leads_nowhere_wrong(wheel: Path) -> None:
+    """It has README.md alone: no relative link, no relative picture, no marker of ours."""
+    text = metadata_of(wheel).partition("\n\n")[2]
+    assert text.startswith("# opt3dgs_optim\n")
+    assert re.findall(r"\]\((?!https?:)[^)]*\)", text) == []
+    assert "![" not in text
+    assert "<!--" not in text
+    assert "## What it buys" in text
+    assert "Project-URL: Paper" in metadata_of(wheel)
+
+
+def test_an_index_takes_both(wheel: Path, tmp_path: Path) -> None:
+    pytest.importorskip("twine", reason="twine is not installed")
+    sdist = build(ROOT, "sdist", tmp_path)
+    command = [sys.executable, "-m", "twine", "check", "--strict", str(wheel), str(sdist)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def test_the_command_is_installed_and_knows_its_version(
     installed: Path, wheel: Path, tmp_path: Path
 ) -> None:
@@ -180,6 +218,8 @@ def test_sdist_builds_the_same_wheel(wheel: Path, tmp_path: Path) -> None:
     (source,) = (tmp_path / "source").iterdir()
     for name in ("tests/test_wheel.py", "examples/quickstart.py", "CITATION.cff", "LICENSE"):
         assert (source / name).exists(), name
+    assert [*source.rglob("*.png")] == []
+    assert sdist.stat().st_size < 2_500_000
     again = build(source, "wheel", tmp_path / "again")
     assert again.name == wheel.name
     assert contents(again) == contents(wheel)

@@ -11,20 +11,18 @@ from torch import Tensor
 from opt3dgs_optim import (
     DEFAULTS,
     ConstantMultiplier,
-    Curvature,
     EnergyHistogram,
-    FreshMoments,
     Part,
     Phase,
     PhaseScheduler,
     PositionNoise,
-    SquaredLoss,
+    paper_parts,
 )
 from opt3dgs_optim.presets import PAPER_WARMUP
 
 NOISE_LR = 5e5  # 3DGS-MCMC
-SETTLING = 100  # iterations after which restarted moments are of use
-HISTOGRAM_ARM = "mcmc+awsgld"
+BASELINE = "mcmc"
+HISTOGRAM_ARM = "awsgld"
 DEFAULT_ARM = "defaults"
 
 # (iterations, mean nu of the arm in `needs` or None) -> what the steps have
@@ -77,33 +75,22 @@ def constant(iterations: int, nu: float | None) -> list[Part]:
     return [ConstantMultiplier(value, warmup=round(iterations * PAPER_WARMUP))]
 
 
-def opt3dgs(iterations: int, _nu: float | None = None) -> list[Part]:
-    """Every part of the paper, settings measured on the run."""
-    last = [FreshMoments(settling=SETTLING), SquaredLoss(), Curvature()]
-    return [*histogram(iterations), *last]
-
-
 _ARMS = (
-    Arm("adam", "torch's Adam alone: no density control, no noise", mcmc=False),
-    Arm("mcmc", "stock 3DGS-MCMC with torch's Adam: the baseline"),
-    Arm(HISTOGRAM_ARM, "with the flat-histogram multiplier", histogram),
+    Arm(BASELINE, "3DGS-MCMC as its authors publish it: the baseline"),
     Arm(
-        "mcmc+constant-multiplier",
+        "adam",
+        "torch's Adam from the start of INRIA's trainer: no density control, no noise",
+        mcmc=False,
+    ),
+    Arm(HISTOGRAM_ARM, "3DGS-MCMC with AW-SGLD's multiplier nu", histogram),
+    Arm(
+        "constant",
         "its control: a constant multiplier, the mean nu of that arm and seed",
         constant,
         needs=HISTOGRAM_ARM,
     ),
-    Arm(
-        "mcmc+l2+reset",
-        "L2 and fresh Adam moments in the last phase",
-        fixed(FreshMoments, SquaredLoss),
-    ),
-    Arm("opt3dgs", "every part of the paper, settings measured on the run", opt3dgs),
-    Arm(
-        DEFAULT_ARM,
-        "the package's: moments faded, the last iterates averaged",
-        lambda _iterations, _nu: [*DEFAULTS],
-    ),
+    Arm("paper", "the paper's preset", lambda iterations, _nu: paper_parts(iterations)),
+    Arm(DEFAULT_ARM, "the package's defaults", lambda _iterations, _nu: [*DEFAULTS]),
 )
 ARMS = {arm.name: arm for arm in _ARMS}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -278,7 +279,8 @@ def run(
 ) -> dict[str, float]:
     """Train to the end, or on from where an earlier call was stopped; return the last metrics.
 
-    Writes `folder/log.jsonl` and `folder/checkpoint.pt`. On Ctrl-C the iteration is finished, its
+    Writes `folder/log.jsonl` and `folder/checkpoint.pt`. The log counts this process's seconds, so
+    that other trainings beside it change nothing. On Ctrl-C the iteration is finished, its
     checkpoint written, and KeyboardInterrupt raised; a second Ctrl-C stops at once.
     """
     checkpoint, path, total = folder / "checkpoint.pt", folder / "log.jsonl", fit.options.iterations
@@ -291,9 +293,9 @@ def run(
     about |= metadata or {}
     # Lines past the checkpoint, or of a run without one, are superseded.
     if path.exists():
-        log = RunLog.resume(path, iteration=fit.iteration, metadata=about)
+        log = RunLog.resume(path, iteration=fit.iteration, metadata=about, clock=time.process_time)
     else:
-        log = RunLog(path, metadata=about)
+        log = RunLog(path, metadata=about, clock=time.process_time)
     every = max(total // fit.options.evaluations, 1)
     bar = tqdm(total=total, initial=fit.iteration, desc=fit.arm.name, unit="it", disable=quiet)
     with log, bar, StopRequest() as stop:

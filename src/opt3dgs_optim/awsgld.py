@@ -26,8 +26,15 @@ class AWSGLD(StepAdam):
 
         x <- x - lr * nu * Adam(grad) + noise
 
-    nu comes from a flat histogram over the training loss (`EnergyHistogram`). With neither
-    histogram nor noise this is `torch.optim.Adam`, bit for bit.
+    nu comes from a flat histogram over the training loss (`EnergyHistogram`), which has to be
+    given: without `histogram=` nu is 1. `AWSGLD([x])`, with neither histogram nor noise, **is
+    plain** `torch.optim.Adam`, bit for bit.
+
+    It serves two purposes, which want different options. In a *training* the loss falls and changes
+    with the view: `histogram=EnergyHistogram()`, Adam's drift, the trainer's own noise. As a
+    *sampler* of a fixed energy it crosses barriers: `preconditioner="none"`,
+    `IsotropicNoise(temperature)`, and a histogram over the energies that the walk visits, with the
+    noise's temperature (second example).
 
     Args:
         params, lr, betas, eps, weight_decay, amsgrad: as in `torch.optim.Adam`.
@@ -51,6 +58,28 @@ class AWSGLD(StepAdam):
         >>> nu = histogram.observe(loss)
         >>> optimizer.step()
         >>> bool((x**2).sum() < 2.0)
+        True
+
+        A walk in a double well whose barrier is six times the temperature. With the histogram it
+        goes to and fro; without it, it stays where it began:
+
+        >>> from opt3dgs_optim import IsotropicNoise
+        >>> def visits_both_wells(histogram):
+        ...     torch.manual_seed(1)
+        ...     x, seen = torch.nn.Parameter(torch.ones(1)), []
+        ...     noise = IsotropicNoise(temperature=1.0)
+        ...     walk = AWSGLD([x], 6e-3, histogram=histogram, noise=noise, preconditioner="none")
+        ...     for _ in range(3000):
+        ...         walk.zero_grad()
+        ...         (energy := 6 * ((x**2 - 1) ** 2).sum()).backward()
+        ...         if histogram is not None:
+        ...             _ = histogram.observe(energy)
+        ...         walk.step()
+        ...         seen.append(x.item())
+        ...     return min(seen) < -0.5 and max(seen) > 0.5
+        >>> visits_both_wells(None)
+        False
+        >>> visits_both_wells(EnergyHistogram(40, (0.0, 8.0), temperature=1.0, warmup=0))
         True
 
     Raises:

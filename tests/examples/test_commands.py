@@ -14,8 +14,8 @@ MAINS = {main.__module__: main for main in (train.main, error_vs_time.main, quic
 @pytest.mark.parametrize(
     ("name", "defaults"),
     [
-        ("train", ["embedded", "images_4", "1500", "2000", "0.9666666666666667", DEFAULT_ARM]),
-        ("error_vs_time", ["embedded", "1500", "2000", error_vs_time.DEFAULT_ARMS, "2"]),
+        ("train", ["embedded", "images_2", "3000", "4000", "0.9666666666666667", DEFAULT_ARM]),
+        ("error_vs_time", ["embedded", "3000", "4000", error_vs_time.DEFAULT_ARMS, "2"]),
         ("quickstart", ["runs/quickstart.png", "0"]),
     ],
 )

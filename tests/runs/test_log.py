@@ -437,13 +437,14 @@ def test_real_clock_runs(tmp_path):
     [
         ({"metadata": {"a": object()}}, TypeError),
         ({"path": None}, TypeError),
+        ({"clock": 3}, TypeError),
     ],
-    ids=["metadata", "path"],
+    ids=["metadata", "path", "clock"],
 )
 def test_a_wrong_option_is_refused(options, error, tmp_path):
     with pytest.raises(error):
         RunLog(**{"path": tmp_path / "run.jsonl", **options})
-    assert set(inspect.signature(RunLog).parameters) == {"path", "metadata"}
+    assert set(inspect.signature(RunLog).parameters) == {"path", "metadata", "clock"}
 
 
 def test_a_log_on_a_system_without_locks(tmp_path, monkeypatch):
@@ -627,3 +628,18 @@ def test_tensorboard_reads_back_what_was_mirrored(tmp_path):
     assert losses == [(i, pytest.approx(1 / i)) for i in (1, 2, 3)]
     assert [event.value for event in found.Scalars("evaluation/psnr")] == [20.5]
     assert math.isnan(found.Scalars("step/nu")[0].value)
+
+
+def test_the_clock_may_be_another(tmp_path: Path) -> None:
+    """That of the process, say; resumed, it goes on from the last line."""
+    now = iter([10.0, 11.0, 13.5, 99.0, 100.0, 101.0, *[102.0] * 20])
+    path = tmp_path / "log.jsonl"
+    with RunLog(path, clock=lambda: next(now)) as log:
+        log.step(1, loss=0.5)
+    with RunLog.resume(path, iteration=1, clock=lambda: next(now)) as log:
+        log.step(2, loss=0.5)
+    seconds = [record["seconds"] for record in read_run(path).records]
+    assert seconds[0] == 1.0
+    assert seconds[1] == 3.5
+    assert seconds == sorted(seconds)
+    assert seconds[-1] < 10  # the time between the two sessions does not count

@@ -37,11 +37,20 @@ class EnergyHistogram(Part):
     range and a temperature it is the paper's update, to the letter (`FixedPartitions`);
     `EnergyHistogram.paper()` has its numbers.
 
+    The default is made for trainings. **For sampling** a fixed energy give both `energy_range`,
+    from the lowest energy to a little above the barriers that are to be crossed, and `temperature`,
+    that of the noise (`IsotropicNoise`), and `warmup=0`. The default does not help to cross a
+    barrier: its partitions follow the walk, so that the well in which it began looks like all there
+    is. In a double well whose barrier is six times the temperature, 20,000 steps of 0.006 cross it
+    once or twice with the default or without a histogram, and dozens of times with a range and a
+    temperature (`tests/test_lqnadam_claims.py`).
+
     Args:
         num_partitions: number of partitions; None for 48 that follow the energy, 200 of a range.
         energy_range: (low, high) in units of the loss, cut uniformly; the first and the last
             partition are open (eq. 7). `"auto"`: see above.
-        zeta: flattening exponent, 0 to 1; with an automatic temperature neither of the two.
+        zeta: flattening exponent, from 0 to 1. With an automatic temperature it must be neither 0
+            nor 1, and cancels.
         temperature: tau, in units of the loss; automatic where the range is, and only there.
         warmup: number of energies during which nu is 1 while Theta is being estimated.
         clamp: (low, high) bounds of nu, or None; `"auto"` is (-1, 3) for partitions that follow

@@ -14,7 +14,7 @@ import re
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from datetime import datetime, timezone
 from enum import Enum
@@ -62,10 +62,12 @@ class RunLog(AbstractContextManager["RunLog"]):
             groups runs by `scene` and `arm`, and pairs those of two arms by `seed`: a run without a
             seed is paired with none. `command` replaces the command line, which is recorded
             otherwise.
+        clock: returns seconds; None is the wall's, `time.perf_counter`. `time.process_time` counts
+            the seconds of this process alone: a CPU that is busy with others changes nothing.
 
     Raises:
         ValueError: `path` exists and is no run log.
-        TypeError: metadata that JSON cannot hold.
+        TypeError: metadata that JSON cannot hold, or a clock that cannot be called.
         BlockingIOError: another RunLog has the file open (noticed where files can be locked).
 
     Examples:
@@ -88,10 +90,16 @@ class RunLog(AbstractContextManager["RunLog"]):
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], *, metadata: Mapping[str, Any] | None = None
+        self,
+        path: str | os.PathLike[str],
+        *,
+        metadata: Mapping[str, Any] | None = None,
+        clock: Callable[[], float] | None = None,
     ) -> None:
+        if clock is not None and not callable(clock):
+            raise TypeError(f"RunLog: clock={clock!r}, must be a function that returns seconds")
         described = json.loads(encoded(with_plain_keys(dict(metadata or {}))))
-        self.path = Path(path)
+        self.path, self._clock = Path(path), clock or time.perf_counter
         self._pending: deque[_Pending] = deque()
         self._mirrors: list[Any] = []
         self._pauses = 0
@@ -99,7 +107,7 @@ class RunLog(AbstractContextManager["RunLog"]):
         try:
             last = read_run(self.path).records[-1:]
             self._base: float = last[0]["seconds"] if last else 0.0
-            self._since: float | None = time.perf_counter()
+            self._since: float | None = self._clock()
             start = self._line("start", last[0]["iteration"] if last else 0)
             self._file.append(start | _origin() | {"metadata": described})
         except BaseException:
@@ -113,6 +121,7 @@ class RunLog(AbstractContextManager["RunLog"]):
         *,
         iteration: int,
         metadata: Mapping[str, Any] | None = None,
+        clock: Callable[[], float] | None = None,
     ) -> RunLog:
         """Continue the log `path`, and its clock, from a checkpoint taken at `iteration`.
 
@@ -125,9 +134,9 @@ class RunLog(AbstractContextManager["RunLog"]):
         """
         if not Path(path).is_file():
             raise FileNotFoundError(f"RunLog.resume: no run log at {os.fspath(path)!r}")
-        log = cls(path, metadata=metadata)
+        log = cls(path, metadata=metadata, clock=clock)
         past = [r["seconds"] for r in read_run(path).records[:-1] if r["iteration"] <= iteration]
-        log._base, log._since = past[-1] if past else 0.0, time.perf_counter()
+        log._base, log._since = past[-1] if past else 0.0, log._clock()
         log.event("resumed", iteration)
         return log
 
@@ -150,8 +159,8 @@ class RunLog(AbstractContextManager["RunLog"]):
 
     @property
     def seconds(self) -> float:
-        """Run seconds so far: wall clock, without pauses, of all sessions of this run."""
-        return self._base + (0.0 if self._since is None else time.perf_counter() - self._since)
+        """Run seconds so far by the log's clock, without pauses, of all sessions of this run."""
+        return self._base + (0.0 if self._since is None else self._clock() - self._since)
 
     def step(
         self, iteration: SupportsIndex, *, phase: str | Enum | None = None, **columns: Number
@@ -209,7 +218,7 @@ class RunLog(AbstractContextManager["RunLog"]):
             self._pauses -= 1
             if self._pauses == 0:
                 _synchronize()
-                self._since = time.perf_counter()
+                self._since = self._clock()
 
     def close(self) -> None:
         """Write what is pending and release the file; a second call does nothing."""

@@ -21,7 +21,7 @@ from splatting.scenes import Scene
 from opt3dgs_optim import Phase, PhaseScheduler
 from opt3dgs_optim.runs import read_run
 
-CONSTANT_ARM = "mcmc+constant-multiplier"
+CONSTANT_ARM = "constant"
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 OPTIONS = FitOptions(iterations=90, points=150, switch=2 / 3, evaluations=3)
 
@@ -74,7 +74,7 @@ def test_without_parts_it_is_the_trainers_own_adam(scene: Scene) -> None:
 def test_a_branch_starts_where_its_trunk_was(scene: Scene, tmp_path: Path) -> None:
     """Clock and phase are the trunk's, whether its checkpoint has a clock or is a stock one's."""
     for trunk in ("mcmc", "defaults"):
-        whole, branch = (Fit(scene, ARMS[name], OPTIONS) for name in (trunk, "mcmc+l2+reset"))
+        whole, branch = (Fit(scene, ARMS[name], OPTIONS) for name in (trunk, "paper"))
         for _ in range(60):
             whole.step()
         whole.save(tmp_path / "at.pt")
@@ -88,7 +88,7 @@ def test_a_branch_starts_where_its_trunk_was(scene: Scene, tmp_path: Path) -> No
 
 
 def test_run_logs_what_the_report_needs(scene: Scene, tmp_path: Path) -> None:
-    metrics = run(Fit(scene, ARMS["opt3dgs"], OPTIONS), tmp_path)
+    metrics = run(Fit(scene, ARMS["paper"], OPTIONS), tmp_path)
     log = read_run(tmp_path / "log.jsonl")
     assert log.evaluations["iteration"].tolist() == [0, 30, 60, 90]
     for name in ("psnr", "ssim", "train_psnr", "seconds", "num_points"):
@@ -101,7 +101,7 @@ def test_run_logs_what_the_report_needs(scene: Scene, tmp_path: Path) -> None:
     assert np.isnan(log.steps["nu"][60:]).all()
     assert np.isfinite(log.steps["accepted"][61:]).all()
     assert log.events[-1]["event"] == "finished"
-    assert run(Fit(scene, ARMS["opt3dgs"], OPTIONS), tmp_path)["psnr"] == metrics["psnr"]
+    assert run(Fit(scene, ARMS["paper"], OPTIONS), tmp_path)["psnr"] == metrics["psnr"]
     assert len(read_run(tmp_path / "log.jsonl").records) == len(log.records)  # not run again
 
 
@@ -110,7 +110,7 @@ def test_ctrl_c_leaves_a_checkpoint_and_a_readable_log(tmp_path: Path) -> None:
     """A real signal to a real process; the second start ends like a run without it."""
     out = tmp_path / "cut"
     words = [sys.executable, str(EXAMPLES / "train.py"), "--iterations", "400", "--points", "150"]
-    words += ["--arm", "opt3dgs", "--switch", "0.5"]
+    words += ["--arm", "paper", "--switch", "0.5"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(
         [*words, "-o", str(out)], env=environment, stderr=subprocess.PIPE, stdout=subprocess.PIPE
@@ -154,7 +154,7 @@ def test_random_initialisation_grows_to_the_budget(scene: Scene) -> None:
 
 def test_spherical_harmonics_are_trained(scene: Scene) -> None:
     options = replace(OPTIONS, sh_degree=2, sh_degree_interval=5)
-    fit = Fit(scene, ARMS["opt3dgs"], options)
+    fit = Fit(scene, ARMS["paper"], options)
     assert fit.gaussians["shN"].shape[1:] == (8, 3)
     trained, degrees = [], []
     for _ in range(12):
@@ -197,7 +197,7 @@ def test_control_runs_after_what_it_controls() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: find_arm("sgd"), "'sgd' is unknown; there are adam, mcmc"),
+        (lambda: find_arm("sgd"), "'sgd' is unknown; there are mcmc, adam"),
         (lambda: FitOptions(iterations=0), "iterations=0"),
         (lambda: FitOptions(points=0), "points=0"),
         (lambda: FitOptions(sh_degree_interval=0), "sh_degree_interval=0"),
