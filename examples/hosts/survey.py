@@ -14,7 +14,6 @@ import datetime
 import json
 import platform
 import re
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,16 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torch
-from hosts.trials import ITERATIONS, TRIALS, Done, Nerfstudio, Outcome, Trial
+from hosts.trials import (
+    ITERATIONS,
+    TRIALS,
+    Done,
+    Nerfstudio,
+    Outcome,
+    Trial,
+    commit_of,
+    parts_of,
+)
 
 from opt3dgs_optim import __version__
 from opt3dgs_optim.hosts import diff
@@ -37,8 +45,6 @@ OTHERS = re.compile(
 MORE = ("sugar_trainers/*.py", "nerfstudio/engine/trainer.py", "internal/gaussian_splatting.py")
 GROUPS = re.compile(r" \(all: [^)]*\)")  # the names of an optimizer's groups: long
 STOPS = re.compile(r"(?<=stops: )(\w+):.*")  # what an exception says after its name
-SAYS_PARTS = re.compile(r"opt3dgs_optim .*, parts (.*), in the steps of ")
-PART = re.compile(r"(\w+)\(")
 PAGE_TEXT = """# Which trainers were tried
 
 `python examples/hosts/survey.py --trainers DIR --write` makes this page \
@@ -93,16 +99,6 @@ def scripts_of(folder: Path) -> list[Path]:
     return sorted(p for p in kept if "backward(" in p.read_text(errors="ignore"))
 
 
-def commit_of(folder: Path) -> str:
-    """The short commit, of git or of a file `.commit` in the folder."""
-    if (folder / ".commit").is_file():
-        words = (folder / ".commit").read_text().split()
-        return f"{words[0][:7]} ({words[-1]})"
-    command = ["git", "-C", str(folder), "log", "-1", "--format=%h (%cs)"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    return done.stdout.strip() or "unknown"
-
-
 def survey(trainers: Path) -> list[Script]:
     """`diff` over every training script."""
     rows = []
@@ -128,8 +124,7 @@ def keep(trial: Trial, trainers: Path, scene: str, got: Outcome) -> None:
     row: dict[str, Any] = {"name": trial.name, "commit": commit_of(trainers / trial.trainer)}
     row |= {"date": datetime.date.today().isoformat(), "torch": torch.__version__}
     row |= {"stock": _shown(got.stock), "ours": _shown(got.ours)}
-    said = SAYS_PARTS.search(got.ours.output)
-    row["parts"] = ", ".join(PART.findall(said[1])) if said else "-"
+    row["parts"] = parts_of(got.ours.output)
     row |= {"checkpoint": "yes" if got.checkpoint else "-", "resume": "-"}
     if got.own and got.theirs:
         row["resume"] = f"own: {_shown(got.own)}; stock's: {_shown(got.theirs)}"

@@ -21,7 +21,9 @@ ON_CPU = Path(__file__).resolve().parent / "on_cpu.py"
 ITERATIONS = 100
 GSPLAT = "examples/simple_trainer.py"
 EVERY_POINT = 5  # of the scene's sparse points, every fifth: seconds instead of minutes
-LIMIT = 1200  # seconds a training
+LIMIT = 7200  # seconds a training
+SAYS_PARTS = re.compile(r"opt3dgs_optim .*, parts (.*), in the steps of ")
+PART = re.compile(r"(\w+)\(")
 
 INRIA_OPTIONS = (
     *("--images", "images_jpg", "--eval", "--densify_from_iter", "10"),
@@ -81,13 +83,20 @@ class Trial:
         return ["--ckpt" if self.gsplat else "--start_checkpoint", str(checkpoint)]
 
     def start(
-        self, trainers: Path, scene: Path, work: Path, out: str, *more: str, ours: bool
+        self,
+        trainers: Path,
+        scene: Path,
+        work: Path,
+        out: str,
+        *more: str,
+        ours: bool,
+        iterations: int = ITERATIONS,
     ) -> Done:
         """Train, stock or with our lines, in `work / out`; copies of the trainers go to `work`."""
         script = trainers / self.trainer / self.script
         if ours:
             script = edited_copy(self, trainers, work / "edited" / self.trainer)
-        command = self.command(scene, work / out, ITERATIONS, ours=ours)
+        command = self.command(scene, work / out, iterations, ours=ours)
         return run(script, [*command, *more], work / out / "cwd", trusted=True)
 
 
@@ -117,11 +126,18 @@ class Nerfstudio(Trial):
         return ["--load-checkpoint", str(checkpoint)]
 
     def start(
-        self, trainers: Path, scene: Path, work: Path, out: str, *more: str, ours: bool
+        self,
+        trainers: Path,
+        scene: Path,
+        work: Path,
+        out: str,
+        *more: str,
+        ours: bool,
+        iterations: int = ITERATIONS,
     ) -> Done:
         """Train and evaluate, stock or ours."""
         scripts = trainers / self.trainer / "nerfstudio" / "scripts"
-        method, *rest = self.command(scene, work / out, ITERATIONS, ours=ours)
+        method, *rest = self.command(scene, work / out, iterations, ours=ours)
         here = work / out / "cwd"
         trained = run(scripts / "train.py", [method, *more, *rest], here, trusted=True)
         if trained.code != 0:
@@ -245,6 +261,22 @@ def try_out(trial: Trial, trainers: Path, scene: Path, work: Path) -> Outcome:
         for out, file in (("own", own), ("theirs", theirs))
     ]
     return Outcome(stock, ours, own, *again)
+
+
+def commit_of(folder: Path) -> str:
+    """The short commit and its date, of git or of a file `.commit` in the folder."""
+    if (folder / ".commit").is_file():
+        words = (folder / ".commit").read_text().split()
+        return f"{words[0][:7]} ({words[-1]})"
+    command = ["git", "-C", str(folder), "log", "-1", "--format=%h (%cs)"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return done.stdout.strip() or "unknown"
+
+
+def parts_of(output: str) -> str:
+    """The parts that an edited run says it has, or "-"."""
+    said = SAYS_PARTS.search(output)
+    return ", ".join(PART.findall(said[1])) if said else "-"
 
 
 def copy_scene(source: Path, target: Path) -> Path:
