@@ -12,6 +12,7 @@ import re
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 from opt3dgs_optim.hosts.counting import read_count
 from opt3dgs_optim.hosts.optimizers import Step, find_optimizers, read_step
@@ -247,16 +248,34 @@ def _check_rhythm(
             )
     for spot in inside:
         skips = isinstance(spot.node, ast.Continue) and loops_around(spot)[-1] is trainer.loop
-        if skips and last < spot.line < first:
+        failed = any(isinstance(node, ast.ExceptHandler) for node in spot.above)
+        if skips and not failed and last < spot.line < first:
             raise refusal(
                 spot.line,
                 f"`continue` between loss.backward() (line {last}) and the step (line {first}): "
                 "one step may have several of them",
             )
     for step in steps:
+        if not _follows(step.spot, trainer.loop, _statements(backwards)):
+            raise refusal(
+                step.spot.line,
+                f"{step.optimizer} steps also where no loss.backward() (line {last}) came before",
+            )
         for node, below in zip(step.spot.above, step.spot.chain, strict=True):
             if isinstance(node, ast.If) and below is not node.test and trainer.loop in step.loops:
                 _check_condition(node.test, inside, step)
+
+
+def _follows(step: Spot, loop: ast.AST, backwards: list[ast.AST]) -> bool:
+    """Whether one of the statements has run whenever a turn of the loop comes to a step."""
+    for around, below in zip(step.above, step.chain, strict=True):
+        if around is loop or loop in step.above[: step.above.index(around)]:
+            for name in ("body", "orelse", "finalbody"):
+                block: list[Any] = getattr(around, name, [])
+                before = block[: block.index(below)] if below in block else []
+                if _comes_to(before, backwards):
+                    return True
+    return False
 
 
 def _check_condition(test: ast.expr, inside: list[Spot], step: Step) -> None:
@@ -350,15 +369,38 @@ def _gives(statement: ast.stmt, optimizer: str, owner: str) -> bool:
     return False
 
 
-def _is_in_each_turn(backwards: list[Spot], inside: list[Spot], loop: ast.AST) -> bool:
-    """Whether every turn of a loop comes to its `loss.backward()`."""
-    (first, *more) = backwards
-    between = first.above[first.above.index(loop) + 1 : -1]
-    plain = all(
-        isinstance(n, ast.With) or (isinstance(n, ast.Try) and not n.handlers) for n in between
-    )
-    jumps = [s for s in inside if isinstance(s.node, ast.Continue) and s.line < first.line]
-    return plain and not more and not jumps
+def _is_in_each_turn(backwards: list[Spot], inside: list[Spot], loop: ast.For) -> bool:
+    """Whether every turn of a loop comes to a `loss.backward()`."""
+    first = min(spot.line for spot in backwards)
+    skips = any(isinstance(spot.node, ast.Continue) and spot.line < first for spot in inside)
+    fails = any(isinstance(spot.node, ast.Try) and spot.node.handlers for spot in inside)
+    return not skips and not fails and _comes_to(loop.body, _statements(backwards))
+
+
+def _statements(found: list[Spot]) -> list[ast.AST]:
+    return [spot.above[-1] for spot in found]
+
+
+def _comes_to(block: list[ast.stmt], targets: list[ast.AST]) -> bool:
+    """Whether statements that run to their end run one of the targets, whatever branches they take.
+
+    A `try` whose handlers leave the block does, if its own statements do.
+    """
+    leaving = (ast.Continue, ast.Break, ast.Return, ast.Raise)
+    for statement in block:
+        match statement:
+            case ast.If(_, body, orelse):
+                found = _comes_to(body, targets) and _comes_to(orelse, targets)
+            case ast.With(_, body):
+                found = _comes_to(body, targets)
+            case ast.Try(body, handlers, _, final):
+                leave = all(isinstance(handler.body[-1], leaving) for handler in handlers)
+                found = _comes_to(final, targets) or (leave and _comes_to(body, targets))
+            case _:
+                found = statement in targets
+        if found:
+            return True
+    return False
 
 
 def _line(node: ast.AST) -> int:
