@@ -96,7 +96,7 @@ class Threedgrut:
             self.model.setup_optimizer()
         kind = "MCMCStrategy" if config.strategy.method == "MCMCStrategy" else "GSStrategy"
         source = "mcmc" if kind == "MCMCStrategy" else "gs"
-        strategies = importlib.import_module(f"threedgrut.strategy.{source}")
+        strategies: Any = importlib.import_module(f"threedgrut.strategy.{source}")
         if source == "mcmc":  # its CUDA extension
             strategies.load_mcmc_plugin = lambda: None
             strategies._mcmc_plugin = types.SimpleNamespace(compute_relocation_tensor=_relocate)

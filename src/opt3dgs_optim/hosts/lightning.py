@@ -70,8 +70,8 @@ class Opt3DGSModule(PluginModule):
         relocates = "MCMC" in type(pl_module.density_controller).__name__
         parts = paper_parts(total) if config.paper else None if relocates else DEFAULTS_ADC
         self.phases = PhaseScheduler(total, config.switch, parts)
+        self.phases.upgrade(pl_module.gaussian_optimizers)
         for optimizer in pl_module.gaussian_optimizers:
-            self.phases.upgrade(optimizer)
             self._check_strategy(pl_module, optimizer)
         self._metrics: dict[str, Tensor] = {}
         pl_module.extra_train_metrics.append(self._take_metrics)
