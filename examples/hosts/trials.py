@@ -37,6 +37,11 @@ SHORT_SPLATFACTO = (
     *("--pipeline.model.warmup-length", "10", "--pipeline.model.refine-every", "10"),
 )
 NO_VIDEO = ("--disable_video",)
+LIGHTNING_PLUGIN = """\
+model:
+  plugins:
+    - class_path: opt3dgs_optim.hosts.lightning.Opt3DGS
+"""
 SHORTER = {*INRIA_OPTIONS, *SHORT_GSPLAT, *SHORT_SPLATFACTO, *NO_VIDEO}
 
 
@@ -151,6 +156,51 @@ class Nerfstudio(Trial):
         return Done(done.code, output, trained.seconds + done.seconds)
 
 
+class Lightning(Trial):
+    """gaussian-splatting-lightning's `main.py fit`: nothing is edited, a configuration is added."""
+
+    def command(self, scene: Path, out: Path, iterations: int, *, ours: bool) -> list[str]:
+        """The script's arguments."""
+        folder = out.parent / "configurations"
+        folder.mkdir(parents=True, exist_ok=True)
+        save, plugin = folder / "save.yaml", folder / "opt3dgs.yaml"
+        save.write_text(f"save_iterations:\n  - {iterations // 2}\n")
+        plugin.write_text(LIGHTNING_PLUGIN)
+        parser = ("--data.parser", "Colmap", "--data.parser.split_mode", "experiment")
+        size = ("--data.parser.image_dir", "images_jpg", "--data.parser.down_sample_factor", "4")
+        return [
+            *("fit", "--data.path", str(scene), *parser, *size, "--config", str(save)),
+            *(("--config", str(plugin)) if ours else ()),
+            *("--max_steps", str(iterations), "--output", str(out), "-n", "run"),
+            *("--trainer.accelerator", "cpu", "--trainer.num_sanity_val_steps", "0"),
+            *self.options,
+        ]
+
+    def checkpoint(self, out: Path, iterations: int) -> Path:
+        """The file that a run leaves behind; it is written before that iteration's step."""
+        name = f"epoch=*-step={iterations // 2 - 1}.ckpt"
+        return next(out.glob(f"run/checkpoints/{name}"), out / name)
+
+    def going_on(self, checkpoint: Path) -> list[str]:
+        """The options to go on from a checkpoint, which holds more than tensors."""
+        return ["--ckpt_path", str(checkpoint), "--weights_only", "false"]
+
+    def start(
+        self,
+        trainers: Path,
+        scene: Path,
+        work: Path,
+        out: str,
+        *more: str,
+        ours: bool,
+        iterations: int = ITERATIONS,
+    ) -> Done:
+        """Train, stock or with the plugin, in `work / out`."""
+        command = self.command(scene, work / out, iterations, ours=ours)
+        script = trainers / self.trainer / self.script
+        return run(script, [*command, *more], work / out / "cwd", trusted=True)
+
+
 def _gsplat(version: str, *options: str, **said: str) -> Trial:
     video = () if version == "gsplat-1.4.0" else NO_VIDEO
     return Trial(version, GSPLAT, (*options[:1], *SHORT_GSPLAT, *video, *options[1:]), **said)
@@ -210,6 +260,10 @@ TRIALS = (
     ),
     _splatfacto("splatfacto"),
     _splatfacto("splatfacto-mcmc"),
+    Lightning(
+        *("gaussian-splatting-lightning", "main.py", ()),
+        different="a plugin, no edit; its own density control, `VanillaDensityController`",
+    ),
 )
 
 
@@ -224,7 +278,8 @@ class Done:
     @property
     def psnr(self) -> float | None:
         """That of the test views, which the trainer printed last, dB."""
-        found = re.findall(r"(?:Evaluating test: .*?PSNR|PSNR:) ([\d.]+)", self.output)
+        said = r"(?:Evaluating test: .*?PSNR |PSNR: |val/psnr=)([\d.]+)"
+        found = re.findall(said, self.output)
         return float(found[-1]) if found else None
 
     @property

@@ -1,4 +1,4 @@
-"""docs/hosts/gsplat.md: the lines that save and resume a gsplat training, with its real strategies."""
+"""docs/hosts/gsplat.md: the lines that save and resume a training, with the real strategies."""
 
 from __future__ import annotations
 
