@@ -14,7 +14,6 @@ import datetime
 import json
 import platform
 import re
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,40 +22,59 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torch
-from hosts.trials import ITERATIONS, TRIALS, Done, Nerfstudio, Outcome, Trial
+from hosts.trials import (
+    ITERATIONS,
+    TRIALS,
+    Done,
+    Lightning,
+    Nerfstudio,
+    Outcome,
+    Trial,
+    commit_of,
+    parts_of,
+)
 
 from opt3dgs_optim import __version__
 from opt3dgs_optim.hosts import diff
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "hosts" / "survey.md"
 TRAINED = PAGE.with_suffix(".json")
+LONG = PAGE.with_name("long_runs.json")
 SCRIPTS = ("*train*.py", "prune_finetune.py")
 OTHERS = re.compile(
     r"(^|/)(submodules|tests?|scripts|docs|utils?|preprocess|ext|internal|Tracking[^/]*)/"
 )
 MORE = ("sugar_trainers/*.py", "nerfstudio/engine/trainer.py", "internal/gaussian_splatting.py")
+FIGURE = re.compile(r"-?[\d.]+ dB|\bruns\b")
 GROUPS = re.compile(r" \(all: [^)]*\)")  # the names of an optimizer's groups: long
 STOPS = re.compile(r"(?<=stops: )(\w+):.*")  # what an exception says after its name
-SAYS_PARTS = re.compile(r"opt3dgs_optim .*, parts (.*), in the steps of ")
-PART = re.compile(r"(\w+)\(")
 PAGE_TEXT = """# Which trainers were tried
 
 `python examples/hosts/survey.py --trainers DIR --write` makes this page \
 (opt3dgs_optim {version}, {today}).
 
+## 3,000 iterations, stock and edited
+
+{long}
+
+## What ran
+
 {iterations} iterations of the real script on a CPU through `on_cpu.py`, \
-on {scene}, stock and with the lines; PSNR of the test views at the end. \
-So short a run shows that the lines work, not what they gain. \
+on {scene}, stock and with the lines. So short a run shows that a trainer runs, saves and resumes \
+with the lines; how good it gets is not to be read from it. \
 Parts of these runs: {parts}. {date}, torch {torch}, {machine}.
 
-| trainer and options | commit | lines of `diff` | stock | edited | resume | what is different |
-|---|---|---|---|---|---|---|
+| trainer and options | commit | lines of `diff` | stock | edited | saved | resumed | what is different |
+|---|---|---|---|---|---|---|---|
 {ran}
 {counts[0]} of the {counts[1]} trials in `examples/hosts/trials.py` have \
-been run for this table; {counts[2]} of them left a checkpoint. Resume: from the edited \
-trainer's own, and from the stock one's; gsplat's scripts evaluate a checkpoint and do \
-not go on from one. With clone and split annealing slows the opacities towards the end: in so \
-few iterations after a reset, or after taking a stock run over, they stay behind stock's.
+been run for this table; {counts[2]} of them left a checkpoint. Resumed: the edited trainer, from its \
+own checkpoint and from the stock one's; gsplat's scripts evaluate a checkpoint and do \
+not go on from one ([lines that do](gsplat.md#save-and-resume)).
+
+3DGRUT and fVDB reality capture render with CUDA kernels of their own: \
+`examples/hosts/without_renderer.py` runs how they make, edit, save and load their optimizers \
+([3DGRUT](3dgrut.md), [fVDB](fvdb.md)).
 
 ## `hosts diff` over public trainers
 
@@ -71,6 +89,13 @@ for these the lines to add by hand are printed.
 {diffs}
 </details>
 """
+LONG_TEXT = """\
+Each trainer's own script and schedules, these scaled to a tenth, on {scene}; PSNR of the test \
+views, one seed. By `examples/hosts/long_runs.py`; {date}, torch {torch}, {machine}.
+
+| trainer and options | commit | stock, dB | edited, dB | parts |
+|---|---|---:|---:|---|
+{rows}"""
 
 
 @dataclass(frozen=True)
@@ -91,16 +116,6 @@ def scripts_of(folder: Path) -> list[Path]:
     kept = {p for p in found if not OTHERS.search(str(p.relative_to(folder)))}
     kept |= {p for pattern in MORE for p in folder.glob(pattern)}
     return sorted(p for p in kept if "backward(" in p.read_text(errors="ignore"))
-
-
-def commit_of(folder: Path) -> str:
-    """The short commit, of git or of a file `.commit` in the folder."""
-    if (folder / ".commit").is_file():
-        words = (folder / ".commit").read_text().split()
-        return f"{words[0][:7]} ({words[-1]})"
-    command = ["git", "-C", str(folder), "log", "-1", "--format=%h (%cs)"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    return done.stdout.strip() or "unknown"
 
 
 def survey(trainers: Path) -> list[Script]:
@@ -128,8 +143,7 @@ def keep(trial: Trial, trainers: Path, scene: str, got: Outcome) -> None:
     row: dict[str, Any] = {"name": trial.name, "commit": commit_of(trainers / trial.trainer)}
     row |= {"date": datetime.date.today().isoformat(), "torch": torch.__version__}
     row |= {"stock": _shown(got.stock), "ours": _shown(got.ours)}
-    said = SAYS_PARTS.search(got.ours.output)
-    row["parts"] = ", ".join(PART.findall(said[1])) if said else "-"
+    row["parts"] = parts_of(got.ours.output)
     row |= {"checkpoint": "yes" if got.checkpoint else "-", "resume": "-"}
     if got.own and got.theirs:
         row["resume"] = f"own: {_shown(got.own)}; stock's: {_shown(got.theirs)}"
@@ -167,10 +181,9 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
     ran = []
     for trial in TRIALS:
         if row := trained.get(trial.name):
-            none = "none needed" if isinstance(trial, Nerfstudio) else "-"
+            none = "none needed" if isinstance(trial, Nerfstudio | Lightning) else "-"
             count = lines.get((trial.trainer, trial.script), none)
-            done = (STOPS.sub(r"\1", row[key]) for key in ("stock", "ours", "resume"))
-            ran.append(_row(trial.name, row["commit"], count, *done, trial.different))
+            ran.append(_row(trial.name, row["commit"], count, *_outcome(row), trial.different))
     saved = sum(row["checkpoint"] == "yes" for row in trials["rows"])
     said: dict[str, list[str]] = {}
     for row in rows:
@@ -185,9 +198,36 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
         **{key: _span(trials, key) for key in ("date", "torch")},
         parts="; ".join(sorted({row["parts"] for row in trials["rows"]} - {"-"})),
         ran="".join(ran),
+        long=_long_runs(),
         counts=(len(trials["rows"]), len(TRIALS), saved, len(rows), len(names), len(edited)),
         diffs="".join(diffs),
     )
+
+
+def _outcome(row: dict[str, Any]) -> list[str]:
+    """Whether the stock and the edited trainer ran, saved and resumed, without figures."""
+    shown = [STOPS.sub(r"\1", row[key]) for key in ("stock", "ours", "resume")]
+    stock, edited, resumed = (FIGURE.sub("ran", text) for text in shown)
+    if resumed != "-":
+        resumed = "yes" if resumed == "own: ran; stock's: ran" else resumed
+    return [stock, edited, row["checkpoint"], resumed]
+
+
+def _long_runs() -> str:
+    """The table of the long runs, or that there are none."""
+    if not LONG.is_file():
+        return "Not run: `python examples/hosts/long_runs.py` makes the table."
+    rows = json.loads(LONG.read_text(encoding="utf-8"))["rows"]
+    lines = [
+        _row(
+            *(row["name"], row["commit"]),
+            *(f"{row[key]['psnr']:.2f}" for key in ("stock", "edited")),
+            row["parts"],
+        )
+        for row in rows
+    ]
+    spans = {key: _span({"rows": rows}, key) for key in ("scene", "date", "torch", "machine")}
+    return LONG_TEXT.format(rows="".join(lines), **spans)
 
 
 def _span(trials: dict[str, Any], key: str) -> str:

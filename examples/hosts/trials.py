@@ -21,7 +21,9 @@ ON_CPU = Path(__file__).resolve().parent / "on_cpu.py"
 ITERATIONS = 100
 GSPLAT = "examples/simple_trainer.py"
 EVERY_POINT = 5  # of the scene's sparse points, every fifth: seconds instead of minutes
-LIMIT = 1200  # seconds a training
+LIMIT = 7200  # seconds a training
+SAYS_PARTS = re.compile(r"opt3dgs_optim .*, parts (.*), in the steps of ")
+PART = re.compile(r"(\w+)\(")
 
 INRIA_OPTIONS = (
     *("--images", "images_jpg", "--eval", "--densify_from_iter", "10"),
@@ -35,6 +37,11 @@ SHORT_SPLATFACTO = (
     *("--pipeline.model.warmup-length", "10", "--pipeline.model.refine-every", "10"),
 )
 NO_VIDEO = ("--disable_video",)
+LIGHTNING_PLUGIN = """\
+model:
+  plugins:
+    - class_path: opt3dgs_optim.hosts.lightning.Opt3DGS
+"""
 SHORTER = {*INRIA_OPTIONS, *SHORT_GSPLAT, *SHORT_SPLATFACTO, *NO_VIDEO}
 
 
@@ -81,13 +88,20 @@ class Trial:
         return ["--ckpt" if self.gsplat else "--start_checkpoint", str(checkpoint)]
 
     def start(
-        self, trainers: Path, scene: Path, work: Path, out: str, *more: str, ours: bool
+        self,
+        trainers: Path,
+        scene: Path,
+        work: Path,
+        out: str,
+        *more: str,
+        ours: bool,
+        iterations: int = ITERATIONS,
     ) -> Done:
         """Train, stock or with our lines, in `work / out`; copies of the trainers go to `work`."""
         script = trainers / self.trainer / self.script
         if ours:
             script = edited_copy(self, trainers, work / "edited" / self.trainer)
-        command = self.command(scene, work / out, ITERATIONS, ours=ours)
+        command = self.command(scene, work / out, iterations, ours=ours)
         return run(script, [*command, *more], work / out / "cwd", trusted=True)
 
 
@@ -117,11 +131,18 @@ class Nerfstudio(Trial):
         return ["--load-checkpoint", str(checkpoint)]
 
     def start(
-        self, trainers: Path, scene: Path, work: Path, out: str, *more: str, ours: bool
+        self,
+        trainers: Path,
+        scene: Path,
+        work: Path,
+        out: str,
+        *more: str,
+        ours: bool,
+        iterations: int = ITERATIONS,
     ) -> Done:
         """Train and evaluate, stock or ours."""
         scripts = trainers / self.trainer / "nerfstudio" / "scripts"
-        method, *rest = self.command(scene, work / out, ITERATIONS, ours=ours)
+        method, *rest = self.command(scene, work / out, iterations, ours=ours)
         here = work / out / "cwd"
         trained = run(scripts / "train.py", [method, *more, *rest], here, trusted=True)
         if trained.code != 0:
@@ -133,6 +154,51 @@ class Nerfstudio(Trial):
         psnr = json.loads(result.read_text())["results"]["psnr"] if done.code == 0 else None
         output = f"{trained.output}\n{done.output}\nPSNR: {psnr}"
         return Done(done.code, output, trained.seconds + done.seconds)
+
+
+class Lightning(Trial):
+    """gaussian-splatting-lightning's `main.py fit`: nothing is edited, a configuration is added."""
+
+    def command(self, scene: Path, out: Path, iterations: int, *, ours: bool) -> list[str]:
+        """The script's arguments."""
+        folder = out.parent / "configurations"
+        folder.mkdir(parents=True, exist_ok=True)
+        save, plugin = folder / "save.yaml", folder / "opt3dgs.yaml"
+        save.write_text(f"save_iterations:\n  - {iterations // 2}\n")
+        plugin.write_text(LIGHTNING_PLUGIN)
+        parser = ("--data.parser", "Colmap", "--data.parser.split_mode", "experiment")
+        size = ("--data.parser.image_dir", "images_jpg", "--data.parser.down_sample_factor", "4")
+        return [
+            *("fit", "--data.path", str(scene), *parser, *size, "--config", str(save)),
+            *(("--config", str(plugin)) if ours else ()),
+            *("--max_steps", str(iterations), "--output", str(out), "-n", "run"),
+            *("--trainer.accelerator", "cpu", "--trainer.num_sanity_val_steps", "0"),
+            *self.options,
+        ]
+
+    def checkpoint(self, out: Path, iterations: int) -> Path:
+        """The file that a run leaves behind; it is written before that iteration's step."""
+        name = f"epoch=*-step={iterations // 2 - 1}.ckpt"
+        return next(out.glob(f"run/checkpoints/{name}"), out / name)
+
+    def going_on(self, checkpoint: Path) -> list[str]:
+        """The options to go on from a checkpoint, which holds more than tensors."""
+        return ["--ckpt_path", str(checkpoint), "--weights_only", "false"]
+
+    def start(
+        self,
+        trainers: Path,
+        scene: Path,
+        work: Path,
+        out: str,
+        *more: str,
+        ours: bool,
+        iterations: int = ITERATIONS,
+    ) -> Done:
+        """Train, stock or with the plugin, in `work / out`."""
+        command = self.command(scene, work / out, iterations, ours=ours)
+        script = trainers / self.trainer / self.script
+        return run(script, [*command, *more], work / out / "cwd", trusted=True)
 
 
 def _gsplat(version: str, *options: str, **said: str) -> Trial:
@@ -194,6 +260,10 @@ TRIALS = (
     ),
     _splatfacto("splatfacto"),
     _splatfacto("splatfacto-mcmc"),
+    Lightning(
+        *("gaussian-splatting-lightning", "main.py", ()),
+        different="a plugin, no edit; its own density control, `VanillaDensityController`",
+    ),
 )
 
 
@@ -208,7 +278,8 @@ class Done:
     @property
     def psnr(self) -> float | None:
         """That of the test views, which the trainer printed last, dB."""
-        found = re.findall(r"(?:Evaluating test: .*?PSNR|PSNR:) ([\d.]+)", self.output)
+        said = r"(?:Evaluating test: .*?PSNR |PSNR: |val/psnr=)([\d.]+)"
+        found = re.findall(said, self.output)
         return float(found[-1]) if found else None
 
     @property
@@ -245,6 +316,22 @@ def try_out(trial: Trial, trainers: Path, scene: Path, work: Path) -> Outcome:
         for out, file in (("own", own), ("theirs", theirs))
     ]
     return Outcome(stock, ours, own, *again)
+
+
+def commit_of(folder: Path) -> str:
+    """The short commit and its date, of git or of a file `.commit` in the folder."""
+    if (folder / ".commit").is_file():
+        words = (folder / ".commit").read_text().split()
+        return f"{words[0][:7]} ({words[-1]})"
+    command = ["git", "-C", str(folder), "log", "-1", "--format=%h (%cs)"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return done.stdout.strip() or "unknown"
+
+
+def parts_of(output: str) -> str:
+    """The parts that an edited run says it has, or "-"."""
+    said = SAYS_PARTS.search(output)
+    return ", ".join(PART.findall(said[1])) if said else "-"
 
 
 def copy_scene(source: Path, target: Path) -> Path:

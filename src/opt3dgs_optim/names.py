@@ -3,14 +3,24 @@
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-# gsplat | INRIA and 3dgs-mcmc | nerfstudio
+# gsplat's name, then those of INRIA and 3dgs-mcmc and of the trainers in the comments; no name may
+# stand twice. The `features` of 3DGRUT and of gsplat's --app_opt are none of them: they are inputs
+# of a network.
 GAUSSIAN_NAMES: Mapping[str, tuple[str, ...]] = {
-    "means": ("means", "xyz", "positions"),
-    "scales": ("scales", "scaling", "log_scales", "scale"),
-    "quats": ("quats", "rotation", "rotations"),
-    "opacities": ("opacities", "opacity", "logit_opacities", "density"),
-    "sh0": ("sh0", "f_dc", "features_dc", "colors", "shs_dc", "features_albedo"),
-    "shN": ("shN", "f_rest", "features_rest", "features", "shs_rest", "features_specular"),
+    "means": ("means", "xyz", "positions"),  # 3DGRUT
+    "scales": ("scales", "scaling", "scale", "log_scales"),  # 3DGRUT, fVDB
+    "quats": ("quats", "rotation", "rotations"),  # gaussian-splatting-lightning, Faster-GS
+    "opacities": ("opacities", "opacity", "density", "logit_opacities"),  # 3DGRUT, fVDB
+    "sh0": (
+        *("sh0", "f_dc", "features_dc", "colors"),  # nerfstudio, gsplat's --app_opt
+        *("features_albedo", "shs_dc"),  # 3DGRUT, gaussian-splatting-lightning
+        *("sh_dc", "sh_coefficients_0"),  # drivestudio, Faster-GS
+    ),
+    "shN": (
+        *("shN", "f_rest", "features_rest"),
+        *("features_specular", "shs_rest"),
+        *("sh_rest", "sh_coefficients_rest"),
+    ),
 }
 GAUSSIAN = tuple(GAUSSIAN_NAMES)
 SLOT = "gaussian"  # of a parameter group: gsplat's name of what it holds

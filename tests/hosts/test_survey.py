@@ -22,10 +22,11 @@ def test_the_table_comes_first_and_the_scripts_are_folded() -> None:
     ]
     text = page(rows, TRIED)
     tried, folded = text.split("<details")
-    for column in ("commit", "lines of `diff`", "stock", "edited", "resume"):
+    for column in ("commit", "lines of `diff`", "stock", "edited", "saved", "resumed"):
         assert f"| {column} |" in tried
     (mcmc,) = [line for line in tried.splitlines() if line.startswith("| 3dgs-mcmc")]
     assert "| 7b4fc9f (2025-01-01) | 5 |" in mcmc
+    assert " dB" not in tried.split("## What ran")[1]  # a hundred iterations say nothing of quality
     assert "| none needed |" in tried  # nerfstudio
     assert "| `3dgs-mcmc/train.py@7b4fc9f` | nothing |" in folded
     assert "| `other/train.py@1234567` | **refused**: no &lt;loop> \\| none |" in folded

@@ -30,6 +30,7 @@ SCENE = Path(os.environ.get("OPT3DGS_SCENE", BESIDE))
 NEEDED = {
     "gsplat": "torchmetrics tyro cv2 sklearn yaml imageio",
     "gsplat-main": "pycolmap piexif",
+    "gaussian-splatting-lightning": "lightning jsonargparse torchmetrics plyfile tensorboard",
     "nerfstudio": "torchmetrics tyro cv2 sklearn yaml imageio nerfacc pytorch_msssim rawpy mediapy",
 }
 GAUSSIANS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")

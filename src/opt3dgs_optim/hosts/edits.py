@@ -16,14 +16,15 @@ from itertools import takewhile
 from pathlib import Path
 from typing import NamedTuple
 
-from opt3dgs_optim.hosts.reading import Trainer, read_trainer, spots
+from opt3dgs_optim.hosts.reading import Trainer, read_trainer
+from opt3dgs_optim.hosts.syntax import FUNCTIONS, refusal, scopes, spots
 
 COMMAND = """Print the lines to change in a training script as a diff; --write applies them.
 
 gsplat's simple_trainer.py, the train.py of INRIA's gaussian-splatting, 3dgs-mcmc and derivatives. A
 file whose names cannot be read with certainty is refused, with the lines to add by hand.
 """
-OURS = ("DEFAULTS_ADC", "PhaseScheduler")  # names that the lines import
+SCHEDULER = "PhaseScheduler"
 LINES_BY_HAND = (
     "from opt3dgs_optim import PhaseScheduler  # at the top",
     "phases = PhaseScheduler(TOTAL_STEPS)  # above the loop; clone and split: parts=DEFAULTS_ADC",
@@ -108,33 +109,93 @@ def write(path: Path) -> Path:
     return backup
 
 
+def _preset(trainer: Trainer) -> tuple[list[str], list[str]]:
+    """What the lines import for a trainer's density control, and the options that they give.
+
+    The only place that knows of two presets.
+    """
+    if trainer.clones == trainer.relocates and not trainer.clones_if:
+        found = "both" if trainer.clones else "neither"
+        trainer.notes.append(
+            "whether its density control clones and splits, or relocates, is not certain "
+            f"({found} was found): clone and split needs PhaseScheduler(..., parts=DEFAULTS_ADC)"
+        )
+    if not trainer.clones:
+        return [], []
+    otherwise = f" if {trainer.clones_if} else None" if trainer.clones_if else ""
+    return ["DEFAULTS_ADC"], [f"parts=DEFAULTS_ADC{otherwise}"]
+
+
 def _edited_lines(lines: list[bytes], tree: ast.Module, trainer: Trainer) -> list[bytes]:
     """The file's lines with ours among them."""
-    used = {getattr(n, "id", getattr(n, "arg", "")) for n in ast.walk(trainer.function)}
-    name = "opt3dgs_phases" if "phases" in used else "phases"
+    used = _used(tree)
+    name = _unused("phases", used)
+    scheduler = SCHEDULER if SCHEDULER not in used else _unused("TwoPhaseScheduler", used)
+    imports, options = _preset(trainer)
+    for taken in used & set(imports):
+        raise ValueError(f"it has a {taken} of its own")
     first, *second = trainer.optimizers
     upgrade = [f"{first} = {name}.upgrade({first})"]
     for other in second:  # None where the trainer's options leave it out
         upgrade += [f"if {other} is not None:", f"    {other} = {name}.upgrade({other})"]
     point = _upgrade_point(trainer)
+    _check_total(trainer, point)
     known = _known(tree, trainer, point)
-    ranks = ", process_group=torch.distributed.group.WORLD if world_size > 1 else None"
-    options = trainer.parts + (ranks if "world_size" in known else "")
-    start = [f"{name} = PhaseScheduler({ast.unparse(trainer.total)}{options})", *upgrade]
+    if "world_size" in known:
+        options.append(
+            "process_group=torch.distributed.group.WORLD if world_size > 1 else None",
+        )
+    call = ", ".join([ast.unparse(trainer.total), *options])
+    start = [f"{name} = {scheduler}({call})", *upgrade]
     for node in ast.walk(ast.parse("\n".join(start))):
-        if isinstance(node, ast.Name) and node.id not in {*known, name, *OURS}:
-            raise ValueError(f"the name {node.id} is not defined where the lines need it")
-    count = f", iteration={trainer.count}" if trainer.count else ""
-    for value, pair in reversed(trainer.pixel):
-        _replace(lines, value, f"{name}.pixel_loss({', '.join(map(ast.unparse, pair))})")
-    ours = OURS if trainer.parts else OURS[1:]
-    _insert(lines, _last_import(tree), [f"from opt3dgs_optim import {', '.join(ours)}"])
+        if isinstance(node, ast.Name) and node.id not in {*known, name, scheduler, *imports}:
+            raise refusal(point, f"the name {node.id} is not defined here, where the lines need it")
+    count = f", iteration={trainer.iteration}" if trainer.iteration else ""
+    for value, images in reversed(trainer.pixel):
+        _replace(lines, value, f"{name}.pixel_loss({', '.join(map(ast.unparse, images))})")
+    renamed = SCHEDULER if scheduler == SCHEDULER else f"{SCHEDULER} as {scheduler}"
+    ours = ", ".join([*imports, renamed])
+    _insert(lines, _last_import(tree, point), [f"from opt3dgs_optim import {ours}"])
     for statement in trainer.backwards:
         _insert(lines, statement, [f"{name}.observe({trainer.loss}{count})"])
     for statement in trainer.setups:
         _insert(lines, statement, upgrade)
     _insert(lines, point, start, above=True)
     return lines
+
+
+def _used(tree: ast.Module) -> set[str]:
+    """Every name that a file uses in any way."""
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        match node:
+            case ast.Name(name) | ast.arg(name) | ast.keyword(str(name)) | ast.Attribute(_, name):
+                found.add(name)
+            case ast.FunctionDef(name) | ast.AsyncFunctionDef(name) | ast.ClassDef(name):
+                found.add(name)
+            case ast.alias(name, other):
+                found |= {name.split(".")[-1], other or name.split(".")[0]}
+    return found
+
+
+def _unused(name: str, used: set[str]) -> str:
+    """A name of ours that a file does not use."""
+    while name in used:
+        name = f"opt3dgs_{name}"
+    return name
+
+
+def _check_total(trainer: Trainer, point: ast.stmt) -> None:
+    """ValueError where the number of iterations changes between our lines and the loop."""
+    parts = {ast.unparse(n) for n in ast.walk(trainer.total) if isinstance(n, ast.expr)}
+    for spot in trainer.spots:
+        match spot.node:
+            case ast.Name(ctx=ast.Store()) | ast.Attribute(ctx=ast.Store()) as node:
+                text = ast.unparse(node)
+                if text in parts and point.lineno <= node.lineno < trainer.loop.lineno:
+                    raise refusal(
+                        node, f"{text} changes here, between the range and the loop over it"
+                    )
 
 
 def _replace(lines: list[bytes], node: ast.expr, text: str) -> None:
@@ -159,24 +220,29 @@ def _insert(lines: list[bytes], node: ast.stmt, new: list[str], *, above: bool =
 
 def _upgrade_point(trainer: Trainer) -> ast.stmt:
     """Where to upgrade: above the first rate scheduler after the last set-up, else the loop."""
-    body, point = trainer.function.body, trainer.loop
+    body, point = trainer.scope.body, trainer.loop
     if point not in body:
         return point
     owner = trainer.optimizers[0]
     model = owner.rsplit(".", 1)[0]
     for statement in reversed(body[: body.index(point)]):
         text = ast.unparse(statement)
-        if f"{model}.training_setup(" in text or f"{model}.restore(" in text:
+        made = {ast.unparse(n) for n in ast.walk(statement) if _is_stored(n)}
+        if owner in made or re.search(rf"\b{re.escape(model)}\.(training_setup|restore)\(", text):
             break
         if owner in text and re.search(r"lr_scheduler|LR\(", text):
             point = statement
     return point
 
 
-def _last_import(tree: ast.Module) -> ast.stmt:
-    """The last import at the top of a file."""
-    code = (ast.FunctionDef, ast.ClassDef)
-    top = takewhile(lambda statement: not isinstance(statement, code), tree.body)
+def _is_stored(node: ast.AST) -> bool:
+    return isinstance(getattr(node, "ctx", None), ast.Store)
+
+
+def _last_import(tree: ast.Module, point: ast.stmt) -> ast.stmt:
+    """The last import at the top of a file, above the lines that need it."""
+    code = (*FUNCTIONS, ast.ClassDef)
+    top = takewhile(lambda s: not isinstance(s, code) and s.lineno < point.lineno, tree.body)
     imports = [s for s in top if isinstance(s, (ast.Import, ast.ImportFrom))]
     if not imports:
         raise ValueError("it has no imports")
@@ -187,8 +253,7 @@ def _known(tree: ast.Module, trainer: Trainer, point: ast.stmt) -> set[str]:
     """The names that have a value where a statement of the training function begins."""
     own = [spot.node for spot in trainer.spots]
     before = [node for node in own if getattr(node, "lineno", point.lineno) < point.lineno]
-    scopes = [n for n in ast.walk(tree) if isinstance(n, (ast.Module, ast.FunctionDef))]
-    around = [scope for scope in scopes if trainer.function in ast.walk(scope)]
+    around = [scope for scope in scopes(tree) if trainer.scope in ast.walk(scope)]
     outside = _bound(spot.node for scope in around for spot in spots(scope)) | set(dir(builtins))
     return _bound(before) | (outside - _bound(own))
 

@@ -1,62 +1,58 @@
 """What a training script is made of, read from its syntax tree: nothing of it is run.
 
-Looked for is a `for` loop over a `range` with one `loss.backward()` and an optimizer's `step()` in
-it: gsplat's `for optimizer in self.optimizers.values()`, or INRIA's `gaussians.optimizer.step()`,
-under whatever names the file uses.
+Looked for is a `for` loop over a `range` with one `loss.backward()` and one step of the Gaussians'
+optimizer in each turn: gsplat's `for optimizer in self.optimizers.values()`, or INRIA's
+`gaussians.optimizer.step()`, under whatever names the file uses. What else a file may hold is
+refused, with the line and the reason: a schedule that runs at another speed than the training
+would be worse than none.
 """
 
 import ast
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
-SECOND = ("shoptimizer",)  # of Gaussians; any other, as of exposures or networks, is left alone
-USUAL_L1 = ("ll1", "l1loss", "l1_loss", "ll1_render")
-CLONES = r"DefaultStrategy|\.(?:prune_and_)?densify\w*(?=\()"  # what clones and splits
+from opt3dgs_optim.hosts.counting import read_count
+from opt3dgs_optim.hosts.optimizers import Step, find_optimizers, read_step
+from opt3dgs_optim.hosts.photometric import PixelLoss, find_pixel_loss
+from opt3dgs_optim.hosts.syntax import (
+    FUNCTIONS,
+    Scope,
+    Spot,
+    are_exclusive,
+    loops_around,
+    refusal,
+    scopes,
+    spots,
+    values,
+)
 
-
-class Spot(NamedTuple):
-    """A node of a function, and the nodes around it, from the function on."""
-
-    node: ast.AST
-    above: tuple[ast.AST, ...]
-
-
-def spots(tree: ast.AST, *above: ast.AST) -> Iterator[Spot]:
-    """Every node below this one, in the file's order; nested functions are not looked into."""
-    for child in ast.iter_child_nodes(tree):
-        yield Spot(child, (*above, tree))
-        if not isinstance(child, (ast.FunctionDef, ast.ClassDef, ast.Lambda)):
-            yield from spots(child, *above, tree)
-
-
-def values(own: list[Spot], name: str) -> Iterator[tuple[int, ast.expr | None]]:
-    """The lines in which a name gets a value, and the value, where it is written there."""
-    for spot in own:
-        match spot:
-            case (ast.Name(id, ast.Store()) as node, (*_, around)) if id == name:
-                yield node.lineno, around.value if isinstance(around, ast.Assign) else None
+BACKWARDS = ("backward", "manual_backward")
+# What clones and splits, and what relocates, by the names that trainers give it.
+CLONES = r"DefaultStrategy|\.(?:prune_and_)?densify\w*\(|(?<![.\w])(?:\w+_)?densification\("
+RELOCATES = r"MCMCStrategy|relocate|[Mm]cmc"
+SOMETIMES = re.compile(r"accum|sync|micro", re.I)  # in the condition of a step of several batches
 
 
 @dataclass
 class Trainer:
     """The places and names in a training script."""
 
-    function: ast.FunctionDef  # that holds the loop
+    scope: Scope  # the function that holds the loop, or the module
     spots: list[Spot]  # every node of it
-    loop: ast.For
-    loss: str  # its name
+    loop: ast.stmt
+    loss: str  # an expression
     backwards: list[ast.stmt]  # `loss.backward()`; several only in branches of an `if`
     total: ast.expr  # how many iterations
-    count: str  # the iteration, from 0, where the loop may start later; else empty
-    parts: str = ""  # where it clones and splits: the argument that says so
+    iteration: str  # an expression, from 0, where the observed losses may not be as many; else ""
+    clones: bool = False  # whether its density control clones and splits
+    relocates: bool = False  # or relocates, as MCMC; some do either
+    clones_if: str = ""  # the test for the first, where it is an option of the trainer
     optimizers: list[str] = field(default_factory=list)  # expressions, the positions' first
     setups: list[ast.stmt] = field(default_factory=list)  # in the loop: they make them anew
-    # The L1 terms: what to replace, and its two arguments.
-    pixel: list[tuple[ast.expr, list[ast.expr]]] = field(default_factory=list)
+    pixel: list[PixelLoss] = field(default_factory=list)  # what to replace
     notes: list[str] = field(default_factory=list)  # what a user should know of this file
 
 
@@ -68,179 +64,344 @@ def read_trainer(tree: ast.Module, folder: Path) -> Trainer:
         folder: where the file lies: the model is read from `scene/*.py` beside it, if there is one.
 
     Raises:
-        ValueError: there is no such loop, or it is not one that can be read with certainty.
+        ValueError: there is no such loop, or it is not one that can be read with certainty; the
+            message names the line and the reason.
     """
-    loops: dict[ast.For, ast.FunctionDef] = {}
-    for function in [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]:
-        for node, above in spots(function):
-            around = [n for n in above if isinstance(n, ast.For)]
-            if _loss(node) and around:
-                loops[around[0]] = function
-    if len(loops) != 1:
-        lines = ", ".join(str(loop.lineno) for loop in loops) or "none"
-        raise ValueError(f"one `for` loop with a loss.backward() in it is needed (lines: {lines})")
-    ((loop, function),) = loops.items()
-    own = list(spots(function))
-    inside = [spot for spot in own if loop in spot.above]
-    backwards = [spot for spot in inside if _loss(spot.node)]
-    statements = [spot.node for spot in backwards if isinstance(spot.node, ast.stmt)]
-    losses = {loss for statement in statements if (loss := _loss(statement))}
-    if len(losses) != 1 or not all(_either(a, b) for a, b in combinations(backwards, 2)):
-        lines = ", ".join(str(statement.lineno) for statement in statements)
-        raise ValueError(f"one loss.backward() an iteration is needed (lines: {lines})")
-    trainer = Trainer(function, own, loop, losses.pop(), statements, *_range(loop, own))
-    _find_optimizers(trainer, inside, folder)
-    _find_pixel_loss(trainer, inside)
-    if re.search(CLONES, ast.unparse(tree)):
-        choice = re.search(r"isinstance\([\w.]+, DefaultStrategy\)", ast.unparse(loop))
-        trainer.parts = ", parts=DEFAULTS_ADC" + (f" if {choice[0]} else None" if choice else "")
+    scope, own, backwards = _backwards(tree)
+    loop = _innermost(backwards)
+    inside = [spot for spot in own if loop in loops_around(spot)]
+    losses = {ast.unparse(_loss(spot)) for spot in backwards}
+    if len(losses) != 1 or not all(are_exclusive(*pair) for pair in combinations(backwards, 2)):
+        lines = ", ".join(str(spot.line) for spot in backwards)
+        raise refusal(
+            backwards[0].line, f"one loss.backward() an iteration is needed (lines: {lines})"
+        )
+    outermost = loops_around(backwards[0])[0]
+    around = [spot for spot in own if outermost in spot.above]
+    steps = [step for spot in around if (step := read_step(spot, own)) is not None]
+    steps = [step for step in steps if loop in step.loops] or steps
+    statements = [spot.above[-1] for spot in backwards]
+    found = [statement for statement in statements if isinstance(statement, ast.stmt)]
+    (loss,) = losses
+    trainer = Trainer(scope, own, loop, loss, found, ast.Constant(0), "")
+    trainer.optimizers, trainer.setups, trainer.notes = find_optimizers(own, loop, steps, folder)
+    main = [step for step in steps if step.optimizer == trainer.optimizers[0]]
+    _check_loops(backwards, main)
+    _check_rhythm(trainer, inside, backwards, main)
+    if not isinstance(loop, ast.For):
+        raise refusal(
+            loop,
+            "the training loop is a `while`: the number of iterations cannot be read from it, only "
+            "from a range(...)",
+        )
+    _check_calls(tree, scope, trainer)
+    each_turn = _is_in_each_turn(backwards, inside, loop)
+    trainer.total, trainer.iteration = read_count(loop, own, found[-1], each_turn=each_turn)
+    trainer.pixel = find_pixel_loss(inside, loop, max(s.lineno for s in found))
+    if not trainer.pixel:
+        trainer.notes.append(
+            "no L1 = l1_loss(render, photo) was found with certainty: the paper's squared loss "
+            "needs phases.pixel_loss(render, photo) in its place, the defaults do not"
+        )
+    text = ast.unparse(tree)
+    trainer.clones = re.search(CLONES, text) is not None
+    trainer.relocates = re.search(RELOCATES, text) is not None
+    choice = re.search(r"isinstance\([\w.]+, DefaultStrategy\)", ast.unparse(loop))
+    trainer.clones_if = choice[0] if choice else ""
     return trainer
 
 
-def _loss(node: ast.AST) -> str | None:
-    """The loss in a statement `loss.backward()` or `scaler.scale(loss).backward()`."""
-    match node:
-        case ast.Expr(ast.Call(ast.Attribute(receiver, "backward"))):
-            match receiver:
-                case ast.Name(loss) | ast.Call(ast.Attribute(_, "scale"), [ast.Name(loss), *_]):
-                    return loss
-    return None
+# -- the loop --------------------------------------------------------------------------------------
 
 
-def _either(first: Spot, second: Spot) -> bool:
-    """Whether the two are in different arms of an `if`."""
-    chains = ((*spot.above[1:], spot.node) for spot in (first, second))
-    for node, one, other in zip(first.above, *chains, strict=False):
-        if one is not other:
-            return isinstance(node, ast.If) and (one in node.orelse) != (other in node.orelse)
+def _backwards(tree: ast.Module) -> tuple[Scope, list[Spot], list[Spot]]:
+    """The scope that trains, its nodes, and the calls of `loss.backward()` in a loop of it."""
+    every = [(scope, [*spots(scope)]) for scope in scopes(tree)]
+    calls = [(scope, own, spot) for scope, own in every for spot in own if _calls_backward(spot)]
+    looped = [(scope, own, spot) for scope, own, spot in calls if loops_around(spot)]
+    if not calls:
+        raise ValueError(
+            "one loop with a loss.backward() in it is needed, and there is no loss.backward()"
+        )
+    if not looped:
+        scope, _, spot = calls[0]
+        where = f"of {scope.name}" if isinstance(scope, FUNCTIONS) else "of the module"
+        raise refusal(
+            spot.line,
+            f"{ast.unparse(spot.node)} is in no loop {where}; one loop with a loss.backward() in "
+            "it is needed, and what calls this is elsewhere",
+        )
+    if len({scope for scope, _, _ in looped}) > 1:
+        lines = ", ".join(str(spot.line) for _, _, spot in looped)
+        raise refusal(
+            looped[0][2].line,
+            f"one loop with a loss.backward() in it is needed, several functions have one "
+            f"(lines: {lines})",
+        )
+    scope, own, _ = looped[0]
+    backwards = [spot for _, _, spot in looped]
+    for spot in backwards:
+        _loss(spot)  # refuses what is no loss
+    inner = {spot.node for spot in backwards}
+    for _, _, spot in calls:
+        around = loops_around(backwards[0])[0]
+        if spot.node not in inner and spot.node in ast.walk(around):
+            raise refusal(spot.line, "this loss.backward() is in a function inside the loop")
+    return scope, own, backwards
+
+
+def _calls_backward(spot: Spot) -> bool:
+    """Whether a node is a call that computes gradients."""
+    match spot.node:
+        case ast.Call(ast.Attribute(receiver, name)) if name in BACKWARDS:
+            return ast.unparse(receiver) != "super()"
     return False
 
 
-def _range(loop: ast.For, own: list[Spot]) -> tuple[ast.expr, str]:
-    """Of the range that a loop counts through: how many, and the count, if it may start later."""
-    source = loop.iter
-    if isinstance(source, ast.Name):
-        above = [v for line, v in values(own, source.id) if v and line < loop.lineno]
-        source = above[-1] if above else source
-    calls = [n for n in ast.walk(source) if isinstance(n, ast.Call)]
-    ranges = [c.args for c in calls if ast.unparse(c.func) in ("range", "tqdm.trange", "trange")]
-    if len(ranges) != 1 or len(ranges[0]) not in (1, 2):
-        raise ValueError(
-            f"the loop in line {loop.lineno} goes over {ast.unparse(loop.iter)}: the number of "
-            "iterations cannot be read from it, only from a range(...)"
-        )
-    start, end = [ast.Constant(0), *ranges[0]][-2:]
-    if isinstance(start, ast.Name) and len(once := [*values(own, start.id)]) == 1:
-        start = once[0][1]
-    count = ast.unparse(loop.target)
-    if len([*values([spot for spot in own if loop in spot.above], count)]) != 1:
-        count = ""  # the loop gives it other values
-    match end:
-        case ast.BinOp(total, ast.Add(), ast.Constant(1)) if len(ranges[0]) == 2:
-            return total, count and f"{count} - 1"
-    return end, "" if isinstance(start, ast.Constant) else count
-
-
-def _find_optimizers(trainer: Trainer, inside: list[Spot], folder: Path) -> None:
-    """Set `optimizers`, `setups` and what is to be said of them."""
-    stepped = list(dict.fromkeys(text for spot in inside if (text := _stepped(spot))))
-    dicts = [text for text in stepped if text.split(".")[-1] == "optimizers"]
-    owners = [text[: -len(".optimizer")] for text in stepped if text.endswith(".optimizer")]
-    if len(owners) > 1:
-        owners = [owner for owner in owners if _set_up(trainer.spots, owner)]
-    if len(dicts) == 1 and not owners:
-        trainer.optimizers = dicts
-    elif len(owners) == 1:
-        (owner,) = owners
-        groups, made = _model(folder)
-        seconds = [name for name in SECOND if name in made or f"{owner}.{name}" in stepped]
-        trainer.optimizers = [f"{owner}.{name}" for name in ("optimizer", *seconds)]
-        trainer.setups = _set_up(inside, owner)
-        if groups and not groups & {"xyz", "means"}:
-            trainer.notes.append(
-                "no group of its optimizer is named xyz or means; those with a Gaussian "
-                f"parameter's name are acted on (all: {', '.join(sorted(groups))})"
-            )
-    else:
-        raise ValueError(
-            "the optimizer of the Gaussians is not clear: one `for optimizer in "
-            "X.optimizers.values()` or one `X.optimizer.step()` is needed "
-            f"(stepped in the loop: {', '.join(stepped) or 'nothing'})"
-        )
-    if others := [text for text in stepped if text not in trainer.optimizers]:
-        trainer.notes.append(f"left alone: {', '.join(others)}")
-
-
-def _set_up(among: list[Spot], owner: str) -> list[ast.stmt]:
-    """The statements that make a model's optimizers."""
-    statements = [spot.node for spot in among if isinstance(spot.node, ast.Expr)]
-    return [s for s in statements if ast.unparse(s).startswith(f"{owner}.training_setup(")]
-
-
-def _stepped(spot: Spot) -> str | None:
-    """The expression of the optimizer, or of the many, that a call steps.
+def _loss(spot: Spot) -> ast.expr:
+    """The loss in a statement `loss.backward()` or `scaler.scale(loss).backward()`.
 
     Raises:
-        ValueError: it is stepped in a way that is no Adam's.
+        ValueError: it is another expression, or no statement of its own.
     """
+    loss: ast.expr | None = None
     match spot.node:
-        case ast.Call(ast.Attribute(owner, "optimizer_step")):
-            return f"{ast.unparse(owner)}.optimizer"
-        case ast.Call(ast.Attribute(owner, "step"), given, options) as call:
-            name = ast.unparse(owner)
-        case _:
-            return None
-    if name.endswith("scaler") and given:
-        name = ast.unparse(given[0])
-    elif not name.endswith("optimizer"):
-        return None
-    elif options or len(given) > 2:
-        raise ValueError(
-            f"line {call.lineno}: {ast.unparse(call)} is no step of an Adam; only step() and "
-            "step(mask, ...) are known"
+        case ast.Call(ast.Attribute(ast.Call(ast.Attribute(_, "scale"), [scaled, *_]), "backward")):
+            loss = scaled
+        case ast.Call(ast.Attribute(receiver, "backward")):
+            loss = receiver
+    if loss is None or not _is_reference(loss) or not isinstance(spot.above[-1], ast.Expr):
+        raise refusal(
+            spot.line,
+            f"{ast.unparse(spot.node)}: a statement loss.backward() of a loss with a name is "
+            "needed, so that what is observed is what is minimised",
         )
-    loops = [n for n in spot.above if isinstance(n, ast.For) and ast.unparse(n.target) == name]
-    return ast.unparse(loops[-1].iter).removesuffix(".values()") if loops else name
+    return loss
 
 
-def _model(folder: Path) -> tuple[set[str], set[str]]:
-    """The names of the parameter groups, and of all attributes set, in the classes of `scene/`."""
-    groups: set[str] = set()
-    made: set[str] = set()
-    for path in sorted((folder / "scene").glob("*model*.py")):
-        try:
-            tree = ast.parse(path.read_bytes())
-        except (OSError, SyntaxError, ValueError):
+def _is_reference(node: ast.AST) -> bool:
+    """Whether an expression only names a value: `loss`, `self.loss`, `losses["total"]`."""
+    match node:
+        case ast.Name():
+            return True
+        case ast.Attribute(value) | ast.Subscript(value, ast.Constant()):
+            return _is_reference(value)
+    return False
+
+
+def _innermost(backwards: list[Spot]) -> ast.stmt:
+    """The loop that holds every `loss.backward()`, and no other loop in it does."""
+    chains = [loops_around(spot) for spot in backwards]
+    if any(chain != chains[0] for chain in chains):
+        lines = ", ".join(str(spot.line) for spot in backwards)
+        raise refusal(
+            backwards[0].line,
+            f"loss.backward() is called in several loops, one is needed (lines: {lines})",
+        )
+    loop = chains[0][-1]
+    if not isinstance(loop, ast.stmt):  # a comprehension, which holds no statement
+        raise refusal(loop, "loss.backward() is called in a comprehension")
+    return loop
+
+
+def _check_loops(backwards: list[Spot], steps: list[Step]) -> None:
+    """ValueError unless each turn of one loop has a backward and a step, and it runs once."""
+    around = loops_around(backwards[0])
+    backward = backwards[0].line
+    for step in steps:
+        if step.loops == around:
             continue
-        for node in ast.walk(tree):
-            match node:
-                case ast.Dict(
-                    [ast.Constant("params"), *_, ast.Constant("name")],
-                    [*_, ast.Constant(str(name))],
-                ):
-                    groups.add(name)
-                case ast.Attribute(_, name, ast.Store()):
-                    made.add(name)
-    return groups, made
-
-
-def _find_pixel_loss(trainer: Trainer, inside: list[Spot]) -> None:
-    """Set `pixel`: `L1 = l1_loss(a, b)`, `F.l1_loss(a, b)` or `l1_loss(a, b).mean()`."""
-    last = max(statement.lineno for statement in trainer.backwards)
-    found: dict[str, list[tuple[ast.expr, list[ast.expr]]]] = {}
-    for node, _ in inside:
-        match node:
-            case ast.Assign(
-                [target, *_],
-                ast.Call(ast.Attribute(ast.Call(called, [_, _] as pair, []), "mean"))
-                | ast.Call(called, [_, _] as pair, []),
-            ) if ast.unparse(called).split(".")[-1] == "l1_loss" and node.lineno < last:
-                found.setdefault(ast.unparse(target), []).append((node.value, pair))
-    names = [name for name in found if name.lower() in USUAL_L1] or list(found)
-    if len(names) == 1:
-        trainer.pixel = found[names[0]]
-    else:
-        trainer.notes.append(
-            "no L1 = l1_loss(render, photo) was found: the paper's squared loss needs "
-            "phases.pixel_loss(render, photo) in its place, the defaults do not"
+        line = step.spot.line
+        if step.loops == around[: len(step.loops)]:
+            raise refusal(
+                backward,
+                f"loss.backward() runs several times for one step of {step.optimizer} (line "
+                f"{line}), in the loop of line {_line(around[len(step.loops)])}: observe the mean "
+                "of its losses once, above the step",
+            )
+        raise refusal(
+            line, f"{step.optimizer} steps in another loop than loss.backward() (line {backward})"
         )
+    if len(around) > 1:
+        raise refusal(
+            around[-1],
+            f"the training loop runs inside another loop (line {_line(around[-2])}): the "
+            "iterations of all its runs together are the schedule's, and cannot be read from one "
+            "of them",
+        )
+
+
+def _check_rhythm(
+    trainer: Trainer, inside: list[Spot], backwards: list[Spot], steps: list[Step]
+) -> None:
+    """ValueError unless each `loss.backward()` of the loop is followed by one step."""
+    last = max(spot.line for spot in backwards)
+    first = min(step.spot.line for step in steps)
+    if first < last:
+        raise refusal(
+            first, f"{steps[0].optimizer} steps above loss.backward() (line {last}), not below it"
+        )
+    for one, other in combinations([step.spot for step in steps], 2):
+        if not are_exclusive(one, other):
+            raise refusal(
+                other.line, f"{steps[0].optimizer} steps twice an iteration (line {one.line})"
+            )
+    for spot in inside:
+        skips = isinstance(spot.node, ast.Continue) and loops_around(spot)[-1] is trainer.loop
+        failed = any(isinstance(node, ast.ExceptHandler) for node in spot.above)
+        if skips and not failed and last < spot.line < first:
+            raise refusal(
+                spot.line,
+                f"`continue` between loss.backward() (line {last}) and the step (line {first}): "
+                "one step may have several of them",
+            )
+    for step in steps:
+        if not _follows(step.spot, trainer.loop, _statements(backwards)):
+            raise refusal(
+                step.spot.line,
+                f"{step.optimizer} steps also where no loss.backward() (line {last}) came before",
+            )
+        for node, below in zip(step.spot.above, step.spot.chain, strict=True):
+            if isinstance(node, ast.If) and below is not node.test and trainer.loop in step.loops:
+                _check_condition(node.test, inside, step)
+
+
+def _follows(step: Spot, loop: ast.AST, backwards: list[ast.AST]) -> bool:
+    """Whether one of the statements has run whenever a turn of the loop comes to a step."""
+    for around, below in zip(step.above, step.chain, strict=True):
+        if around is loop or loop in step.above[: step.above.index(around)]:
+            for name in ("body", "orelse", "finalbody"):
+                block: list[Any] = getattr(around, name, [])
+                before = block[: block.index(below)] if below in block else []
+                if _comes_to(before, backwards):
+                    return True
+    return False
+
+
+def _check_condition(test: ast.expr, inside: list[Spot], step: Step) -> None:
+    """ValueError where a step is made only in every so many iterations."""
+    nodes = [*ast.walk(test)]
+    names = {node.id for node in nodes if isinstance(node, ast.Name)}
+    given = [value for name in names for _, value in values(inside, name) if value is not None]
+    nodes += [node for value in given for node in ast.walk(value)]
+    shown = " ".join(map(ast.unparse, (test, *given)))
+    if any(isinstance(node, ast.Mod | ast.FloorDiv | ast.BitAnd) for node in nodes) or (
+        SOMETIMES.search(shown)
+    ):
+        raise refusal(
+            step.spot.line,
+            f"{step.optimizer} steps only where {ast.unparse(test)}: one step may have several "
+            "losses; observe their mean once, above the step",
+        )
+
+
+def _check_calls(tree: ast.Module, scope: Scope, trainer: Trainer) -> None:
+    """ValueError where a function that trains with optimizers of others runs more than once."""
+    if isinstance(scope, ast.Module) or _makes_optimizers(scope, trainer.optimizers[0]):
+        return
+    called = _calls(tree, scope)
+    what = f"{scope.name} (line {scope.lineno}) trains"
+    for spot, loops in called:
+        if loops:
+            raise refusal(
+                spot.line,
+                f"{what} and is called in a loop (line {_line(loops[-1])}): the iterations of all "
+                "its calls together are the schedule's",
+            )
+    for (one, _), (other, _) in combinations(called, 2):
+        if one.above[0] is not other.above[0] or not are_exclusive(one, other):
+            raise refusal(
+                other.line,
+                f"{what} and is called twice (line {one.line}): the iterations of both calls "
+                "together are the schedule's",
+            )
+    for spot, _ in called:
+        caller = spot.above[0]
+        if isinstance(caller, FUNCTIONS) and caller is not scope:
+            _check_calls(tree, caller, trainer)
+
+
+def _calls(tree: ast.Module, function: ast.AST) -> list[tuple[Spot, list[ast.AST]]]:
+    """Where a function is called, and the loops in which that is on the same optimizers.
+
+    A method is called on `self`, or on an object that the same scope has made of its class: one
+    that is made in the loop has optimizers of its own.
+    """
+    name = getattr(function, "name", "")
+    every = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+    owners = {node.name for node in every if function in node.body}
+    found = []
+    for own in [[*spots(scope)] for scope in scopes(tree)]:
+        for spot in own:
+            match spot.node:
+                case ast.Call(ast.Name(known)) if known == name and not owners:
+                    found.append((spot, loops_around(spot)))
+                case ast.Call(ast.Attribute(ast.Name("self" | "cls"), known)) if known == name:
+                    found += [(spot, loops_around(spot))] if owners else []
+                case ast.Call(ast.Attribute(ast.Name(holder), known)) if known == name:
+                    for made in own:
+                        match made.node:
+                            case ast.Assign([ast.Name(given)], ast.Call(kind)) if (
+                                given == holder and ast.unparse(kind) in owners
+                            ):
+                                around = loops_around(made)
+                                loops = [n for n in loops_around(spot) if n not in around]
+                                found.append((spot, loops))
+    return found
+
+
+def _makes_optimizers(scope: ast.AST, optimizer: str) -> bool:
+    """Whether a function makes the optimizers itself, so that each call trains anew."""
+    nodes = [spot.node for spot in spots(scope)]
+    return any(
+        isinstance(node, ast.stmt) and _gives(node, optimizer, optimizer.removesuffix(".optimizer"))
+        for node in nodes
+    )
+
+
+def _gives(statement: ast.stmt, optimizer: str, owner: str) -> bool:
+    """Whether a statement makes the optimizer."""
+    match statement:
+        case ast.Assign(targets):
+            return optimizer in {ast.unparse(n) for t in targets for n in ast.walk(t)}
+        case ast.Expr(value):
+            return ast.unparse(value).startswith(f"{owner}.training_setup(")
+    return False
+
+
+def _is_in_each_turn(backwards: list[Spot], inside: list[Spot], loop: ast.For) -> bool:
+    """Whether every turn of a loop comes to a `loss.backward()`."""
+    first = min(spot.line for spot in backwards)
+    skips = any(isinstance(spot.node, ast.Continue) and spot.line < first for spot in inside)
+    fails = any(isinstance(spot.node, ast.Try) and spot.node.handlers for spot in inside)
+    return not skips and not fails and _comes_to(loop.body, _statements(backwards))
+
+
+def _statements(found: list[Spot]) -> list[ast.AST]:
+    return [spot.above[-1] for spot in found]
+
+
+def _comes_to(block: list[ast.stmt], targets: list[ast.AST]) -> bool:
+    """Whether statements that run to their end run one of the targets, whatever branches they take.
+
+    A `try` whose handlers leave the block does, if its own statements do.
+    """
+    leaving = (ast.Continue, ast.Break, ast.Return, ast.Raise)
+    for statement in block:
+        match statement:
+            case ast.If(_, body, orelse):
+                found = _comes_to(body, targets) and _comes_to(orelse, targets)
+            case ast.With(_, body):
+                found = _comes_to(body, targets)
+            case ast.Try(body, handlers, _, final):
+                leave = all(isinstance(handler.body[-1], leaving) for handler in handlers)
+                found = _comes_to(final, targets) or (leave and _comes_to(body, targets))
+            case _:
+                found = statement in targets
+        if found:
+            return True
+    return False
+
+
+def _line(node: ast.AST) -> int:
+    return getattr(node, "lineno", 1)

@@ -1,0 +1,128 @@
+"""Three trainers for 3,000 iterations each, stock and edited: what the lines do to PSNR.
+
+    python examples/hosts/long_runs.py --trainers DIR --scene SCENE
+
+DIR and SCENE are those of `survey.py`. Each training is the trainer's own script, run on a CPU
+through `on_cpu.py`, with every schedule of its 30,000 iterations scaled to a tenth: learning rates,
+densification, resets. Each takes five to ten minutes of a core. The figures go into
+docs/hosts/long_runs.json as they come; `survey.py --write` puts them on the page.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import platform
+import shutil
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import torch
+from hosts.trials import GSPLAT, NO_VIDEO, Trial, commit_of, copy_scene, parts_of
+
+from opt3dgs_optim import __version__
+
+FIGURES = Path(__file__).resolve().parents[2] / "docs" / "hosts" / "long_runs.json"
+ITERATIONS = 3_000
+FULL = 30_000  # the trainers' own schedules, which are scaled to ITERATIONS
+CAP = 4_000  # Gaussians of MCMC: what a scene of this size needs
+SCALED_INRIA = {
+    "position_lr_max_steps": FULL,
+    "densify_from_iter": 500,
+    "densification_interval": 100,
+    "opacity_reset_interval": 3_000,
+    "densify_until_iter": 15_000,
+}
+
+
+@dataclass(frozen=True)
+class LongRun(Trial):
+    """A training with its trainer's schedules scaled, and nothing saved."""
+
+    def command(self, scene: Path, out: Path, iterations: int, *, ours: bool) -> list[str]:
+        """The script's arguments."""
+        n = str(iterations)
+        if self.gsplat:
+            strategy, *rest = self.options
+            return [
+                *(strategy, "--data_dir", str(scene), "--result_dir", str(out), *rest),
+                *("--disable_viewer", "--data_factor", "4", *NO_VIDEO, "--eval_steps", str(FULL)),
+                *("--max_steps", str(FULL), "--steps_scaler", str(iterations / FULL)),
+            ]
+        scaled = {name: value * iterations // FULL for name, value in SCALED_INRIA.items()}
+        return [
+            *("-s", str(scene), "-m", str(out), "--images", "images_jpg", "--eval"),
+            *("--iterations", n, "--test_iterations", n, *self.options),
+            *(text for name, value in scaled.items() for text in (f"--{name}", str(value))),
+        ]
+
+
+LONG_RUNS = (
+    LongRun("gsplat-1.5.3", GSPLAT, ("mcmc", "--strategy.cap_max", str(CAP))),
+    LongRun("gsplat-1.5.3", GSPLAT, ("default",)),
+    LongRun("gaussian-splatting", "train.py", ("--disable_viewer",)),
+)
+
+
+def train(run: LongRun, trainers: Path, scene: Path, iterations: int) -> dict[str, Any]:
+    """Train stock and edited, and return the row for the table.
+
+    Raises:
+        RuntimeError: one of the two stopped; the message has the end of its output.
+    """
+    row: dict[str, Any] = {"name": run.name, "commit": commit_of(trainers / run.trainer)}
+    for ours in (False, True):
+        work = Path(tempfile.mkdtemp(prefix="long_run_"))
+        try:
+            done = run.start(trainers, scene, work, "out", ours=ours, iterations=iterations)
+        finally:
+            shutil.rmtree(work)
+        if done.code != 0 or done.psnr is None:
+            raise RuntimeError(f"{run.name} stopped with {done.code}: {done.output[-3000:]}")
+        key = "edited" if ours else "stock"
+        row[key] = {"psnr": done.psnr, "seconds": round(done.seconds)}
+        if ours:
+            row["parts"] = parts_of(done.output)
+    return row
+
+
+def main() -> None:
+    """Train, and write the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--trainers", type=Path, required=True, help="a folder of repositories")
+    parser.add_argument("--scene", type=Path, required=True, help="a scene in COLMAP's layout")
+    parser.add_argument("--iterations", type=int, default=ITERATIONS)
+    parser.add_argument("--only", default="", help="run those whose name holds this text")
+    parser.add_argument("--json", type=Path, default=FIGURES, help="where the figures go")
+    options = parser.parse_args()
+    rows: dict[str, Any] = {}
+    if options.json.is_file():
+        rows = {row["name"]: row for row in json.loads(options.json.read_text())["rows"]}
+    with tempfile.TemporaryDirectory() as folder:
+        scene = copy_scene(options.scene, Path(folder) / "scene")
+        for run in LONG_RUNS:
+            if options.only not in run.name:
+                continue
+            row = train(run, options.trainers, scene, options.iterations)
+            row |= {
+                "iterations": options.iterations,
+                "scene": options.scene.name,
+                "version": __version__,
+                "date": datetime.date.today().isoformat(),
+                "torch": torch.__version__,
+                "machine": f"{platform.machine()}, Python {platform.python_version()}",
+            }
+            rows[run.name] = row
+            kept = [rows[each.name] for each in LONG_RUNS if each.name in rows]
+            options.json.write_text(json.dumps({"rows": kept}, indent=1) + "\n")
+            print(f"{run.name}: stock {row['stock']['psnr']}, edited {row['edited']['psnr']} dB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,333 @@
+"""Optimizers, density control and checkpoints of trainers whose renderers need CUDA, on a CPU.
+
+    python examples/hosts/without_renderer.py 3dgrut TRAINERS/3dgrut
+    python examples/hosts/without_renderer.py fvdb TRAINERS/fvdb-reality-capture
+
+3DGRUT and fVDB reality capture render with kernels of their own, so that `on_cpu.py` cannot run
+their scripts. What touches an optimizer is Python, and runs here from their sources: how they make
+it, move, add and remove Gaussians in it, save it and load it. In place of a render stands a loss
+with known minima. Printed is what holds, as JSON: that with no parts the steps are the trainer's
+own, bit for bit; that with the default parts it trains on through every edit; and that a training
+resumed from the trainer's own checkpoint ends bit for bit as the uninterrupted one does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import importlib.machinery
+import json
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import torch
+from hosts.cpu_host import cuda, stand_ins
+from splatting.relocation import relocated_values
+from torch import Tensor
+from torch.nn import Parameter
+
+from opt3dgs_optim import PhaseScheduler
+
+ITERATIONS = 60
+POINTS = 40
+BEFORE = "what holds:\n"  # the figures, below what the trainers print
+
+
+class Host(Protocol):
+    """A trainer without its renderer."""
+
+    def parameters(self) -> dict[str, Tensor]:
+        """The Gaussians, by the names of their groups."""
+        ...
+
+    def upgrade(self, phases: PhaseScheduler) -> None:
+        """The line of the trainer's page."""
+        ...
+
+    def step(self) -> None:
+        """The trainer's own step."""
+        ...
+
+    def control(self, iteration: int) -> None:
+        """The trainer's own density control."""
+        ...
+
+    def checkpoint(self) -> dict[str, Any]:
+        """What the trainer saves."""
+        ...
+
+
+def start_values(widths: dict[str, int]) -> dict[str, Tensor]:
+    """Gaussians to begin with, the same in every run."""
+    torch.manual_seed(1)
+    return {name: torch.randn(POINTS, width) * 0.5 - 1.0 for name, width in widths.items()}
+
+
+def bare_package(name: str, sources: Path) -> None:
+    """Have a package's modules without what its `__init__` imports: readers, viewers."""
+    package = types.ModuleType(name)
+    package.__path__ = [str(sources / name.replace(".", "/"))]
+    sys.modules[name] = package
+
+
+# -- 3DGRUT ----------------------------------------------------------------------------------------
+
+
+class Threedgrut:
+    """`MixtureOfGaussians` with the strategy of a configuration."""
+
+    def __init__(self, config: Any, saved: dict[str, Any] | None = None) -> None:
+        module = importlib.import_module("threedgrut.model.model")
+        self.model = module.MixtureOfGaussians(config, scene_extent=1.0)
+        if saved is not None:
+            self.model.init_from_checkpoint(saved)
+        else:
+            widths = {
+                **{"positions": 3, "rotation": 4, "scale": 3, "density": 1, "features_albedo": 3},
+                "features_specular": self.model.features_specular.shape[1],
+            }
+            for name, value in start_values(widths).items():
+                setattr(self.model, name, Parameter(value))
+            self.model.setup_optimizer()
+        kind = "MCMCStrategy" if config.strategy.method == "MCMCStrategy" else "GSStrategy"
+        source = "mcmc" if kind == "MCMCStrategy" else "gs"
+        strategies: Any = importlib.import_module(f"threedgrut.strategy.{source}")
+        if source == "mcmc":  # its CUDA extension
+            strategies.load_mcmc_plugin = lambda: None
+            strategies._mcmc_plugin = types.SimpleNamespace(compute_relocation_tensor=_relocate)
+        self.strategy = getattr(strategies, kind)(config, self.model)
+        self.strategy.init_densification_buffer()
+        self.clones = source == "gs"
+
+    def parameters(self) -> dict[str, Tensor]:
+        return {g["name"]: g["params"][0] for g in self.model.optimizer.param_groups}
+
+    def upgrade(self, phases: PhaseScheduler) -> None:
+        self.model.optimizer = phases.upgrade(self.model.optimizer)
+
+    def step(self) -> None:
+        self.model.optimizer.step()
+        self.model.optimizer.zero_grad()
+        self.model.scheduler_step(0)
+
+    def control(self, iteration: int) -> None:
+        if not self.clones:
+            if iteration % 10 == 5:
+                with torch.no_grad():
+                    self.model.density[:4] = -8.0  # dead, so that they are relocated
+                self.strategy.relocate_gaussians()
+                self.strategy.add_new_gaussians()
+            self.strategy.perturb_gaussians()
+        elif iteration % 20 == 5:
+            rows = self.model.num_gaussians
+            large = torch.arange(rows).reshape(-1, 1) % 7 == 0
+            self.strategy.densify_grad_norm_accum = large.float()
+            self.strategy.densify_grad_norm_denom = torch.ones_like(large.float())
+            self.strategy.densify_gaussians(scene_extent=1.0)
+            with torch.no_grad():
+                self.model.density[:2] = -8.0
+            self.strategy.prune_gaussians_opacity()
+        elif iteration == 30:
+            self.strategy.reset_density()
+
+    def checkpoint(self) -> dict[str, Any]:
+        return self.model.get_model_parameters()
+
+
+def _relocate(
+    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, largest: int
+) -> tuple[Tensor, Tensor]:
+    """Opacities and scales of relocated Gaussians, in the place of the extension's."""
+    new_opacities, new_scales = relocated_values(opacities.reshape(-1), scales, ratios.reshape(-1))
+    return new_opacities.reshape(opacities.shape), new_scales
+
+
+def threedgrut(sources: Path, app: str) -> Callable[..., Host]:
+    """A maker of 3DGRUT's model under one of its configurations."""
+    from hydra import compose, initialize_config_dir  # pyright: ignore
+
+    for name in ("threedgrt_tracer", "threedgut_tracer"):
+        sys.modules[name] = stand_ins.Empty(name)
+    sys.path.insert(0, str(sources))
+    bare_package("threedgrut.datasets", sources)
+    torch.cuda.nvtx.range_push = torch.cuda.nvtx.range_pop = lambda *_: 0
+    with initialize_config_dir(str((sources / "configs").resolve()), version_base=None):
+        config = compose(app)
+    return lambda saved=None: Threedgrut(config, saved)
+
+
+# -- fVDB ------------------------------------------------------------------------------------------
+
+FVDB = {"means": 3, "log_scales": 3, "quats": 4, "logit_opacities": 1, "sh0": 3, "shN": 9}
+
+
+class SplatModel:
+    """What of `fvdb.GaussianSplat3d` its optimizer uses."""
+
+    accumulate_mean_2d_gradients = accumulate_max_2d_radii = False
+
+    def __init__(self, values: dict[str, Tensor]) -> None:
+        self.set_state(**values)
+
+    def set_state(
+        self,
+        means: Tensor,
+        quats: Tensor,
+        log_scales: Tensor,
+        logit_opacities: Tensor,
+        sh0: Tensor,
+        shN: Tensor,
+    ) -> None:
+        """Take new Gaussians, as the real one does."""
+        given = (means, log_scales, quats, logit_opacities, sh0, shN)
+        values = dict(zip(FVDB, given, strict=True))
+        for name, value in values.items():
+            leaf = value if value.is_leaf and value.requires_grad else value.detach()
+            setattr(self, name, leaf.requires_grad_(True))
+        rows = len(values["means"])
+        self.accumulated_gradient_step_counts = torch.ones(rows, dtype=torch.int32)
+        self.accumulated_mean_2d_gradient_norms = (torch.arange(rows) % 7 == 0).float()
+
+    @property
+    def num_gaussians(self) -> int:
+        return len(self.means)  # pyright: ignore
+
+    @property
+    def device(self) -> torch.device:
+        return torch.device("cpu")
+
+    @property
+    def scales(self) -> Tensor:
+        return self.log_scales.exp()  # pyright: ignore
+
+    @property
+    def opacities(self) -> Tensor:
+        return self.logit_opacities.sigmoid()  # pyright: ignore
+
+    def reset_accumulated_gradient_state(self) -> None:
+        """Nothing was accumulated."""
+
+
+class Fvdb:
+    """`GaussianSplatOptimizer` over a model without a renderer."""
+
+    def __init__(self, saved: dict[str, Any] | None = None) -> None:
+        module = importlib.import_module("fvdb_reality_capture.training.gaussian_splat_optimizer")
+        kind = module.GaussianSplatOptimizer
+        if saved is None:
+            values = start_values(FVDB)
+            values["logit_opacities"] = values["logit_opacities"].reshape(-1)
+            self.model = SplatModel(values)
+            config = module.GaussianSplatOptimizerConfig()
+            self.trainer = kind.from_model_and_config(self.model, config, batch_size=1)
+        else:
+            self.model = SplatModel({k: v.clone() for k, v in saved["model"].items()})
+            self.trainer = kind.from_state_dict(self.model, saved["optimizer"])
+
+    def parameters(self) -> dict[str, Tensor]:
+        return {name: getattr(self.model, name) for name in FVDB}
+
+    def upgrade(self, phases: PhaseScheduler) -> None:
+        phases.upgrade(self.trainer._optimizers)
+
+    def step(self) -> None:
+        self.trainer.step()
+        self.trainer.zero_grad(set_to_none=True)
+
+    def control(self, iteration: int) -> None:
+        if iteration % 20 == 5:
+            self.trainer.refine_gaussians()
+        if iteration == 30:
+            self.trainer.reset_opacities()
+
+    def checkpoint(self) -> dict[str, Any]:
+        model = {name: getattr(self.model, name).detach() for name in FVDB}
+        return {"model": model, "optimizer": self.trainer.state_dict()}
+
+
+def fvdb(sources: Path) -> Callable[..., Host]:
+    """A maker of fVDB's optimizer."""
+    sys.path.insert(0, str(sources))
+    sys.modules["fvdb"] = stand_ins.Empty("fvdb")
+    for name in ("fvdb_reality_capture", "fvdb_reality_capture.training"):
+        bare_package(name, sources)
+    return Fvdb
+
+
+# -- what is tried ---------------------------------------------------------------------------------
+
+
+def train(host: Host, phases: PhaseScheduler | None, first: int, last: int) -> None:
+    """Iterations of the trainer's order: backward, observe, step, density control."""
+    for iteration in range(first, last):
+        torch.manual_seed(iteration)
+        terms = []
+        for value in host.parameters().values():
+            visible = torch.rand(len(value)) < 0.7
+            goal = torch.randn(1) * 0.1 - 1.0
+            terms.append(((value - goal)[visible]).square().sum() / POINTS)
+        loss = torch.stack(terms).sum()
+        loss.backward()
+        if phases is not None:
+            phases.observe(loss, iteration=iteration)
+        host.step()
+        host.control(iteration)
+
+
+def try_out(make: Callable[..., Host]) -> dict[str, Any]:
+    """What holds of a trainer."""
+    stock, plain, whole, half = (make() for _ in range(4))
+    train(stock, None, 0, ITERATIONS)
+    without = PhaseScheduler(ITERATIONS, parts=[])
+    plain.upgrade(without)
+    train(plain, without, 0, ITERATIONS)
+    phases = PhaseScheduler(ITERATIONS)
+    whole.upgrade(phases)
+    train(whole, phases, 0, ITERATIONS)
+    before = PhaseScheduler(ITERATIONS)
+    half.upgrade(before)
+    train(half, before, 0, ITERATIONS // 2)
+    again = PhaseScheduler(ITERATIONS)
+    resumed = make(half.checkpoint())
+    resumed.upgrade(again)
+    begun = again.iteration
+    train(resumed, again, begun, ITERATIONS)
+    finite = all(bool(value.isfinite().all()) for value in whole.parameters().values())
+    return {
+        "names": list(stock.parameters()),
+        "points": [POINTS, len(next(iter(whole.parameters().values())))],
+        "without parts the trainer's own": _same(stock, plain),
+        "with the default parts finite and another": finite and not _same(stock, whole),
+        "resumed at": begun,
+        "resumed as uninterrupted": _same(whole, resumed),
+    }
+
+
+def _same(one: Host, other: Host) -> bool:
+    pairs = zip(one.parameters().values(), other.parameters().values(), strict=True)
+    return all(torch.equal(a, b) for a, b in pairs)
+
+
+def main() -> None:
+    """Try a trainer, and print what holds."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("trainer", choices=("3dgrut", "fvdb"))
+    parser.add_argument("sources", type=Path, help="the folder of its repository")
+    options = parser.parse_args()
+    stand_ins.install()
+    cuda.install()
+    if options.trainer == "fvdb":
+        found = {"GaussianSplatOptimizer": try_out(fvdb(options.sources))}
+    else:
+        apps = ("apps/colmap_3dgut_mcmc", "apps/colmap_3dgut")
+        found = {app: try_out(threedgrut(options.sources, app)) for app in apps}
+    print(f"{BEFORE}{json.dumps(found, indent=1)}")
+
+
+if __name__ == "__main__":
+    main()

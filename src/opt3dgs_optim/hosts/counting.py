@@ -1,0 +1,157 @@
+"""How a training loop counts: over which range, how far, and which expression is the iteration."""
+
+import ast
+from typing import NamedTuple
+
+from opt3dgs_optim.hosts.syntax import Spot, refusal, values
+
+RANGES = ("range", "trange")
+WRAPPERS = ("tqdm", "track", "iter", "list")  # what goes over its first argument, in its order
+FUNCTIONS_OF_NUMBERS = ("int", "len", "max", "min", "round", "abs")
+
+
+class Count(NamedTuple):
+    """How many iterations a training has, and which one the loop is in."""
+
+    total: ast.expr
+    iteration: str  # an expression, from 0; empty where the number of observed losses is the same
+
+
+def read_count(loop: ast.For, own: list[Spot], observed: ast.stmt, *, each_turn: bool) -> Count:
+    """The count of a loop over a range.
+
+    Args:
+        loop: the training loop.
+        own: every node of its scope.
+        observed: the last statement after which the loss is observed.
+        each_turn: whether every turn of the loop observes a loss.
+
+    Raises:
+        ValueError: it goes over something else, backwards, or changes its own count.
+    """
+    start, end, step = _arguments(loop, own)
+    if _number(step) == 0 or isinstance(step, ast.UnaryOp) or (_number(step) or 1) < 0:
+        raise refusal(loop, f"range(...) with a step of {ast.unparse(step)} counts down")
+    if not _is_plain(end):
+        raise refusal(
+            loop,
+            f"the number of iterations is {ast.unparse(end)}, which may not be evaluated twice; "
+            "give it a name above the loop",
+        )
+    total, shift = end, ""
+    match end:
+        case ast.BinOp(left, ast.Add(), ast.Constant(1)) if _is_one_or_more(start, loop, own):
+            total, shift = left, " - 1"
+    if _is_zero(start, own) and _number(step) == 1 and each_turn:
+        return Count(total, "")
+    count = ast.unparse(loop.target)
+    if not isinstance(loop.target, ast.Name):
+        raise refusal(loop, f"the loop counts in {count}, but one name is needed")
+    last = observed.end_lineno or observed.lineno
+    inside = [s for s in own if loop in s.above and s.node is not loop.target and s.line <= last]
+    for line, _ in values(inside, count):
+        raise refusal(line, f"{count}, the count of the loop, gets another value in it")
+    return Count(total, count + shift)
+
+
+def _arguments(loop: ast.For, own: list[Spot]) -> tuple[ast.expr, ast.expr, ast.expr]:
+    """Start, end and step of the range that a loop goes over."""
+    shown = ast.unparse(loop.iter)
+    ranges = _ranges(loop.iter, own, loop.lineno)
+    found = {tuple(map(ast.unparse, call.args)): call.args for call in ranges}
+    if len(found) > 1:
+        lines = ", ".join(str(call.lineno) for call in ranges)
+        raise refusal(
+            loop, f"the loop goes over {shown}, which has several values (lines: {lines})"
+        )
+    arguments = next(iter(found.values()), [])
+    if not 1 <= len(arguments) <= 3 or any(isinstance(a, ast.Starred) for a in arguments):
+        raise refusal(
+            loop,
+            f"the loop goes over {shown}: the number of iterations cannot be read from it, only "
+            "from a range(...), bare or in tqdm(...)",
+        )
+    if len(arguments) == 1:
+        arguments = [ast.Constant(0), *arguments]
+    start, end, *step = arguments
+    return start, end, step[0] if step else ast.Constant(1)
+
+
+def _ranges(source: ast.expr, own: list[Spot], line: int) -> list[ast.Call]:
+    """The calls of `range` that an expression may stand for in a line; none where it is unclear."""
+    match source:
+        case ast.Name(name):
+            given = [(at, value) for at, value in values(own, name) if at < line]
+            found = [_ranges(value, own, at) if value else [] for at, value in given]
+            return [call for calls in found for call in calls] if all(found) else []
+        case ast.IfExp(_, yes, no):
+            arms = [_ranges(arm, own, line) for arm in (yes, no)]
+            return [call for calls in arms for call in calls] if all(arms) else []
+        case ast.Call(called, arguments):
+            name = ast.unparse(called).split(".")[-1]
+            if name in RANGES:
+                return [source]
+            if name in WRAPPERS and arguments:
+                return _ranges(arguments[0], own, line)
+    return []
+
+
+def _is_plain(node: ast.AST) -> bool:
+    """Whether an expression of numbers can be evaluated twice, and gives the same."""
+    match node:
+        case ast.Name() | ast.Constant():
+            return True
+        case ast.Attribute(value) | ast.UnaryOp(_, value):
+            return _is_plain(value)
+        case ast.Subscript(value, index):
+            return _is_plain(value) and _is_plain(index)
+        case ast.BinOp(left, _, right):
+            return _is_plain(left) and _is_plain(right)
+        case ast.Call(ast.Name(name), arguments, []):
+            return name in FUNCTIONS_OF_NUMBERS and all(map(_is_plain, arguments))
+    return False
+
+
+def _number(node: ast.AST | None) -> int | None:
+    """The integer that is written there."""
+    match node:
+        case ast.Constant(int(value)) if not isinstance(value, bool):
+            return value
+    return None
+
+
+def _is_zero(start: ast.expr, own: list[Spot]) -> bool:
+    """Whether a count certainly starts at 0: written so, or a name with this one value."""
+    if isinstance(start, ast.Name):
+        given = [*values(own, start.id)]
+        return len(given) == 1 and _number(given[0][1]) == 0
+    return _number(start) == 0
+
+
+def _is_one_or_more(start: ast.expr, loop: ast.For, own: list[Spot]) -> bool:
+    """Whether a count certainly starts at 1 or later: by its value, or by `start += 1` above."""
+    match start:
+        case ast.BinOp(_, ast.Add(), more):
+            return _is_positive(more)
+        case ast.Name(name):
+            above = next(spot.above for spot in own if spot.node is loop)
+            before = [spot for spot in own if spot.line < loop.lineno]
+            given = [*values(before, name)]
+            if given and all(_is_positive(value) for _, value in given):
+                return True
+            last = max((line for line, _ in given), default=0)
+            return any(
+                isinstance(spot.node, ast.AugAssign)
+                and spot.line == last
+                and ast.unparse(spot.node.target) == name
+                and isinstance(spot.node.op, ast.Add)
+                and _is_positive(spot.node.value)
+                and spot.above[-1] in above  # in no branch that may be left out
+                for spot in before
+            )
+    return _is_positive(start)
+
+
+def _is_positive(node: ast.AST | None) -> bool:
+    """Whether a positive integer is written there."""
+    return (_number(node) or 0) >= 1

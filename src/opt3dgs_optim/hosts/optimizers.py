@@ -1,0 +1,179 @@
+"""Which optimizers a training loop steps, and which of them are the Gaussians'."""
+
+import ast
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+from opt3dgs_optim.hosts.syntax import (
+    COMPREHENSIONS,
+    FUNCTIONS,
+    Spot,
+    loops_around,
+    refusal,
+    values,
+)
+
+SECOND = ("shoptimizer",)  # of Gaussians; any other, as of exposures or networks, is left alone
+ADAM = re.compile(r"(^|\.)\w*Adam\w*$")
+
+
+class Step(NamedTuple):
+    """A place where an optimizer steps."""
+
+    optimizer: str  # the expression of the optimizer, or of all of them
+    spot: Spot
+    loops: list[ast.AST]  # around it, without the one over the optimizers
+
+
+class Optimizers(NamedTuple):
+    """What is upgraded."""
+
+    expressions: list[str]  # the positions' first
+    setups: list[ast.stmt]  # statements in the loop that make them anew
+    notes: list[str]  # what a user should know
+
+
+def find_optimizers(own: list[Spot], loop: ast.stmt, steps: list[Step], folder: Path) -> Optimizers:
+    """The optimizers of the Gaussians among those that a training loop steps.
+
+    Args:
+        own: every node of the loop's scope.
+        loop: the training loop.
+        steps: where it steps an optimizer.
+        folder: where the file lies: the model is read from `scene/*.py` beside it.
+
+    Raises:
+        ValueError: it is not clear which one is the Gaussians'.
+    """
+    setups: list[ast.stmt] = []
+    notes: list[str] = []
+    stepped = list(dict.fromkeys(step.optimizer for step in steps))
+    dicts = [text for text in stepped if text.split(".")[-1] == "optimizers"]
+    owners = [text[: -len(".optimizer")] for text in stepped if text.endswith(".optimizer")]
+    named = [text for text in stepped if _is_adam(own, text)]
+    if len(owners) > 1:
+        owners = [owner for owner in owners if set_ups(own, owner)]
+    if len(dicts) == 1 and not owners:
+        found = dicts
+    elif len(owners) == 1 and not dicts:
+        (owner,) = owners
+        groups, made = _model(folder)
+        seconds = [name for name in SECOND if name in made or f"{owner}.{name}" in stepped]
+        found = [f"{owner}.{name}" for name in ("optimizer", *seconds)]
+        inside = [spot for spot in own if loop in loops_around(spot)]
+        setups = set_ups(inside, owner)
+        if groups and not groups & {"xyz", "means"}:
+            notes.append(
+                "no group of its optimizer is named xyz or means; those with a Gaussian "
+                f"parameter's name are acted on (all: {', '.join(sorted(groups))})"
+            )
+    elif len(named) == 1 and not owners and not dicts:
+        found = named
+    else:
+        lines = ", ".join(f"{step.optimizer} in line {step.spot.line}" for step in steps)
+        raise refusal(
+            loop,
+            "the optimizer of the Gaussians is not clear: one `for optimizer in "
+            "X.optimizers.values()` or one `X.optimizer.step()` is needed "
+            f"(stepped in the loop: {lines or 'nothing'})",
+        )
+    if others := [text for text in stepped if text not in found]:
+        notes.append(f"left alone: {', '.join(others)}")
+    return Optimizers(found, setups, notes)
+
+
+def _is_adam(own: list[Spot], name: str) -> bool:
+    """Whether a name gets an Adam, or a dict of such, and nothing else."""
+    given = [value for _, value in values(own, name)]
+    return bool(given) and all(_makes_adam(value) for value in given)
+
+
+def _makes_adam(value: ast.expr | None) -> bool:
+    match value:
+        case ast.Call(called):
+            return ADAM.search(ast.unparse(called)) is not None
+        case ast.DictComp(_, each):
+            return _makes_adam(each)
+        case ast.Dict(_, many):
+            return bool(many) and all(map(_makes_adam, many))
+    return False
+
+
+def set_ups(among: list[Spot], owner: str) -> list[ast.stmt]:
+    """The statements that make a model's optimizers."""
+    statements = [spot.node for spot in among if isinstance(spot.node, ast.Expr)]
+    return [s for s in statements if ast.unparse(s).startswith(f"{owner}.training_setup(")]
+
+
+def read_step(spot: Spot, own: list[Spot]) -> Step | None:
+    """The step that a call makes: of an optimizer, or of each of many.
+
+    Raises:
+        ValueError: it is stepped in a way that is no Adam's.
+    """
+    loops = loops_around(spot)
+    match spot.node:
+        case ast.Call(ast.Attribute(owner, "optimizer_step")):
+            return Step(f"{ast.unparse(owner)}.optimizer", spot, loops)
+        case ast.Call(ast.Attribute(owner, "step"), given, options) as call:
+            name = ast.unparse(owner)
+        case _:
+            return None
+    scaled = name.endswith("scaler") and bool(given)
+    if scaled:
+        name = ast.unparse(given[0])
+    around = [(loop, text) for loop in loops if (text := _goes_over_optimizers(loop, name))]
+    if around:
+        loop, name = around[-1]
+        loops = [each for each in loops if each is not loop]
+    elif not name.endswith("optimizer") and not _is_adam(own, name):
+        return None
+    if not scaled and (options or len(given) > 2 or any(_is_closure(each, own) for each in given)):
+        raise refusal(
+            call,
+            f"{ast.unparse(call)} is no step of an Adam; only step() and step(mask, ...) are known",
+        )
+    return Step(name, spot, loops)
+
+
+def _goes_over_optimizers(loop: ast.AST, name: str) -> str:
+    """What a loop goes over, where it steps one optimizer after another in this name; else ""."""
+    pairs: list[tuple[ast.expr, ast.expr]] = []
+    if isinstance(loop, ast.For):
+        pairs = [(loop.target, loop.iter)]
+    elif isinstance(loop, COMPREHENSIONS):
+        pairs = [(each.target, each.iter) for each in loop.generators]
+    for target, source in pairs:
+        text = re.sub(r"\.(values|items)\(\)$", "", ast.unparse(source))
+        names = {node.id for node in ast.walk(target) if isinstance(node, ast.Name)}
+        if name in names and text.lower().endswith(("optimizers", "optims")):
+            return text
+    return ""
+
+
+def _is_closure(node: ast.expr, own: list[Spot]) -> bool:
+    """Whether an argument of `step` is a function, which would compute the loss itself."""
+    functions = [spot.node.name for spot in own if isinstance(spot.node, FUNCTIONS)]
+    return isinstance(node, ast.Lambda) or (isinstance(node, ast.Name) and node.id in functions)
+
+
+def _model(folder: Path) -> tuple[set[str], set[str]]:
+    """The names of the parameter groups, and of all attributes set, in the classes of `scene/`."""
+    groups: set[str] = set()
+    made: set[str] = set()
+    for path in sorted((folder / "scene").glob("*model*.py")):
+        try:
+            tree = ast.parse(path.read_bytes())
+        except (OSError, SyntaxError, ValueError):
+            continue
+        for node in ast.walk(tree):
+            match node:
+                case ast.Dict(
+                    [ast.Constant("params"), *_, ast.Constant("name")],
+                    [*_, ast.Constant(str(name))],
+                ):
+                    groups.add(name)
+                case ast.Attribute(_, name, ast.Store()):
+                    made.add(name)
+    return groups, made

@@ -1,0 +1,51 @@
+"""Where a training loop computes the L1 term of photos."""
+
+import ast
+import re
+from typing import NamedTuple
+
+from opt3dgs_optim.hosts.syntax import Spot, loops_around, values
+
+USUAL_L1 = ("ll1", "l1loss", "l1_loss", "ll1_render", "loss_l1", "l1", "photometric_loss")
+# Terms of other things than photos, by the names that trainers give them.
+NO_PHOTO = re.compile(r"depth|normal|disp(?!lay)|alpha|opac|flow|feat|semantic", re.I)
+
+
+class PixelLoss(NamedTuple):
+    """A photometric L1 term."""
+
+    value: ast.expr  # what to replace
+    images: list[ast.expr]  # its two arguments
+
+
+def find_pixel_loss(inside: list[Spot], loop: ast.stmt, last: int) -> list[PixelLoss]:
+    """The photometric term above a line: `L1 = l1_loss(a, b)`, alone or with `.mean()`.
+
+    Several only where branches write the same name; none where it is not certain which it is.
+    """
+    found: dict[str, list[PixelLoss]] = {}
+    for spot in inside:
+        match spot.node:
+            case ast.Assign(
+                [target, *_],
+                ast.Call(ast.Attribute(ast.Call(called, [_, _] as pair, []), "mean"), [], [])
+                | ast.Call(called, [_, _] as pair, []),
+            ) if ast.unparse(called).split(".")[-1] == "l1_loss" and spot.line < last:
+                name = ast.unparse(target)
+                shown = " ".join([name, *(_written(each, inside) for each in pair)])
+                usual = name.lower() in USUAL_L1
+                if usual and not NO_PHOTO.search(shown) and loops_around(spot)[-1] is loop:
+                    found.setdefault(name, []).append(PixelLoss(spot.node.value, pair))
+    return next(iter(found.values())) if len(found) == 1 else []
+
+
+def _written(image: ast.expr, inside: list[Spot]) -> str:
+    """An image's expression, and what its names are given in the loop: says what it shows.
+
+    A mask that picks pixels says nothing of what is picked.
+    """
+    picked = image.value if isinstance(image, ast.Subscript) else image
+    names = {node.id for node in ast.walk(picked) if isinstance(node, ast.Name)}
+    given = [value for name in names for _, value in values(inside, name)]
+    plain = [v for v in given if isinstance(v, ast.Name | ast.Attribute | ast.Subscript)]
+    return " ".join(map(ast.unparse, (picked, *plain)))

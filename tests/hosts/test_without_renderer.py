@@ -1,0 +1,42 @@
+"""3DGRUT and fVDB reality capture: their optimizers, density control and checkpoints on a CPU.
+
+`python -m pytest -m hosts tests/hosts` with OPT3DGS_TRAINERS, as for `test_trainers.py`.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hosts import without_renderer
+
+TRAINERS = Path(os.environ.get("OPT3DGS_TRAINERS", "/no/trainers"))
+
+pytestmark = pytest.mark.hosts
+
+
+@pytest.mark.parametrize(
+    ("name", "folder"), [("3dgrut", "3dgrut"), ("fvdb", "fvdb-reality-capture")]
+)
+def test_trained_edited_saved_and_resumed(name: str, folder: str) -> None:
+    """Bit for bit the trainer's own without parts, and through its checkpoint."""
+    if not (TRAINERS / folder).is_dir():
+        pytest.skip(f"no {TRAINERS / folder}: put its sources there, set OPT3DGS_TRAINERS")
+    if name == "3dgrut" and importlib.util.find_spec("hydra") is None:
+        pytest.skip("3dgrut needs hydra-core: pip install it")
+    command = [sys.executable, without_renderer.__file__, name, str(TRAINERS / folder)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    found = json.loads(done.stdout.partition(without_renderer.BEFORE)[2])
+    assert found
+    for held in found.values():
+        assert held["points"][0] != held["points"][1]
+        assert held["without parts the trainer's own"]
+        assert held["with the default parts finite and another"]
+        assert held["resumed at"] == without_renderer.ITERATIONS // 2
+        assert held["resumed as uninterrupted"]
