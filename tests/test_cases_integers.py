@@ -10,6 +10,7 @@ import pytest
 import torch
 from placed_training import marked, mended_later
 from torch.nn import Parameter
+from torch.utils._pytree import tree_leaves
 
 from opt3dgs_optim import (
     ConstantMultiplier,
@@ -88,7 +89,7 @@ def test_a_trainers_own_iteration_may_be_numpys(kind: Any) -> None:
             adam.step()
         ends.append(p.detach().clone())
         # What is saved is plain, so that torch.load(weights_only=True) takes it.
-        plain = torch.utils._pytree.tree_leaves(adam.state_dict())
+        plain = tree_leaves(adam.state_dict())
         assert not any(isinstance(each, np.generic) for each in plain)
     assert torch.equal(ends[0], ends[1])
 

@@ -1,0 +1,101 @@
+"""Rows that a trainer moves in place: one public call begins them anew.
+
+ubc-vision/3dgs-mcmc #21 and forks write `_xyz.data[dead] = new` and zero the moments, in the last
+iterations, too. `StepAdam.reset_rows(param, rows)` zeroes moments and all that parts keep of rows.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from placed_training import ADAMS, mended_later
+from torch import Tensor
+from torch.nn import Parameter
+from trainers import AveragedThroughout
+
+from opt3dgs_optim import Averaging, Curvature, Fading, OutOfView, PhaseScheduler
+
+pytestmark = mended_later("StepAdam.reset_rows is not there yet")
+PARTS: dict[str, Any] = {
+    "Averaging": lambda: [Averaging()],
+    "averaging throughout": lambda: [AveragedThroughout()],
+    "Curvature": lambda: [Curvature()],
+    "all": lambda: [Fading(start=0.0), OutOfView(), Curvature(), AveragedThroughout()],
+}
+ROWS: dict[str, Any] = {
+    "indices": torch.tensor([0, 3]),
+    "a mask": torch.tensor([True, False, False, True, False, False]),
+    "one": torch.tensor([3]),
+    "none": torch.tensor([], dtype=torch.long),
+}
+
+
+def trained(parts: str, until: int) -> tuple[Parameter, Any, PhaseScheduler]:
+    p = Parameter(torch.arange(18.0).reshape(6, 3) / 18)
+    phases = PhaseScheduler(300, 200, PARTS[parts]())
+    adam: Any = phases.upgrade(torch.optim.Adam([{"params": [p], "name": "means"}], lr=0.01))
+    run(p, adam, phases, until, torch.zeros(6, 3))
+    return p, adam, phases
+
+
+def run(p: Parameter, adam: Any, phases: PhaseScheduler, until: int, goal: Tensor) -> None:
+    scale = torch.tensor([1.0, 3.0, 9.0])
+    while phases.iteration < until:
+        p.grad = (p.detach() - goal) * scale
+        phases.observe(0.1)
+        adam.step()
+
+
+@pytest.mark.parametrize("parts", PARTS)
+@pytest.mark.parametrize("rows", ROWS)
+def test_the_rows_begin_anew_and_the_others_do_not(parts: str, rows: str) -> None:
+    p, adam, _ = trained(parts, 296)
+    before = {key: each.clone() for key, each in adam.state[p].items()}
+    adam.reset_rows(p, ROWS[rows])
+    chosen = torch.zeros(6, dtype=torch.bool)
+    chosen[ROWS[rows]] = True
+    for key, each in adam.state[p].items():
+        if key == "step":
+            assert torch.equal(each, before[key])
+        elif each.dim() and len(each) == 6:
+            assert not each[chosen].any(), key
+            assert torch.equal(each[~chosen], before[key][~chosen]), key
+
+
+@pytest.mark.parametrize("parts", PARTS)
+@pytest.mark.parametrize("at", [100, 250, 295])
+def test_a_point_that_was_moved_ends_where_it_was_put(parts: str, at: int) -> None:
+    p, adam, phases = trained(parts, at)
+    goal = torch.zeros(6, 3)
+    with torch.no_grad():
+        p[0] = goal[0] = 10.0
+    adam.reset_rows(p, torch.tensor([0]))
+    run(p, adam, phases, 300, goal)
+    assert bool((p[0] - 10.0).abs().max() < 0.1)
+
+
+@pytest.mark.parametrize(
+    "rows", [torch.tensor([6]), torch.tensor([-7]), torch.ones(5, dtype=torch.bool), [0], None]
+)
+def test_rows_that_are_not_there_are_refused_and_nothing_is_changed(rows: Any) -> None:
+    p, adam, _ = trained("all", 250)
+    before = {key: each.clone() for key, each in adam.state[p].items()}
+    assert hasattr(adam, "reset_rows")
+    with pytest.raises((ValueError, TypeError), match="reset_rows"):
+        adam.reset_rows(p, rows)
+    assert all(torch.equal(each, before[key]) for key, each in adam.state[p].items())
+
+
+def test_a_parameter_that_is_not_its_own_is_refused() -> None:
+    _, adam, _ = trained("Averaging", 250)
+    assert hasattr(adam, "reset_rows")
+    with pytest.raises(ValueError, match="reset_rows"):
+        adam.reset_rows(Parameter(torch.ones(6, 3)), torch.tensor([0]))
+
+
+def test_before_the_first_step_there_is_nothing_to_reset() -> None:
+    p, adam, _ = trained("Averaging", 0)
+    adam.reset_rows(p, torch.tensor([0]))
+    assert not {key for key in adam.state[p] if key not in ADAMS}
