@@ -14,13 +14,10 @@ from typing import Any
 
 import pytest
 import torch
-from placed_training import marked, mended_later
 from torch.nn import Parameter
 from torch.optim import Adam, AdamW
 
 from opt3dgs_optim import DEFAULTS, PhaseScheduler, StepAdam
-
-THROWN = "upgrade gives the optimizer another class, and throws the trainer's away"
 
 
 class Counting(Adam):
@@ -86,10 +83,7 @@ def step(optimizer: Any, times: int = 1) -> None:
         optimizer.step()
 
 
-NOT_ADAM = {name: THROWN for name in KINDS if name != "Adam"}
-
-
-@pytest.mark.parametrize("name", marked(KINDS, NOT_ADAM))
+@pytest.mark.parametrize("name", KINDS)
 def test_it_is_still_of_its_class(name: str) -> None:
     kind = KINDS[name]
     optimizer = upgraded(kind)
@@ -101,7 +95,6 @@ def test_it_is_still_of_its_class(name: str) -> None:
     assert type(upgraded(kind)) is type(optimizer)
 
 
-@mended_later(THROWN)
 def test_what_a_trainer_overrides_is_called() -> None:
     optimizer = upgraded(Deeper)
     optimizer.zero_grad()
@@ -112,7 +105,6 @@ def test_what_a_trainer_overrides_is_called() -> None:
     assert optimizer.lowest_rate() == 0.1
 
 
-@mended_later(THROWN)
 def test_what_a_trainer_overrides_calls_super_once_for_each_step() -> None:
     """An override that wraps torch's own keeps its effect on what is saved."""
 
@@ -133,7 +125,7 @@ COPIES: dict[str, Callable[[Any], Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", marked(KINDS, NOT_ADAM))
+@pytest.mark.parametrize("name", KINDS)
 @pytest.mark.parametrize("way", COPIES)
 def test_it_is_copied_and_pickled(name: str, way: str) -> None:
     """The class that is made is found again by pickle, in this process and in another."""
@@ -170,7 +162,6 @@ ROADS: dict[str, Callable[[Any], Any]] = {
     "a file": by_file,
     "of an older torch": of_an_older_torch,
 }
-DECAY = "the group of an old checkpoint is Adam's, not AdamW's: AdamW's __setstate__ is not called"
 
 
 def trained(kind: type[Adam], parts: Any, saved: Any) -> torch.Tensor:
@@ -186,10 +177,7 @@ def trained(kind: type[Adam], parts: Any, saved: Any) -> torch.Tensor:
     return x.detach()
 
 
-OLD = {road: DECAY for road in ROADS if road == "of an older torch"}
-
-
-@pytest.mark.parametrize("road", marked(ROADS, OLD))
+@pytest.mark.parametrize("road", ROADS)
 @pytest.mark.parametrize("kind", [AdamW, Decoupled])
 def test_a_stock_adamws_checkpoint_is_an_adamws(road: str, kind: type[Adam]) -> None:
     x = Parameter(torch.ones(4, 3))
@@ -200,7 +188,7 @@ def test_a_stock_adamws_checkpoint_is_an_adamws(road: str, kind: type[Adam]) -> 
     assert torch.equal(ours, theirs)
 
 
-@pytest.mark.parametrize("road", marked(ROADS, OLD))
+@pytest.mark.parametrize("road", ROADS)
 @pytest.mark.parametrize("kind", [AdamW, Decoupled])
 def test_an_upgraded_adamws_checkpoint_is_an_adamws(road: str, kind: type[Adam]) -> None:
     """Ours to ours, and ours to stock."""

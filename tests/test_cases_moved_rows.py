@@ -10,14 +10,13 @@ from typing import Any
 
 import pytest
 import torch
-from placed_training import ADAMS, mended_later
+from placed_training import ADAMS
 from torch import Tensor
 from torch.nn import Parameter
 from trainers import AveragedThroughout
 
 from opt3dgs_optim import Averaging, Curvature, Fading, OutOfView, PhaseScheduler
 
-pytestmark = mended_later("StepAdam.reset_rows is not there yet")
 PARTS: dict[str, Any] = {
     "Averaging": lambda: [Averaging()],
     "averaging throughout": lambda: [AveragedThroughout()],
@@ -77,7 +76,7 @@ def test_a_point_that_was_moved_ends_where_it_was_put(parts: str, at: int) -> No
 
 
 @pytest.mark.parametrize(
-    "rows", [torch.tensor([6]), torch.tensor([-7]), torch.ones(5, dtype=torch.bool), [0], None]
+    "rows", [torch.tensor([6]), torch.tensor([-7]), torch.ones(5, dtype=torch.bool), torch.ones(1)]
 )
 def test_rows_that_are_not_there_are_refused_and_nothing_is_changed(rows: Any) -> None:
     p, adam, _ = trained("all", 250)

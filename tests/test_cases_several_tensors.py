@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import torch
-from placed_training import ARMS, marked
+from placed_training import ARMS
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -20,9 +20,8 @@ TOTAL, SWITCH, ROWS = 90, 60, 20
 SHAPES = {"means": (3,), "opacities": (1,)}
 RATES = {"means": 1e-2, "opacities": 5e-2}
 # Parts that draw numbers, or that need the other parameters, are about one set of Gaussians.
-ALONE = [arm for arm in ARMS if "Noise" not in arm and arm != "everything"]
-WRONG = "it is kept per group, or by the last tensor that was stepped"
-BROKEN = ("Fading", "OutOfView", "FreshMoments", "DEFAULTS", "DEFAULTS_ADC", "paper")
+NOT_ALONE = ("PositionNoise", "IsotropicNoise", "OwnFrame", "everything")
+ALONE = [arm for arm in ARMS if arm not in NOT_ALONE]
 
 
 class Sets:
@@ -70,7 +69,7 @@ class Sets:
         return {f"{n}.{key}": state[key].clone() for n, state in states.items() for key in keys}
 
 
-@pytest.mark.parametrize("arm", marked(ALONE, dict.fromkeys(BROKEN, WRONG)))
+@pytest.mark.parametrize("arm", ALONE)
 @pytest.mark.parametrize("numbers", [[0, 1], [2, 1, 0]])
 def test_each_set_goes_where_it_goes_alone(arm: str, numbers: list[int]) -> None:
     together = Sets(arm, numbers).run()

@@ -7,12 +7,11 @@ a finished one's checkpoint or on the same objects, ends where it would with Ada
 
 from __future__ import annotations
 
-import itertools
 from typing import Any
 
 import pytest
 import torch
-from placed_training import ADAMS, Training, distance, marked, mended_later
+from placed_training import ADAMS, Training, distance
 from torch.nn import Parameter
 from trainers import AveragedThroughout
 
@@ -36,36 +35,24 @@ KEEPERS: dict[str, Any] = {  # whose memory is of a window, not of the run's ene
         Averaging(),
     ],
 }
-MEANS, PAIRS = "the mean holds iterates of the old run", "pairs of the old exploitation"
-NOTE = "the group's note is of the old run"
-OLD = {"Averaging": MEANS, "averaging throughout": MEANS, "all": MEANS, "FreshMoments": NOTE}
-OLD |= {"Curvature": PAIRS, "curvature of all": PAIRS}
 STOPPED = (SHORT, SHORT - 1, SHORT * 2 // 3 + 5)
-# A switch that has been is another one in a longer run; a mean of the last thirtieth has not begun.
-FINE = {("FreshMoments", at) for at in STOPPED} | {("Averaging", STOPPED[2])}
 
 
 def begun(keeper: str, total: int, **options: Any) -> Training:
     return Training(KEEPERS[keeper], total=total, switch=total * 2 // 3, **options)
 
 
-@pytest.mark.parametrize(
-    "case",
-    marked(
-        cases := list(itertools.product(KEEPERS, STOPPED)),
-        {case: OLD[case[0]] for case in cases if case[0] in OLD and case not in FINE},
-    ),
-)
-def test_a_training_that_goes_on_longer(case: tuple[str, int]) -> None:
+@pytest.mark.parametrize("keeper", KEEPERS)
+@pytest.mark.parametrize("at", STOPPED)
+def test_a_training_that_goes_on_longer(keeper: str, at: int) -> None:
     """A finished one, or one that is stopped within its windows, loaded into a longer one."""
-    keeper, at = case
     first = begun(keeper, SHORT).run(at)
     resumed = begun(keeper, LONGER).resume(first).run()
     anew = begun(keeper, LONGER, counts=True).resume_moments(first).run()
     assert distance(resumed.values(), anew.values()) == 0.0
 
 
-@pytest.mark.parametrize("keeper", marked(KEEPERS, OLD))
+@pytest.mark.parametrize("keeper", KEEPERS)
 def test_a_clock_that_starts_again_on_the_same_objects(keeper: str) -> None:
     first = begun(keeper, SHORT, counts=True).run()
     anew = begun(keeper, SHORT, counts=True).resume_moments(first)
@@ -75,19 +62,10 @@ def test_a_clock_that_starts_again_on_the_same_objects(keeper: str) -> None:
     assert distance(first.values(), anew.values()) == 0.0
 
 
-BACK = (30, 10, 3)
-
-
-@pytest.mark.parametrize(
-    "case",
-    marked(
-        backs := list(itertools.product(KEEPERS, BACK)),
-        {(keeper, 30): why for keeper, why in OLD.items() if keeper != "Averaging"},
-    ),
-)
-def test_a_clock_that_goes_back_within_a_training(case: tuple[str, int]) -> None:
+@pytest.mark.parametrize("keeper", KEEPERS)
+@pytest.mark.parametrize("back", [30, 10, 3])
+def test_a_clock_that_goes_back_within_a_training(keeper: str, back: int) -> None:
     """A trainer that goes back to an older state of its own, without a checkpoint."""
-    keeper, back = case
     first = begun(keeper, SHORT, counts=True).run(SHORT - 2)
     anew = begun(keeper, SHORT, counts=True).resume_moments(first)
     for training in (first, anew):
@@ -102,7 +80,6 @@ def kept_keys(training: Training) -> set[str]:
     return {key for key in training.kept() if key.split(".", 1)[1] not in ADAMS}
 
 
-@mended_later("nothing is dropped when a window ends")
 @pytest.mark.parametrize("keeper", ["Averaging", "Curvature"])
 def test_memory_is_given_back_when_a_window_is_over(keeper: str) -> None:
     training = begun(keeper, SHORT, counts=True).run(SHORT - 1)
@@ -112,7 +89,6 @@ def test_memory_is_given_back_when_a_window_is_over(keeper: str) -> None:
     assert kept_keys(training) == set()
 
 
-@mended_later(MEANS)
 def test_a_new_end_is_the_mean_of_the_new_run_alone() -> None:
     """From 0 to 1 in 300 iterations; then on to 3 until 900."""
     ends = []
