@@ -145,7 +145,7 @@ def test_a_report_needs_no_optimizer() -> None:
 
 
 def test_nothing_but_torch_and_numpy_is_imported_at_the_top() -> None:
-    """Whatever an extra brings is imported where it is used; some hosts' modules are their users'."""
+    """What an extra brings is imported where it is used; some hosts' modules are their users'."""
     allowed = {PACKAGE, "torch", "numpy", *sys.stdlib_module_names}
     for module, tree in TREES.items():
         if module.endswith((".nerfstudio", ".lightning")):
