@@ -86,7 +86,7 @@ def train(run: LongRun, trainers: Path, scene: Path, iterations: int) -> dict[st
         if done.code != 0 or done.psnr is None:
             raise RuntimeError(f"{run.name} stopped with {done.code}: {done.output[-3000:]}")
         key = "edited" if ours else "stock"
-        row[key] = {"psnr": done.psnr, "seconds": round(done.seconds)}
+        row[key] = {"psnr": done.psnr}
         if ours:
             row["parts"] = parts_of(done.output)
     return row

@@ -4,6 +4,8 @@
     python examples/hosts/on_cpu.py train.py -s SCENE --iterations 100
     python examples/hosts/on_cpu.py nerfstudio/scripts/train.py splatfacto-opt3dgs \
         --vis tensorboard --max-num-iterations 100 colmap --data SCENE --colmap-path sparse/0
+    python examples/hosts/on_cpu.py gaussian-splatting-lightning/main.py fit --config opt3dgs.yaml \
+        --data.path SCENE --data.parser Colmap --trainer.accelerator cpu --max_steps 100
 
 Everything after the script's path is the script's own. CUDA is mapped to the CPU, the CUDA
 rasterizers are replaced by the examples' own (`pip install "opt3dgs_optim[examples]"`), viewers and

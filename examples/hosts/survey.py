@@ -64,13 +64,14 @@ on {scene}, stock and with the lines. So short a run shows that a trainer runs, 
 with the lines; how good it gets is not to be read from it. \
 Parts of these runs: {parts}. {date}, torch {torch}, {machine}.
 
-| trainer and options | commit | lines of `diff` | stock | edited | saved | resumed | what is different |
+| trainer and options | commit | lines of `diff` | stock | edited | saved | resumed | \
+what is different |
 |---|---|---|---|---|---|---|---|
 {ran}
 {counts[0]} of the {counts[1]} trials in `examples/hosts/trials.py` have \
-been run for this table; {counts[2]} of them left a checkpoint. Resumed: the edited trainer, from its \
-own checkpoint and from the stock one's; gsplat's scripts evaluate a checkpoint and do \
-not go on from one ([lines that do](gsplat.md#save-and-resume)).
+been run for this table; {counts[2]} of them left a checkpoint. \
+Resumed: the edited trainer, from its own checkpoint and from the stock one's; \
+gsplat's scripts evaluate a checkpoint and do not go on from one ([lines that do](gsplat.md#save-and-resume)).
 
 3DGRUT and fVDB reality capture render with CUDA kernels of their own: \
 `examples/hosts/without_renderer.py` runs how they make, edit, save and load their optimizers \

@@ -182,8 +182,8 @@ class Lightning(Trial):
         return next(out.glob(f"run/checkpoints/{name}"), out / name)
 
     def going_on(self, checkpoint: Path) -> list[str]:
-        """The options to go on from a checkpoint, which holds more than tensors."""
-        return ["--ckpt_path", str(checkpoint), "--weights_only", "false"]
+        """The options to go on from a checkpoint."""
+        return ["--ckpt_path", str(checkpoint)]
 
     def start(
         self,

@@ -192,7 +192,8 @@ def _check_total(trainer: Trainer, point: ast.stmt) -> None:
         match spot.node:
             case ast.Name(ctx=ast.Store()) | ast.Attribute(ctx=ast.Store()) as node:
                 text = ast.unparse(node)
-                if text in parts and point.lineno <= node.lineno < trainer.loop.lineno:
+                later = node.lineno > trainer.total.lineno or node.lineno >= point.lineno
+                if text in parts and later and node.lineno < trainer.loop.lineno:
                     raise refusal(
                         node, f"{text} changes here, between the range and the loop over it"
                     )

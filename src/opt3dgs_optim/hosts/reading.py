@@ -166,9 +166,9 @@ def _loss(spot: Spot) -> ast.expr:
     """
     loss: ast.expr | None = None
     match spot.node:
-        case ast.Call(ast.Attribute(ast.Call(ast.Attribute(_, "scale"), [scaled, *_]), "backward")):
+        case ast.Call(ast.Attribute(ast.Call(ast.Attribute(_, "scale"), [scaled]), "backward"), []):
             loss = scaled
-        case ast.Call(ast.Attribute(receiver, "backward")):
+        case ast.Call(ast.Attribute(receiver, "backward"), []):  # no accelerator.backward(loss)
             loss = receiver
     if loss is None or not _is_reference(loss) or not isinstance(spot.above[-1], ast.Expr):
         raise refusal(
