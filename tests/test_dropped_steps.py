@@ -11,7 +11,18 @@ from typing import Any
 
 import pytest
 import torch
-from placed_training import ARMS, GPU, LATE, LONG, PRESETS, SWITCH, TOTAL, Training, distance, marked
+from placed_training import (
+    ARMS,
+    GPU,
+    LATE,
+    LONG,
+    PRESETS,
+    SWITCH,
+    TOTAL,
+    Training,
+    distance,
+    marked,
+)
 from simulated_device import SimulatedDevice, on_host
 
 FUSED = {"fused": True}
