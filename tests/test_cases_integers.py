@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from placed_training import marked, mended_later
+from placed_training import marked
 from torch.nn import Parameter
 from torch.utils._pytree import tree_leaves
 
@@ -51,11 +51,7 @@ OPTIONS: dict[str, tuple[Callable[[Any], Any], int]] = {
 KINDS = (np.int64, np.int32, np.int16, np.uint8, np.uint64)
 
 
-PYTHONS = dict.fromkeys(OPTIONS, "checks.check_count asks for an int of Python")
-del PYTHONS["paper_parts"]
-
-
-@pytest.mark.parametrize("option", marked(OPTIONS, PYTHONS))
+@pytest.mark.parametrize("option", OPTIONS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_integer_of_numpy_is_one(option: str, kind: Any) -> None:
     make, number = OPTIONS[option]
@@ -75,7 +71,6 @@ def test_what_is_no_integer_is_refused(option: str, value: Any) -> None:
         OPTIONS[option][0](value)
 
 
-@mended_later("checks.check_count asks for an int of Python")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_trainers_own_iteration_may_be_numpys(kind: Any) -> None:
     ends = []
@@ -100,7 +95,6 @@ def test_the_recursions_history_size(kind: Any) -> None:
     assert torch.equal(two_loop(grad, history, kind(5)), two_loop(grad, history, 5))
 
 
-@mended_later("checks.check_number asks for a float of Python")
 @pytest.mark.parametrize("kind", [np.float32, np.int64])
 def test_a_number_of_numpy_is_one(kind: Any) -> None:
     assert PhaseScheduler(60, np.float64(0.5)).switch_step == 30

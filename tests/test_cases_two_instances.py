@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from placed_training import Training, distance, marked, mended_later
+from placed_training import Training, distance, marked
 from trainers import AveragedThroughout
 
 from opt3dgs_optim import (
@@ -70,7 +70,11 @@ BESIDE: dict[str, tuple[Made, Made, int]] = {
         lambda t: [FreshMoments(settling=10_000), FreshMoments()],
         90,
     ),
-    "FreshMoments twice": (lambda t: [FreshMoments()], lambda t: [FreshMoments()] * 2, 90),
+    "FreshMoments twice": (
+        lambda t: [FreshMoments()],
+        lambda t: [FreshMoments(), FreshMoments()],
+        90,
+    ),
     "OutOfView": (lambda t: [OutOfView()], lambda t: [OutOfView(), OutOfView()], 90),
     "EnergyHistogram": (
         lambda t: [EnergyHistogram(warmup=10)],
@@ -106,8 +110,6 @@ BESIDE: dict[str, tuple[Made, Made, int]] = {
     ),
 }
 SHARED = {
-    "Fading": "both count their events under one key of the group",
-    "Fading, the other first": "both count their events under one key of the group",
     "PositionNoise": "the noise of one is taken for a trainer's by the other",
 }
 
@@ -143,7 +145,6 @@ def test_two_of_a_class_are_resumed(name: str, at: int) -> None:
     assert distance(second.values(), first.run().values()) == 0.0
 
 
-@mended_later("both keep theirs under one key")
 def test_two_of_a_class_keep_their_own() -> None:
     """Two histories of two sizes of one parameter; two means of two windows."""
     pairs = trained(lambda t: [Curvature(2), Curvature(4)], 70).kept()
