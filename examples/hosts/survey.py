@@ -71,7 +71,8 @@ what is different |
 {counts[0]} of the {counts[1]} trials in `examples/hosts/trials.py` have \
 been run for this table; {counts[2]} of them left a checkpoint. \
 Resumed: the edited trainer, from its own checkpoint and from the stock one's; \
-gsplat's scripts evaluate a checkpoint and do not go on from one ([lines that do](gsplat.md#save-and-resume)).
+gsplat's scripts evaluate a checkpoint and do not go on from one \
+([lines that do](gsplat.md#save-and-resume)).
 
 3DGRUT and fVDB reality capture render with CUDA kernels of their own: \
 `examples/hosts/without_renderer.py` runs how they make, edit, save and load their optimizers \

@@ -136,9 +136,10 @@ def test_a_step_that_the_device_drops_leaves_no_pair(monkeypatch: Any) -> None:
     x = Parameter(torch.zeros(4, 3))
     phases = only(TOTAL, Curvature(3), switch=0)
     means: Any = phases.upgrade({"means": torch.optim.Adam([x], lr=0.1, fused=True)})["means"]
+    before = torch.zeros(0)
     for loss, slope in ((0.1, 1.0), (float("nan"), 3.0)):
         x.grad = torch.full((4, 3), slope)
-        before = means.state[x]["Curvature.history"].clone() if means.state else None
+        before = means.state[x]["Curvature.history"].clone() if means.state else before
         phases.observe(loss)
         means.step()
     assert torch.equal(means.state[x]["Curvature.history"], before)

@@ -230,7 +230,7 @@ def test_a_dropped_step_adds_no_noise_and_draws_as_many_numbers(
             splats = make_splats()
             splats["opacities"].data.fill_(-9.0)
             generator = torch.Generator().manual_seed(5)
-            options = {"scale": 1e4} if kind is PositionNoise else {"std": 0.5}
+            options: dict[str, Any] = {"scale": 1e4} if kind is PositionNoise else {"std": 0.5}
             phases = only(60, kind(generator=generator, **options))
             adams = phases.upgrade(gsplat_optimizers(splats, fused=True))
             for i in range(6):

@@ -53,7 +53,7 @@ def test_the_frame_is_that_of_the_covariance(rows: int, dtype: torch.dtype) -> N
     v, quats = (torch.randn(rows, n, generator=draw, dtype=dtype) for n in (3, 4))
     scales = 3 * torch.randn(rows, 3, generator=draw, dtype=dtype)
     b, frames = frame(quats, scales), Frames(quats, scales, dtype)
-    tight = (
+    tight: dict[str, Any] = (
         {"rtol": 2e-5, "atol": 1e-5} if dtype == torch.float32 else {"rtol": 1e-12, "atol": 1e-12}
     )
     # Rounding is relative to the axis, and in the world to the longest of them.
