@@ -23,6 +23,7 @@ import opt3dgs_optim
 from opt3dgs_optim import hosts
 
 PAGES = pages()
+README = ROOT / "README.md"
 
 
 def of_pages(*languages: str) -> list[Any]:
@@ -44,16 +45,14 @@ def test_python_blocks_run_and_print_what_is_shown(
 ) -> None:
     """The blocks of a page run one after the other, in one namespace and an empty folder."""
     monkeypatch.chdir(tmp_path)
-    namespace: dict[str, Any] = {"__name__": "docs"}
-    printed, given = None, {}
+    namespace: dict[str, Any] = {**trainer_names(), "__name__": "docs"}
+    printed = None
     try:
         for block in blocks(page):
             if block.language == "python" and not is_excerpt(block):
                 printed = io.StringIO()
-                # A block for another trainer finds that one; what a page defines stays.
-                kept = [name for name, value in given.items() if namespace[name] is not value]
-                given = {n: v for n, v in trainer_names().items() if n not in kept}
-                namespace |= given
+                if page == README:  # each block is for another trainer
+                    namespace |= trainer_names()
                 code = compile("\n" * block.line + block.text, name(page), "exec")
                 with contextlib.redirect_stdout(printed):
                     exec(code, namespace)
@@ -97,9 +96,18 @@ def test_the_algorithm_pages_quote_the_source() -> None:
 HOST_PAGES = {kind: "gsplat" if "gsplat" in kind else "inria" for kind in SYNTHETIC}
 
 
-def statements(page: Path) -> set[str]:
-    """The lines of a page's Python blocks, without comments."""
-    lines = "\n".join(block.text for block in blocks(page, "python")).splitlines()
+def statements(page: Path, *, whole: bool = True) -> set[str]:
+    """The lines of a page's Python blocks, without comments.
+
+    Not whole: of those above its first section, without Grendel-GS's, which no test has.
+    """
+    end = len(page.read_text(encoding="utf-8").partition("\n## ")[0].splitlines())
+    found = [
+        block
+        for block in blocks(page, "python")
+        if whole or (block.line <= end and "opt_args" not in block.text)
+    ]
+    lines = "\n".join(block.text for block in found).splitlines()
     return {re.sub(r"\s*#.*", "", line).strip() for line in lines} - {""}
 
 
@@ -118,10 +126,7 @@ def test_host_pages_show_no_other_lines(tmp_path: Path) -> None:
         trainer.write_text(text)
         written.setdefault(HOST_PAGES[kind], set()).update(added(hosts.diff(trainer).diff))
     for page, lines in written.items():
-        assert statements(DOCS / "hosts" / f"{page}.md") == lines
-
-
-README = ROOT / "README.md"
+        assert statements(DOCS / "hosts" / f"{page}.md", whole=False) == lines
 
 
 def test_the_readme_shows_what_the_command_prints(tmp_path: Path) -> None:
@@ -206,7 +211,19 @@ def test_every_block_is_checked_by_something() -> None:
         for block in blocks(page):
             known = block.language in ("python", *SHELL) or block.title == "prints"
             known |= page == README and block.language in ("diff", "bibtex")
+            known |= block.language == "yaml"
             assert known, f"{name(page)}, line {block.line}: nothing checks a {block.language!r}"
+
+
+@pytest.mark.parametrize("page", of_pages("yaml"))
+def test_configurations_name_classes_that_exist(page: Path) -> None:
+    for block in blocks(page, "yaml"):
+        (path,) = re.findall(r"class_path: (\S+)", block.text)
+        module, _, wanted = path.rpartition(".")
+        spec = importlib.util.find_spec(module)
+        assert spec is not None
+        assert spec.origin is not None
+        assert f"class {wanted}" in Path(spec.origin).read_text(encoding="utf-8")
 
 
 # -- pictures and links ----------------------------------------------------------------------------
