@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from placed_training import ADAMS, ARMS, PRESETS, Training, distance, marked, mended_later
+from placed_training import ADAMS, ARMS, PRESETS, Training, distance, mended_later
 from torch.nn import Parameter
 
 from opt3dgs_optim import DEFAULTS, PhaseScheduler
@@ -22,12 +22,7 @@ def stop_of(arm: str) -> int:
     return 88 if arm in PRESETS else 40
 
 
-CAST = "torch's load has cast what a part keeps to the parameter's dtype"
-LOST = {(arm, dtype): CAST for arm in ("Averaging", "DEFAULTS", "DEFAULTS_ADC") for dtype in DTYPES}
-LOST |= {(arm, dtype): CAST for arm in ("Curvature", "paper") for dtype in ("bfloat16", "float16")}
-
-
-@pytest.mark.parametrize("case", marked(itertools.product(QUIET, DTYPES), LOST))
+@pytest.mark.parametrize("case", itertools.product(QUIET, DTYPES))
 def test_a_training_is_resumed(case: tuple[str, str]) -> None:
     """torch's load casts all floating state to the parameter's dtype; ours is cast back."""
     arm, dtype = case
@@ -58,11 +53,7 @@ def plain() -> dict[str, Training]:
     return {arm: Training(arm).run() for arm in ARMS}
 
 
-FOLLOWS = "what is drawn or kept follows torch's default dtype"
-FOLLOWING = ("Fading", "Averaging", "DEFAULTS", "DEFAULTS_ADC", "everything")
-
-
-@pytest.mark.parametrize("arm", marked(ARMS, dict.fromkeys(FOLLOWING, FOLLOWS)))
+@pytest.mark.parametrize("arm", ARMS)
 def test_nothing_follows_the_default_dtype(arm: str, plain: dict[str, Training]) -> None:
     expected = plain[arm]
     torch.set_default_dtype(torch.float64)
@@ -77,10 +68,7 @@ def test_nothing_follows_the_default_dtype(arm: str, plain: dict[str, Training])
     assert distance(training.values(), expected.values()) == 0.0
 
 
-ROUNDS = dict.fromkeys(("Averaging", "DEFAULTS", "DEFAULTS_ADC"), "the mean is float32")
-
-
-@pytest.mark.parametrize("arm", marked(QUIET, ROUNDS))
+@pytest.mark.parametrize("arm", QUIET)
 def test_with_a_learning_rate_of_zero_nothing_moves(arm: str) -> None:
     """Georeferenced positions (sparkjsdev/spark #356) have more digits than float32 has."""
     training = Training(arm, dtype=torch.float64)
