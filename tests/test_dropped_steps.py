@@ -26,8 +26,8 @@ from placed_training import (
 from simulated_device import SimulatedDevice, on_host
 
 FUSED = {"fused": True}
-ROUNDED, NU = 2e-6, 1e-4  # nu is float32 on a device: see test_simulated_device.py
-UNLIKE = {"EnergyHistogram": NU, "EnergyHistogram.paper": ROUNDED, "paper": ROUNDED}
+ROUNDED = 2e-6  # nu is float32 on a device: see test_simulated_device.py
+UNLIKE = {"EnergyHistogram": ROUNDED, "EnergyHistogram.paper": ROUNDED, "paper": ROUNDED}
 WHEN = {
     "one": {9},
     "the first": {0},

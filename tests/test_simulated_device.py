@@ -255,7 +255,7 @@ FUSED: dict[str, Any] = {"fused": True}
 FOREACH: dict[str, Any] = {"foreach": True}
 SINGLE: dict[str, Any] = {"foreach": False}
 EXACT, ROUNDED = 0.0, 2e-6  # the latter where nu is a float32 of the device, a float of the host
-OTHER_PATH = 1e-5
+OTHER_PATH = 1e-5  # of another path of torch's Adam, whose last digits differ
 UNLIKE = {"EnergyHistogram": ROUNDED, "EnergyHistogram.paper": ROUNDED, "paper": ROUNDED}
 
 
