@@ -73,7 +73,6 @@ def test_nothing_is_left_alone(trainer: str, caplog: pytest.LogCaptureFixture) -
 
 @pytest.mark.parametrize("trainer", ["gsplat", "INRIA", "nerfstudio"])
 @pytest.mark.parametrize("layout", LAYOUTS)
-@pytest.mark.xfail(strict=True, reason="OutOfView: who is out of view is known at the positions")
 def test_the_order_of_groups_says_nothing(trainer: str, layout: str) -> None:
     """3DGRUT's and others' positions are not the first; what is out of view is known in time."""
     expected = trained(TRAINERS[trainer], layout, (0, 1, 2, 3, 4, 5))

@@ -226,7 +226,7 @@ def test_a_backend_that_there_is_not() -> None:
 
 
 # Bases that nobody constructs, the enum, and those that have such tests of their own.
-OTHERS = {"Kept", "Course", "Part", "Phase", "StepAdam", "EnergyHistogram", "RunLog"}
+OTHERS = {"Kept", "OwnFrame", "Course", "Part", "Phase", "StepAdam", "EnergyHistogram", "RunLog"}
 
 
 def test_every_public_class_is_here() -> None:

@@ -130,7 +130,14 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
             continue
         listed = own["kept"].get(str(i), ())
         rows.append(_rows(call, optimizer.course, own, param, rest, kept, listed, loaded))
-    if orphaned:
+    by_name = any(isinstance(number, str) for number in state)  # torch's distributed checkpoints
+    if own is None and by_name and steps and any(optimizer.course.declared.values()):
+        warn_user(
+            f"{call}: a distributed checkpoint of {steps} steps without our state, as flattened "
+            "ones and those of a stock trainer are: what the parts keep begins anew, and the clock "
+            "needs observe(loss, iteration=...)"
+        )
+    elif orphaned:
         warn_user(
             f"{call}: this checkpoint has what parts keep per point, but not for which iterations: "
             "it begins anew (a consolidated or flattened checkpoint leaves that out)"

@@ -83,6 +83,7 @@ class Course:
         self.valid: Tensor | bool = True  # whether the last energy was finite
         self.energy_device = torch.device("cpu")
         self.kept_numbers: dict[str, Tensor] = {}  # what parts keep per training
+        self._numbers_read: dict[int, tuple[int, weakref.ref[Tensor], float]] = {}
         self._reported: set[str] = set()  # kinds of mistakes that were said
         self._published: dict[tuple[str, Place], tuple[int, Any]] = {}
         self._places: dict[int, tuple[weakref.ref[Tensor], Place]] = {}  # id of a tensor -> where
@@ -232,6 +233,18 @@ class Course:
             return {}
         return {name: each for where, name, each in self._gaussians() if where == place}
 
+    def number_kept(self, part: Part, name: str, param: Tensor) -> Tensor | None:
+        """What a part keeps per parameter for another parameter than that of the present hook.
+
+        Args:
+            part: one of the parts.
+            name: as the part declares it.
+            param: of shape [N, ..]; None is returned where nothing is kept for it yet.
+        """
+        key = f"{self.name_of(part)}.{name}"
+        found = (each.record_of(param) for each in self.followers())
+        return next((record.numbers.get(key) for record in found if record is not None), None)
+
     def _gaussians(self) -> Iterator[tuple[Place, str, Tensor]]:
         for optimizer in self.followers():
             for group in optimizer.param_groups:
@@ -307,6 +320,16 @@ class Course:
         if isinstance(self.valid, Tensor):
             self.valid = bool(self.valid)
         return self.valid
+
+    def on_host(self, number: Tensor) -> float:
+        """A 0-d tensor as the host knows it: read once an energy, whoever asks."""
+        if number.device.type == "cpu":
+            return number.item()
+        known = self._numbers_read.get(id(number))
+        if known is None or known[0] != self.num_observed or known[1]() is not number:
+            known = self.num_observed, weakref.ref(number), number.item()
+            self._numbers_read = {id(number): known}
+        return known[2]
 
     def expect(self, steps: int) -> None:
         """Called where Adam's moments come without our state: they have made so many steps."""
@@ -412,7 +435,13 @@ class Course:
 
     def __getstate__(self) -> dict[str, Any]:
         # Copies of the optimizers make themselves known to the copy of the course.
-        return {**vars(self), "_followers": [], "_places": {}, "_published": {}}
+        return {
+            **vars(self),
+            "_followers": [],
+            "_places": {},
+            "_published": {},
+            "_numbers_read": {},
+        }
 
 
 def _by_name(parts: Iterable[Part]) -> dict[str, Part]:

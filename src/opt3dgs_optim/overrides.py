@@ -62,12 +62,17 @@ def _delete(owner: Any, key: Any, _: Any) -> None:
 
 
 def scale_learning_rate(
-    overrides: TemporaryOverrides, group: Group, factors: list[Any], counts: Tensor | bool
+    overrides: TemporaryOverrides,
+    group: Group,
+    factors: list[Any],
+    counts: Tensor | bool,
+    read: Callable[[Tensor], float],
 ) -> None:
     """lr times the factors, never left in the group: schedulers would compound it.
 
     Not on decoupled weight decay, which would grow weights where a factor is negative. `counts` is
-    whether the step will be made, 0-d where only the device knows.
+    whether the step will be made, 0-d where only the device knows; `read` gives a device's number
+    to the host.
     """
     if not factors:
         return
@@ -78,7 +83,7 @@ def scale_learning_rate(
         # do parameters there, where a copy that is not waited for may be read before it is made.
         on_device = device.type != "cpu" and factor.device.type != "cpu"
         if not on_device or not (group["fused"] or group["capturable"]):
-            factor = factor.item()
+            factor = read(factor)
         else:
             factor = factor.to(device=device, dtype=torch.float32, non_blocking=True)
     if group.get("decoupled_weight_decay") and group["weight_decay"]:

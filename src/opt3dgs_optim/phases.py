@@ -261,9 +261,8 @@ class PhaseScheduler(Course):
             )
 
     def _stepped_before_first_energy(self) -> bool:
-        """Whether each optimizer made one step, with a learning rate, before there was a loss."""
-        rates = [group["lr"] for each in self.followers() for group in each.param_groups]
-        return self.steps == self._num_optimizers and any(float(rate) != 0 for rate in rates)
+        """Whether each optimizer made one step before there was a loss."""
+        return 0 < self.steps == self._num_optimizers
 
     def _watch_losses(self) -> None:
         """Say once that losses have not been finite for long, as far as the host knows them."""

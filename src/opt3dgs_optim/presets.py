@@ -1,5 +1,6 @@
 """What is on: the parts that paid, and those of the paper."""
 
+from opt3dgs_optim.checks import check_count
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.parts.annealing import Annealing
 from opt3dgs_optim.parts.averaging import Averaging
@@ -23,5 +24,6 @@ DEFAULTS_ADC: tuple[Part, ...] = (
 
 def paper_parts(total_steps: int = PAPER_STEPS) -> list[Part]:
     """The parts of Opt3DGS with the paper's settings, its warm-up scaled to `total_steps`."""
+    total_steps = check_count("paper_parts", "total_steps", total_steps, 1)
     warmup = round(total_steps * PAPER_WARMUP)
     return [EnergyHistogram.paper(warmup=warmup), FreshMoments(), SquaredLoss(), Curvature()]

@@ -218,12 +218,19 @@ class StepAdam(Adam):
             with torch.enable_grad():
                 loss = closure()
         with torch.set_grad_enabled(self.defaults["differentiable"]):
-            acting = self.course.stepping(loss)
+            # torch's distributed checkpoints make a step of length zero, to have Adam's moments.
+            idle = loss is None and self.course.num_observed == 0 and self._is_held()
+            acting = not idle and self.course.stepping(loss)
             if mask is None and not self.course.parts:
                 self._step_base(None)
             else:
                 self._step(mask, acting)
         return loss
+
+    def _is_held(self) -> bool:
+        """Whether no learning rate moves anything."""
+        rates = [group["lr"] for group in self.param_groups]
+        return not any((isinstance(rate, Tensor) and not rate.is_cpu) or rate for rate in rates)
 
     # Learning-rate schedulers, which would wrap `step` on the instance, need not: `step` tells.
     step._wrapped_by_lr_sched = True  # pyright: ignore[reportFunctionMemberAccess]
@@ -267,7 +274,7 @@ class StepAdam(Adam):
                 self._prepare_group(step, group, records, parts)
                 said = [part.factor(group, course) for _, part in parts.factor]
                 factors = [factor for factor in said if factor is not None]
-                scale_learning_rate(temporary, group, factors, counts)
+                scale_learning_rate(temporary, group, factors, counts, course.on_host)
             if counts is not False:
                 if isinstance(counts, Tensor) and self._base is Adam:
                     # As a GradScaler tells torch's fused step not to be made.
@@ -428,6 +435,14 @@ class StepAdam(Adam):
             said = "iteration %d: %s is not finite; such numbers count as zero"
             LOGGER.warning(said, self.course.current, what)
 
+    def record_of(self, param: Tensor) -> ParameterRecord | None:
+        """What is known of the parameter at its place; None where it is none of these."""
+        for group, records in zip(self.param_groups, self._records, strict=False):
+            for each, record in zip(group["params"], records, strict=False):
+                if each is param:
+                    return record
+        return None
+
     # -- whose state it is -----------------------------------------------------------------------
 
     def _follow_windows(self) -> None:
@@ -466,6 +481,8 @@ class StepAdam(Adam):
         call = f"{self.call_name}.reset_rows"
         if not any(param is each for group in self.param_groups for each in group["params"]):
             raise ValueError(f"{call}: a parameter of shape {tuple(param.shape)} is none of these")
+        if not isinstance(rows, (Tensor, list, tuple, range)):
+            raise ValueError(f"{call}: rows={rows!r}, but a tensor of indices or a mask is needed")
         rows = torch.as_tensor(rows, device=param.device)
         whole = not rows.is_floating_point() and not rows.is_complex()
         fits = rows.dtype == torch.bool and rows.shape == param.shape[:1]

@@ -112,6 +112,7 @@ class PositionNoise(Part):
                 f"PositionNoise: {len(scales)} scales for {len(means)} means; the dict must hold "
                 "the tensors that belong to the means being stepped"
             )
+        scales, quats, opacities = (each.to(means.device) for each in (scales, quats, opacities))
         noise = covariance_noise(scales, quats, opacities, _normal_like(means, self.generator))
         means += noise * (lr * self.scale)
 

@@ -48,24 +48,27 @@ class OutOfView(Part):
         if grad.dim() == 0 or len(grad) == 0:
             return grad
         if gaussian_of(group) == "means":
-            share: Any = state[SEEN_SHARE]
-            stride = 1 + len(grad) // MAX_POINTS_LOOKED_AT
-            some = _has_gradient(grad[::stride] if stride > 1 else grad)
-            now = some.mean(dtype=torch.float32).clamp_(min=MIN_SEEN_SHARE)
-            share.lerp_(now.to(share.dtype), 1 / NUM_VIEWS_AVERAGED)
-            if grad.is_cpu:
-                share = share.item()
+            kept = state[SEEN_SHARE]
+            kept.copy_(_next_share(kept, grad))
+            # A GPU's number is not read.
+            share: Any = kept.item() if grad.is_cpu else kept
             course.publish(SEEN_SHARE, param, share)
-            if not isinstance(share, float) or share < MAX_SEEN_SHARE:  # a GPU is not waited for
+            if not isinstance(share, float) or share < MAX_SEEN_SHARE:
                 course.publish(OUT_OF_VIEW, param, ~_has_gradient(grad))
             return grad
-        share = course.published(SEEN_SHARE, param, earlier=True)
-        if share is None or (isinstance(share, float) and share >= MAX_SEEN_SHARE):
-            return grad
+        share = course.published(SEEN_SHARE, param)
         unseen = course.published(OUT_OF_VIEW, param)
-        if unseen is None:  # the positions come later
+        if share is None:  # the positions come later in this iteration
             means = course.gaussians_of(param).get("means")
-            unseen = None if means is None or means.grad is None else ~_has_gradient(means.grad)
+            if means is None or means.grad is None:
+                return grad
+            kept = course.number_kept(self, SEEN_SHARE, means)
+            kept = torch.ones((), device=means.device) if kept is None else kept
+            share = _next_share(kept, means.grad)
+            share = share.item() if share.is_cpu else share
+            unseen = ~_has_gradient(means.grad)
+        if isinstance(share, float) and share >= MAX_SEEN_SHARE:
+            return grad
         if unseen is None or len(unseen) != len(grad):
             return grad
         factor = MAX_SEEN_SHARE / share * (share < MAX_SEEN_SHARE)
@@ -80,6 +83,14 @@ class OutOfView(Part):
         """`visible_share`: the mean share of the points that a view sees."""
         share = course.last_published(SEEN_SHARE)
         return {"visible_share": 1.0 if share is None else share}
+
+
+def _next_share(share: Tensor, grad: Tensor) -> Tensor:
+    """The mean share of the points that a view sees, after one more view; 0-d."""
+    stride = 1 + len(grad) // MAX_POINTS_LOOKED_AT
+    seen = _has_gradient(grad[::stride] if stride > 1 else grad)
+    now = seen.mean(dtype=torch.float32).clamp_(min=MIN_SEEN_SHARE)
+    return share.lerp(now.to(share), 1 / NUM_VIEWS_AVERAGED)
 
 
 def _has_gradient(grad: Tensor) -> Tensor:

@@ -108,7 +108,8 @@ class OwnFrame(Part):
     ) -> Tensor:
         """B^T g [N, 3], which is what Adam is fed."""
         gaussians = course.gaussians_of(param)
-        quats, scales = gaussians["quats"].detach(), gaussians["scales"].detach()
+        # To where the positions are: some trainers keep others on the host.
+        quats, scales = (gaussians[name].detach().to(param.device) for name in ("quats", "scales"))
         # Kept for `displacement`: one optimizer of all groups has moved them by then.
         frames = Frames(quats, scales, param.dtype)
         course.publish(FRAMES, param, frames)
