@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
 import torch
 from inria_host import OPTIONS, SimulatedModel, fill
 from torch.nn import Parameter
@@ -97,7 +98,8 @@ def test_anchors_instead_of_positions() -> None:
         for name, n in shapes.items()
     ]
     phases = PhaseScheduler(TOTAL)
-    optimizer = phases.upgrade(Adam(groups, lr=0.0, eps=1e-15))
+    with pytest.warns(UserWarning, match="anchor stay as they are"):
+        optimizer = phases.upgrade(Adam(groups, lr=0.0, eps=1e-15))
     for group in optimizer.param_groups:
         group["params"][0].grad = torch.ones_like(group["params"][0])
     phases.observe(0.1)

@@ -31,7 +31,8 @@ NEEDED = {
     "gsplat": "torchmetrics tyro cv2 sklearn yaml imageio",
     "gsplat-main": "pycolmap piexif",
     "gaussian-splatting-lightning": "lightning jsonargparse torchmetrics plyfile tensorboard",
-    "nerfstudio": "torchmetrics tyro cv2 sklearn yaml imageio nerfacc pytorch_msssim rawpy mediapy",
+    "nerfstudio": "torchmetrics tyro cv2 sklearn yaml imageio nerfacc pytorch_msssim rawpy mediapy "
+    "appdirs requests pyquaternion fpsample",
 }
 GAUSSIANS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
 OURS = 1.5  # dB that an edited run of 100 iterations may be worse than the stock one
