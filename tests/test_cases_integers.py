@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from placed_training import marked
 from torch.nn import Parameter
 from torch.utils._pytree import tree_leaves
 
@@ -60,7 +59,7 @@ def test_an_integer_of_numpy_is_one(option: str, kind: Any) -> None:
     assert isinstance(found, (int, np.integer))
 
 
-@pytest.mark.parametrize("option", marked(OPTIONS, {"paper_parts": "nothing is looked at"}))
+@pytest.mark.parametrize("option", OPTIONS)
 @pytest.mark.parametrize("value", [True, np.True_, "3", None, [3], np.array([3]), np.nan, 2.5])
 def test_what_is_no_integer_is_refused(option: str, value: Any) -> None:
     if value == 2.5 and "switch" in option:

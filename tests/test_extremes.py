@@ -227,6 +227,7 @@ def test_all_rows_unseen_for_long(steps: int) -> None:
     assert bool(torch.isfinite(back).all())
 
 
+@pytest.mark.filterwarnings("ignore:LQNAdam:UserWarning")  # of one dimension
 @pytest.mark.parametrize("shape", [(0, 3), (1, 3), (4,), (), (3, 2, 2)], ids=str)
 @pytest.mark.parametrize("cls", BOTH)
 def test_any_shape_whose_first_dimension_is_points(cls: Any, shape: tuple[int, ...]) -> None:

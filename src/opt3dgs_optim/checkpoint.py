@@ -131,7 +131,7 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
         listed = own["kept"].get(str(i), ())
         rows.append(_rows(call, optimizer.course, own, param, rest, kept, listed, loaded))
     by_name = any(isinstance(number, str) for number in state)  # torch's distributed checkpoints
-    if own is None and by_name and steps and any(optimizer.course.declared.values()):
+    if own is None and by_name and steps and optimizer.course.keeps_state:
         warn_user(
             f"{call}: a distributed checkpoint of {steps} steps without our state, as flattened "
             "ones and those of a stock trainer are: what the parts keep begins anew, and the clock "
@@ -142,6 +142,8 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
             f"{call}: this checkpoint has what parts keep per point, but not for which iterations: "
             "it begins anew (a consolidated or flattened checkpoint leaves that out)"
         )
+    if by_name and own is not None and clock is not None:
+        _warn_of_rows_left_out(call, optimizer.course, clock["iteration"] - 1, rows)
     windows = {} if own is None or stale else own["windows"]
     records = [] if own is None else own["records"]
     rest = {**loaded, "state": state, "param_groups": groups}
@@ -264,7 +266,11 @@ def _rows(
         missing = [key for key in absent if key in listed]
         if len(absent) < len(entries):
             missing = absent  # what a part keeps is of use together only
-        if missing:
+        by_name = any(isinstance(number, str) for number in loaded["state"])
+        if missing and by_name and len(absent) == len(entries):
+            # torch's distributed files give only what a fresh optimizer had, too.
+            warn_user(f"{call}: {missing} are not in this checkpoint: they begin anew")
+        elif missing:
             raise ValueError(f"{call}: {missing} are missing, which the checkpoint says are there")
         for key, entry in entries.items():
             value = kept.get(key)
@@ -283,6 +289,19 @@ def _rows(
             else:
                 found[key] = value
     return found
+
+
+def _warn_of_rows_left_out(
+    call: str, course: Course, last_step: int, rows: list[dict[str, Tensor]]
+) -> None:
+    """Torch's distributed files give only what a fresh optimizer had, too: no rows of parts."""
+    found = set().union(*rows) if rows else set()
+    for name, part in course.named().items():
+        window = part.window(course)
+        keys = [key_of(name, entry) for entry in course.declared[name].values()]
+        begun = window is None or window[0] <= last_step < window[1]
+        if any(key in course.row_keys for key in keys) and begun and not found & set(keys):
+            warn_user(f"{call}: {name} has kept nothing in this checkpoint, and begins anew")
 
 
 def _is_there(value: Any) -> bool:

@@ -82,6 +82,7 @@ class Course:
         self.rewinds = 0  # how often the clock has been set back
         self.valid: Tensor | bool = True  # whether the last energy was finite
         self.energy_device = torch.device("cpu")
+        self.needs_energies = False  # whether the parts stand still before the first energy
         self.kept_numbers: dict[str, Tensor] = {}  # what parts keep per training
         self._numbers_read: dict[int, tuple[int, weakref.ref[Tensor], float]] = {}
         self._reported: set[str] = set()  # kinds of mistakes that were said

@@ -90,7 +90,7 @@ class PhaseScheduler(Course):
         )
         if log is not None and not hasattr(log, "step"):
             raise ValueError(f"{CALL}: log={log!r}, but a RunLog or None is needed")
-        self.log = log
+        self.log, self.needs_energies = log, True
         self._over_ranks = None if process_group is None else RankMean(CALL, process_group)
         self._iterations_without_step = 1
         self._steps_without_energy = 0

@@ -219,7 +219,8 @@ class StepAdam(Adam):
                 loss = closure()
         with torch.set_grad_enabled(self.defaults["differentiable"]):
             # torch's distributed checkpoints make a step of length zero, to have Adam's moments.
-            idle = loss is None and self.course.num_observed == 0 and self._is_held()
+            begun = not self.course.needs_energies or self.course.num_observed > 0
+            idle = not begun and loss is None and self._is_held()
             acting = not idle and self.course.stepping(loss)
             if mask is None and not self.course.parts:
                 self._step_base(None)
