@@ -77,6 +77,7 @@ class Course:
         self.adaptive = adaptive
         self.switched_off: dict[str, str] = {}  # part's name -> why
         self._current = -1
+        self._windows: tuple[int | None, dict[str, Window | None]] = (None, {})  # at an iteration
         self.num_observed = 0
         self.steps = 0  # of all optimizers
         self.rewinds = 0  # how often the clock has been set back
@@ -97,6 +98,7 @@ class Course:
             for kept in entries.values()
             if kept.per == "row"
         )
+        self.asks_parts = any(overrides(part, "ready") for part in self._parts)
         self._windowed = [name for name, entries in self.declared.items() if entries]
         self._plan()
 
@@ -165,11 +167,14 @@ class Course:
 
     def open_windows(self) -> dict[str, Window | None]:
         """The window of each part that keeps something for a time, None while it is closed."""
+        if self._windows[0] == self._current:  # each optimizer asks
+            return self._windows[1]
         found: dict[str, Window | None] = {}
         for name in self._windowed:
             window = self._named[name].window(self)
             if window is not None:
                 found[name] = window if window[0] <= self.current < window[1] else None
+        self._windows = self._current, found
         return found
 
     # -- the parts -------------------------------------------------------------------------------

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 from torch.optim import Adam
 
-from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Group
 
 
@@ -151,12 +150,14 @@ def zero_nonfinite(grad: Tensor) -> bool | Tensor:
     return found
 
 
-def refuse_capture(call: str, course: Course) -> None:
+def refuse_capture(optimizer: Any) -> None:
     """RuntimeError in the capture of a CUDA graph: its replays would repeat what parts say now."""
-    if course.parts and torch.cuda.is_initialized() and torch.cuda.is_current_stream_capturing():
+    if not torch.cuda.is_initialized() or not optimizer.course.parts:
+        return
+    if torch.cuda.is_current_stream_capturing():
         raise RuntimeError(
-            f"{call}.step: a CUDA graph is being captured, but its replays would repeat this "
-            "iteration's factors and phase; leave the optimizers' steps out of it"
+            f"{optimizer.call_name}.step: a CUDA graph is being captured, but its replays would "
+            "repeat this iteration's factors and phase; leave the optimizers' steps out of it"
         )
 
 

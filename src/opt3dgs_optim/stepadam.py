@@ -33,7 +33,7 @@ from opt3dgs_optim.overrides import (
     use_fused,
     zero_nonfinite,
 )
-from opt3dgs_optim.part import Group, Part, Window, overrides
+from opt3dgs_optim.part import Group, Part, Window
 from opt3dgs_optim.state import (
     MOMENTS,
     HeldRows,
@@ -208,7 +208,7 @@ class StepAdam(Adam):
             RuntimeError: a CUDA graph is being captured, and there are parts.
         """
         self._opt_called = True  # what learning-rate schedulers would note by wrapping this method
-        refuse_capture(self.call_name, self.course)
+        refuse_capture(self)
         masks: list[Any] = [each for each in (visible, visibility) if each is not None]
         if isinstance(closure, Tensor):
             masks, closure = [closure, *masks], None
@@ -304,7 +304,7 @@ class StepAdam(Adam):
 
     def _ready(self, parts: ActingParts, group: Group) -> ActingParts:
         """Without the parts that say that they cannot act on the group in this step."""
-        if not any(overrides(part, "ready") for each in parts for _, part in each):
+        if not self.course.asks_parts:
             return parts
         course = self.course
         return ActingParts(
