@@ -61,7 +61,7 @@ class ActingParts(NamedTuple):
 NO_PARTS = ActingParts([], [], [], [])
 
 
-@dataclass
+@dataclass(slots=True)
 class MovingParameter:
     """A parameter in the middle of a step.
 
@@ -69,6 +69,7 @@ class MovingParameter:
         state: what the hooks see of its state.
         rows: [N] bool, those that a mask lets move; None: all.
         counts: whether the step counts, 0-d where only the device knows.
+        guarded: whether something of what the hooks do is to be undone.
         buffer: where Adam writes its step, if a part says what becomes of it; else None.
     """
 
@@ -76,15 +77,11 @@ class MovingParameter:
     param: Tensor
     record: ParameterRecord
     parts: ActingParts
+    rows: Tensor | None
+    counts: Tensor | bool
+    guarded: bool
     state: ParameterState | None = None
-    rows: Tensor | None = None
-    counts: Tensor | bool = True
     buffer: Tensor | None = None
-
-    @property
-    def guarded(self) -> bool:
-        """Whether something of what the hooks do is to be undone."""
-        return self.rows is not None or self.counts is not True
 
     def where_it_moves(self, new: Tensor, old: Tensor | float) -> Tensor:
         """`new` in the rows that move, if the step counts, else `old`."""
@@ -94,7 +91,7 @@ class MovingParameter:
         return torch.where(torch.as_tensor(keep, device=new.device), new, old)
 
 
-@dataclass
+@dataclass(slots=True)
 class StepInProgress:
     """What a step has to finish, or to undo, once Adam has moved the parameters."""
 
@@ -253,10 +250,12 @@ class StepAdam(Adam):
         if not isinstance(counts, Tensor):
             return counts
         groups = self.param_groups
-        told = self._base is not Adam and mask is not None
-        told = told or (self._base is Adam and all(group["fused"] for group in groups))
+        if self._base is Adam:  # only torch's fused step can be told on the device not to be made
+            droppable = all(group["fused"] for group in groups)
+        else:  # another base's own step can be given an empty mask
+            droppable = mask is not None
         tensors = chain.from_iterable(group["params"] for group in groups)
-        if told and all(counts.is_cpu or not param.is_cpu for param in tensors):
+        if droppable and all(counts.is_cpu or not param.is_cpu for param in tensors):
             return counts
         return self.course.valid_on_host() if overflow is None else bool(counts)
 
@@ -273,8 +272,8 @@ class StepAdam(Adam):
             for group, records in zip(self.param_groups, self._records, strict=True):
                 parts = self._ready(self._parts_of(group), group) if acting else NO_PARTS
                 self._prepare_group(step, group, records, parts)
-                said = [part.factor(group, course) for _, part in parts.factor]
-                factors = [factor for factor in said if factor is not None]
+                found = [part.factor(group, course) for _, part in parts.factor]
+                factors = [factor for factor in found if factor is not None]
                 scale_learning_rate(temporary, group, factors, counts, course.on_host)
             if counts is not False:
                 if isinstance(counts, Tensor) and self._base is Adam:
@@ -333,23 +332,26 @@ class StepAdam(Adam):
         rows = step.mask if masked and (self._base is Adam or any(parts)) else None
         if parts.displacement and group["weight_decay"]:
             self._decay_before(step, group)
-        params = list(group["params"])
+        params, counts = list(group["params"]), step.counts
+        guarded = rows is not None or counts is not True
+        needed = rows is not None or any(parts) or bool(self.course.row_keys)
+        now = max(self.course.current, 0)  # a course may have no clock
         for i, (param, record) in enumerate(zip(params, records, strict=True)):
             if param.grad is None or param.grad.is_sparse:
                 continue
             self._zero_nonfinite(param)
-            moving = MovingParameter(group, param, record, parts)
-            if rows is not None:
-                moving.rows = rows.to(param.device)
-            moving.counts = step.counts
-            if isinstance(step.counts, Tensor):
-                moving.counts = step.counts.to(param.device, non_blocking=True)
-            if rows is not None or any(parts) or self.course.row_keys:
+            own, known = rows, counts
+            if own is not None:
+                own = own.to(param.device)
+            if isinstance(known, Tensor):
+                known = known.to(param.device, non_blocking=True)
+            moving = MovingParameter(group, param, record, parts, own, known, guarded)
+            if needed:
                 self._prepare(step, moving)
             if moving.buffer is not None:
                 params[i] = moving.buffer
-            if step.acting and step.counts is not False:
-                record.last_step = max(self.course.current, 0)  # a course may have no clock
+            if step.acting and counts is not False:
+                record.last_step = now
             step.moving.append(moving)
         if parts.displacement:
             step.overrides.item(group, "params", params)
@@ -433,8 +435,8 @@ class StepAdam(Adam):
     def _report_nonfinite(self, what: str) -> None:
         if not self._nonfinite_reported:
             self._nonfinite_reported = True
-            said = "iteration %d: %s is not finite; such numbers count as zero"
-            LOGGER.warning(said, self.course.current, what)
+            message = "iteration %d: %s is not finite; such numbers count as zero"
+            LOGGER.warning(message, self.course.current, what)
 
     def record_of(self, param: Tensor) -> ParameterRecord | None:
         """What is known of the parameter at its place; None where it is none of these."""
