@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -15,7 +15,7 @@ from opt3dgs_optim.names import GAUSSIAN
 if TYPE_CHECKING:
     from opt3dgs_optim.course import Course
 
-Group = MutableMapping[str, Any]  # a parameter group of an optimizer
+Group = dict[str, Any]  # a parameter group of an optimizer
 State = Any  # what a hook sees of a parameter's state: `state.ParameterState`, see `Part`
 Window = tuple[int, int]  # first iteration, and the one after the last
 

@@ -33,6 +33,9 @@ WARMUP = 2  # of the histogram: the third and fourth nu, of no limit, are compar
 OPTIONS = {"min_cosine": 1e-6, "graft": True}
 BUILDS = Path(tempfile.gettempdir()) / "opt3dgs_optim_host_kernels"
 
+# As it is: tests put a kernel on the host in its place.
+LQN_DIRECTION = cuda.lqn_direction
+
 
 def compiler() -> str | None:
     """g++, or None: then the tests that need it skip with this as the reason."""
@@ -103,7 +106,7 @@ class HostKernels:
         x, g, cells = (t.to(self.dtype) for t in (position, grad, history))
         size = self.history_size
         with self.launched():
-            result = cuda.lqn_direction(x, g, cells, size, min_cosine, graft)
+            result = LQN_DIRECTION(x, g, cells, size, min_cosine, graft)
         history.copy_(cells)
         return result
 
