@@ -38,6 +38,7 @@ from mutations import Mutant, mutants  # noqa: E402
 
 PACKAGE = ROOT / "src/opt3dgs_optim"
 EQUIVALENT = ROOT / "tests/mutants_equivalent.json"
+EXPLAINED = ROOT / "docs/results/stability/mutants_explained.json"
 RESULT = ROOT / "docs/results/stability/mutants.json"
 ENERGY = ["test_partitions.py", "parts/test_histogram.py", "parts/test_histogram_extremes.py"]
 CURVATURE = [
@@ -213,10 +214,15 @@ def examine(
 # -- the package's own modules ---------------------------------------------------------------------
 
 
-def reasons() -> dict[tuple[str, str, str, str], str]:
+def reasons(path: Path = EQUIVALENT) -> dict[tuple[str, str, str, str], str]:
     """Why a survivor changes nothing, by (module, function, before, after)."""
-    entries = json.loads(EQUIVALENT.read_text())
+    entries = json.loads(path.read_text())
     return {(e["module"], e["function"], e["before"], e["after"]): e["why"] for e in entries}
+
+
+def reasons_of_the_committed_run() -> dict[tuple[str, str, str, str], str]:
+    """Those, and what was said of survivors whose lines have changed since that run."""
+    return reasons() | reasons(EXPLAINED)
 
 
 def described(mutant: Mutant) -> dict[str, str]:

@@ -11,7 +11,10 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from mutants import reasons, survivor_key  # tests/, where `stability` has put them within reach
+from mutants import (  # tests/, where `stability` has put them within reach
+    reasons_of_the_committed_run,
+    survivor_key,
+)
 
 LEAST_COVERAGE = 95.0  # per cent, of branches and of statements; modules below are listed
 SLOW = "python -m pytest -m slow --junitxml=build/slow.xml"
@@ -102,7 +105,7 @@ def mutants_block(result: dict[str, Any]) -> str:
     modules, about = result["modules"], result["about"]
     many = sum(entry["mutants"] for entry in modules.values())
     dead = sum(entry["killed"] for entry in modules.values())
-    why = reasons()
+    why = reasons_of_the_committed_run()
     gaps = [
         (f"`{name}` {one['function']}", _code(one["before"]), _code(one["after"]))
         for name, entry in modules.items()

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mutants import TARGETS, reasons, survivor_key
+from mutants import TARGETS, reasons_of_the_committed_run, survivor_key
 from studies import pages
 from studies.stability import stability, stability_page
 
@@ -100,4 +100,4 @@ def test_mutants_are_noticed_and_survivors_explained() -> None:
     for name, entry in modules.items():
         assert entry["mutants"] - entry["killed"] == len(entry["survivors"])
         for one in entry["survivors"]:
-            assert reasons()[(name, *survivor_key(one))], one
+            assert reasons_of_the_committed_run()[(name, *survivor_key(one))], one
