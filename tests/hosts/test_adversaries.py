@@ -857,3 +857,25 @@ def training():
 """
     with pytest.raises(ValueError, match=r"^line \d+: .*calls itself"):
         diff(saved(tmp_path, text))
+
+
+def test_a_smaller_photo_is_a_photo(tmp_path: Path) -> None:
+    """DashGaussian: the photo is made smaller, by a function that is given a scale."""
+    text = EDITED["L1 twice under one name, depth last"].replace(
+        "    for iteration", "    torch.scaled = lambda x, scale: [x]\n    for iteration"
+    )
+    text = text.replace(
+        "inverse_z, prior",
+        "gt_image = torch.scaled(gt_image, scale=2)[0]\n        inverse_z, prior",
+        1,
+    )
+    lines = added(diff(saved(tmp_path, text)).diff)
+    assert "Ll1 = phases.pixel_loss(image, gt_image)" in lines
+
+
+def test_an_error_at_a_count_ends_no_training(tmp_path: Path) -> None:
+    """LightGaussian refuses options that it does not know where it prunes."""
+    text = EDITED["restored in the loop"].replace(
+        "gaussians.restore(gaussians.optimizer.state_dict(), opt)", "raise ValueError(opt)"
+    )
+    assert "PhaseScheduler(opt.iterations)" in diff(saved(tmp_path, text)).diff

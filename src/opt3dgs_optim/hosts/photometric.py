@@ -59,5 +59,13 @@ def _written(image: ast.expr, inside: list[Spot]) -> str:
     picked = image.value if isinstance(image, ast.Subscript) else image
     names = {node.id for node in ast.walk(picked) if isinstance(node, ast.Name)}
     given = [value for name in names for _, value in values(inside, name)]
-    plain = [v for v in given if isinstance(v, ast.Name | ast.Attribute | ast.Subscript)]
+    # What a call is given, as the scale of a smaller photo, says nothing of what comes of it.
+    plain = [v for v in given if isinstance(_source(v), ast.Name | ast.Attribute)]
     return " ".join(map(ast.unparse, (picked, *plain)))
+
+
+def _source(value: ast.expr | None) -> ast.expr | None:
+    """What an expression picks items or rows of."""
+    while isinstance(value, ast.Subscript):
+        value = value.value
+    return value
