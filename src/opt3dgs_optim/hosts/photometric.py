@@ -60,11 +60,11 @@ def _written(image: ast.expr, inside: list[Spot]) -> str:
     names = {node.id for node in ast.walk(picked) if isinstance(node, ast.Name)}
     given = [value for name in names for _, value in values(inside, name)]
     # What a call is given, as the scale of a smaller photo, says nothing of what comes of it.
-    plain = [v for v in given if isinstance(_source(v), ast.Name | ast.Attribute)]
+    plain = [v for v in given if v and isinstance(_source(v), ast.Name | ast.Attribute)]
     return " ".join(map(ast.unparse, (picked, *plain)))
 
 
-def _source(value: ast.expr | None) -> ast.expr | None:
+def _source(value: ast.expr) -> ast.expr:
     """What an expression picks items or rows of."""
     while isinstance(value, ast.Subscript):
         value = value.value
