@@ -1,5 +1,6 @@
 """Which parameter group is which Gaussian parameter, in the names trainers use."""
 
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -23,6 +24,11 @@ GAUSSIAN_NAMES: Mapping[str, tuple[str, ...]] = {
     ),
 }
 GAUSSIAN = tuple(GAUSSIAN_NAMES)
+# Groups of public trainers that are no Gaussian parameters, though they may have as many rows:
+# inputs of networks (3DGRUT, gsplat's --app_opt, Scaffold-GS), and what belongs to a photo.
+_OTHERS = re.compile(
+    r"features|anchor_feat|offset|embed|appearance|app_|mlp|expos|camera|pose|bilateral|grid", re.I
+)
 SLOT = "gaussian"  # of a parameter group: gsplat's name of what it holds
 _CANONICAL = {alias: name for name, aliases in GAUSSIAN_NAMES.items() for alias in aliases}
 
@@ -41,6 +47,12 @@ def split_name(name: Any) -> tuple[str, str | None]:
 def canonical_name(name: Any) -> str | None:
     """gsplat's name of a Gaussian parameter group, or None for any other group."""
     return split_name(name)[1]
+
+
+def is_known_other(name: Any) -> bool:
+    """Whether a group's name says that it is no Gaussian parameter."""
+    known = any(_OTHERS.match(part) for part in str(name).split("#"))
+    return known and canonical_name(name) is None
 
 
 class NamedGroup(dict[str, Any]):
