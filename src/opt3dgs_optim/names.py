@@ -51,7 +51,7 @@ def canonical_name(name: Any) -> str | None:
 
 def is_known_other(name: Any) -> bool:
     """Whether a group's name says that it is no Gaussian parameter."""
-    known = any(_OTHERS.match(part) for part in str(name).split("#"))
+    known = _OTHERS.search(str(name)) is not None
     return known and canonical_name(name) is None
 
 
