@@ -359,8 +359,9 @@ class StepAdam(Adam):
         masked = step.mask is not None and self._takes_mask(group, step.mask.numel())
         # Another base's own step knows its mask; what the parts do does not.
         rows = step.mask if masked and (self._base is Adam or parts.any) else None
-        if parts.displacement and group["weight_decay"]:
-            self._decay_before(step, group)
+        if parts.displacement and group["weight_decay"] and group.get("decoupled_weight_decay"):
+            # Of the parameter itself, not of the buffer that Adam will move.
+            decay_weights(step.overrides, group, step.counts)
         params, counts = list(group["params"]), step.counts
         guarded = rows is not None or counts is not True
         needed = rows is not None or parts.any or bool(self.course.row_keys)
@@ -422,11 +423,6 @@ class StepAdam(Adam):
             step.overrides.extra_item(self.state, moving.buffer, state)
         elif fed is not param.grad:
             step.overrides.attribute(param, "grad", fed)
-
-    def _decay_before(self, step: StepInProgress, group: Group) -> None:
-        """Weight decay is of the parameter itself, not of the buffer that Adam will move."""
-        if group.get("decoupled_weight_decay"):
-            decay_weights(step.overrides, group, step.counts)
 
     def _finish(self, moving: MovingParameter, view: ParameterState, course: Course) -> None:
         """Move the parameter by what the parts make of Adam's step; have them act after it."""
