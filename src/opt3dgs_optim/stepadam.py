@@ -408,8 +408,8 @@ class StepAdam(Adam):
         # Parts see the gradient of what is minimised, without AMP's scale.
         scale = getattr(self, "grad_scale", None)
         plain = not parts.shaping or (scale is None and not group["maximize"])
+        unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
         if not plain:
-            unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
             fed = fed / unit
         if parts.displacement and group["weight_decay"]:
             fed = fed.add(param.detach(), alpha=group["weight_decay"])

@@ -56,21 +56,23 @@ class OutOfView(Part):
             if not isinstance(share, float) or share < MAX_SEEN_SHARE:
                 course.publish(OUT_OF_VIEW, param, ~_has_gradient(grad))
             return grad
-        share, means = course.published(SEEN_SHARE, param), None
+        share = course.published(SEEN_SHARE, param)
+        positions: Tensor | None = None  # their gradient, where they come later
         if share is None:  # the positions come later in this iteration
             means = course.gaussians_of(param).get("means")
             if means is None or means.grad is None:
                 return grad
             kept = course.number_kept(self, SEEN_SHARE, means)
             kept = torch.ones((), device=means.device) if kept is None else kept
-            share = kept.lerp(_seen_share(means.grad).to(kept), 1 / NUM_VIEWS_AVERAGED)
+            positions = means.grad
+            share = kept.lerp(_seen_share(positions).to(kept), 1 / NUM_VIEWS_AVERAGED)
             share = share.item() if share.is_cpu else share
         if isinstance(share, float) and share >= MAX_SEEN_SHARE:
             return grad
-        if means is None:
+        if positions is None:
             unseen = course.published(OUT_OF_VIEW, param)
         else:
-            unseen = ~_has_gradient(means.grad)
+            unseen = ~_has_gradient(positions)
         if unseen is None or unseen.shape != grad.shape[:1]:
             return grad
         factor = MAX_SEEN_SHARE / share * (share < MAX_SEEN_SHARE)
