@@ -2,7 +2,7 @@
 
     python examples/studies/bench/bench_step.py     (one thread: 1,000 to 1,000,000 points)
 
-Writes `step_cpu.md`, `step_cpu.json` and `step_cpu.png` to `--out`. A million points take 4 GB.
+Writes `step_cpu.md`, `step_cpu.json` and `step_cpu.png` to `--out`. A million points take 3 GB.
 `python examples/gpu.py` measures the same on a GPU.
 """
 
@@ -27,7 +27,8 @@ from tqdm import tqdm
 from studies.bench.steps import COMPARED, Results, counts_table, draw, measure_all, times_table
 
 CPU = torch.device("cpu")
-MAKES = 5  # times that subject and baseline are made anew
+MAKES = 3  # times that the subjects are made anew
+TOGETHER = 100_000  # points up to which all subjects are in memory at once
 # What a step of the defaults may cost on a CPU: points -> ratio to six Adams in the same round.
 GOALS = {1_000: 1.40, 10_000: 1.15, 100_000: 1.05, 1_000_000: 1.03}
 
@@ -65,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     results: Results = {}
     for points in tqdm(args.points, desc="steps", unit="size"):
         results[points] = measure_all(
-            points, CPU, COMPARED, args.repeats, makes=MAKES, together=True
+            points, CPU, COMPARED, args.repeats, makes=MAKES, together=points <= TOGETHER
         )
     words = sys.argv[1:] if arguments is None else arguments
     record = {
@@ -79,9 +80,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parts = ["# Cost of a step", "\n".join(f"- {key}: {value}" for key, value in record.items())]
     parts += [
         f"Nanoseconds per point, medians of {args.repeats} rounds. A round times everything in "
-        "this table once; behind x stand the median of the ratio to six torch Adams in the same "
-        "round, and its quartiles. `fused` is beside six fused Adams. Before each call the caches "
-        "are filled with something else, as rendering does.",
+        f"this table once (of more than {TOGETHER:,} points, one of them and six Adams); behind x "
+        "stand the median of the ratio to six torch Adams in the same round, and its quartiles. "
+        "`fused` is beside six fused Adams. Before each call the caches are filled with something "
+        "else, as rendering does.",
         goals_line(results),
         times_table(results),
         "## What a step does",
