@@ -2,7 +2,7 @@
 
     python examples/studies/bench/bench_step.py     (one thread: 1,000 to 1,000,000 points)
 
-Writes `step_cpu.md`, `step_cpu.json` and `step_cpu.png` to `--out`. A million points take 3 GB.
+Writes `step_cpu.md`, `step_cpu.json` and `step_cpu.png` to `--out`.
 `python examples/gpu.py` measures the same on a GPU.
 """
 
