@@ -25,9 +25,14 @@ GAUSSIAN_NAMES: Mapping[str, tuple[str, ...]] = {
 }
 GAUSSIAN = tuple(GAUSSIAN_NAMES)
 # Groups of public trainers that are no Gaussian parameters, though they may have as many rows:
-# inputs of networks (3DGRUT, gsplat's --app_opt, Scaffold-GS), and what belongs to a photo.
-_OTHERS = re.compile(
-    r"features|anchor_feat|offset|embed|appearance|app_|mlp|expos|camera|pose|bilateral|grid", re.I
+# inputs of networks (3DGRUT, gsplat's --app_opt, Scaffold-GS) by their whole names, ...
+_OTHERS = frozenset({"features", "anchor_feat", "offset"})
+# ... networks and what belongs to a photo by a whole word of the name.
+_WORDS_OF_OTHERS = frozenset(
+    (
+        *("app", "appearance", "bilateral", "camera", "cameras", "embedding", "embeddings"),
+        *("exposure", "exposures", "grid", "grids", "mlp", "pose", "poses"),
+    )
 )
 SLOT = "gaussian"  # of a parameter group: gsplat's name of what it holds
 _CANONICAL = {alias: name for name, aliases in GAUSSIAN_NAMES.items() for alias in aliases}
@@ -51,8 +56,8 @@ def canonical_name(name: Any) -> str | None:
 
 def is_known_other(name: Any) -> bool:
     """Whether a group's name says that it is no Gaussian parameter."""
-    known = _OTHERS.search(str(name)) is not None
-    return known and canonical_name(name) is None
+    last = str(name).rpartition("#")[2].lower()
+    return last in _OTHERS or not _WORDS_OF_OTHERS.isdisjoint(re.split(r"[\W_]+", last))
 
 
 class NamedGroup(dict[str, Any]):
