@@ -55,6 +55,7 @@ KEEPING: dict[str, Callable[[Tensor], Tensor]] = {
     # Forks of 3dgs-mcmc leave the opacity as it is.
     "relocate with the same opacity": lambda v: overwritten(v, slice(0, 40), v[40:80]),
     "relocate and grow": lambda v: torch.cat([overwritten(v, slice(0, 30), v[30:60] - 0.3), v[:5]]),
+    "all changed, but two": lambda v: torch.cat([v[50:52], v[2:] - 0.3]),
     "permute": lambda v: v.flip(0),
     "permute and clone": lambda v: torch.cat([v.flip(0), v[:5]]),
 }
