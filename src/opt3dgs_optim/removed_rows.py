@@ -52,8 +52,8 @@ def were_removed(before: Tensor, after: Tensor) -> bool:
 
     Half or more of the rows that are known by their value, a tenth of all at least, must stand at
     another place than before. Either they are in their old order: what is left, then the children
-    of what was split. Or they are sorted anew, as fVDB's are, and more than one in a hundred has a copy.
-    Relocation moves no row that it keeps, and changes the opacity of what it copies.
+    of what was split. Or they are sorted anew, as fVDB's are, and more than one in a hundred has a
+    copy. Relocation moves no row that it keeps, and changes the opacity of what it copies.
     """
     before, after = before.flatten(), after.flatten().to(before)
     count = len(before)
