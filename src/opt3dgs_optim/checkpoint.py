@@ -109,8 +109,9 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
     steps = number_of_steps(value for value in state.values() if isinstance(value, Mapping))
     stale = own is not None and own["steps"] not in (None, steps)
     if stale and own is not None and clock is not None:
-        further = max(steps - int(own["steps"] or 0), 0)
-        clock = {**clock, "iteration": clock["iteration"] + further}
+        # Torch's distributed checkpoints make a step of a fresh optimizer: of no iteration of ours.
+        counted = int(own["steps"] or 0) if clock["iteration"] else 0
+        clock = {**clock, "iteration": clock["iteration"] + max(steps - counted, 0)}
         warn_user(
             f"{call}: Adam's moments have made {steps} steps, but {own['steps']} when our state "
             "was saved: another optimizer has gone on with them. The clock is moved on to "
