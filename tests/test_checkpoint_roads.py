@@ -17,7 +17,7 @@ from typing import Any
 import landed_checkpoints
 import pytest
 import torch
-from placed_training import ROWS, Training, distance, marked, mended_later
+from placed_training import ROWS, Training, distance, mended_later
 from ranks import free_port
 from torch import Tensor
 from torch.distributed.checkpoint import state_dict as dcp_state
