@@ -33,9 +33,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 import torch
 from splatting.stopping import command
 from splatting.writable import check_folder
-from studies.bench.bench_step import BASELINE, cpu_name
-from studies.bench.gpu_steps import measure_all
+from studies.bench.bench_step import cpu_name
 from studies.bench.gpu_training import KINDS, run, train_both
+from studies.bench.steps import COMPARED, counts_table, draw, measure_all, times_table
+from studies.bench.subjects import BASELINES
 from studies.pages import table
 from tqdm import tqdm
 
@@ -46,6 +47,7 @@ POINTS = {"cuda": (10_000, 100_000, 1_000_000, 5_000_000), "cpu": (1_000, 10_000
 REPEATS = {"cuda": 30, "cpu": 5}
 ITERATIONS = {"cuda": 3_000, "cpu": 30}
 GAUSSIANS = {"cuda": 30_000, "cpu": 1_000}
+STEPPED = tuple(name for name in COMPARED if name not in BASELINES)  # on a GPU all are fused
 CPU_NOTE = (
     "This is a CPU: no kernel was launched, nothing waited for a device, and the figures say "
     "nothing about a GPU. In the place of launches stand torch's operators, in that of waits the "
@@ -95,27 +97,6 @@ def about(device: torch.device, words: Sequence[str]) -> dict[str, Any]:
     return made
 
 
-def steps_table(points: int, rows: dict[str, dict[str, Any]]) -> str:
-    """Markdown of one number of points."""
-
-    def cells(name: str, row: dict[str, Any]) -> list[str]:
-        if "skipped" in row:
-            return [name, f"not run: {row['skipped']}", *[""] * 6]
-        spread = f"{row['ms']:.3f} ({row['ms_low']:.3f} to {row['ms_high']:.3f})"
-        ratio = f"x{row['ratio']:.2f} ({row['ratio_low']:.2f} to {row['ratio_high']:.2f})"
-        rate = f"{row['gb_per_second']:,.0f}" if "gb_per_second" in row else "-"
-        peak = f"{row['peak_bytes'] / points:,.0f}" if "peak_bytes" in row else "-"
-        kept, launches = f"{row['bytes_per_point']:,.0f}", row.get("launches", row["operators"])
-        return [name, spread, ratio, str(launches), str(row["waits"]), kept, peak, rate]
-
-    first = next(row for row in rows.values() if "skipped" not in row)
-    heads = ["", "ms", "to six Adams", "launches", "waits", "bytes per point"]
-    heads += ["more within the step", "GB/s, at least"]
-    base = [BASELINE, f"{first['baseline_ms']:.3f}", "x1.00", *["-"] * 5]
-    body = [cells(name, row) for name, row in rows.items()]
-    return f"**{points:,} points**\n\n{table(heads, 'lr', [base, *body])}"
-
-
 def training_text(found: dict[str, Any]) -> str:
     """Markdown of the two trainings, or why there are none."""
     if "skipped" in found:
@@ -146,51 +127,18 @@ def report(result: dict[str, Any]) -> str:
         lines += [f"Skipped: {reason}." for reason in tests["reasons"]]
         if "output" in tests:
             lines += ["", "```text", tests["output"].rstrip(), "```"]
-    lines += ["", "## A step", "", "Medians and quartiles, in turn with six torch Adams.", ""]
-    for points, rows in result["steps"].items():
-        lines += [steps_table(int(points), rows), ""]
-    lines += (
-        ["![Ratio to six Adams](step.png)", ""]
-        if result["picture"]
-        else [
-            "No picture: matplotlib is not installed.",
-            "",
-        ]
-    )
+    lines += ["", "## A step", ""]
+    lines += [
+        "Medians, in turn with six torch Adams, and the quartiles of the ratio. Bytes are kept "
+        "beside parameters and gradients.",
+        "",
+    ]
+    lines += [times_table(result["steps"]), "", counts_table(result["steps"]), ""]
+    picture = "![Times of a step, and ratios to six Adams](step.png)"
+    lines += [picture if result["picture"] else "No picture: matplotlib is not installed.", ""]
     lines += ["## gsplat's own trainer", "", training_text(result["training"]), ""]
     lines.append(f"All of it took {result['seconds']:.0f} s.")
     return "\n".join(lines) + "\n"
-
-
-def draw(steps: dict[int, dict[str, dict[str, Any]]], title: str, path: Path) -> bool:
-    """Milliseconds and ratios over the number of points; False without matplotlib."""
-    if importlib.util.find_spec("matplotlib") is None:
-        return False
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
-    for index, name in enumerate(next(iter(steps.values()))):
-        known = {n: rows[name] for n, rows in steps.items() if "skipped" not in rows[name]}
-        for axis, key in zip(axes, ("ms", "ratio"), strict=True):
-            values = [row[key] for row in known.values()]
-            low = [row[key] - row[f"{key}_low"] for row in known.values()]
-            high = [row[f"{key}_high"] - row[key] for row in known.values()]
-            axis.errorbar(
-                list(known), values, [low, high], fmt="o-", color=f"C{index}", capsize=3, label=name
-            )
-    axes[0].set(xscale="log", yscale="log", xlabel="points", ylabel="ms", title=title)
-    axes[1].set(xscale="log", yscale="log", xlabel="points", ylabel="times six torch Adams")
-    axes[1].axhline(1.0, color="black", linewidth=0.8)
-    for axis in axes:
-        axis.grid(alpha=0.3)
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return True
 
 
 def training(args: argparse.Namespace, device: torch.device) -> dict[str, Any]:
@@ -230,7 +178,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if args.gsplat is not None and not args.gsplat.is_file():
         raise FileNotFoundError(f"--gsplat {args.gsplat}: no such file")
     check_folder(args.out)
-    logging.getLogger("opt3dgs_optim").setLevel(logging.WARNING)
+    logging.getLogger("opt3dgs_optim").addHandler(logging.NullHandler())
     device, start = torch.device(kind), time.perf_counter()
     words = list(sys.argv[1:] if arguments is None else arguments)
     result: dict[str, Any] = {"about": about(device, words), "checks": check(device), "steps": {}}
@@ -238,7 +186,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if kind == "cpu":
         torch.set_num_threads(1)
     for points in tqdm(args.points or POINTS[kind], desc="steps", unit="size"):
-        result["steps"][points] = measure_all(points, device, args.repeats or REPEATS[kind])
+        repeats = args.repeats or REPEATS[kind]
+        result["steps"][points] = measure_all(points, device, STEPPED, repeats)
     title = result["about"].get("gpu", {}).get("name", "CPU, one thread")
     result["picture"] = draw(result["steps"], title, args.out / "step.png")
     result["training"] = training(args, device)

@@ -4,8 +4,9 @@
 
 DIR and SCENE are those of `survey.py`. Each training is the trainer's own script, run on a CPU
 through `on_cpu.py`, with every schedule of its 30,000 iterations scaled to a tenth: learning rates,
-densification, resets. Each takes five to ten minutes of a core. The figures go into
-docs/hosts/long_runs.json as they come; `survey.py --write` puts them on the page.
+densification, resets. Each takes five to ten minutes of a core. Every training's figure goes into
+docs/hosts/long_runs.json when it has ended, and one that is there already is kept: the command may
+be stopped and called again. `survey.py --write` puts the figures on the page.
 """
 
 from __future__ import annotations
@@ -70,58 +71,71 @@ LONG_RUNS = (
 )
 
 
-def train(run: LongRun, trainers: Path, scene: Path, iterations: int) -> dict[str, Any]:
-    """Train stock and edited, and return the row for the table.
+def train(
+    run: LongRun, trainers: Path, scene: Path, iterations: int, *, ours: bool
+) -> dict[str, Any]:
+    """Train, stock or edited, and return what came of it.
 
     Raises:
-        RuntimeError: one of the two stopped; the message has the end of its output.
+        RuntimeError: the training stopped; the message has the end of its output.
     """
-    row: dict[str, Any] = {"name": run.name, "commit": commit_of(trainers / run.trainer)}
-    for ours in (False, True):
-        work = Path(tempfile.mkdtemp(prefix="long_run_"))
-        try:
-            done = run.start(trainers, scene, work, "out", ours=ours, iterations=iterations)
-        finally:
-            shutil.rmtree(work)
-        if done.code != 0 or done.psnr is None:
-            raise RuntimeError(f"{run.name} stopped with {done.code}: {done.output[-3000:]}")
-        key = "edited" if ours else "stock"
-        row[key] = {"psnr": done.psnr}
-        if ours:
-            row["parts"] = parts_of(done.output)
-    return row
+    work = Path(tempfile.mkdtemp(prefix="long_run_"))
+    try:
+        done = run.start(trainers, scene, work, "out", ours=ours, iterations=iterations)
+    finally:
+        shutil.rmtree(work)
+    if done.code != 0 or done.psnr is None:
+        raise RuntimeError(f"{run.name} stopped with {done.code}: {done.output[-3000:]}")
+    return {
+        "psnr": done.psnr,
+        "parts": parts_of(done.output),
+        "version": __version__,
+        "date": datetime.date.today().isoformat(),
+        "torch": torch.__version__,
+        "machine": f"{platform.machine()}, Python {platform.python_version()}",
+    }
+
+
+def read_rows(path: Path) -> dict[str, dict[str, Any]]:
+    """The rows that there are, by the names of the runs."""
+    if not path.is_file():
+        return {}
+    return {row["name"]: row for row in json.loads(path.read_text(encoding="utf-8"))["rows"]}
 
 
 def main() -> None:
-    """Train, and write the figures."""
+    """Train what has no figure yet, and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trainers", type=Path, required=True, help="a folder of repositories")
     parser.add_argument("--scene", type=Path, required=True, help="a scene in COLMAP's layout")
     parser.add_argument("--iterations", type=int, default=ITERATIONS)
     parser.add_argument("--only", default="", help="run those whose name holds this text")
+    parser.add_argument("--again", action="store_true", help="also those that have a figure")
     parser.add_argument("--json", type=Path, default=FIGURES, help="where the figures go")
     options = parser.parse_args()
-    rows: dict[str, Any] = {}
-    if options.json.is_file():
-        rows = {row["name"]: row for row in json.loads(options.json.read_text())["rows"]}
+    rows = read_rows(options.json)
     with tempfile.TemporaryDirectory() as folder:
         scene = copy_scene(options.scene, Path(folder) / "scene")
         for run in LONG_RUNS:
             if options.only not in run.name:
                 continue
-            row = train(run, options.trainers, scene, options.iterations)
-            row |= {
+            about = {
+                "name": run.name,
+                "commit": commit_of(options.trainers / run.trainer),
                 "iterations": options.iterations,
                 "scene": options.scene.name,
-                "version": __version__,
-                "date": datetime.date.today().isoformat(),
-                "torch": torch.__version__,
-                "machine": f"{platform.machine()}, Python {platform.python_version()}",
             }
+            row = rows.get(run.name, {})
+            if options.again or any(row.get(key) != value for key, value in about.items()):
+                row = about
             rows[run.name] = row
-            kept = [rows[each.name] for each in LONG_RUNS if each.name in rows]
-            options.json.write_text(json.dumps({"rows": kept}, indent=1) + "\n")
-            print(f"{run.name}: stock {row['stock']['psnr']}, edited {row['edited']['psnr']} dB")
+            for half, ours in (("stock", False), ("edited", True)):
+                if half not in row:
+                    row[half] = train(run, options.trainers, scene, options.iterations, ours=ours)
+                    print(f"{run.name}, {half}: {row[half]['psnr']} dB", flush=True)
+                kept = [rows[each.name] for each in LONG_RUNS if each.name in rows]
+                text = json.dumps({"rows": kept}, indent=1) + "\n"
+                options.json.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -95,8 +95,8 @@ LONG_TEXT = """\
 Each trainer's own script and schedules, these scaled to a tenth, on {scene}; PSNR of the test \
 views, one seed. By `examples/hosts/long_runs.py`; {date}, torch {torch}, {machine}.
 
-| trainer and options | commit | stock, dB | edited, dB | parts |
-|---|---|---:|---:|---|
+| trainer and options | commit | stock, dB | edited, dB | difference | parts |
+|---|---|---:|---:|---:|---|
 {rows}"""
 
 
@@ -217,18 +217,17 @@ def _outcome(row: dict[str, Any]) -> list[str]:
 
 def _long_runs() -> str:
     """The table of the long runs, or that there are none."""
-    if not LONG.is_file():
+    rows = json.loads(LONG.read_text(encoding="utf-8"))["rows"] if LONG.is_file() else []
+    rows = [row for row in rows if "stock" in row and "edited" in row]
+    if not rows:
         return "Not run: `python examples/hosts/long_runs.py` makes the table."
-    rows = json.loads(LONG.read_text(encoding="utf-8"))["rows"]
-    lines = [
-        _row(
-            *(row["name"], row["commit"]),
-            *(f"{row[key]['psnr']:.2f}" for key in ("stock", "edited")),
-            row["parts"],
-        )
-        for row in rows
-    ]
-    spans = {key: _span({"rows": rows}, key) for key in ("scene", "date", "torch", "machine")}
+    lines = []
+    for row in rows:
+        stock, edited = (row[half]["psnr"] for half in ("stock", "edited"))
+        figures = (f"{stock:.2f}", f"{edited:.2f}", f"{edited - stock:+.2f}")
+        lines.append(_row(row["name"], row["commit"], *figures, row["edited"]["parts"]))
+    halves = [{"scene": row["scene"], **row[half]} for row in rows for half in ("stock", "edited")]
+    spans = {key: _span({"rows": halves}, key) for key in ("scene", "date", "torch", "machine")}
     return LONG_TEXT.format(rows="".join(lines), **spans)
 
 

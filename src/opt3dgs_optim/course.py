@@ -99,7 +99,11 @@ class Course:
             if kept.per == "row"
         )
         self.asks_parts = any(overrides(part, "ready") for part in self._parts)
-        self._windowed = [name for name, entries in self.declared.items() if entries]
+        self._windowed = [
+            name
+            for name, part in self._named.items()
+            if self.declared[name] or overrides(part, "window")
+        ]
         self._plan()
 
     def _plan(self) -> None:
@@ -127,7 +131,9 @@ class Course:
     @current.setter
     def current(self, iteration: int) -> None:
         self._current = iteration
-        # Noted here, so that a compiled loss does not depend on the iteration but at the switch.
+        # Noted here, because every optimizer asks, and so that a compiled loss does not depend on
+        # the iteration but at the switch.
+        self.hooks = self._hooks[self.phase_of(iteration)]  # of the step that comes next
         self.pixel_parts = self._hooks[self.phase_of(iteration + 1)]["pixel_loss"]
 
     @property
@@ -166,7 +172,7 @@ class Course:
         return (0, self.switch_step) if exploring else (self.switch_step, NEVER)
 
     def open_windows(self) -> dict[str, Window | None]:
-        """The window of each part that keeps something for a time, None while it is closed."""
+        """The window of each part that has one, None while it is closed."""
         if self._windows[0] == self._current:  # each optimizer asks
             return self._windows[1]
         found: dict[str, Window | None] = {}
@@ -174,15 +180,12 @@ class Course:
             window = self._named[name].window(self)
             if window is not None:
                 found[name] = window if window[0] <= self.current < window[1] else None
+        if found == self._windows[1]:
+            found = self._windows[1]  # the same object: nothing has changed
         self._windows = self._current, found
         return found
 
     # -- the parts -------------------------------------------------------------------------------
-
-    @property
-    def hooks(self) -> dict[str, list[Part]]:
-        """The parts that act in the step that comes next, by the hooks that they have."""
-        return self._hooks[self.phase_of(self.current)]
 
     def part(self, kind: type[P]) -> P | None:
         """The first part of a class, or None."""

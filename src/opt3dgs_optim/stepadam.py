@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -49,15 +49,33 @@ DEVICE_LOOK_INTERVAL = 16  # energies between two looks at a device's gradients 
 NamedPart = tuple[str, Part]
 
 
-class ActingParts(NamedTuple):
-    """The parts that act on a group in a step, by their hooks, with their names."""
+@dataclass(slots=True)
+class ActingParts:
+    """The parts that act on a group in a step, by their hooks, with their names.
+
+    Attributes:
+        any: whether there are any.
+        shaping: whether Adam may be fed another gradient.
+    """
 
     before: list[NamedPart]
     factor: list[NamedPart]
     displacement: list[NamedPart]
     after: list[NamedPart]
+    any: bool = field(init=False)
+    shaping: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.shaping = bool(self.before or self.displacement)
+        self.any = bool(self.shaping or self.factor or self.after)
+
+    @classmethod
+    def sought(cls, find: Callable[[str], list[NamedPart]]) -> ActingParts:
+        """What `find` finds for the name of each hook."""
+        return cls(*map(find, STEP_HOOKS))
 
 
+STEP_HOOKS = ("before", "factor", "displacement", "after")
 NO_PARTS = ActingParts([], [], [], [])
 
 
@@ -124,7 +142,8 @@ class StepAdam(Adam):
     _rewinds = 0
     _nonfinite_reported = False
     _nonfinite: Tensor | None = None  # seen on a device, and not looked at yet
-    _acting: tuple[Any, dict[str | None, ActingParts]] = (None, {})  # for these hooks, by slot
+    # Sought for these hooks and windows: by the Gaussian parameter, who acts on it.
+    _acting: tuple[Any, Any, dict[str | None, ActingParts]] = (None, None, {})
 
     def follow(self, course: Course, base: type[Adam] = Adam) -> None:
         """Have the parts of `course` from now on, around the step of `base`.
@@ -154,7 +173,13 @@ class StepAdam(Adam):
 
     def _name_groups(self) -> None:
         """Know what each group holds; of those that came or were exchanged their names say it."""
-        groups, known = self.param_groups, vars(self).setdefault("_slots", [])
+        groups, records = self.param_groups, self._records
+        if len(groups) == len(records) and all(
+            type(group) is NamedGroup and len(group["params"]) <= len(own)
+            for group, own in zip(groups, records, strict=True)
+        ):
+            return
+        known = vars(self).setdefault("_slots", [])
         for i, group in enumerate(groups):
             if i == len(known):
                 known.append(split_name(group.get("name")))
@@ -165,7 +190,7 @@ class StepAdam(Adam):
                 name = split_name(group.get("name"))
                 known[i] = name if name[1] is not None else known[i]
                 groups[i] = NamedGroup(group, *known[i])
-                self._acting = (None, {})
+                self._acting = (None, None, {})
             if i == len(self._records):
                 self._records.append([])
             while len(self._records[i]) < len(group["params"]):
@@ -270,44 +295,48 @@ class StepAdam(Adam):
         with TemporaryOverrides() as temporary:
             step = StepInProgress(mask, acting, counts, temporary)
             for group, records in zip(self.param_groups, self._records, strict=True):
-                parts = self._ready(self._parts_of(group), group) if acting else NO_PARTS
+                parts = self._parts_of(group) if acting else NO_PARTS
+                if course.asks_parts:
+                    parts = self._ready(parts, group)
                 self._prepare_group(step, group, records, parts)
-                found = [part.factor(group, course) for _, part in parts.factor]
-                factors = [factor for factor in found if factor is not None]
-                scale_learning_rate(temporary, group, factors, counts, course.on_host)
+                if parts.factor:
+                    found = [part.factor(group, course) for _, part in parts.factor]
+                    factors = [factor for factor in found if factor is not None]
+                    scale_learning_rate(temporary, group, factors, counts, course.on_host)
             if counts is not False:
                 if isinstance(counts, Tensor) and self._base is Adam:
                     # As a GradScaler tells torch's fused step not to be made.
                     temporary.attribute(self, "found_inf", (~counts).to(torch.float32))
                 self._step_base(mask)
         for moving in step.moving:
-            self._finish(moving, course)
+            if moving.state is not None:
+                self._finish(moving, moving.state, course)
         for rows in reversed(step.held):
             rows.put_back()
 
     def _parts_of(self, group: Group) -> ActingParts:
         """The parts that act on a group in this step; sought when they change."""
-        hooks, slot = self.course.hooks, gaussian_of(group)
-        if self._acting[0] is not hooks:
-            self._acting = hooks, {}
-        known = self._acting[1]
-        if slot not in known:
-            name_of = self.course.name_of
-            known[slot] = ActingParts(
-                *(
-                    [(name_of(part), part) for part in hooks[hook] if self.acts_on(part, group)]
-                    for hook in ActingParts._fields
-                )
-            )
-        return known[slot]
+        hooks, windows, slot = self.course.hooks, self._open_windows, gaussian_of(group)
+        if self._acting[0] is not hooks or self._acting[1] is not windows:
+            self._acting = hooks, windows, {}
+        known = self._acting[2].get(slot)
+        if known is None:
+            known = ActingParts.sought(lambda hook: self._named_parts(hooks[hook], group))
+            self._acting[2][slot] = known
+        return known
+
+    def _named_parts(self, parts: list[Part], group: Group) -> list[NamedPart]:
+        """Those of the parts that act on a group, in whose windows the step is."""
+        named = [(self.course.name_of(part), part) for part in parts if self.acts_on(part, group)]
+        return [
+            (name, part) for name, part in named if self._open_windows.get(name, ()) is not None
+        ]
 
     def _ready(self, parts: ActingParts, group: Group) -> ActingParts:
         """Without the parts that say that they cannot act on the group in this step."""
-        if not self.course.asks_parts:
-            return parts
         course = self.course
-        return ActingParts(
-            *([pair for pair in each if pair[1].ready(group, course)] for each in parts)
+        return ActingParts.sought(
+            lambda hook: [pair for pair in getattr(parts, hook) if pair[1].ready(group, course)]
         )
 
     def _step_base(self, mask: Tensor | None) -> None:
@@ -329,12 +358,13 @@ class StepAdam(Adam):
         """Have the base's step read what the parts say of a group's gradients."""
         masked = step.mask is not None and self._takes_mask(group, step.mask.numel())
         # Another base's own step knows its mask; what the parts do does not.
-        rows = step.mask if masked and (self._base is Adam or any(parts)) else None
-        if parts.displacement and group["weight_decay"]:
-            self._decay_before(step, group)
+        rows = step.mask if masked and (self._base is Adam or parts.any) else None
+        if parts.displacement and group["weight_decay"] and group.get("decoupled_weight_decay"):
+            # Of the parameter itself, not of the buffer that Adam will move.
+            decay_weights(step.overrides, group, step.counts)
         params, counts = list(group["params"]), step.counts
         guarded = rows is not None or counts is not True
-        needed = rows is not None or any(parts) or bool(self.course.row_keys)
+        needed = rows is not None or parts.any or bool(self.course.row_keys)
         now = max(self.course.current, 0)  # a course may have no clock
         for i, (param, record) in enumerate(zip(params, records, strict=True)):
             if param.grad is None or param.grad.is_sparse:
@@ -370,22 +400,23 @@ class StepAdam(Adam):
             if self._base is Adam:
                 step.held.append(HeldRows(moving.rows, param, state))
             fed = torch.where(broadcast_rows(moving.rows, fed), fed, 0.0)
-        if moving.guarded and any(parts):
+        if moving.guarded and parts.any:
             own_mask = moving.rows is not None and self._base is not Adam
             view.guard(moments=moving.counts is False or own_mask)
             if moving.counts is not True:  # a step that does not count has no gradient
                 fed = moving.where_it_moves(fed, 0.0)
         # Parts see the gradient of what is minimised, without AMP's scale.
-        shaping = bool(parts.before or parts.displacement)
-        scale = getattr(self, "grad_scale", None) if shaping else None
+        scale = getattr(self, "grad_scale", None)
+        plain = not parts.shaping or (scale is None and not group["maximize"])
         unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
-        plain = not shaping or (scale is None and unit == 1.0)
-        fed = fed if plain else fed / unit
+        if not plain:
+            fed = fed / unit
         if parts.displacement and group["weight_decay"]:
             fed = fed.add(param.detach(), alpha=group["weight_decay"])
         for name, part in parts.before:
             fed = part.before(group, param, fed, view.of(name), course)
-        fed = fed if plain else fed * unit
+        if not plain:
+            fed = fed * unit
         if parts.displacement:  # Adam moves a buffer, whose state is the parameter's
             moving.buffer = torch.zeros_like(param, requires_grad=False)
             moving.buffer.grad = fed
@@ -393,16 +424,9 @@ class StepAdam(Adam):
         elif fed is not param.grad:
             step.overrides.attribute(param, "grad", fed)
 
-    def _decay_before(self, step: StepInProgress, group: Group) -> None:
-        """Weight decay is of the parameter itself, not of the buffer that Adam will move."""
-        if group.get("decoupled_weight_decay"):
-            decay_weights(step.overrides, group, step.counts)
-
-    def _finish(self, moving: MovingParameter, course: Course) -> None:
+    def _finish(self, moving: MovingParameter, view: ParameterState, course: Course) -> None:
         """Move the parameter by what the parts make of Adam's step; have them act after it."""
-        group, param, parts, view = moving.group, moving.param, moving.parts, moving.state
-        if view is None:
-            return
+        group, param, parts = moving.group, moving.param, moving.parts
         if moving.buffer is not None:
             step = moving.buffer
             for name, part in parts.displacement:
@@ -415,9 +439,9 @@ class StepAdam(Adam):
             if before is not None:
                 # .data: no write that a part should notice by the version counter.
                 param.data.copy_(moving.where_it_moves(param.data, before))
-        if moving.guarded and any(parts):
+        if moving.guarded and parts.any:
             view.settle(moving.rows, moving.counts)
-        self._ownership.claim(param, self.state[param], course.row_keys)
+        self._ownership.claim(param, view.adam, course.row_keys)
 
     def _zero_nonfinite(self, param: Tensor) -> None:
         """Take what is not finite in a gradient as zero, and say so once."""
@@ -450,8 +474,9 @@ class StepAdam(Adam):
 
     def _follow_windows(self) -> None:
         """Drop what parts have kept for a window that is over, or that begins."""
-        now, course = self.course.open_windows(), self.course
-        if now == self._open_windows and self._rewinds == course.rewinds:
+        course = self.course
+        now = course.open_windows()
+        if now is self._open_windows and self._rewinds == course.rewinds:
             return
         rewound, self._rewinds = self._rewinds != course.rewinds, course.rewinds
         for name, window in now.items():
@@ -606,7 +631,7 @@ class StepAdam(Adam):
         if saved is None:
             saved = inspect_checkpoint(self, _as_loaded(self))[0]
             self.param_groups[0].pop(STATE_KEY, None)
-        self._acting, self._records = (None, {}), []
+        self._acting, self._records = (None, None, {}), []
         self._name_groups()
         params = chain.from_iterable(group["params"] for group in self.param_groups)
         for param, rows in zip(params, saved.rows, strict=True):

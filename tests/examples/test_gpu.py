@@ -18,8 +18,8 @@ import pytest
 import torch
 from splatting.colmap_writer import write_colmap
 from splatting.scenes import load_scene
-from studies.bench import gpu_steps, gpu_training
-from studies.bench.bench_subjects import SUBJECTS
+from studies.bench import gpu_training, steps
+from studies.bench.subjects import SUBJECTS
 
 CPU = torch.device("cpu")
 SUMMARY = "SKIPPED [59] tests/cuda/test_cuda.py:1: torch sees no CUDA device\n{} in 0.10s\n"
@@ -49,11 +49,13 @@ def test_all_of_it_runs_on_a_cpu(checked: dict[str, Any], tmp_path: Path) -> Non
     assert gpu.main(small(tmp_path)) == 0
     made = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
     rows = made["steps"]["64"]
-    assert set(gpu_steps.COMPARED) == set(rows) <= set(SUBJECTS)
-    # Parameter, gradient, two moments: 59 numbers each; six step counts beside them.
-    assert 944 <= rows["six Adams again"]["bytes_per_point"] < 944 + 2
+    assert {steps.BASELINE, *gpu.STEPPED} == set(rows) <= set(SUBJECTS)
+    # Two moments of 59 numbers; six step counts beside them.
+    assert 472 <= rows["six Adams again"]["bytes_per_point"] < 472 + 2
     assert rows["two-loop, [N, 3] in and out"]["waits"] == 0
-    assert all(row["ms_low"] <= row["ms"] <= row["ms_high"] for row in rows.values())
+    measured = [rows[name] for name in gpu.STEPPED]
+    assert all(row["ns_low"] <= row["ns_per_point"] <= row["ns_high"] for row in measured)
+    assert rows[steps.BASELINE]["per_adam"] == 1.0
     assert made["checks"]["tests"]["passed"] == 3
     page = (tmp_path / "report.md").read_text(encoding="utf-8")
     assert gpu.CPU_NOTE in page
@@ -61,7 +63,7 @@ def test_all_of_it_runs_on_a_cpu(checked: dict[str, Any], tmp_path: Path) -> Non
     assert "3 passed, 0 failed, 0 error, 59 skipped" in page
     assert "Skipped: torch sees no CUDA device." in page
     assert "Not run: --gsplat PATH/examples/simple_trainer.py was not given." in page
-    assert re.search(r"\| defaults \| [\d.]+ \([\d.]+ to [\d.]+\) \| x[\d.]+", page)
+    assert re.search(r"\| defaults \| [\d.e+]+ ns, x[\d.]+ \([\d.]+ to [\d.]+\) \|", page)
     assert (tmp_path / "step.png").stat().st_size > 10_000
 
 
@@ -69,20 +71,17 @@ def test_what_fails_is_in_the_report_and_in_the_exit_status(
     checked: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     checked["tests"] = 1, SUMMARY.format("2 failed, 1 passed, 59 skipped")
-    monkeypatch.setattr(gpu, "measure_all", lambda *_: {"defaults": {"skipped": "out of memory"}})
-    monkeypatch.setattr(gpu, "draw", lambda *_: False)
-    with pytest.raises(StopIteration):  # no subject at all was measured: there is nothing to show
-        gpu.main(small(tmp_path))
-    row = {"ms": 1.0, "ms_low": 1.0, "ms_high": 1.0, "baseline_ms": 1.0, "waits": 0}
-    row |= {"ratio": 1.0, "ratio_low": 1.0, "ratio_high": 1.0, "bytes_per_point": 944.0}
-    row |= {"launches": 6, "operators": 30, "peak_bytes": 128}
+    row = {"ns_per_point": 1e4, "per_adam": 1.0, "adam_low": 1.0, "adam_high": 1.0, "waits": 0}
+    row |= {"launches": 6, "operators": 30, "peak_bytes": 128, "bytes_per_point": 472.0}
     rows = {"defaults": row, "six Adams again": {"skipped": "out of memory"}}
     monkeypatch.setattr(gpu, "measure_all", lambda *_: rows)
+    monkeypatch.setattr(gpu, "draw", lambda *_: False)
     assert gpu.main(small(tmp_path)) == 1
     page = (tmp_path / "report.md").read_text(encoding="utf-8")
     assert "1 passed, 2 failed" in page
     assert "| six Adams again | not run: out of memory |" in page
-    assert "| x1.00 (1.00 to 1.00) | 6 | 0 | 944 | 2 | - |" in page
+    assert "| defaults | 1e+04 ns, x1.00 (1.00 to 1.00) |" in page
+    assert "| defaults | 64 | 6 | 0 | 472 | 2 | - |" in page
     assert "No picture: matplotlib is not installed." in page
     assert (
         "2 failed"
@@ -97,7 +96,7 @@ def test_without_pytest_or_matplotlib_it_says_so(
     assert gpu.check(CPU)["tests"] == {
         "skipped": "pytest is not installed: pip install -e '.[test]'"
     }
-    assert not gpu.draw({}, "", tmp_path / "none.png")
+    assert not steps.draw({}, "", tmp_path / "none.png")
     arguments = SimpleNamespace(gsplat=tmp_path)
     assert "pip install gsplat" in gpu.training(arguments, CPU)["skipped"]  # pyright: ignore
 
@@ -166,16 +165,16 @@ def test_launches_waits_and_memory_on_a_simulated_device(monkeypatch: pytest.Mon
         warnings.warn("called a synchronizing CUDA operation", stacklevel=2)
         warnings.warn("something else", stacklevel=2)
 
-    monkeypatch.setattr(gpu_steps, "profile", Profiler)
+    monkeypatch.setattr(steps, "profile", Profiler)
     device: Any = SimpleNamespace(type="cuda")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the calls whose warnings nobody counts
-        counted = gpu_steps.count(call, device)
+        counted = steps.count(call, device)
     assert counted == {"operators": 0, "launches": 2, "waits": 1, "peak_bytes": 128}
     modes = [name for name in calls if name.startswith("set_sync_debug_mode")]
     assert modes == ["set_sync_debug_mode('warn',)", "set_sync_debug_mode('default',)"]
-    assert gpu_steps.bytes_in_use(device) == 1_000
-    gpu_steps.release(device)
+    assert steps.bytes_in_use(device) == 1_000
+    steps.release(device)
     assert calls[-1].startswith("empty_cache")
 
 
@@ -190,7 +189,7 @@ def test_a_gpus_name_and_size_are_in_the_report(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_a_value_that_is_read_is_a_wait() -> None:
-    counted = gpu_steps.count(lambda: torch.ones(()).add(1).item(), CPU)
+    counted = steps.count(lambda: torch.ones(()).add(1).item(), CPU)
     assert counted == {"operators": 3, "waits": 1}
 
 
@@ -199,9 +198,11 @@ def test_a_subject_too_large_for_the_memory_is_skipped(monkeypatch: pytest.Monke
         raise torch.OutOfMemoryError("out of memory\nand so on")
 
     monkeypatch.setitem(SUBJECTS, "defaults", fails)
-    made = gpu_steps.measure_all(16, CPU, 1)
+    made = steps.measure_all(16, CPU, ["defaults", "six Adams again"], 1)
     assert made["defaults"] == {"skipped": "out of memory"}
-    assert made["six Adams again"]["ms"] > 0
+    assert made["six Adams again"]["ns_per_point"] > 0
+    with pytest.raises(ValueError, match="none of defaults could be measured at 16"):
+        steps.measure_all(16, CPU, ["defaults"], 1)
 
 
 def test_the_embedded_scene_in_colmaps_layout(tmp_path: Path) -> None:
@@ -266,8 +267,8 @@ def test_both_trainings_of_gsplats_script(
 
 
 COPY = {
-    **{"ms": 1.0, "ms_low": 1.0, "ms_high": 1.0, "baseline_ms": 1.0, "waits": 0, "operators": 1},
-    **{"ratio": 1.0, "ratio_low": 1.0, "ratio_high": 1.0, "bytes_per_point": 288.0},
+    **{"ns_per_point": 1.0, "ns_low": 1.0, "ns_high": 1.0, "waits": 0, "operators": 1},
+    **{"per_adam": 1.0, "adam_low": 1.0, "adam_high": 1.0, "bytes_per_point": 288.0},
     "gb_per_second": 7.0,
 }
 

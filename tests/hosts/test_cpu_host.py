@@ -8,11 +8,11 @@ import pytest
 import torch
 from hosts.cpu_host.gsplat_modules import rasterize
 from hosts.cpu_host.rendering import draw
+from raster_scene import synthetic_scene
 from splatting.camera import Camera
 from splatting.projection import rotation_matrices
 from splatting.rasterizer import render
 from splatting.spherical_harmonics import SH_0
-from studies.bench.bench_raster import synthetic_scene
 from torch import Tensor
 
 

@@ -31,7 +31,8 @@ from splatting.stopping import command
 from tqdm import tqdm
 
 from opt3dgs_optim import cuda
-from studies.bench.gpu_steps import ADAM_BYTES, NUMBERS
+from studies.bench.steps import ADAM_BYTES
+from studies.bench.subjects import NUMBERS
 from studies.pages import table
 
 OUT = Path(__file__).resolve().parents[3] / "docs" / "benchmarks"

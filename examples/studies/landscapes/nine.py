@@ -132,7 +132,6 @@ def seed_result(census: Census, rows: slice, truth: Tensor) -> dict[str, Any]:
         "median_iterations": median if math.isfinite(median) else None,
         "kl_raw": kl(raw.sum(0), truth),
         "kl": kl(weighted.sum(0), truth),
-        "kl_per_chain": statistics.fmean(kl(row, truth) for row in weighted),
     }
 
 
@@ -151,14 +150,11 @@ def run_arm(
     schedule = cosine if arm.cycles else None
     run.run(steps, census, every=EVERY, schedule=schedule, progress=progress)
     truth = nine_masses()
-    marks = [round(steps * i / 50) for i in range(51)]
-    found = [float((census.first <= mark).sum(1).double().mean()) for mark in marks]
     return {
         "arm": asdict(arm),
         "seeds": [
             seed_result(census, slice(i * chains, (i + 1) * chains), truth) for i in range(seeds)
         ],
         "mean_nu": float(run.mean_nu.mean()),
-        "curve": {"iterations": marks, "modes": found},
         "path": census.path,
     }

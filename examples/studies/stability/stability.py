@@ -62,12 +62,6 @@ Course = list[tuple[int, float, float]]  # iteration, seconds, error
 Step = Callable[[], Tensor]  # takes one iteration, returns the rows' points
 SHARES = (1e-3, 1e-2, 1e-1)
 ARMS = ("Adam", "AWSGLD", "LQNAdam", "LBFGS (torch)", "two-loop + line search")
-COLORS = dict(zip(ARMS, ("#4c72b0", "#222222", "#c44e52", "#dd8452", "#55a868"), strict=True))
-# AWSGLD is near Adam: seen on top of it.
-STYLES: dict[str, dict[str, Any]] = {
-    "Adam": {"lw": 5, "alpha": 0.5},
-    "AWSGLD": {"lw": 1.5, "ls": "--"},
-}
 CONDITIONS = (1.0, 1e1, 1e2, 1e3, 1e4, 1e6, 1e9, 1e12)
 LBFGS_ROWS = 4
 # Several valleys. The double well's start is a minimum.
@@ -234,32 +228,6 @@ Decades of gradient size (of 82, 1e-44 to 1e37; float32) with the same steps: {d
 """
 
 
-def plot(results: dict[str, dict[str, Course]], path: Path) -> None:
-    """Error over iterations."""
-    import matplotlib.pyplot as plt
-
-    wide = 4
-    tall = -(-len(results) // wide)
-    figure, axes = plt.subplots(tall, wide, figsize=(3.4 * wide, 2.9 * tall), squeeze=False)
-    for axis, (name, courses) in zip(axes.flat, results.items(), strict=False):
-        for arm in ARMS:
-            iterations, _, errors = zip(*courses[arm], strict=True)
-            style = STYLES.get(arm, {"lw": 1.5})
-            axis.plot(iterations, errors, color=COLORS[arm], label=arm, **style)
-        axis.set(title=name, xscale="log", yscale="log", xlabel="iterations")
-        axis.set_ylim(bottom=1e-32, top=1e4)
-        axis.grid(alpha=0.3)
-    for axis in axes.flat[len(results) :]:
-        axis.axis("off")
-    for row in axes:
-        row[0].set_ylabel("median error / start")
-    handles, labels = axes[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=len(ARMS), frameon=False)
-    figure.tight_layout(rect=(0, 0.06, 1, 1))
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
 def measured(rows: int, steps: int, machine: str) -> dict[str, Any]:
     """Every arm on every problem."""
     sizes = (rows, steps)
@@ -298,9 +266,6 @@ def main() -> None:
         results = measured(options.rows, options.steps, f"{machine}, 1 thread")
         (folder / "stability.json").write_text(json.dumps(results) + "\n")
     results = json.loads((folder / "stability.json").read_text())
-    if not (options.slow or options.coverage):
-        plot(results["problems"], folder / "iterations.png")
-        plot(results["quadratics"], folder / "conditions.png")
     made = texts(folder, report(results))
     PAGE.write_text(filled(PAGE.read_text(), made, MARK))
     print(f"wrote {folder} and {PAGE}")

@@ -3,7 +3,7 @@
 import ast
 from typing import NamedTuple
 
-from opt3dgs_optim.hosts.syntax import Spot, refusal, values
+from opt3dgs_optim.hosts.syntax import Spot, changed, loops_around, refusal, values, with_values
 
 RANGES = ("range", "trange")
 WRAPPERS = ("tqdm", "track", "iter", "list")  # what goes over its first argument, in its order
@@ -27,11 +27,22 @@ def read_count(loop: ast.For, own: list[Spot], observed: ast.stmt, *, each_turn:
         each_turn: whether every turn of the loop observes a loss.
 
     Raises:
-        ValueError: it goes over something else, backwards, or changes its own count.
+        ValueError: it goes over something else, backwards, or over the rest of a training, changes
+            its own count, or ends before it.
     """
     start, end, step = _arguments(loop, own)
-    if _number(step) == 0 or isinstance(step, ast.UnaryOp) or (_number(step) or 1) < 0:
-        raise refusal(loop, f"range(...) with a step of {ast.unparse(step)} counts down")
+    for value in _possible_values(step, own):
+        if isinstance(value, ast.UnaryOp) or (_number(value) or 1) < 0 or _number(value) == 0:
+            raise refusal(loop, f"range(...) with a step of {ast.unparse(value)} counts down")
+    _check_end(loop, own)
+    if _is_zero(start, own):
+        for value in _possible_values(end, own):
+            if _is_difference(value):
+                raise refusal(
+                    loop,
+                    f"range({ast.unparse(value)}) may be the rest of a training; a range from its "
+                    "first to its last iteration is needed",
+                )
     if not _is_plain(end):
         raise refusal(
             loop,
@@ -52,6 +63,52 @@ def read_count(loop: ast.For, own: list[Spot], observed: ast.stmt, *, each_turn:
     for line, _ in values(inside, count):
         raise refusal(line, f"{count}, the count of the loop, gets another value in it")
     return Count(total, count + shift)
+
+
+def _check_end(loop: ast.For, own: list[Spot]) -> None:
+    """ValueError where the loop is left at a certain count, before its range is over."""
+    inside = [spot for spot in own if loop in loops_around(spot)]
+    counts = {n.id for n in ast.walk(loop.target) if isinstance(n, ast.Name)} | changed(inside)
+    for spot in inside:
+        match spot.node:
+            case ast.Break():
+                leaves = loops_around(spot)[-1] is loop
+            case ast.Return():  # an exception is no end that a training has
+                leaves = True
+            case ast.Call(called):
+                leaves = ast.unparse(called) in ("exit", "quit", "sys.exit", "os._exit")
+            case _:
+                leaves = False
+        if not leaves:
+            continue
+        for around, below in zip(spot.above, spot.chain, strict=True):
+            if not isinstance(around, ast.If) or loop not in spot.above or below is around.test:
+                continue
+            asked = [n for value in with_values(around.test, inside) for n in ast.walk(value)]
+            if around in {s.node for s in inside} and any(
+                isinstance(n, ast.expr) and ast.unparse(n) in counts for n in asked
+            ):
+                raise refusal(
+                    spot.line,
+                    f"the loop over {ast.unparse(loop.iter)} is left where "
+                    f"{ast.unparse(around.test)}: the number of iterations cannot be read from its "
+                    "range",
+                )
+
+
+def _possible_values(number: ast.expr, own: list[Spot]) -> list[ast.expr]:
+    """An expression, and what it is given where it is a name."""
+    if not isinstance(number, ast.Name):
+        return [number]
+    return [number, *(value for _, value in values(own, number.id) if value is not None)]
+
+
+def _is_difference(number: ast.expr) -> bool:
+    """Whether something that is not written there is subtracted."""
+    return any(
+        isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub) and _number(node.right) is None
+        for node in ast.walk(number)
+    )
 
 
 def _arguments(loop: ast.For, own: list[Spot]) -> tuple[ast.expr, ast.expr, ast.expr]:

@@ -1,8 +1,8 @@
 """The lines to change in a trainer: read from the file, put into it, and checked.
 
 What is written is at most: the import, `PhaseScheduler(...)` and `upgrade` above the training loop
-(and after every new set-up inside it), `pixel_loss` in place of the L1 term, `observe` after
-`backward`. The result must compile, and each name it uses must be bound where it stands.
+(and below what makes the optimizers anew in it), `pixel_loss` in place of the L1 term, `observe`
+after `backward`. The result must compile, and each name it uses must be bound where it stands.
 """
 
 import argparse
@@ -132,13 +132,15 @@ def _edited_lines(lines: list[bytes], tree: ast.Module, trainer: Trainer) -> lis
     name = _unused("phases", used)
     scheduler = SCHEDULER if SCHEDULER not in used else _unused("TwoPhaseScheduler", used)
     imports, options = _preset(trainer)
-    for taken in used & set(imports):
-        raise ValueError(f"it has a {taken} of its own")
+    names = {each: _unused(each, used) for each in imports}
+    for each, ours in names.items():  # a trainer may have one of its own
+        options = [option.replace(each, ours) for option in options]
+    imports = [each if each == ours else f"{each} as {ours}" for each, ours in names.items()]
     first, *second = trainer.optimizers
     upgrade = [f"{first} = {name}.upgrade({first})"]
     for other in second:  # None where the trainer's options leave it out
         upgrade += [f"if {other} is not None:", f"    {other} = {name}.upgrade({other})"]
-    point = _upgrade_point(trainer)
+    point = trainer.loop  # below all that may make the optimizers anew
     _check_total(trainer, point)
     known = _known(tree, trainer, point)
     if "world_size" in known:
@@ -148,7 +150,10 @@ def _edited_lines(lines: list[bytes], tree: ast.Module, trainer: Trainer) -> lis
     call = ", ".join([ast.unparse(trainer.total), *options])
     start = [f"{name} = {scheduler}({call})", *upgrade]
     for node in ast.walk(ast.parse("\n".join(start))):
-        if isinstance(node, ast.Name) and node.id not in {*known, name, scheduler, *imports}:
+        if isinstance(node, ast.Name) and node.id not in {
+            *(*known, name, scheduler),
+            *names.values(),
+        }:
             raise refusal(point, f"the name {node.id} is not defined here, where the lines need it")
     count = f", iteration={trainer.iteration}" if trainer.iteration else ""
     for value, images in reversed(trainer.pixel):
@@ -217,27 +222,6 @@ def _insert(lines: list[bytes], node: ast.stmt, new: list[str], *, above: bool =
     own, text = lines[at].removesuffix(end), [indent + line.encode() for line in new]
     # The file's last line may have no end.
     lines[at] = (end or b"\n").join([*text, own] if above else [own, *text]) + end
-
-
-def _upgrade_point(trainer: Trainer) -> ast.stmt:
-    """Where to upgrade: above the first rate scheduler after the last set-up, else the loop."""
-    body, point = trainer.scope.body, trainer.loop
-    if point not in body:
-        return point
-    owner = trainer.optimizers[0]
-    model = owner.rsplit(".", 1)[0]
-    for statement in reversed(body[: body.index(point)]):
-        text = ast.unparse(statement)
-        made = {ast.unparse(n) for n in ast.walk(statement) if _is_stored(n)}
-        if owner in made or re.search(rf"\b{re.escape(model)}\.(training_setup|restore)\(", text):
-            break
-        if owner in text and re.search(r"lr_scheduler|LR\(", text):
-            point = statement
-    return point
-
-
-def _is_stored(node: ast.AST) -> bool:
-    return isinstance(getattr(node, "ctx", None), ast.Store)
 
 
 def _last_import(tree: ast.Module, point: ast.stmt) -> ast.stmt:

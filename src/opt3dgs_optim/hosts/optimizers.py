@@ -9,8 +9,10 @@ from opt3dgs_optim.hosts.syntax import (
     COMPREHENSIONS,
     FUNCTIONS,
     Spot,
+    is_reference,
     loops_around,
     refusal,
+    spots,
     values,
 )
 
@@ -34,10 +36,13 @@ class Optimizers(NamedTuple):
     notes: list[str]  # what a user should know
 
 
-def find_optimizers(own: list[Spot], loop: ast.stmt, steps: list[Step], folder: Path) -> Optimizers:
+def find_optimizers(
+    tree: ast.Module, own: list[Spot], loop: ast.stmt, steps: list[Step], folder: Path
+) -> Optimizers:
     """The optimizers of the Gaussians among those that a training loop steps.
 
     Args:
+        tree: the file's syntax tree.
         own: every node of the loop's scope.
         loop: the training loop.
         steps: where it steps an optimizer.
@@ -46,9 +51,15 @@ def find_optimizers(own: list[Spot], loop: ast.stmt, steps: list[Step], folder: 
     Raises:
         ValueError: it is not clear which one is the Gaussians'.
     """
-    setups: list[ast.stmt] = []
     notes: list[str] = []
     stepped = list(dict.fromkeys(step.optimizer for step in steps))
+    for step in steps:
+        if not is_reference(ast.parse(step.optimizer, mode="eval").body):
+            raise refusal(
+                step.spot.line,
+                f"{step.optimizer} steps here, of which it is not clear what are the Gaussians' "
+                "optimizers; a loop over these alone is needed",
+            )
     dicts = [text for text in stepped if text.split(".")[-1] == "optimizers"]
     owners = [text[: -len(".optimizer")] for text in stepped if text.endswith(".optimizer")]
     named = [text for text in stepped if _is_adam(own, text)]
@@ -61,8 +72,6 @@ def find_optimizers(own: list[Spot], loop: ast.stmt, steps: list[Step], folder: 
         groups, made = _model(folder)
         seconds = [name for name in SECOND if name in made or f"{owner}.{name}" in stepped]
         found = [f"{owner}.{name}" for name in ("optimizer", *seconds)]
-        inside = [spot for spot in own if loop in loops_around(spot)]
-        setups = set_ups(inside, owner)
         if groups and not groups & {"xyz", "means"}:
             notes.append(
                 "no group of its optimizer is named xyz or means; those with a Gaussian "
@@ -78,6 +87,8 @@ def find_optimizers(own: list[Spot], loop: ast.stmt, steps: list[Step], folder: 
             "X.optimizers.values()` or one `X.optimizer.step()` is needed "
             f"(stepped in the loop: {lines or 'nothing'})",
         )
+    inside = [spot for spot in own if loop in loops_around(spot)]
+    setups = _remade(inside, found[0], _makers(tree, folder))
     if others := [text for text in stepped if text not in found]:
         notes.append(f"left alone: {', '.join(others)}")
     return Optimizers(found, setups, notes)
@@ -158,15 +169,89 @@ def _is_closure(node: ast.expr, own: list[Spot]) -> bool:
     return isinstance(node, ast.Lambda) or (isinstance(node, ast.Name) and node.id in functions)
 
 
+def _remade(inside: list[Spot], optimizer: str, makers: set[str]) -> list[ast.stmt]:
+    """The statements in a loop after which the optimizers may be others, in the file's order.
+
+    Upgrading again what is the same changes nothing, so that one too many does no harm.
+
+    Raises:
+        ValueError: the object that holds them is exchanged, or it happens in a condition.
+    """
+    owner = optimizer.rpartition(".")[0]
+    found: list[ast.stmt] = []
+    for spot in inside:
+        stored = ast.unparse(spot.node) if isinstance(spot.node, ast.expr) else ""
+        if isinstance(getattr(spot.node, "ctx", None), ast.Store) and stored == owner:
+            raise refusal(spot.line, f"{owner}, which has the optimizers, gets another value here")
+        match spot.node:
+            case ast.Name(_, ast.Store()) | ast.Attribute(_, _, ast.Store()):
+                makes = stored == optimizer
+            case ast.Subscript(holder, _, ast.Store()):
+                makes = ast.unparse(holder) == optimizer
+            case ast.Call(ast.Name(name) | ast.Attribute(_, name)):
+                makes = name in makers
+            case _:
+                makes = False
+        if not makes:
+            continue
+        statement = next(node for node in reversed(spot.above) if isinstance(node, ast.stmt))
+        if not isinstance(statement, (ast.Expr, ast.Assign, ast.AnnAssign)):
+            raise refusal(
+                spot.line,
+                f"{optimizer} may be made anew by {ast.unparse(spot.node)}, and no line can stand "
+                "directly below it; give it a statement of its own",
+            )
+        if statement not in found:
+            found.append(statement)
+    return found
+
+
+def _makers(tree: ast.Module, folder: Path) -> set[str]:
+    """The functions and methods that make optimizers, by their names.
+
+    Those of the file and of `scene/*model*.py` that set an attribute `optimizer` or `optimizers`,
+    and those that call such a one.
+    """
+    names = {"optimizer", "optimizers", *SECOND}
+    calls: dict[str, set[str]] = {}
+    found = {"training_setup", "restore"}  # INRIA's, where the model's file is not beside it
+    for each in (tree, *_model_files(folder)):
+        for function in ast.walk(each):
+            if not isinstance(function, FUNCTIONS) or function.name.startswith("__"):
+                continue
+            for spot in spots(function):
+                match spot.node:
+                    case ast.Attribute(_, name, ast.Store()) if name in names:
+                        around = spot.above[-1]
+                        empty = isinstance(around, ast.Assign) and _is_none(around.value)
+                        found |= set() if empty else {function.name}
+                    case ast.Call(ast.Name(name) | ast.Attribute(_, name)):
+                        calls.setdefault(function.name, set()).add(name)
+    while more := {name for name, called in calls.items() if called & found} - found:
+        found |= more
+    return found
+
+
+def _is_none(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) and node.value is None
+
+
+def _model_files(folder: Path) -> list[ast.Module]:
+    """The files of `scene/` that have the model's classes."""
+    trees = []
+    for path in sorted((folder / "scene").glob("*model*.py")):
+        try:
+            trees.append(ast.parse(path.read_bytes()))
+        except (OSError, SyntaxError, ValueError):
+            continue
+    return trees
+
+
 def _model(folder: Path) -> tuple[set[str], set[str]]:
     """The names of the parameter groups, and of all attributes set, in the classes of `scene/`."""
     groups: set[str] = set()
     made: set[str] = set()
-    for path in sorted((folder / "scene").glob("*model*.py")):
-        try:
-            tree = ast.parse(path.read_bytes())
-        except (OSError, SyntaxError, ValueError):
-            continue
+    for tree in _model_files(folder):
         for node in ast.walk(tree):
             match node:
                 case ast.Dict(

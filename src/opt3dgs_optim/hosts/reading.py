@@ -22,11 +22,14 @@ from opt3dgs_optim.hosts.syntax import (
     Scope,
     Spot,
     are_exclusive,
+    changed,
+    is_reference,
     loops_around,
     refusal,
     scopes,
     spots,
     values,
+    with_values,
 )
 
 BACKWARDS = ("backward", "manual_backward")
@@ -83,8 +86,10 @@ def read_trainer(tree: ast.Module, folder: Path) -> Trainer:
     statements = [spot.above[-1] for spot in backwards]
     found = [statement for statement in statements if isinstance(statement, ast.stmt)]
     (loss,) = losses
+    _check_scale(loss, inside)
     trainer = Trainer(scope, own, loop, loss, found, ast.Constant(0), "")
-    trainer.optimizers, trainer.setups, trainer.notes = find_optimizers(own, loop, steps, folder)
+    found_optimizers = find_optimizers(tree, own, loop, steps, folder)
+    trainer.optimizers, trainer.setups, trainer.notes = found_optimizers
     main = [step for step in steps if step.optimizer == trainer.optimizers[0]]
     _check_loops(backwards, main)
     _check_rhythm(trainer, inside, backwards, main)
@@ -170,7 +175,7 @@ def _loss(spot: Spot) -> ast.expr:
             loss = scaled
         case ast.Call(ast.Attribute(receiver, "backward"), []):  # no accelerator.backward(loss)
             loss = receiver
-    if loss is None or not _is_reference(loss) or not isinstance(spot.above[-1], ast.Expr):
+    if loss is None or not is_reference(loss) or not isinstance(spot.above[-1], ast.Expr):
         raise refusal(
             spot.line,
             f"{ast.unparse(spot.node)}: a statement loss.backward() of a loss with a name is "
@@ -179,14 +184,17 @@ def _loss(spot: Spot) -> ast.expr:
     return loss
 
 
-def _is_reference(node: ast.AST) -> bool:
-    """Whether an expression only names a value: `loss`, `self.loss`, `losses["total"]`."""
-    match node:
-        case ast.Name():
-            return True
-        case ast.Attribute(value) | ast.Subscript(value, ast.Constant()):
-            return _is_reference(value)
-    return False
+def _check_scale(loss: str, inside: list[Spot]) -> None:
+    """ValueError where the loss is one that a GradScaler has scaled, by a factor that changes."""
+    for line, value in values(inside, loss):
+        for node in ast.walk(value) if value else ():
+            match node:
+                case ast.Call(ast.Attribute(_, "scale" | "scale_loss")):
+                    raise refusal(
+                        line,
+                        f"{loss} is {ast.unparse(node)}, scaled by a factor that changes; the "
+                        "scheduler needs the loss itself: scaler.scale(loss).backward()",
+                    )
 
 
 def _innermost(backwards: list[Spot]) -> ast.stmt:
@@ -280,14 +288,23 @@ def _follows(step: Spot, loop: ast.AST, backwards: list[ast.AST]) -> bool:
 
 def _check_condition(test: ast.expr, inside: list[Spot], step: Step) -> None:
     """ValueError where a step is made only in every so many iterations."""
-    nodes = [*ast.walk(test)]
-    names = {node.id for node in nodes if isinstance(node, ast.Name)}
-    given = [value for name in names for _, value in values(inside, name) if value is not None]
-    nodes += [node for value in given for node in ast.walk(value)]
-    shown = " ".join(map(ast.unparse, (test, *given)))
-    if any(isinstance(node, ast.Mod | ast.FloorDiv | ast.BitAnd) for node in nodes) or (
-        SOMETIMES.search(shown)
-    ):
+    asked = with_values(test, inside)
+    counts = (
+        changed(inside)
+        | {node.id for node in ast.walk(step.loops[-1].target) if isinstance(node, ast.Name)}
+        if isinstance(step.loops[-1], ast.For)
+        else changed(inside)
+    )
+    sometimes = SOMETIMES.search(" ".join(map(ast.unparse, asked))) is not None
+    for node in [each for value in asked for each in ast.walk(value)]:
+        match node:
+            case ast.BinOp(_, ast.Mod() | ast.FloorDiv() | ast.BitAnd()):
+                sometimes = True
+            case ast.Compare(left, [ast.Eq() | ast.In()], [right]):
+                sometimes |= bool({ast.unparse(left), ast.unparse(right)} & counts)
+            case ast.Call(_, arguments):
+                sometimes |= bool({ast.unparse(each) for each in arguments} & counts)
+    if sometimes:
         raise refusal(
             step.spot.line,
             f"{step.optimizer} steps only where {ast.unparse(test)}: one step may have several "
@@ -295,10 +312,18 @@ def _check_condition(test: ast.expr, inside: list[Spot], step: Step) -> None:
         )
 
 
-def _check_calls(tree: ast.Module, scope: Scope, trainer: Trainer) -> None:
+def _check_calls(
+    tree: ast.Module, scope: Scope, trainer: Trainer, seen: frozenset[Scope] = frozenset()
+) -> None:
     """ValueError where a function that trains with optimizers of others runs more than once."""
     if isinstance(scope, ast.Module) or _makes_optimizers(scope, trainer.optimizers[0]):
         return
+    if scope in seen:
+        raise refusal(
+            scope,
+            f"{scope.name} trains and calls itself: the iterations of all its calls together are "
+            "the schedule's",
+        )
     called = _calls(tree, scope)
     what = f"{scope.name} (line {scope.lineno}) trains"
     for spot, loops in called:
@@ -318,14 +343,15 @@ def _check_calls(tree: ast.Module, scope: Scope, trainer: Trainer) -> None:
     for spot, _ in called:
         caller = spot.above[0]
         if isinstance(caller, FUNCTIONS) and caller is not scope:
-            _check_calls(tree, caller, trainer)
+            _check_calls(tree, caller, trainer, seen | {scope})
 
 
 def _calls(tree: ast.Module, function: ast.AST) -> list[tuple[Spot, list[ast.AST]]]:
     """Where a function is called, and the loops in which that is on the same optimizers.
 
     A method is called on `self`, or on an object that the same scope has made of its class: one
-    that is made in the loop has optimizers of its own.
+    that is made in the loop has optimizers of its own. An object that comes from elsewhere may be
+    of the class; only `train()`, which every network has too, is not taken for the method there.
     """
     name = getattr(function, "name", "")
     every = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
@@ -339,6 +365,9 @@ def _calls(tree: ast.Module, function: ast.AST) -> list[tuple[Spot, list[ast.AST
                 case ast.Call(ast.Attribute(ast.Name("self" | "cls"), known)) if known == name:
                     found += [(spot, loops_around(spot))] if owners else []
                 case ast.Call(ast.Attribute(ast.Name(holder), known)) if known == name:
+                    given = [value for _, value in values(own, holder)]
+                    if owners and name != "train" and given in ([], [None]):
+                        found.append((spot, loops_around(spot)))
                     for made in own:
                         match made.node:
                             case ast.Assign([ast.Name(given)], ast.Call(kind)) if (

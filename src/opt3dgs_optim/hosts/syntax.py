@@ -73,6 +73,28 @@ def are_exclusive(first: Spot, second: Spot) -> bool:
     return False
 
 
+def is_reference(node: ast.AST) -> bool:
+    """Whether an expression only names a value: `loss`, `self.loss`, `losses["total"]`."""
+    match node:
+        case ast.Name():
+            return True
+        case ast.Attribute(value) | ast.Subscript(value, ast.Constant()):
+            return is_reference(value)
+    return False
+
+
+def changed(inside: list[Spot]) -> set[str]:
+    """What is counted up or down in these nodes: the targets of `+=` and the like."""
+    nodes = [spot.node for spot in inside]
+    return {ast.unparse(node.target) for node in nodes if isinstance(node, ast.AugAssign)}
+
+
+def with_values(test: ast.expr, inside: list[Spot]) -> list[ast.expr]:
+    """A condition, and what the names in it are given in these nodes."""
+    names = {node.id for node in ast.walk(test) if isinstance(node, ast.Name)}
+    return [test, *(value for name in names for _, value in values(inside, name) if value)]
+
+
 def values(own: list[Spot], name: str) -> Iterator[tuple[int, ast.expr | None]]:
     """The lines in which a name gets a value, and the value, where it is written there.
 

@@ -41,11 +41,7 @@ class Averaging(Part):
     @torch.no_grad()
     def after(self, group: Group, param: Tensor, state: State, course: Course) -> None:
         """Take the parameter [N, ..] into its mean; in the last steps put that in its place."""
-        if course.progress < 1 - self.share - 1 / course.total_steps:  # far from the window
-            return
         start, end = self.window(course)
-        if not start <= course.current < end:
-            return
         count = state["count"].add_(1.0)
         mean, finite = state["mean"], param.isfinite()
         iterate = torch.where(finite, param, 0.0).to(mean.dtype)

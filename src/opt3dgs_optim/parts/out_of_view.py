@@ -45,11 +45,11 @@ class OutOfView(Part):
         self, group: Group, param: Tensor, grad: Tensor, state: State, course: Course
     ) -> Tensor:
         """See at the positions [N, ..] who is out of view; raise the others' second moments."""
-        if grad.dim() == 0 or len(grad) == 0:
+        if grad.dim() == 0 or grad.shape[0] == 0:
             return grad
         if gaussian_of(group) == "means":
             kept = state[SEEN_SHARE]
-            kept.copy_(_next_share(kept, grad))
+            kept.lerp_(_seen_share(grad).to(kept), 1 / NUM_VIEWS_AVERAGED)
             # A GPU's number is not read.
             share: Any = kept.item() if grad.is_cpu else kept
             course.publish(SEEN_SHARE, param, share)
@@ -57,19 +57,23 @@ class OutOfView(Part):
                 course.publish(OUT_OF_VIEW, param, ~_has_gradient(grad))
             return grad
         share = course.published(SEEN_SHARE, param)
-        unseen = course.published(OUT_OF_VIEW, param)
+        positions: Tensor | None = None  # their gradient, where they come later
         if share is None:  # the positions come later in this iteration
             means = course.gaussians_of(param).get("means")
             if means is None or means.grad is None:
                 return grad
             kept = course.number_kept(self, SEEN_SHARE, means)
             kept = torch.ones((), device=means.device) if kept is None else kept
-            share = _next_share(kept, means.grad)
+            positions = means.grad
+            share = kept.lerp(_seen_share(positions).to(kept), 1 / NUM_VIEWS_AVERAGED)
             share = share.item() if share.is_cpu else share
-            unseen = ~_has_gradient(means.grad)
         if isinstance(share, float) and share >= MAX_SEEN_SHARE:
             return grad
-        if unseen is None or len(unseen) != len(grad):
+        if positions is None:
+            unseen = course.published(OUT_OF_VIEW, param)
+        else:
+            unseen = ~_has_gradient(positions)
+        if unseen is None or unseen.shape != grad.shape[:1]:
             return grad
         factor = MAX_SEEN_SHARE / share * (share < MAX_SEEN_SHARE)
         if isinstance(factor, Tensor):
@@ -85,14 +89,15 @@ class OutOfView(Part):
         return {"visible_share": 1.0 if share is None else share}
 
 
-def _next_share(share: Tensor, grad: Tensor) -> Tensor:
-    """The mean share of the points that a view sees, after one more view; 0-d."""
-    stride = 1 + len(grad) // MAX_POINTS_LOOKED_AT
+def _seen_share(grad: Tensor) -> Tensor:
+    """The share of the points that this view sees, 0-d."""
+    stride = 1 + grad.shape[0] // MAX_POINTS_LOOKED_AT
     seen = _has_gradient(grad[::stride] if stride > 1 else grad)
-    now = seen.mean(dtype=torch.float32).clamp_(min=MIN_SEEN_SHARE)
-    return share.lerp(now.to(share), 1 / NUM_VIEWS_AVERAGED)
+    # Not `mean`, which takes twice as long.
+    share = seen.sum(dtype=torch.float32).div_(seen.shape[0])
+    return share.clamp_(min=MIN_SEEN_SHARE)
 
 
 def _has_gradient(grad: Tensor) -> Tensor:
     """Which points have a gradient, [N] bool."""
-    return (grad if grad.dim() == 2 else grad.reshape(len(grad), -1)).any(1)
+    return (grad if grad.dim() == 2 else grad.reshape(grad.shape[0], -1)).any(1)

@@ -9,6 +9,7 @@ import numba
 import numpy as np
 import pytest
 import torch
+from raster_scene import synthetic_scene
 from splatting.camera import Camera
 from splatting.compositing import composite
 from splatting.fast.kernel import kernel
@@ -16,7 +17,6 @@ from splatting.fast.tiles import depth_order
 from splatting.projection import project, rotation_matrices
 from splatting.rasterizer import Backend, render
 from splatting.spherical_harmonics import SH_0, sh_basis
-from studies.bench.bench_raster import synthetic_scene
 from torch import Tensor
 
 BACKENDS: tuple[Backend, ...] = ("reference", "fast")

@@ -11,11 +11,11 @@ import warnings
 import pytest
 import torch
 import torch.utils.cpp_extension
+from raster_scene import synthetic_scene
 from splatting.camera import Camera
 from splatting.projection import project, rotation_matrices, visible_points
 from splatting.rasterizer import Backend, render
 from splatting.spherical_harmonics import sh_colors
-from studies.bench.bench_raster import synthetic_scene
 from torch import Tensor
 
 

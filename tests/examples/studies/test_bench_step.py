@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from studies.bench.bench_step import goals_line, main
-from studies.bench.bench_subjects import SUBJECTS
+from studies.bench.steps import BASELINE, COMPARED
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 
@@ -18,11 +18,12 @@ def test_every_subject_is_timed(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert main(["--points", "64", "--repeats", "1", "--out", str(tmp_path)]) == 0
     made = json.loads((tmp_path / "step_cpu.json").read_text(encoding="utf-8"))
     rows = made["results"]["64"]
-    assert list(rows) == list(SUBJECTS)
-    assert rows["six Adams"]["per_adam"] == 1.0
+    assert list(rows) == [BASELINE, *COMPARED]
+    assert rows[BASELINE]["per_adam"] == 1.0
+    assert rows["defaults, fused"]["baseline"] == "six fused Adams"
     assert all(row["ns_per_point"] > 0 for row in rows.values())
     table = (tmp_path / "step_cpu.md").read_text(encoding="utf-8")
-    assert all(f"| {name} |" in table for name in SUBJECTS)
+    assert all(f"| {name} |" in table for name in rows)
     assert table in capsys.readouterr().out
 
 

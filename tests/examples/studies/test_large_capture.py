@@ -11,7 +11,7 @@ from splatting.scenes import View
 from studies import large_capture
 from studies.pages import filled
 
-SMALL = ["--photos", "80", "--points", "300", "--iterations", "20"]
+SMALL = ["--photos", "80", "--points", "300", "--iterations", "20", "--seeds", "2"]
 
 
 def test_a_photo_sees_little_of_the_scene() -> None:
@@ -38,7 +38,8 @@ def test_it_trains_goes_on_and_draws(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert large_capture.main(words) == 0
     first = json.loads((tmp_path / "out" / "capture.json").read_text(encoding="utf-8"))
     assert list(first["arms"]) == [arm.name for arm in large_capture.ARMS]
-    assert all(arm["iteration"][-1] == 20 for arm in first["arms"].values())
+    seeds = [arm["seeds"] for arm in first["arms"].values()]
+    assert all(len(each) == 2 and each[1]["iteration"][-1] == 20 for each in seeds)
     assert large_capture.main([*words, "--redraw"]) == 0  # nothing is trained
     assert json.loads((tmp_path / "out" / "capture.json").read_text())["arms"] == first["arms"]
     assert (tmp_path / "out" / "capture.png").stat().st_size > 10_000

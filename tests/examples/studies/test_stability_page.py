@@ -55,8 +55,6 @@ def test_every_arm_is_measured_over_iterations_and_seconds() -> None:
             assert list(iterations) == sorted(iterations)
             assert list(seconds) == sorted(seconds)
             assert min(errors) > 0
-    for name in ("iterations", "conditions"):
-        assert (FOLDER / f"{name}.png").stat().st_size > 10_000
 
 
 @pytest.mark.processes

@@ -14,7 +14,6 @@ import pytest
 import torch
 from splatting.fit import Fit, FitOptions
 from splatting.scenes import load_scene
-from studies import collapse
 from studies.pages import filled
 from studies.scenes import arms, plots, report
 from studies.scenes.analysis import Study, difference, same_start
@@ -518,9 +517,3 @@ def test_the_readmes_arm_is_all_that_a_new_one_takes(
     assert [type(part).__name__ for part in fit.phases.parts][:2] == ["Fading", "Averaging"]
     with pytest.raises(ValueError, match="'nonsense' is unknown"):
         plan(tmp_path, tmp_path, ["embedded"], arms=["nonsense"])
-
-
-def test_the_table_of_falls_is_made_from_its_records() -> None:
-    folder = collapse.OUT
-    records = json.loads((folder / "collapse.json").read_text(encoding="utf-8"))
-    assert collapse.table(records) == (folder / "collapse.md").read_text(encoding="utf-8")
