@@ -7,6 +7,7 @@ a finished one's checkpoint or on the same objects, ends where it would with Ada
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ from placed_training import ADAMS, Training, distance
 from torch.nn import Parameter
 from trainers import AveragedThroughout
 
-from opt3dgs_optim import Averaging, Curvature, Fading, FreshMoments, PhaseScheduler
+from opt3dgs_optim import Averaging, Curvature, Fading, FreshMoments, Part, PhaseScheduler
 from opt3dgs_optim.names import GAUSSIAN
 
 pytestmark = pytest.mark.filterwarnings("ignore:PhaseScheduler")
@@ -111,3 +112,47 @@ def go(phases: Any, adam: Any, p: Parameter, iterations: range, goal: float) -> 
         p.grad = p.detach() - goal
         phases.observe(0.1, iteration=i)
         adam.step()
+
+
+class InWindow(Part):
+    """Notes in which iteration which of its hooks is called; keeps nothing."""
+
+    def __init__(self, first: int, end: int) -> None:
+        self.first, self.end = first, end
+        self.called: dict[str, list[int]] = {}
+
+    def note(self, hook: str, course: Any) -> None:
+        self.called.setdefault(hook, []).append(course.current)
+
+    def window(self, course: Any) -> tuple[int, int]:
+        return self.first, self.end
+
+    def factor(self, group: Any, course: Any) -> float:
+        self.note("factor", course)
+        return 1.0
+
+    def before(self, group: Any, param: Any, grad: Any, state: Any, course: Any) -> Any:
+        self.note("before", course)
+        return grad
+
+    def displacement(self, group: Any, param: Any, step: Any, state: Any, course: Any) -> Any:
+        self.note("displacement", course)
+        return step
+
+    def after(self, group: Any, param: Any, state: Any, course: Any) -> None:
+        self.note("after", course)
+
+
+@pytest.mark.parametrize("order", [range(8), (0, 3, 6, 2, 5, 7), (5, 2)])
+def test_a_part_acts_in_no_step_outside_of_its_window(order: Sequence[int]) -> None:
+    """Also where the clock jumps, or is set back."""
+    means, part = Parameter(torch.ones(4, 3)), InWindow(2, 5)
+    phases = PhaseScheduler(8, parts=[part])
+    adam = phases.upgrade(torch.optim.Adam([{"params": [means], "lr": 0.01, "name": "means"}]))
+    for iteration in order:
+        means.grad = torch.ones_like(means)
+        phases.observe(torch.tensor(0.1), iteration=iteration)
+        adam.step()
+    inside = [iteration for iteration in order if 2 <= iteration < 5]
+    hooks = ("factor", "before", "displacement", "after")
+    assert part.called == dict.fromkeys(hooks, inside)

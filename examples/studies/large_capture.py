@@ -210,8 +210,8 @@ def photo_psnr(scene: Scene, place: Path) -> np.ndarray:
     return np.array([float(psnr(render, view.image)) for render, view in pairs])
 
 
-def gather(args: argparse.Namespace, scene: Scene) -> dict[str, Any]:
-    """What the trainings have left."""
+def gather(args: argparse.Namespace, scene: Scene, share: float) -> dict[str, Any]:
+    """What the trainings have left; `share` is that of the points that a photo sees."""
     arms = {
         arm.name: {
             "what": arm.what,
@@ -228,7 +228,7 @@ def gather(args: argparse.Namespace, scene: Scene) -> dict[str, Any]:
         "pixels": list(SIZE),
         "points": args.points,
         "iterations": args.iterations,
-        "share": round(share_seen(scene), 4),
+        "share": round(share, 4),
         "arms": arms,
     }
 
@@ -315,11 +315,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     scene, whole = make_scene(args.photos, args.points // 2)
+    share = share_seen(scene)
     if not args.redraw:
-        share_seen(scene)
         for seed in range(args.seeds):
             train_all(args, seed, scene, whole)
-    result = gather(args, scene)
+    result = gather(args, scene, share)
     (args.out / "capture.json").write_text(json.dumps(result) + "\n", encoding="utf-8")
     draw(scene, whole, args.runs, args.out / "capture.png")
     if args.out == OUT:

@@ -117,8 +117,8 @@ class Part:
         """The iterations for which what the part keeps is valid; None: all.
 
         What was kept in another window is dropped: in a longer run, after the clock has been set
-        back, or when the window is over. A part acts in no step outside of its window.
-        A part that acts in one phase has that phase's window.
+        back, or when the window is over. A part acts in no step outside of its window. A part that
+        acts in one phase has that phase's window.
         """
         return course.window_of(self.during)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from itertools import chain
 from typing import Any, cast
 
@@ -75,7 +75,7 @@ class ActingParts:
         return cls(*map(find, STEP_HOOKS))
 
 
-STEP_HOOKS = ("before", "factor", "displacement", "after")
+STEP_HOOKS = tuple(each.name for each in fields(ActingParts) if each.init)
 NO_PARTS = ActingParts([], [], [], [])
 
 
@@ -296,7 +296,7 @@ class StepAdam(Adam):
             step = StepInProgress(mask, acting, counts, temporary)
             for group, records in zip(self.param_groups, self._records, strict=True):
                 parts = self._parts_of(group) if acting else NO_PARTS
-                if course.asks_parts:
+                if acting and course.asks_parts:
                     parts = self._ready(parts, group)
                 self._prepare_group(step, group, records, parts)
                 if parts.factor:
@@ -406,16 +406,15 @@ class StepAdam(Adam):
             if moving.counts is not True:  # a step that does not count has no gradient
                 fed = moving.where_it_moves(fed, 0.0)
         # Parts see the gradient of what is minimised, without AMP's scale.
-        scale = getattr(self, "grad_scale", None)
-        plain = not parts.shaping or (scale is None and not group["maximize"])
-        unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
-        if not plain:
+        scale, unit = getattr(self, "grad_scale", None), None
+        if parts.shaping and (scale is not None or group["maximize"]):
+            unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
             fed = fed / unit
         if parts.displacement and group["weight_decay"]:
             fed = fed.add(param.detach(), alpha=group["weight_decay"])
         for name, part in parts.before:
             fed = part.before(group, param, fed, view.of(name), course)
-        if not plain:
+        if unit is not None:
             fed = fed * unit
         if parts.displacement:  # Adam moves a buffer, whose state is the parameter's
             moving.buffer = torch.zeros_like(param, requires_grad=False)

@@ -7,6 +7,7 @@ is told, an optimizer that notes its steps, a loss.
 
 from __future__ import annotations
 
+import sys
 import types
 from dataclasses import dataclass, field
 from typing import Any
@@ -265,12 +266,12 @@ def run(source: bytes) -> Seen:
     ours: Any = types.ModuleType("opt3dgs_optim")
     ours.PhaseScheduler = type("PhaseScheduler", (StandInScheduler,), {"seen": seen})
     ours.DEFAULTS_ADC = ()
-    return _run_with({"trainer": trainer, "opt3dgs_optim": ours}, source, seen)
+    run_with({"trainer": trainer, "opt3dgs_optim": ours}, source)
+    return seen
 
 
-def _run_with(modules: dict[str, Any], source: bytes, seen: Seen) -> Seen:
-    import sys
-
+def run_with(modules: dict[str, Any], source: bytes) -> None:
+    """Run a script that imports these modules in the place of those that there are."""
     before = {name: sys.modules.get(name) for name in modules}
     sys.modules.update(modules)
     try:
@@ -281,4 +282,3 @@ def _run_with(modules: dict[str, Any], source: bytes, seen: Seen) -> Seen:
                 del sys.modules[name]
             else:
                 sys.modules[name] = module
-    return seen

@@ -7,13 +7,13 @@ the scheduler took it for.
 
 from __future__ import annotations
 
-import sys
 import types
 import warnings
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+from random_trainers import run_with
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
@@ -142,18 +142,9 @@ def run(source: bytes, **more: Any) -> Ran:
     ours: Any = types.ModuleType("opt3dgs_optim")
     vars(ours).update({name: getattr(opt3dgs_optim, name) for name in opt3dgs_optim.__all__})
     ours.PhaseScheduler = runner.scheduler_class()
-    before = {name: sys.modules.get(name) for name in ("trainer", "opt3dgs_optim")}
-    sys.modules.update({"trainer": trainer, "opt3dgs_optim": ours})
-    try:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            exec(compile(source, "<trainer>", "exec"), {"__name__": "__main__"})
-    finally:
-        for name, module in before.items():
-            if module is None:
-                del sys.modules[name]
-            else:
-                sys.modules[name] = module
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        run_with({"trainer": trainer, "opt3dgs_optim": ours}, source)
     runner.ran.warned = [str(each.message) for each in caught]
     runner.ran.end = float(torch.stack([p.detach().sum() for p in runner.parameters]).sum())
     return runner.ran

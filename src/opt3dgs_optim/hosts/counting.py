@@ -3,7 +3,7 @@
 import ast
 from typing import NamedTuple
 
-from opt3dgs_optim.hosts.syntax import Spot, changed, loops_around, refusal, values, with_values
+from opt3dgs_optim.hosts.syntax import Spot, counts_of, loops_around, refusal, values, with_values
 
 RANGES = ("range", "trange")
 WRAPPERS = ("tqdm", "track", "iter", "list")  # what goes over its first argument, in its order
@@ -68,7 +68,7 @@ def read_count(loop: ast.For, own: list[Spot], observed: ast.stmt, *, each_turn:
 def _check_end(loop: ast.For, own: list[Spot]) -> None:
     """ValueError where the loop is left at a certain count, before its range is over."""
     inside = [spot for spot in own if loop in loops_around(spot)]
-    counts = {n.id for n in ast.walk(loop.target) if isinstance(n, ast.Name)} | changed(inside)
+    counts, nodes = counts_of(loop, inside), {spot.node for spot in inside}
     for spot in inside:
         match spot.node:
             case ast.Break():
@@ -82,12 +82,10 @@ def _check_end(loop: ast.For, own: list[Spot]) -> None:
         if not leaves:
             continue
         for around, below in zip(spot.above, spot.chain, strict=True):
-            if not isinstance(around, ast.If) or loop not in spot.above or below is around.test:
+            if not isinstance(around, ast.If) or around not in nodes or below is around.test:
                 continue
             asked = [n for value in with_values(around.test, inside) for n in ast.walk(value)]
-            if around in {s.node for s in inside} and any(
-                isinstance(n, ast.expr) and ast.unparse(n) in counts for n in asked
-            ):
+            if any(isinstance(n, ast.expr) and ast.unparse(n) in counts for n in asked):
                 raise refusal(
                     spot.line,
                     f"the loop over {ast.unparse(loop.iter)} is left where "

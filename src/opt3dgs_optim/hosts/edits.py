@@ -149,11 +149,9 @@ def _edited_lines(lines: list[bytes], tree: ast.Module, trainer: Trainer) -> lis
         )
     call = ", ".join([ast.unparse(trainer.total), *options])
     start = [f"{name} = {scheduler}({call})", *upgrade]
+    defined = {*known, name, scheduler, *names.values()}
     for node in ast.walk(ast.parse("\n".join(start))):
-        if isinstance(node, ast.Name) and node.id not in {
-            *(*known, name, scheduler),
-            *names.values(),
-        }:
+        if isinstance(node, ast.Name) and node.id not in defined:
             raise refusal(point, f"the name {node.id} is not defined here, where the lines need it")
     count = f", iteration={trainer.iteration}" if trainer.iteration else ""
     for value, images in reversed(trainer.pixel):

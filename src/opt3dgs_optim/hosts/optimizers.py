@@ -52,6 +52,7 @@ def find_optimizers(
         ValueError: it is not clear which one is the Gaussians'.
     """
     notes: list[str] = []
+    models = _model_files(folder)
     stepped = list(dict.fromkeys(step.optimizer for step in steps))
     for step in steps:
         if not is_reference(ast.parse(step.optimizer, mode="eval").body):
@@ -69,7 +70,7 @@ def find_optimizers(
         found = dicts
     elif len(owners) == 1 and not dicts:
         (owner,) = owners
-        groups, made = _model(folder)
+        groups, made = _model(models)
         seconds = [name for name in SECOND if name in made or f"{owner}.{name}" in stepped]
         found = [f"{owner}.{name}" for name in ("optimizer", *seconds)]
         if groups and not groups & {"xyz", "means"}:
@@ -88,7 +89,7 @@ def find_optimizers(
             f"(stepped in the loop: {lines or 'nothing'})",
         )
     inside = [spot for spot in own if loop in loops_around(spot)]
-    setups = _remade(inside, found[0], _makers(tree, folder))
+    setups = _remade(inside, found[0], _makers([tree, *models]))
     if others := [text for text in stepped if text not in found]:
         notes.append(f"left alone: {', '.join(others)}")
     return Optimizers(found, setups, notes)
@@ -206,17 +207,16 @@ def _remade(inside: list[Spot], optimizer: str, makers: set[str]) -> list[ast.st
     return found
 
 
-def _makers(tree: ast.Module, folder: Path) -> set[str]:
-    """The functions and methods that make optimizers, by their names.
+def _makers(trees: list[ast.Module]) -> set[str]:
+    """The functions and methods of these files that make optimizers, by their names.
 
-    Those of the file and of `scene/*model*.py` that set an attribute `optimizer` or `optimizers`,
-    and those that call such a one.
+    Those that set an attribute `optimizer` or `optimizers`, and those that call such a one.
     """
     names = {"optimizer", "optimizers", *SECOND}
     calls: dict[str, set[str]] = {}
     found = {"training_setup", "restore"}  # INRIA's, where the model's file is not beside it
-    for each in (tree, *_model_files(folder)):
-        for function in ast.walk(each):
+    for tree in trees:
+        for function in ast.walk(tree):
             if not isinstance(function, FUNCTIONS) or function.name.startswith("__"):
                 continue
             for spot in spots(function):
@@ -224,7 +224,8 @@ def _makers(tree: ast.Module, folder: Path) -> set[str]:
                     case ast.Attribute(_, name, ast.Store()) if name in names:
                         around = spot.above[-1]
                         empty = isinstance(around, ast.Assign) and _is_none(around.value)
-                        found |= set() if empty else {function.name}
+                        if not empty:
+                            found.add(function.name)
                     case ast.Call(ast.Name(name) | ast.Attribute(_, name)):
                         calls.setdefault(function.name, set()).add(name)
     while more := {name for name, called in calls.items() if called & found} - found:
@@ -247,11 +248,11 @@ def _model_files(folder: Path) -> list[ast.Module]:
     return trees
 
 
-def _model(folder: Path) -> tuple[set[str], set[str]]:
-    """The names of the parameter groups, and of all attributes set, in the classes of `scene/`."""
+def _model(trees: list[ast.Module]) -> tuple[set[str], set[str]]:
+    """The names of the parameter groups, and of all attributes set, in these files' classes."""
     groups: set[str] = set()
     made: set[str] = set()
-    for tree in _model_files(folder):
+    for tree in trees:
         for node in ast.walk(tree):
             match node:
                 case ast.Dict(

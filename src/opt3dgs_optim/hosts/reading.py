@@ -22,7 +22,7 @@ from opt3dgs_optim.hosts.syntax import (
     Scope,
     Spot,
     are_exclusive,
-    changed,
+    counts_of,
     is_reference,
     loops_around,
     refusal,
@@ -289,12 +289,7 @@ def _follows(step: Spot, loop: ast.AST, backwards: list[ast.AST]) -> bool:
 def _check_condition(test: ast.expr, inside: list[Spot], step: Step) -> None:
     """ValueError where a step is made only in every so many iterations."""
     asked = with_values(test, inside)
-    counts = (
-        changed(inside)
-        | {node.id for node in ast.walk(step.loops[-1].target) if isinstance(node, ast.Name)}
-        if isinstance(step.loops[-1], ast.For)
-        else changed(inside)
-    )
+    counts = counts_of(step.loops[-1], inside)
     sometimes = SOMETIMES.search(" ".join(map(ast.unparse, asked))) is not None
     for node in [each for value in asked for each in ast.walk(value)]:
         match node:

@@ -83,10 +83,17 @@ def is_reference(node: ast.AST) -> bool:
     return False
 
 
-def changed(inside: list[Spot]) -> set[str]:
-    """What is counted up or down in these nodes: the targets of `+=` and the like."""
+def counts_of(loop: ast.AST, inside: list[Spot]) -> set[str]:
+    """What counts the turns of a loop: its own names, and the targets of `+=` and the like in it.
+
+    Args:
+        loop: a `while`, which has no names of its own, counts by what is in it alone.
+        inside: the nodes in the loop.
+    """
+    own = ast.walk(loop.target) if isinstance(loop, ast.For) else ()
+    names = {node.id for node in own if isinstance(node, ast.Name)}
     nodes = [spot.node for spot in inside]
-    return {ast.unparse(node.target) for node in nodes if isinstance(node, ast.AugAssign)}
+    return names | {ast.unparse(node.target) for node in nodes if isinstance(node, ast.AugAssign)}
 
 
 def with_values(test: ast.expr, inside: list[Spot]) -> list[ast.expr]:
