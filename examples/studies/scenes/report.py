@@ -92,13 +92,15 @@ def conclusions(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
     degrees = [*every, *every_scene(study, LONG, sh_degree=3)]
     nine = settings_of(study, LONG, PIECES["OutOfView"])
     trained = [r for r in study.records() if r.setting.rotated]
+    tuned = [small_trainings(study), settings_of(study, BRIEF), long]
     return {
         "rotated-machines": machines_line(trained),
         "decisions": decisions_table(study, BRIEF),
         "every-scene": scenes_gain_table(study, degrees, DEFAULTS, BASELINE),
         "headline": headline_table(study, long, BRIEF),
         "reach": reach_table(study, long, DEFAULTS, SHORTER),
-        "tuned": tuned_table(study, small_trainings(study), PLUSH),
+        "tuned": tuned_table(study, tuned, PLUSH),
+        "tuned-brief": tuned_table(study, tuned, PLUSH, brief=True),
         "paper": paper_table(study, quarter),
         "paper-brief": paper_table(study, quarter, brief=True),
         "adaptive-brief": metrics_table(study, long, ADAPTIVE_ARMS, seed=0, plain=True),

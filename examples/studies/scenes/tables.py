@@ -39,7 +39,17 @@ PAPER = (  # what the pages say of the paper's parts: the part, what without it,
     ),
     ("all of them, the paper's preset", "3DGS-MCMC", "paper", BASELINE),
 )
-FACTORS = (0.1, 0.3, 1.5, 2.0, 3.0, 10.0)  # on all learning rates, of `tuned_table`
+FACTORS = (0.1, 0.3, 1.5, 2.0, 3.0, 10.0)  # on learning rates, of `tuned_table`
+TUNED = {
+    **{f"rates-x{k:g}": f"3DGS-MCMC, all learning rates times {k:g}" for k in FACTORS},
+    **{
+        f"positions-x{k:g}": f"3DGS-MCMC, the positions' learning rate times {k:g}" for k in FACTORS
+    },
+}
+OURS = {  # the last lines of `tuned_table`
+    "**`Fading` alone**, learning rates as published": "faded",
+    "**the defaults**, learning rates as published": DEFAULTS,
+}
 
 
 def label(arm: str) -> str:
@@ -123,21 +133,36 @@ def headline_table(study: Study, long: Sequence[Setting], short: int) -> str:
     """The baseline beside the defaults at both lengths: what a reader sees first.
 
     Means over the seeds that all of a scene's trainings have, since a seed has held-out views of
-    its own.
+    its own. Where the baseline was trained with other learning rates on all of these, the best of
+    them stands between the two.
     """
     lengths = (long[0].iterations, short) if long else ()
-    whats = {LABELS[BASELINE]: BASELINE, f"**{LABELS[DEFAULTS]}**": DEFAULTS}
-    columns: list[list[str]] = []
+    shared = {}
     for setting in long:
-        of = [
-            study.runs(replace(setting, iterations=count), arm)
-            for count in lengths
-            for arm in whats.values()
-        ]
-        shared = set.intersection(*map(set, of))
-        columns.append([_cell([runs[seed] for seed in shared], seeds=False) for runs in of])
-    heads = [f"{what}, {count:,}" for count in lengths for what in whats]
-    rows = list(zip(heads, *columns, strict=True))
+        of = [replace(setting, iterations=count) for count in lengths]
+        both = [study.runs(each, arm) for each in of for arm in (BASELINE, DEFAULTS)]
+        shared[setting] = set.intersection(*map(set, both))
+    rows = []
+    for count in lengths:
+        lines = {LABELS[BASELINE]: BASELINE, f"**{LABELS[DEFAULTS]}**": DEFAULTS}
+        found = {
+            arm: [
+                [runs[seed] for seed in seeds if seed in runs]
+                for setting, seeds in shared.items()
+                for runs in [study.runs(replace(setting, iterations=count), arm)]
+            ]
+            for arm in (*lines.values(), *TUNED)
+        }
+        best = max(
+            (arm for arm in TUNED if [*map(len, found[arm])] == [*map(len, shared.values())]),
+            key=lambda arm: fmean(fmean(r.final for r in records) for records in found[arm]),
+            default=None,
+        )
+        if best is not None:
+            lines = {LABELS[BASELINE]: BASELINE, TUNED[best]: best, **lines}
+        for what, arm in lines.items():
+            cells = [_cell(records, seeds=False) for records in found[arm]]
+            rows.append((f"{what}, {count:,}", *cells))
     return table(["training, iterations", *(s.scene for s in long)], "l", rows)
 
 
@@ -189,46 +214,65 @@ def reach_table(study: Study, long: Sequence[Setting], arm: str, shorter: Sequen
     return table([*heads, *(f"trained for {n:,} iterations only" for n in shorter)], "l", rows)
 
 
-def tuned_table(study: Study, small: Sequence[Setting], own: Setting) -> str:
+def tuned_table(
+    study: Study, columns: Sequence[Sequence[Setting]], own: Setting, *, brief: bool = False
+) -> str:
     """What 3DGS-MCMC gains in PSNR by a factor on its learning rates, beside this package.
 
     At equal seconds; other rates are taken to cost the same.
 
     Args:
-        small: short trainings of small scenes; there a factor multiplies the steps.
-        own: a longer one at the trainer's own rates, of which other rates were tried with one seed.
+        columns: the settings of a column each, where a factor multiplies the steps; those without
+            such trainings are left out.
+        own: one of which other rates of the trainer itself were tried: the last column.
+        brief: only factors above 1, for the README.
     """
-    seeds = {s for k in FACTORS for s in study.runs(replace(own, rates=k), BASELINE)}
-    base = study.runs(own, BASELINE)
+    factors = [k for k in FACTORS if k > 1 or not brief]
+    every = {what: arm for arm, what in TUNED.items() if float(arm.partition("-x")[2]) in factors}
+    found, base = [], study.runs(own, BASELINE)
+    for settings in columns:
+        if settings:
+            kind = "scene" if settings[0].rotated else "small scene"
+            tuned = {
+                what: difference(study, settings, arm, BASELINE) for what, arm in every.items()
+            }
+            found.append(_tuned_column(study, settings, kind, tuned))
+    pairs = {}
+    for k, what in zip(factors, every, strict=False):
+        runs = study.runs(replace(own, rates=k), BASELINE)
+        both = [(runs[seed], base[seed], 1.0) for seed in sorted(runs.keys() & base.keys())]
+        pairs[what] = Difference(BASELINE, BASELINE, {own.scene: both} if both else {})
+    found = [column for column in [*found, _tuned_column(study, [own], own.scene, pairs)] if column]
+    rows = [("3DGS-MCMC as published", *["0"] * len(found))]
+    for what in (*every, *OURS):
+        cells = [cells.get(what, "-") for _, cells in found]
+        if set(cells) != {"-"}:
+            rows.append((what, *cells))
+    return table(["training", *(head for head, _ in found)], "l" + "r" * len(found), rows)
 
-    def of_small(arm: str) -> str:
-        found = difference(study, small, arm, BASELINE)
-        return cells_of(found)[0] if found.count else "-"
 
-    def of_rates(factor: float) -> str:
-        runs = study.runs(replace(own, rates=factor), BASELINE)
-        gains = [runs[seed].final - base[seed].final for seed in seeds & runs.keys()]
-        return _signed(fmean(gains), math.nan, 2) if gains else "-"
+def _tuned_column(
+    study: Study, settings: Sequence[Setting], kind: str, tuned: dict[str, Difference]
+) -> tuple[str, dict[str, str]] | None:
+    """Head and cells of a column of `tuned_table`; None where nothing was tried.
 
-    def of_own(arm: str) -> str:
-        found = difference(study, [own], arm, BASELINE)
-        of = {s: [p for p in pairs if p[0].seed in seeds] for s, pairs in found.pairs.items()}
-        return _signed(*replace(found, pairs=of).of("psnr"), 2)
-
-    rows = [("3DGS-MCMC as published", "0", "0")]
-    for k in FACTORS:
-        what = f"3DGS-MCMC, all learning rates times {k:g}"
-        rows.append((what, of_small(f"rates-x{k:g}"), of_rates(k)))
-    for what, arm in (("`Fading` alone", "faded"), ("the defaults", DEFAULTS)):
-        rows.append((f"**{what}**, learning rates as published", of_small(arm), of_own(arm)))
-    counts = difference(study, small, "rates-x3", BASELINE)
-    scenes = f"{counted(len(counts.pairs), 'small scene')}, {small[0].iterations:,} iterations"
-    heads = (
-        "training",
-        f"{scenes}, {counted(counts.count, 'training')}",
-        f"{own.scene}, {own.iterations:,} iterations, {counted(len(seeds), 'training')}",
-    )
-    return table(heads, "lrr", rows)
+    Those trainings count whose scene and seed were tried with other rates. A cell that has fewer
+    of them than its column says how many.
+    """
+    every = [found.pairs.items() for found in tuned.values()]
+    tried = {(scene, p[0].seed) for found in every for scene, pairs in found for p in pairs}
+    ours = {what: difference(study, settings, arm, BASELINE) for what, arm in OURS.items()}
+    cells = {}
+    for what, found in (tuned | ours).items():
+        of = {s: [p for p in pairs if (s, p[0].seed) in tried] for s, pairs in found.pairs.items()}
+        kept = replace(found, pairs={scene: pairs for scene, pairs in of.items() if pairs})
+        if kept.count:
+            fewer = f" ({counted(kept.count, 'training')})" * (kept.count < len(tried))
+            cells[what] = cells_of(kept)[0] + fewer
+    scenes = len({scene for scene, _ in tried})
+    what = kind if len(settings) == 1 and kind == settings[0].scene else counted(scenes, kind)
+    head = f"{what}, {settings[0].iterations:,} iterations, {counted(len(tried), 'training')}"
+    return (head, cells) if tried else None
 
 
 def decisions_table(study: Study, beside: int) -> str:

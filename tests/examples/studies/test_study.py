@@ -270,13 +270,46 @@ def test_tuned_rates_stand_beside_the_defaults_of_the_same_seeds() -> None:
     ours = [rotated_record(DEFAULT_ARM, "plush", s, psnr=21.0 + s) for s in (0, 1)]
     small = [record(arm, "a", 0, psnr) for arm, psnr in ((BASELINE, 20.0), ("rates-x3", 20.25))]
     study = Study([own, tuned, other, *ours, *small])
-    lines = tuned_table(study, [small[0].setting], own.setting).splitlines()
+    lines = tuned_table(study, [[small[0].setting], []], own.setting).splitlines()
     columns = "1 small scene, 3,000 iterations, 1 training | plush, 7,500 iterations, 1 training"
     assert lines[0] == f"| training | {columns} |"
     assert "| 3DGS-MCMC as published | 0 | 0 |" in lines
     assert "| 3DGS-MCMC, all learning rates times 3 | +0.25 | +0.50 |" in lines
-    assert "| 3DGS-MCMC, all learning rates times 10 | - | - |" in lines
+    assert not any("times 10" in line for line in lines)  # which nobody has trained
     assert "| **the defaults**, learning rates as published | - | +1.00 |" in lines
+
+
+def test_a_column_of_tuned_rates_appears_with_its_trainings() -> None:
+    """And counts the defaults only on the scenes and seeds that were tried with other rates."""
+    trained = [(BASELINE, 20.0), ("rates-x2", 20.5), ("positions-x3", 20.2), (DEFAULT_ARM, 21.0)]
+    records = [rotated_record(arm, "a", 0, psnr=psnr) for arm, psnr in trained]
+    records += [rotated_record(arm, "b", 0, psnr=psnr + 1) for arm, psnr in trained[:2]]
+    records += [rotated_record(DEFAULT_ARM, "b", 0, psnr=23.0)]
+    records += [rotated_record(arm, "c", 0, psnr=10.0) for arm in (BASELINE, DEFAULT_ARM)]
+    study = Study(records)
+    nowhere = Setting("plush", 4_000, 7_500, "sfm", rotated=True)
+    lines = tuned_table(study, [study.settings()], nowhere, brief=True).splitlines()
+    assert lines[0] == "| training | 2 scenes, 7,500 iterations, 2 trainings |"
+    assert lines[2:] == [
+        "| 3DGS-MCMC as published | 0 |",
+        "| 3DGS-MCMC, all learning rates times 2 | +0.50 ± 0.00 |",
+        "| 3DGS-MCMC, the positions' learning rate times 3 | +0.20 (1 training) |",
+        "| **the defaults**, learning rates as published | +1.50 ± 0.50 |",
+    ]
+
+
+def test_the_headline_has_the_best_tuned_rates_where_every_training_has_them() -> None:
+    arms = {BASELINE: 20.0, "rates-x2": 20.5, "positions-x3": 20.8, DEFAULT_ARM: 21.0}
+    long = [rotated_record(arm, "a", s, psnr=psnr) for arm, psnr in arms.items() for s in (0, 1)]
+    without = [r for r in long if (r.arm, r.seed) != ("positions-x3", 1)]
+    rest = " / 0.700 / 0.200 |"
+    for records, best in ((long, "positions' learning rate times 3"), (without, "rates times 2")):
+        study = Study(records)
+        lines = headline_table(study, study.settings(), 7_500).splitlines()[2:5]
+        psnr = max(p for arm, p in arms.items() if arm.endswith(best[-1]) and "-x" in arm)
+        assert lines[0] == f"| 3DGS-MCMC, 7,500 | 20.00{rest}"
+        assert lines[1].endswith(f"{best}, 7,500 | {psnr:.2f}{rest}")
+        assert lines[2] == f"| **the defaults**, 7,500 | 21.00{rest}"
 
 
 def test_zero_has_no_sign() -> None:
