@@ -83,7 +83,7 @@ def adaptive(name: str, what: str, parts: MakeParts | None = None) -> StudyArm:
 
 
 LIST = (
-    StudyArm(BASELINE, "stock 3DGS-MCMC, torch's Adam"),
+    StudyArm(BASELINE, "3DGS-MCMC as published, torch's Adam"),
     *(
         StudyArm(f"rates-x{k:g}", f"all steps times {k:g}", of(ConstantMultiplier(k)))
         for k in (1.5, 2.0, 3.0)
@@ -109,13 +109,13 @@ LIST = (
     *(
         StudyArm(
             f"frame-{rate:g}+faded",
-            "the same, all but the positions faded, points out of view held",
+            "as its control, all but the positions faded, points out of view held",
             of(OwnFrame(rate), FADING_OTHERS, OutOfView()),
             control=f"frame-{rate:g}",
         )
         for rate in (0.05, 0.1, 0.2)
     ),
-    adaptive(ADAPTIVE, "stock 3DGS with adaptive density control, torch's Adam"),
+    adaptive(ADAPTIVE, "3DGS with adaptive density control as published, torch's Adam"),
     adaptive(
         "adc+annealed+faded-but-scales",
         "annealed and faded, the positions not annealed, the scales left alone",
@@ -124,7 +124,7 @@ LIST = (
     *(adaptive(f"adc+frame-{rate:g}", "own frame", of(OwnFrame(rate))) for rate in (0.1, 0.2)),
     adaptive(
         "adc+frame-0.1+faded",
-        "the same, faded, scales and positions left alone",
+        "as `adc+frame-0.1`, faded, scales and positions left alone",
         of(OwnFrame(0.1), replace(FADING, names=BUT_SCALES), OutOfView()),
     ),
 )
@@ -140,7 +140,7 @@ def averaged(arm: StudyArm) -> StudyArm:
     return replace(
         arm,
         name=f"{arm.name}{AVERAGED}",
-        what="the same, and the last 1/30 of the iterates averaged",
+        what="as its control, and the last 1/30 of the iterates averaged",
         parts=lambda iterations, nu: [*made(iterations, nu), *held, Averaging()],
         control=arm.name,
         switch=LAST_THIRTIETH,
