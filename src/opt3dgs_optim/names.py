@@ -1,5 +1,6 @@
 """Which parameter group is which Gaussian parameter, in the names trainers use."""
 
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -23,6 +24,16 @@ GAUSSIAN_NAMES: Mapping[str, tuple[str, ...]] = {
     ),
 }
 GAUSSIAN = tuple(GAUSSIAN_NAMES)
+# Groups of public trainers that are no Gaussian parameters, though they may have as many rows:
+# inputs of networks (3DGRUT, gsplat's --app_opt, Scaffold-GS) by their whole names, ...
+_OTHERS = frozenset({"features", "anchor_feat", "offset"})
+# ... networks and what belongs to a photo by a whole word of the name.
+_WORDS_OF_OTHERS = frozenset(
+    (
+        *("app", "appearance", "bilateral", "camera", "cameras", "embedding", "embeddings"),
+        *("exposure", "exposures", "grid", "grids", "mlp", "pose", "poses"),
+    )
+)
 SLOT = "gaussian"  # of a parameter group: gsplat's name of what it holds
 _CANONICAL = {alias: name for name, aliases in GAUSSIAN_NAMES.items() for alias in aliases}
 
@@ -41,6 +52,12 @@ def split_name(name: Any) -> tuple[str, str | None]:
 def canonical_name(name: Any) -> str | None:
     """gsplat's name of a Gaussian parameter group, or None for any other group."""
     return split_name(name)[1]
+
+
+def is_known_other(name: Any) -> bool:
+    """Whether a group's name says that it is no Gaussian parameter."""
+    last = str(name).rpartition("#")[2].lower()
+    return last in _OTHERS or not _WORDS_OF_OTHERS.isdisjoint(re.split(r"[\W_]+", last))
 
 
 class NamedGroup(dict[str, Any]):

@@ -15,6 +15,7 @@ from opt3dgs_optim.names import (
     canonical_name,
     gaussian_of,
     group_name,
+    is_known_other,
     set_of,
     split_name,
 )
@@ -115,11 +116,12 @@ def _warn_of_unknown(unknown: list[tuple[str, Any]], known_rows: set[int]) -> No
         for name, group in unknown
         if any(param.dim() and rows_of(param) in known_rows for param in group["params"])
         and max(known_rows) > 1
+        and not is_known_other(name)
     ]
     if suspects:
         warn_user(
             f"{CALL}: {', '.join(suspects)} stay as they are, though they have as many rows as the "
-            "Gaussian parameters. If they are some, the parts act on a half of the Gaussians; put "
+            "Gaussian parameters. If they are some, the parts act on the others only; put "
             f"the optimizers into a dict under names that are known: {', '.join(GAUSSIAN_NAMES)}"
         )
 

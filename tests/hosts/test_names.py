@@ -92,3 +92,33 @@ def test_several_sets_in_one_optimizer() -> None:
     ends = [group["params"][0] for optimizer in alone for group in optimizer.param_groups]
     for group, end in zip(together.param_groups, ends, strict=True):
         assert torch.equal(group["params"][0], end), group["name"]
+
+
+OTHERS = {  # groups beside the six that are left alone, as the trainers name them
+    "3DGRUT": "features",
+    "gsplat": "features app_module pose_opt",
+    "Scaffold-GS": "offset anchor_feat mlp_opacity embedding_appearance",
+    "INRIA": "exposure",
+    "drivestudio": "Background#features CamPose#all_camera",
+    "nerfstudio": "camera_opt bilateral_grid",
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("trainer", OTHERS)
+def test_known_groups_of_other_things_are_left_alone_in_silence(trainer: str) -> None:
+    """Even where there are as many photos as Gaussians."""
+    others = OTHERS[trainer].split()
+    optimizer = PhaseScheduler(100).upgrade(adam_with([*TRAINERS["INRIA"].split(), *others]))
+    assert [group.get(SLOT) for group in optimizer.param_groups[6:]] == [None] * len(others)
+
+
+# The second line: a known other group's name, or a word of it, is only a part of these.
+MAYBE = ["sizes", "log_sizes", "anchor", "Background#sizes"]
+MAYBE += ["features_dc_low", "offset_means", "CamPose#sizes", "exposed_opacities", "gridded_scales"]
+
+
+@pytest.mark.parametrize("name", MAYBE)
+def test_groups_that_may_be_gaussians_are_warned_of(name: str) -> None:
+    with pytest.warns(UserWarning, match=f"{name} stay as they are"):
+        PhaseScheduler(100).upgrade(adam_with([*TRAINERS["INRIA"].split(), name]))
