@@ -14,8 +14,15 @@ from opt3dgs_optim.checks import check_choice, check_count, check_number, warn_u
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import block
 from opt3dgs_optim.part import Part, Phase
-from opt3dgs_optim.presets import DEFAULTS, PAPER_STEPS, PAPER_SWITCH, paper_parts
-from opt3dgs_optim.upgrading import upgrade
+from opt3dgs_optim.presets import (
+    DEFAULTS,
+    LEFT_OUT_WITH_REMOVAL,
+    PAPER_STEPS,
+    PAPER_SWITCH,
+    paper_parts,
+)
+from opt3dgs_optim.removed_rows import RemovedRows
+from opt3dgs_optim.upgrading import say, upgrade
 
 if TYPE_CHECKING:
     from opt3dgs_optim.runs import RunLog
@@ -24,6 +31,7 @@ CALL = "PhaseScheduler"
 # How long a trainer may do something by design before it is taken for a mistake.
 PATIENCE = 20  # iterations without a step, steps without an energy, or losses that are not finite
 LONG_PATIENCE = 200  # iterations without a step in a training that has stepped
+REMOVAL = "the trainer removes Gaussians, as clone, split and prune does"  # why a part is off
 Optimizers = TypeVar("Optimizers", bound="Optimizer | Mapping[str, Optimizer] | list[Optimizer]")
 
 
@@ -36,7 +44,8 @@ class PhaseScheduler(Course):
         total_steps: iterations of the training.
         switch: where exploitation starts: a fraction of `total_steps` in (0, 1] if a float, an
             iteration if an int (`total_steps`: never). The paper: 29/30.
-        parts: what the steps have, in order; None: `DEFAULTS` (clone and split: `DEFAULTS_ADC`).
+        parts: what the steps have, in order; None: `DEFAULTS`, whose `Fading` is switched off as
+            soon as the trainer removes Gaussians (clone, split and prune), since it loses there.
             One that learns (`EnergyHistogram`, `Curvature`, `PositionNoise`) serves one run.
         adaptive: whether parts that this training shows no need of are switched off, see
             `switched_off`. Every 100 iterations that is one synchronisation with the GPU.
@@ -91,6 +100,9 @@ class PhaseScheduler(Course):
         if log is not None and not hasattr(log, "step"):
             raise ValueError(f"{CALL}: log={log!r}, but a RunLog or None is needed")
         self.log, self.needs_energies = log, True
+        # Parts that the user has chosen stay as they are.
+        self._removed_rows = RemovedRows() if parts is None else None
+        self._chosen = parts is not None
         self._over_ranks = None if process_group is None else RankMean(CALL, process_group)
         self._iterations_without_step = 1
         self._steps_without_energy = 0
@@ -158,8 +170,11 @@ class PhaseScheduler(Course):
             iteration = check_count(f"{CALL}.observe", "iteration", iteration, 0)
             if iteration < self.current:  # what is kept for a time begins anew
                 self.rewinds += 1
+                if self._removed_rows is not None:
+                    self._removed_rows = RemovedRows()
         self.current = self.iteration if iteration is None else iteration
         self._watch_clock()
+        self._watch_rows()
         value = loss if isinstance(loss, Tensor) else torch.tensor(float(loss))
         value = value.detach().reshape(()) if value.dim() else value.detach()
         self.take(value if self._over_ranks is None else self._over_ranks(value))
@@ -259,6 +274,41 @@ class PhaseScheduler(Course):
                 f"{self.current} of {self.total_steps}; a training that goes on from a checkpoint "
                 "of the stock trainer needs observe(loss, iteration=...)"
             )
+
+    def _watch_rows(self) -> None:
+        """Switch off what loses with clone, split and prune once the trainer removes Gaussians."""
+        if self._removed_rows is None or not self._removed_rows.found(self.followers()):
+            return
+        self._removed_rows = None
+        off = [
+            name
+            for name, part in self._named.items()
+            if isinstance(part, LEFT_OUT_WITH_REMOVAL) and name not in self.switched_off
+        ]
+        self.switched_off.update(dict.fromkeys(off, REMOVAL))
+        self._plan()
+        for name in off:
+            say(
+                f"opt3dgs_optim: iteration {self.current}: {name} is switched off, since "
+                f"{REMOVAL}; parts that are given to PhaseScheduler stay on"
+            )
+            if self.log is not None:
+                self.log.event("switched_off", self.current, part=name, reason=REMOVAL)
+
+    def state_dict(self) -> dict[str, Any]:
+        """As `Course.state_dict`; a resumed run cannot see what was removed before."""
+        self._watch_rows()
+        return super().state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """As `Course.load_state_dict`; parts that the user has chosen are not off for removal."""
+        super().load_state_dict(state)
+        if self._removed_rows is not None:
+            self._removed_rows = RemovedRows()
+        if self._chosen and REMOVAL in self.switched_off.values():
+            left = {name: why for name, why in self.switched_off.items() if why != REMOVAL}
+            self.switched_off = left
+            self._plan()
 
     def _stepped_before_first_energy(self) -> bool:
         """Whether each optimizer made one step before there was a loss."""

@@ -14,6 +14,8 @@ PAPER_STEPS = 30_000
 PAPER_SWITCH = 29_000 / PAPER_STEPS
 PAPER_WARMUP = 2_500 / PAPER_STEPS
 DEFAULTS: tuple[Part, ...] = (Fading(), OutOfView(), Averaging())  # what paid: docs/evidence.md
+# What is switched off where a trainer removes Gaussians and nobody has chosen the parts.
+LEFT_OUT_WITH_REMOVAL: tuple[type[Part], ...] = (Fading,)
 # For clone, split and prune: longer steps let scales grow until they are pruned as too big.
 DEFAULTS_ADC: tuple[Part, ...] = (
     Annealing(names=("quats", "opacities", "sh0", "shN")),

@@ -89,7 +89,7 @@ def upgrade(optimizers: Any, course: Course) -> int:
     parts = ", ".join(str(part) for part in course.parts) or "none"
     others = f"; left alone: {', '.join(left)}" if left else ""
     again = f" from iteration {course.iteration}" if course.iteration else ""
-    _say(
+    say(
         f"opt3dgs_optim {__version__}: total_steps={course.total_steps}{again}, parts {parts}, "
         f"in the steps of {', '.join(taken)}{others}"
     )
@@ -189,7 +189,7 @@ def _check_device_path(optimizer: Any, shown: str) -> None:
                 )
 
 
-def _say(message: str) -> None:
+def say(message: str) -> None:
     """A log line (INFO); on stderr where nobody has set logging up, as in most trainers."""
     if LOGGER.hasHandlers():
         LOGGER.info(message)

@@ -252,7 +252,6 @@ training(opt)
     "own PhaseScheduler": """\
 class PhaseScheduler:
     pass
-DEFAULTS_ADC = 3
 def training(opt):
     gaussians = GaussianModel()
     gaussians.training_setup(opt)

@@ -14,17 +14,13 @@ from trainer_files import GSPLAT, INRIA, MCMC, MINI_SPLATTING, SYNTHETIC, TAMING
 from opt3dgs_optim.hosts import diff, write
 from opt3dgs_optim.hosts.edits import main
 
-IMPORT = "from opt3dgs_optim import DEFAULTS_ADC, PhaseScheduler"
-PLAIN_IMPORT = "from opt3dgs_optim import PhaseScheduler"
+IMPORT = "from opt3dgs_optim import PhaseScheduler"
 OURS = [
-    "phases = PhaseScheduler(opt.iterations, parts=DEFAULTS_ADC)",
+    "phases = PhaseScheduler(opt.iterations)",
     "gaussians.optimizer = phases.upgrade(gaussians.optimizer)",
     "Ll1 = phases.pixel_loss(image, gt_image)",
     "phases.observe(loss, iteration=iteration - 1)",
 ]
-
-
-CHOICE = ", parts=DEFAULTS_ADC if isinstance(self.cfg.strategy, DefaultStrategy) else None"
 
 
 def saved(folder: Path, text: str, name: str = "train.py") -> Path:
@@ -41,7 +37,7 @@ def lines_for(folder: Path, text: str) -> list[str]:
 def test_what_is_written_is_what_was_shown(tmp_path: Path, kind: str) -> None:
     path = saved(tmp_path, SYNTHETIC[kind])
     lines = added(diff(path).diff)
-    assert lines[0] == (PLAIN_IMPORT if kind == "3dgs-mcmc" else IMPORT)
+    assert lines[0] == IMPORT
     backup = write(path)
     assert backup.name == "train.py.orig"
     assert backup.read_text() == SYNTHETIC[kind]
@@ -67,7 +63,7 @@ def test_the_lines_of_gsplat(tmp_path: Path) -> None:
     ranks = ", process_group=torch.distributed.group.WORLD if world_size > 1 else None"
     lines = [
         IMPORT,
-        f"phases = PhaseScheduler(max_steps{CHOICE}{ranks})",
+        f"phases = PhaseScheduler(max_steps{ranks})",
         "self.optimizers = phases.upgrade(self.optimizers)",
         "l1loss = phases.pixel_loss(colors, pixels)",
         "phases.observe(loss)",
@@ -79,20 +75,14 @@ def test_the_lines_of_gsplat(tmp_path: Path) -> None:
     assert text.index("schedulers = [") < text.index(lines[1]) < text.index("for step in pbar")
 
 
-@pytest.mark.parametrize("call", ["densify", "prune_and_densify", "densify_with_score"])
-def test_the_parts_where_it_clones_and_splits(tmp_path: Path, call: str) -> None:
+@pytest.mark.parametrize("call", ["relocate_gs", "densify", "prune_and_densify"])
+def test_one_set_of_lines_for_both_density_controls(tmp_path: Path, call: str) -> None:
+    """Which it is, the scheduler sees in the training."""
     assert lines_for(tmp_path, MCMC.replace("relocate_gs", call)) == [IMPORT, *OURS]
 
 
-def test_the_lines_of_3dgs_mcmc(tmp_path: Path) -> None:
-    plain = [line.replace(", parts=DEFAULTS_ADC", "") for line in OURS]
-    assert lines_for(tmp_path, MCMC) == [PLAIN_IMPORT, *plain]
-
-
 def test_world_size_only_where_it_is_defined(tmp_path: Path) -> None:
-    assert "phases = PhaseScheduler(max_steps, parts=DEFAULTS_ADC)" in lines_for(
-        tmp_path, SYNTHETIC["gsplat 2DGS"]
-    )
+    assert "phases = PhaseScheduler(max_steps)" in lines_for(tmp_path, SYNTHETIC["gsplat 2DGS"])
 
 
 @pytest.mark.parametrize("name", ["convexes", "student_gaussians"])
@@ -105,11 +95,9 @@ def test_other_names_of_loss_options_and_ours(tmp_path: Path) -> None:
     text = INRIA.replace("        loss.b", "        total_loss = loss\n        total_loss.b")
     assert "phases.observe(total_loss, iteration=iteration - 1)" in lines_for(tmp_path, text)
     text = INRIA.replace("opt.iterations", "final_iter").replace("opt, pipe", "final_iter, opt")
-    assert "phases = PhaseScheduler(final_iter, parts=DEFAULTS_ADC)" in lines_for(tmp_path, text)
+    assert "phases = PhaseScheduler(final_iter)" in lines_for(tmp_path, text)
     text = INRIA.replace("first_iter = 0\n", "phases = first_iter = 0\n")
-    assert "opt3dgs_phases = PhaseScheduler(opt.iterations, parts=DEFAULTS_ADC)" in lines_for(
-        tmp_path, text
-    )
+    assert "opt3dgs_phases = PhaseScheduler(opt.iterations)" in lines_for(tmp_path, text)
 
 
 def test_names_of_a_function_around_it(tmp_path: Path) -> None:

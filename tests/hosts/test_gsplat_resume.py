@@ -14,7 +14,7 @@ from gsplat_host import Trainer, strategies
 from test_host_gsplat import build, make_strategy, start
 from trainers import gsplat_optimizers
 
-from opt3dgs_optim import DEFAULTS_ADC, PhaseScheduler
+from opt3dgs_optim import PhaseScheduler
 
 TOTAL, HALF = 60, 30
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "hosts" / "gsplat.md"
@@ -49,18 +49,15 @@ def names_for(trainer: Trainer, path: Path) -> dict[str, Any]:
 def test_the_lines_save_and_resume_bit_for_bit(kind: str, tmp_path: Path) -> None:
     save, resume = lines_of_the_page()
 
-    def phases() -> PhaseScheduler:
-        return PhaseScheduler(TOTAL, parts=DEFAULTS_ADC if kind == "default" else None)
-
-    whole = build("1.5.3", kind, "step, strategy", phases())
+    whole = build("1.5.3", kind, "step, strategy", PhaseScheduler(TOTAL))
     whole.run(0, TOTAL)
 
-    half = build("1.5.3", kind, "step, strategy", phases())
+    half = build("1.5.3", kind, "step, strategy", PhaseScheduler(TOTAL))
     half.run(0, HALF)
     names = names_for(half, tmp_path / "resume.pt")
     exec(save, names)
 
-    again = phases()
+    again = PhaseScheduler(TOTAL)
     splats = start(seed=1)  # of another start: everything must come from the file
     optimizers = again.upgrade(gsplat_optimizers(dict(splats)))
     host = types.SimpleNamespace(splats=splats, optimizers=optimizers)

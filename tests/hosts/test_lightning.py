@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from opt3dgs_optim import DEFAULTS, DEFAULTS_ADC
+from opt3dgs_optim import DEFAULTS
 from opt3dgs_optim.presets import paper_parts
 
 TOTAL = 60
@@ -50,7 +50,6 @@ class StrangeAdam(Adam):
 
 
 def trainer(
-    controller: str = "VanillaDensityControllerImpl",
     strategy: str = "VanillaOptStrategy",
     total: int = TOTAL,
     kind: type[Adam] = Adam,
@@ -70,7 +69,6 @@ def trainer(
     ]
     return types.SimpleNamespace(
         trainer=types.SimpleNamespace(max_steps=total),
-        density_controller=type(controller, (), {})(),
         gaussian_optimizers=optimizers,
         hparams={"opt_strategy": type(strategy, (), {})()},
         extra_train_metrics=[],
@@ -98,24 +96,22 @@ def backward(host: Any, step: int) -> Tensor:
     return metrics["loss"]
 
 
-@pytest.mark.parametrize(
-    ("controller", "parts"),
-    [
-        ("MCMCDensityControllerImpl", DEFAULTS),
-        ("VanillaDensityControllerImpl", DEFAULTS_ADC),
-        ("Taming3DGSDensityControllerModule", DEFAULTS_ADC),
-    ],
-)
-def test_the_parts_follow_the_density_control(
-    lightning: Any, controller: str, parts: tuple[Any, ...]
-) -> None:
-    module = set_up(lightning, trainer(controller))
-    assert [repr(part) for part in module.phases.parts] == [repr(part) for part in parts]
+def test_the_defaults_notice_that_gaussians_are_removed(lightning: Any) -> None:
+    """Whatever the trainer calls its density control."""
+    host = trainer()
+    module = set_up(lightning, host)
+    assert list(module.phases.parts) == list(DEFAULTS)
+    backward(host, 1)
+    assert module.phases.switched_off == {}
+    for optimizer in host.gaussian_optimizers:
+        for group in optimizer.param_groups:
+            group["params"][0] = torch.nn.Parameter(group["params"][0].detach()[1:])
+    backward(host, 2)
+    assert set(module.phases.switched_off) == {"Fading"}
 
 
-@pytest.mark.parametrize("controller", ["MCMCDensityControllerImpl", "VanillaDensityController"])
-def test_the_papers_parts_whatever_the_density_control(lightning: Any, controller: str) -> None:
-    host = trainer(controller)
+def test_the_papers_parts(lightning: Any) -> None:
+    host = trainer()
     module = set_up(lightning, host, paper=True, switch=0.5)
     assert [repr(p) for p in module.phases.parts] == [repr(p) for p in paper_parts(TOTAL)]
     render, photo = torch.full((2, 3), 0.5), torch.zeros(2, 3)

@@ -18,7 +18,7 @@ from gsplat_host import HOSTS
 from torch.nn import Parameter
 from trainers import edit_rows, make_splats
 
-from opt3dgs_optim import DEFAULTS, DEFAULTS_ADC, Phase
+from opt3dgs_optim import DEFAULTS, Phase
 
 TOTAL = 40
 NAMES = {"sh0": "features_dc", "shN": "features_rest"}
@@ -279,7 +279,7 @@ def test_the_package_defaults_unless_the_paper_is_asked_for(ours: Any) -> None:
     plain = Training(ours, ours.splatfacto_opt3dgs, paper=False)
     assert "Curvature" in repr(ask.model.phases)
     assert "Fading" not in repr(ask.model.phases)
-    assert list(plain.model.phases.parts) == list(DEFAULTS_ADC)  # splatfacto clones and splits
+    assert list(plain.model.phases.parts) == list(DEFAULTS)
     relocating = Training(ours, ours.splatfacto_mcmc_opt3dgs, paper=False)
     assert list(relocating.model.phases.parts) == list(DEFAULTS)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from trainer_files import GSPLAT, INRIA, MCMC, added
+from trainer_files import GSPLAT, INRIA, added
 
 from opt3dgs_optim.hosts import diff
 
@@ -112,14 +112,14 @@ def test_batches_of_a_range_with_three_arguments(tmp_path: Path) -> None:
     """Grendel-GS: the count goes on by the batch."""
     text = INRIA.replace("opt.iterations + 1)", "opt.iterations + 1, opt.bsz)")
     lines = lines_for(tmp_path, text)
-    assert "phases = PhaseScheduler(opt.iterations, parts=DEFAULTS_ADC)" in lines
+    assert "phases = PhaseScheduler(opt.iterations)" in lines
     assert "phases.observe(loss, iteration=iteration - 1)" in lines
 
 
 def test_a_start_that_may_be_zero_is_never_minus_one(tmp_path: Path) -> None:
     text = INRIA.replace("    first_iter += 1\n", "")
     lines = lines_for(tmp_path, text)
-    assert "phases = PhaseScheduler(opt.iterations + 1, parts=DEFAULTS_ADC)" in lines
+    assert "phases = PhaseScheduler(opt.iterations + 1)" in lines
     assert "phases.observe(loss, iteration=iteration)" in lines
 
 
@@ -150,8 +150,8 @@ def test_a_scheduler_of_the_trainers_own(tmp_path: Path) -> None:
     text = INRIA.replace("import torch\n", "import torch\nfrom utils import PhaseScheduler\n")
     text = text.replace("    first_iter += 1\n", "    first_iter += 1\n    PhaseScheduler(opt)\n")
     lines = lines_for(tmp_path, text)
-    assert "from opt3dgs_optim import DEFAULTS_ADC, PhaseScheduler as TwoPhaseScheduler" in lines
-    assert "phases = TwoPhaseScheduler(opt.iterations, parts=DEFAULTS_ADC)" in lines
+    assert "from opt3dgs_optim import PhaseScheduler as TwoPhaseScheduler" in lines
+    assert "phases = TwoPhaseScheduler(opt.iterations)" in lines
 
 
 def test_a_loop_at_module_level(tmp_path: Path) -> None:
@@ -175,14 +175,3 @@ def test_a_method_called_for_each_epoch(tmp_path: Path) -> None:
 def test_a_trainer_of_its_own_for_each_scene(tmp_path: Path) -> None:
     text = GSPLAT + "\n\nfor scene in scenes:\n    runner = Runner(scene)\n    runner.train()\n"
     assert "phases.observe(loss)" in lines_for(tmp_path, text)
-
-
-def test_density_control_that_is_not_certain_is_noted(tmp_path: Path) -> None:
-    both = MCMC.replace(
-        "            if iteration < opt.iterations:\n",
-        "            gaussians.densify_and_prune(1)\n            if iteration < opt.iterations:\n",
-    )
-    neither = MCMC.replace("gaussians.relocate_gs(", "gaussians.change(")
-    for text, found in ((both, "both was found"), (neither, "neither was found")):
-        assert any(found in note for note in edited(tmp_path, text).notes)
-    assert not any("density control" in note for note in edited(tmp_path, INRIA).notes)

@@ -265,7 +265,6 @@ def run(source: bytes) -> Seen:
     vars(trainer).update(names)
     ours: Any = types.ModuleType("opt3dgs_optim")
     ours.PhaseScheduler = type("PhaseScheduler", (StandInScheduler,), {"seen": seen})
-    ours.DEFAULTS_ADC = ()
     run_with({"trainer": trainer, "opt3dgs_optim": ours}, source)
     return seen
 

@@ -27,7 +27,7 @@ file whose names cannot be read with certainty is refused, with the lines to add
 SCHEDULER = "PhaseScheduler"
 LINES_BY_HAND = (
     "from opt3dgs_optim import PhaseScheduler  # at the top",
-    "phases = PhaseScheduler(TOTAL_STEPS)  # above the loop; clone and split: parts=DEFAULTS_ADC",
+    "phases = PhaseScheduler(TOTAL_STEPS)  # above the loop",
     "OPTIMIZER = phases.upgrade(OPTIMIZER)  # a torch.optim.Adam with named groups, or a dict",
     "L1 = phases.pixel_loss(RENDER, PHOTO)  # in place of the mean absolute error",
     "phases.observe(LOSS)  # after LOSS.backward(), before OPTIMIZER.step()",
@@ -109,33 +109,11 @@ def write(path: Path) -> Path:
     return backup
 
 
-def _preset(trainer: Trainer) -> tuple[list[str], list[str]]:
-    """What the lines import for a trainer's density control, and the options that they give.
-
-    The only place that knows of two presets.
-    """
-    if trainer.clones == trainer.relocates and not trainer.clones_if:
-        found = "both" if trainer.clones else "neither"
-        trainer.notes.append(
-            "whether its density control clones and splits, or relocates, is not certain "
-            f"({found} was found): clone and split needs PhaseScheduler(..., parts=DEFAULTS_ADC)"
-        )
-    if not trainer.clones:
-        return [], []
-    otherwise = f" if {trainer.clones_if} else None" if trainer.clones_if else ""
-    return ["DEFAULTS_ADC"], [f"parts=DEFAULTS_ADC{otherwise}"]
-
-
 def _edited_lines(lines: list[bytes], tree: ast.Module, trainer: Trainer) -> list[bytes]:
     """The file's lines with ours among them."""
     used = _used(tree)
     name = _unused("phases", used)
     scheduler = SCHEDULER if SCHEDULER not in used else _unused("TwoPhaseScheduler", used)
-    imports, options = _preset(trainer)
-    names = {each: _unused(each, used) for each in imports}
-    for each, ours in names.items():  # a trainer may have one of its own
-        options = [option.replace(each, ours) for option in options]
-    imports = [each if each == ours else f"{each} as {ours}" for each, ours in names.items()]
     first, *second = trainer.optimizers
     upgrade = [f"{first} = {name}.upgrade({first})"]
     for other in second:  # None where the trainer's options leave it out
@@ -143,13 +121,11 @@ def _edited_lines(lines: list[bytes], tree: ast.Module, trainer: Trainer) -> lis
     point = trainer.loop  # below all that may make the optimizers anew
     _check_total(trainer, point)
     known = _known(tree, trainer, point)
+    call = ast.unparse(trainer.total)
     if "world_size" in known:
-        options.append(
-            "process_group=torch.distributed.group.WORLD if world_size > 1 else None",
-        )
-    call = ", ".join([ast.unparse(trainer.total), *options])
+        call += ", process_group=torch.distributed.group.WORLD if world_size > 1 else None"
     start = [f"{name} = {scheduler}({call})", *upgrade]
-    defined = {*known, name, scheduler, *names.values()}
+    defined = {*known, name, scheduler}
     for node in ast.walk(ast.parse("\n".join(start))):
         if isinstance(node, ast.Name) and node.id not in defined:
             raise refusal(point, f"the name {node.id} is not defined here, where the lines need it")
@@ -157,8 +133,7 @@ def _edited_lines(lines: list[bytes], tree: ast.Module, trainer: Trainer) -> lis
     for value, images in reversed(trainer.pixel):
         _replace(lines, value, f"{name}.pixel_loss({', '.join(map(ast.unparse, images))})")
     renamed = SCHEDULER if scheduler == SCHEDULER else f"{SCHEDULER} as {scheduler}"
-    ours = ", ".join([*imports, renamed])
-    _insert(lines, _last_import(tree, point), [f"from opt3dgs_optim import {ours}"])
+    _insert(lines, _last_import(tree, point), [f"from opt3dgs_optim import {renamed}"])
     for statement in trainer.backwards:
         _insert(lines, statement, [f"{name}.observe({trainer.loss}{count})"])
     for statement in trainer.setups:

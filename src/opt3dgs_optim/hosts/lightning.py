@@ -16,7 +16,7 @@ from typing import Any
 from torch import Tensor
 
 from opt3dgs_optim.phases import PhaseScheduler
-from opt3dgs_optim.presets import DEFAULTS_ADC, PAPER_SWITCH, paper_parts
+from opt3dgs_optim.presets import PAPER_SWITCH, paper_parts
 
 try:
     from internal.plugins.plugin import Plugin, PluginModule  # pyright: ignore
@@ -67,8 +67,7 @@ class Opt3DGSModule(PluginModule):
                 f"Opt3DGS: total_steps={config.total_steps} and max_steps={total} of the trainer, "
                 "but the number of iterations is needed; set total_steps of the plugin"
             )
-        relocates = "MCMC" in type(pl_module.density_controller).__name__
-        parts = paper_parts(total) if config.paper else None if relocates else DEFAULTS_ADC
+        parts = paper_parts(total) if config.paper else None
         self.phases = PhaseScheduler(total, config.switch, parts)
         self.phases.upgrade(pl_module.gaussian_optimizers)
         for optimizer in pl_module.gaussian_optimizers:

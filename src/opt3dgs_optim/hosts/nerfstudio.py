@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.phases import PhaseScheduler
-from opt3dgs_optim.presets import DEFAULTS_ADC, PAPER_SWITCH, paper_parts
+from opt3dgs_optim.presets import PAPER_SWITCH, paper_parts
 
 try:
     from nerfstudio.models.splatfacto import (  # pyright: ignore
@@ -64,8 +64,7 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
                 "Opt3DGSSplatfactoModel: total_steps=None and no trainer, but the number of "
                 "iterations is needed; set pipeline.model.total_steps"
             )
-        clones = getattr(config, "strategy", "default") == "default"
-        parts = paper_parts(total) if config.paper else DEFAULTS_ADC if clones else None
+        parts = paper_parts(total) if config.paper else None
         self.phases = PhaseScheduler(total, config.switch, parts)
         for name, (param,) in self.get_gaussian_param_groups().items():
             # On a resume nerfstudio builds its optimizers first and makes new Parameters then, that

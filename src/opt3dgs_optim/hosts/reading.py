@@ -33,9 +33,6 @@ from opt3dgs_optim.hosts.syntax import (
 )
 
 BACKWARDS = ("backward", "manual_backward")
-# What clones and splits, and what relocates, by the names that trainers give it.
-CLONES = r"DefaultStrategy|\.(?:prune_and_)?densify\w*\(|(?<![.\w])(?:\w+_)?densification\("
-RELOCATES = r"MCMCStrategy|relocate|[Mm]cmc"
 SOMETIMES = re.compile(r"accum|sync|micro", re.I)  # in the condition of a step of several batches
 
 
@@ -50,9 +47,6 @@ class Trainer:
     backwards: list[ast.stmt]  # `loss.backward()`; several only in branches of an `if`
     total: ast.expr  # how many iterations
     iteration: str  # an expression, from 0, where the observed losses may not be as many; else ""
-    clones: bool = False  # whether its density control clones and splits
-    relocates: bool = False  # or relocates, as MCMC; some do either
-    clones_if: str = ""  # the test for the first, where it is an option of the trainer
     optimizers: list[str] = field(default_factory=list)  # expressions, the positions' first
     setups: list[ast.stmt] = field(default_factory=list)  # in the loop: they make them anew
     pixel: list[PixelLoss] = field(default_factory=list)  # what to replace
@@ -108,11 +102,6 @@ def read_trainer(tree: ast.Module, folder: Path) -> Trainer:
             "no L1 = l1_loss(render, photo) was found with certainty: the paper's squared loss "
             "needs phases.pixel_loss(render, photo) in its place, the defaults do not"
         )
-    text = ast.unparse(tree)
-    trainer.clones = re.search(CLONES, text) is not None
-    trainer.relocates = re.search(RELOCATES, text) is not None
-    choice = re.search(r"isinstance\([\w.]+, DefaultStrategy\)", ast.unparse(loop))
-    trainer.clones_if = choice[0] if choice else ""
     return trainer
 
 

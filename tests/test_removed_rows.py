@@ -1,0 +1,331 @@
+"""Trainers that remove Gaussians are told from those that relocate them; `Fading` goes off."""
+
+from __future__ import annotations
+
+import copy
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from gsplat_host import Trainer, strategies
+from inria_host import OPTIONS, SimulatedModel, fill, real_model
+from torch import Tensor
+from torch.nn import Parameter, ParameterDict
+from trainers import gsplat_optimizers, make_splats
+
+from opt3dgs_optim import DEFAULTS, DEFAULTS_ADC, PhaseScheduler
+from opt3dgs_optim.removed_rows import RemovedRows, were_removed
+from opt3dgs_optim.runs import RunLog
+
+TOTAL, POINTS = 60, 200
+FIRST, EVERY = 5, 7  # first iteration after which rows are edited; the edits follow its multiples
+FIRST_EDIT = 7
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning"),
+    pytest.mark.filterwarnings("ignore:.*non-writable:UserWarning"),
+]
+
+
+def row_numbers(count: int) -> Tensor:
+    """Opacities that say which row they were."""
+    return torch.arange(count, dtype=torch.float32)[:, None] - count / 2
+
+
+# -- single edits ---------------------------------------------------------------------------------
+
+ROWS = row_numbers(100)
+REMOVING: dict[str, Callable[[Tensor], Tensor]] = {
+    "prune one at the end": lambda v: v[:-1],
+    "prune the first": lambda v: v[1:],
+    "split three": lambda v: torch.cat([v[3:], v[:3] + 0.5, v[:3] + 0.5]),
+    "split most": lambda v: torch.cat([v[::5], *2 * [v[torch.arange(100) % 5 > 0]]]),
+    "clone forty, split one": lambda v: torch.cat([v[1:], v[1:41], v[:1] + 0.5, v[:1] + 0.5]),
+    "prune one, clone two": lambda v: torch.cat([v[:30], v[31:], v[50:52]]),
+}
+KEEPING: dict[str, Callable[[Tensor], Tensor]] = {
+    "a copy": lambda v: v.clone(),
+    "clone": lambda v: torch.cat([v, v[::3]]),
+    "reset": lambda v: v.clamp(max=-10.0),
+    "reset to one value": lambda v: torch.full_like(v, -4.6),
+    "relocate": lambda v: overwritten(v, slice(0, 30), v[30:60] - 0.3),
+    # Forks of 3dgs-mcmc leave the opacity as it is.
+    "relocate with the same opacity": lambda v: overwritten(v, slice(0, 40), v[40:80]),
+    "relocate and grow": lambda v: torch.cat([overwritten(v, slice(0, 30), v[30:60] - 0.3), v[:5]]),
+    "permute": lambda v: v.flip(0),
+    "permute and clone": lambda v: torch.cat([v.flip(0), v[:5]]),
+}
+
+
+def overwritten(values: Tensor, rows: slice, new: Tensor) -> Tensor:
+    """A copy with other values in some rows."""
+    values = values.clone()
+    values[rows] = new
+    return values
+
+
+@pytest.mark.parametrize("edit", REMOVING)
+@pytest.mark.parametrize("shape", [(100,), (100, 1)])
+def test_rows_that_are_removed_are_found(edit: str, shape: tuple[int, ...]) -> None:
+    before = ROWS.reshape(shape)
+    assert were_removed(before, REMOVING[edit](before))
+
+
+@pytest.mark.parametrize("edit", KEEPING)
+def test_rows_that_are_kept_are_not_taken_for_removed(edit: str) -> None:
+    assert not were_removed(ROWS, KEEPING[edit](ROWS))
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_rows(count: int) -> None:
+    rows = row_numbers(count)
+    assert not were_removed(rows, rows.clone())
+    assert not were_removed(rows, torch.cat([rows, rows]))
+    if count:
+        assert were_removed(rows, rows[1:])
+
+
+def optimizer_of(*opacities: Tensor) -> torch.optim.Adam:
+    """One optimizer with so many sets of Gaussians."""
+    groups = [
+        {"params": [Parameter(rows)], "name": f"{number}#opacity"}
+        for number, rows in enumerate(opacities)
+    ]
+    return PhaseScheduler(TOTAL).upgrade(torch.optim.Adam(groups))
+
+
+def test_edits_in_place_and_steps_are_no_removal() -> None:
+    watch, optimizer = RemovedRows(), optimizer_of(row_numbers(10))
+    (group,) = optimizer.param_groups
+    assert not watch.found([optimizer])
+    group["params"][0].data.add_(1.0)
+    assert not watch.found([optimizer])
+    rows = Parameter(group["params"][0].data)  # as relocation makes it: the same memory
+    rows.data[:8] = rows.data[2:].clone()
+    group["params"][0] = rows
+    assert not watch.found([optimizer])
+
+
+def test_each_set_of_gaussians_is_compared_with_itself() -> None:
+    watch = RemovedRows()
+    optimizer, other = optimizer_of(row_numbers(10), row_numbers(20)), optimizer_of(row_numbers(5))
+    assert not watch.found([optimizer, other])
+    assert not watch.found([other, optimizer])
+    group = optimizer.param_groups[1]
+    group["params"][0] = Parameter(group["params"][0].detach()[5:])
+    assert watch.found([other, optimizer])
+    assert not watch.found([other, optimizer])
+
+
+# -- real strategies ------------------------------------------------------------------------------
+
+
+def gsplat_strategy(kind: str, **options: Any) -> Any:
+    """gsplat 1.5.3's strategy, which edits every 7th iteration after the 5th."""
+    times = {"refine_start_iter": FIRST, "refine_stop_iter": 50, "refine_every": EVERY}
+    if kind == "mcmc":
+        return strategies("1.5.3").MCMCStrategy(cap_max=400, noise_lr=1.0, **times)
+    default: dict[str, Any] = {"grow_grad2d": 1e-4, "grow_scale3d": 0.6, "prune_opa": 0.3}
+    default |= {"reset_every": 20, "prune_scale3d": 1e9, **options}
+    return strategies("1.5.3").DefaultStrategy(**times, **default)
+
+
+def gsplat_trainer(kind: str, phases: PhaseScheduler, **options: Any) -> Trainer:
+    """Its strategy around 200 Gaussians, a third of them dead."""
+    splats: Any = ParameterDict(make_splats(POINTS, 0))
+    splats["opacities"].data[::3] = -9.0
+    optimizers = phases.upgrade(gsplat_optimizers(dict(splats)))
+    strategy = gsplat_strategy(kind, **options)
+    return Trainer(splats, optimizers, strategy, total=TOTAL, phases=phases)
+
+
+SPLITS_ONLY = {"prune_opa": 1e-9, "grow_scale3d": 2.5}
+
+
+@pytest.mark.parametrize("options", [{}, SPLITS_ONLY, {"grow_grad2d": 1e9}])
+def test_clone_split_and_prune_of_gsplat(
+    options: dict[str, float], caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    """Together, splits only, prunes only: seen in the iteration after the first edit, said once."""
+    caplog.set_level("INFO", "opt3dgs_optim")
+    with RunLog(tmp_path / "run.jsonl") as log:
+        phases = PhaseScheduler(TOTAL, log=log)
+        trainer = gsplat_trainer("default", phases, **options)
+        trainer.run(0, FIRST_EDIT + 1)
+        assert phases.switched_off == {}
+        trainer.run(FIRST_EDIT + 1, FIRST_EDIT + 2)
+        assert set(phases.switched_off) == {"Fading"}
+        trainer.run(FIRST_EDIT + 2, TOTAL)
+    said = [text for text in caplog.messages if "switched off" in text]
+    assert len(said) == 1
+    assert "Fading is switched off, since the trainer removes Gaussians" in said[0]
+    assert (tmp_path / "run.jsonl").read_text().count('"switched_off"') == 1
+    assert "Fading" in repr(phases)
+    assert set(phases.switched_off) == {"Fading"}
+
+
+def test_relocation_of_gsplat_is_none(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "opt3dgs_optim")
+    phases = PhaseScheduler(TOTAL)
+    trainer = gsplat_trainer("mcmc", phases)
+    trainer.run(0, TOTAL)
+    assert len(trainer.splats["means"]) > POINTS
+    assert phases.switched_off == {}
+    assert "in the steps of" in caplog.text
+    assert "switched off" not in caplog.text
+
+
+@pytest.mark.parametrize("parts", [DEFAULTS, DEFAULTS_ADC])
+def test_parts_that_were_chosen_stay(parts: Any) -> None:
+    phases = PhaseScheduler(TOTAL, parts=parts)
+    gsplat_trainer("default", phases).run(0, TOTAL)
+    assert phases.switched_off == {}
+
+
+def test_fading_that_is_off_is_as_if_it_were_not_there() -> None:
+    """Fading's first event is at 3 % of the training, here after the first edit."""
+    total = 1_000
+    ends = []
+    for parts in (None, DEFAULTS[1:]):
+        phases = PhaseScheduler(total, parts=parts)
+        trainer = gsplat_trainer("default", phases)
+        trainer.run(0, TOTAL)
+        ends.append(trainer.splats)
+    assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[0])
+
+
+# -- the INRIA family -----------------------------------------------------------------------------
+
+
+def inria_model(kind: str) -> Any:
+    splats = make_splats(POINTS)
+    splats["opacities"].data[::3] = -9.0
+    model = SimulatedModel() if kind == "simulated" else real_model(kind)
+    fill(model, splats)
+    model.training_setup(OPTIONS)
+    return model
+
+
+def densify_and_prune(model: Any, iteration: int) -> None:
+    """As INRIA's: clone, split (children appended, then the parents pruned), prune."""
+    chosen = torch.arange(len(model._xyz)) % 5 == iteration % 5
+    model.append(chosen.nonzero()[:, 0])
+    parents = torch.zeros(len(model._xyz), dtype=torch.bool)
+    parents[iteration % 11 :: 11] = True
+    model.append(parents.nonzero()[:, 0])
+    model.append(parents[: len(parents)].nonzero()[:, 0])
+    model.prune_points(torch.cat([parents, torch.zeros(2 * int(parents.sum()), dtype=torch.bool)]))
+
+
+def relocate_and_grow(model: Any, iteration: int) -> None:
+    """As 3dgs-mcmc's."""
+    model.relocate_gs((model.get_opacity <= 0.005).squeeze(-1))
+    model.add_new_gs(400)
+
+
+def run_inria(
+    model: Any, phases: PhaseScheduler, edit: Callable[[Any, int], None], first: int, last: int
+) -> None:
+    """INRIA's order: backward, observe, edits of rows, step."""
+    for iteration in range(first, last):
+        torch.manual_seed(iteration)
+        seen = torch.arange(len(model._xyz)) % 3 != iteration % 3
+        render = model._xyz.sum(-1) + model.get_opacity[:, 0] + model.get_scaling.mean(-1)
+        render = render + model._rotation.sum(-1)
+        render = render + model._features_dc.mean((1, 2)) + model._features_rest.mean((1, 2))
+        loss = (render[seen] - 0.1 * (iteration % 5)).abs().mean() + 0.01 * model.get_opacity.mean()
+        loss.backward()
+        phases.observe(loss, iteration=iteration)
+        if iteration > FIRST and iteration % EVERY == 0:
+            with torch.no_grad():
+                edit(model, iteration)
+            if iteration % (3 * EVERY) == 0 and edit is densify_and_prune:
+                model.reset_opacity()
+        model.optimizer.step()
+        model.optimizer.zero_grad(set_to_none=True)
+
+
+def test_densify_and_prune_of_inria() -> None:
+    model, phases = inria_model("simulated"), PhaseScheduler(TOTAL)
+    phases.upgrade(model.optimizer)
+    run_inria(model, phases, densify_and_prune, 0, FIRST_EDIT + 1)
+    assert phases.switched_off == {}
+    run_inria(model, phases, densify_and_prune, FIRST_EDIT + 1, FIRST_EDIT + 2)
+    assert set(phases.switched_off) == {"Fading"}
+
+
+@pytest.mark.parametrize("kind", ["simulated", "3dgs-mcmc"])
+def test_relocation_of_3dgs_mcmc_is_none(kind: str) -> None:
+    model, phases = inria_model(kind), PhaseScheduler(TOTAL)
+    phases.upgrade(model.optimizer)
+    run_inria(model, phases, relocate_and_grow, 0, TOTAL)
+    assert len(model._xyz) > POINTS
+    assert phases.switched_off == {}
+
+
+# -- going on from a checkpoint -------------------------------------------------------------------
+
+
+def saved(model: Any) -> Any:
+    buffer = io.BytesIO()
+    torch.save(model.optimizer.state_dict(), buffer)
+    buffer.seek(0)
+    return torch.load(buffer)
+
+
+@pytest.mark.parametrize("at", [FIRST_EDIT, FIRST_EDIT + 1, FIRST_EDIT + 2, 30])
+@pytest.mark.parametrize("chosen", [None, DEFAULTS])
+def test_a_resumed_training(at: int, chosen: Any) -> None:
+    """Saved before the first edit, right after it, after it was seen, and long after that."""
+    model, phases = inria_model("simulated"), PhaseScheduler(TOTAL, parts=chosen)
+    phases.upgrade(model.optimizer)
+    run_inria(model, phases, densify_and_prune, 0, at)
+    state, resumed = saved(model), copy.deepcopy(model)
+    resumed.training_setup(OPTIONS)
+    again = PhaseScheduler(TOTAL, parts=chosen)
+    again.upgrade(resumed.optimizer)
+    resumed.optimizer.load_state_dict(state)
+    # Rows that went before the checkpoint are known to it.
+    assert set(again.switched_off) == ({"Fading"} if at > FIRST_EDIT and chosen is None else set())
+    run_inria(model, phases, densify_and_prune, at, TOTAL)
+    run_inria(resumed, again, densify_and_prune, at, TOTAL)
+    assert phases.switched_off == again.switched_off
+    assert torch.equal(model._xyz, resumed._xyz)
+    assert torch.equal(model._scaling, resumed._scaling)
+
+
+def test_what_a_checkpoint_says_does_not_switch_off_what_was_chosen() -> None:
+    model, phases = inria_model("simulated"), PhaseScheduler(TOTAL)
+    phases.upgrade(model.optimizer)
+    run_inria(model, phases, densify_and_prune, 0, 30)
+    state = saved(model)
+    assert set(phases.switched_off) == {"Fading"}
+    model.training_setup(OPTIONS)
+    again = PhaseScheduler(TOTAL, parts=DEFAULTS)
+    again.upgrade(model.optimizer)
+    model.optimizer.load_state_dict(state)
+    assert again.switched_off == {}
+    assert again.iteration == 30
+
+
+def test_fewer_gaussians_of_a_checkpoint_are_no_removal() -> None:
+    """A trainer that loads another model and sets its clock back."""
+    model, phases = inria_model("simulated"), PhaseScheduler(TOTAL)
+    phases.upgrade(model.optimizer)
+    run_inria(model, phases, relocate_and_grow, 0, 20)
+    model.prune_points(torch.arange(len(model._xyz)) >= POINTS)
+    run_inria(model, phases, relocate_and_grow, 0, 20)
+    assert phases.switched_off == {}
+
+
+def test_a_copy_looks_for_itself() -> None:
+    model, phases = inria_model("simulated"), PhaseScheduler(TOTAL)
+    phases.upgrade(model.optimizer)
+    run_inria(model, phases, densify_and_prune, 0, FIRST_EDIT)
+    other = copy.deepcopy(model)
+    run_inria(other, other.optimizer.course, densify_and_prune, FIRST_EDIT, TOTAL)
+    assert set(other.optimizer.course.switched_off) == {"Fading"}
+    assert phases.switched_off == {}
