@@ -30,7 +30,7 @@ from studies.scenes.decisions import (
     points_of,
     settings_of,
 )
-from studies.scenes.plots import VIEWS, plot_metrics, plot_sizes
+from studies.scenes.plots import VIEWS, plot_metrics, plot_one, plot_sizes
 from studies.scenes.records import (
     COSTS,
     FOLDER,
@@ -65,6 +65,7 @@ LONG, BRIEF = 30_000, 7_500
 SHORTER = (BRIEF, 10_000)  # lengths that may do instead of the baseline's
 ADAPTIVE_ARMS = (ADAPTIVE, "adc+annealed+faded", ADAPTIVE_DEFAULTS)
 PLUSH = Setting("plush", 4_000, BRIEF, "sfm", rotated=True)  # where other rates were tried, too
+LARGEST = Setting("bonsai", 50_000, LONG, "sfm", rotated=True, size="images_2")  # the README's
 UNSEEN_ARMS = (BASELINE, "faded", "faded+out-of-view+averaged")
 
 
@@ -185,7 +186,8 @@ def plots(study: Study) -> list[Path]:
     arms = (BASELINE, "paper", DEFAULTS)
     plot_metrics(study, settings_of(study, LONG), arms, FOLDER / "rotated.png", SHORTER)
     plot_sizes(study, FOLDER / "sizes.png")
-    return [FOLDER / "rotated.png", FOLDER / "sizes.png"]
+    plot_one(study, LARGEST, FOLDER / "largest.png")
+    return [FOLDER / name for name in ("rotated.png", "sizes.png", "largest.png")]
 
 
 @command("report")
