@@ -48,6 +48,7 @@ from studies.scenes.tables import (
     crowd,
     decisions_table,
     differences_table,
+    falls_table,
     headline_table,
     machines_line,
     metrics_table,
@@ -60,6 +61,7 @@ from studies.scenes.tables import (
 REPOSITORY = Path(__file__).resolve().parents[3]
 PAGE = REPOSITORY / "docs" / "evidence.md"
 PAGES = (PAGE, FOLDER / "tables.md", REPOSITORY / "README.md")  # that have tables
+FALLS = FOLDER.parent / "histogram" / "collapse.json"
 MARK = "<!-- study:{} -->"
 LONG, BRIEF = 30_000, 7_500
 SHORTER = (BRIEF, 10_000)  # lengths that may do instead of the baseline's
@@ -146,7 +148,7 @@ def appendix(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
     made["tiled"] = metrics_table(
         study, tiled, mcmc, head=lambda s: f"{s.scene}, {s.tiled} pieces, {s.iterations:,}"
     )
-    made["collapse"] = (FOLDER.parent / "histogram" / "collapse.md").read_text("utf-8").strip()
+    made["collapse"] = falls_table(json.loads(FALLS.read_text("utf-8")))
     fixed = [s for s in study.settings() if not s.rotated]
     few = [s for s in fixed if s.scene == "brighton_beach" and s.iterations == BRIEF]
     made["few-views"] = metrics_table(study, few, study.arms(few))
