@@ -30,7 +30,7 @@ from studies.scenes.decisions import (
     points_of,
     settings_of,
 )
-from studies.scenes.plots import VIEWS, plot_metrics, plot_sizes
+from studies.scenes.plots import VIEWS, plot_metrics, plot_one, plot_sizes
 from studies.scenes.records import (
     COSTS,
     FOLDER,
@@ -48,6 +48,7 @@ from studies.scenes.tables import (
     crowd,
     decisions_table,
     differences_table,
+    falls_table,
     headline_table,
     machines_line,
     metrics_table,
@@ -60,11 +61,13 @@ from studies.scenes.tables import (
 REPOSITORY = Path(__file__).resolve().parents[3]
 PAGE = REPOSITORY / "docs" / "evidence.md"
 PAGES = (PAGE, FOLDER / "tables.md", REPOSITORY / "README.md")  # that have tables
+FALLS = FOLDER.parent / "histogram" / "collapse.json"
 MARK = "<!-- study:{} -->"
 LONG, BRIEF = 30_000, 7_500
 SHORTER = (BRIEF, 10_000)  # lengths that may do instead of the baseline's
 ADAPTIVE_ARMS = (ADAPTIVE, "adc+annealed+faded", ADAPTIVE_DEFAULTS)
 PLUSH = Setting("plush", 4_000, BRIEF, "sfm", rotated=True)  # where other rates were tried, too
+LARGEST = Setting("bonsai", 50_000, LONG, "sfm", rotated=True, size="images_2")  # the README's
 UNSEEN_ARMS = (BASELINE, "faded", "faded+out-of-view+averaged")
 
 
@@ -145,7 +148,7 @@ def appendix(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
     made["tiled"] = metrics_table(
         study, tiled, mcmc, head=lambda s: f"{s.scene}, {s.tiled} pieces, {s.iterations:,}"
     )
-    made["collapse"] = (FOLDER.parent / "histogram" / "collapse.md").read_text("utf-8").strip()
+    made["collapse"] = falls_table(json.loads(FALLS.read_text("utf-8")))
     fixed = [s for s in study.settings() if not s.rotated]
     few = [s for s in fixed if s.scene == "brighton_beach" and s.iterations == BRIEF]
     made["few-views"] = metrics_table(study, few, study.arms(few))
@@ -185,7 +188,8 @@ def plots(study: Study) -> list[Path]:
     arms = (BASELINE, "paper", DEFAULTS)
     plot_metrics(study, settings_of(study, LONG), arms, FOLDER / "rotated.png", SHORTER)
     plot_sizes(study, FOLDER / "sizes.png")
-    return [FOLDER / "rotated.png", FOLDER / "sizes.png"]
+    plot_one(study, LARGEST, FOLDER / "largest.png")
+    return [FOLDER / name for name in ("rotated.png", "sizes.png", "largest.png")]
 
 
 @command("report")

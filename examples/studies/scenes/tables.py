@@ -11,7 +11,7 @@ from studies.pages import table
 from studies.scenes.analysis import METRICS, Difference, Study, difference
 from studies.scenes.arms import ADAPTIVE, ADAPTIVE_DEFAULTS, BASELINE, DEFAULTS, arm_of
 from studies.scenes.decisions import MANY_VIEWS_SCENES, PIECES, decide, settings_of
-from studies.scenes.records import Record, Setting
+from studies.scenes.records import Plain, Record, Setting
 
 SIZES = {"images_4": "quarter", "images_2": "half", "images": "full"}
 # How pages that are read without the list of variants name them.
@@ -39,6 +39,7 @@ PAPER = (  # what the pages say of the paper's parts: the part, what without it,
     ),
     ("all of them, the paper's preset", "3DGS-MCMC", "paper", BASELINE),
 )
+LOOKS = 60  # at the training PSNR, of each record of `falls_table`
 FACTORS = (0.1, 0.3, 1.5, 2.0, 3.0, 10.0)  # on learning rates, of `tuned_table`
 TUNED = {
     **{f"rates-x{k:g}": f"3DGS-MCMC, all learning rates times {k:g}" for k in FACTORS},
@@ -273,6 +274,35 @@ def _tuned_column(
     what = kind if len(settings) == 1 and kind == settings[0].scene else counted(scenes, kind)
     head = f"{what}, {settings[0].iterations:,} iterations, {counted(len(tried), 'training')}"
     return (head, cells) if tried else None
+
+
+def falls_table(records: Sequence[Plain]) -> str:
+    """How far trainings fall with two forms of nu and without: the worst of a scene's seeds.
+
+    Args:
+        records: of docs/results/histogram/collapse.json, whose code is gone.
+    """
+    forms = {
+        "stock": "3DGS-MCMC, no ν",
+        "frozen": "range measured once (until 2026-11-22)",
+        "default": "range follows the energy (today)",
+    }
+    by_scene: dict[str, list[Plain]] = {}
+    for record in sorted(records, key=lambda r: (r["scene"], r["seed"])):
+        by_scene.setdefault(record["scene"], []).append(record)
+    rows = []
+    for scene, every in by_scene.items():
+        cells, ends = [], []
+        for form in forms:
+            of = [record for record in every if record["arm"] == form]
+            fall, looks = (max(r[key] for r in of) for key in ("largest_fall", "looks_below_1_db"))
+            clamped = [r["at_clamp"] for r in of if "at_clamp" in r]
+            share = f", {max(clamped):.1%}" if clamped else ""
+            seeds = f" ({counted(len(of), 'seed')})" * (len(of) > 1)
+            cells.append(f"{fall:.2f} dB, {looks} of {LOOKS}{share}{seeds}")
+            ends.append(f"{of[0]['psnr']:.2f}")
+        rows.append((f"{scene}, {every[0]['iterations']:,}", *cells, " / ".join(ends)))
+    return table(("scene, iterations", *forms.values(), "test PSNR, seed 0"), "l", rows)
 
 
 def decisions_table(study: Study, beside: int) -> str:

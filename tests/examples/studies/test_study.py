@@ -550,3 +550,23 @@ def test_the_readmes_arm_is_all_that_a_new_one_takes(
     assert [type(part).__name__ for part in fit.phases.parts][:2] == ["Fading", "Averaging"]
     with pytest.raises(ValueError, match="'nonsense' is unknown"):
         plan(tmp_path, tmp_path, ["embedded"], arms=["nonsense"])
+
+
+def test_the_readmes_curve_is_of_the_seeds_that_both_have(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    ends = (BASELINE, 0, 20.0), (BASELINE, 1, 22.0), (BASELINE, 2, 90.0)
+    ends = *ends, (DEFAULT_ARM, 0, 23.0), (DEFAULT_ARM, 1, 25.0)
+    study = Study([rotated_record(arm, "a", seed, psnr=psnr) for arm, seed, psnr in ends])
+    kept: list[Any] = []
+    monkeypatch.setattr(plots.plt, "close", kept.append)
+    (setting,) = study.settings()
+    plots.plot_one(study, setting, tmp_path / "one.png")
+    (figure,) = kept
+    (axis,) = figure.axes
+    assert [float(line.get_ydata()[-1]) for line in axis.lines] == [21.0, 24.0]
+    assert [text.get_text() for text in axis.texts] == [
+        "3DGS-MCMC\n21.0 dB",
+        "the defaults\n24.0 dB",
+    ]
+    assert (tmp_path / "one.png").stat().st_size > 1000
