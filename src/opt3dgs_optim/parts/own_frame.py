@@ -32,9 +32,9 @@ class OwnFrame(Part):
     positions' learning rate, which counts in one way only: at 0 the positions are held. Position
     noise and everything else that reads that rate are not changed.
 
-    Trained Gaussians are thin: in most of them one axis is a hundred times shorter than the
-    longest, thinner than a pixel shows. Steps in proportion to it would hold the Gaussian fast
-    across its own surface, so that an axis counts as no thinner than `min_aspect` of the longest.
+    Trained Gaussians are thin, often far thinner than a pixel. Steps in proportion to such an axis
+    would hold the Gaussian fast across its own surface, so that an axis counts as no thinner than
+    `min_aspect` of the longest.
 
     Adam's moments of the positions then belong to the own frame; everything else stays as it is.
     Scales and quaternions are looked up in the groups of the upgraded optimizers (gsplat's,
