@@ -86,14 +86,14 @@ def mathml(latex: str, *, block: bool) -> str:
     return f'<div class="formula">{formula}</div>' if block else formula
 
 
-STEPS = (
-    *("six Adams", "defaults", "defaults, a tenth in view"),
-    *("the paper's exploration", "the paper's exploitation"),
+STEPS = (  # rows of the benchmark, on the page
+    *("six Adams", "defaults", "defaults, a tenth in view", "defaults, last thirtieth"),
+    *("defaults, steps of a tenth", "the paper's exploration", "the paper's exploitation"),
 )
 
 
 def step_costs() -> str:
-    """What whole steps cost, of every docs/benchmarks/step_*.json."""
+    """What whole steps cost, of every docs/benchmarks/step_*.json, and whether that is the goal."""
     text = []
     for path in sorted((DOCS / "benchmarks").glob("step_*.json")):
         bench = json.loads(path.read_text(encoding="utf-8"))
@@ -102,11 +102,22 @@ def step_costs() -> str:
         text += ["| ns per point | " + " | ".join(f"{int(n):,} points" for n in sizes) + " |"]
         text += ["|---|" + "---:|" * len(sizes)]
         for step in STEPS:
-            cells = [bench["results"][n].get(step) for n in sizes]
-            shown = ["–" if c is None else f"{c['ns_per_point']:.0f}" for c in cells]
+            rows = [bench["results"][n][step] for n in sizes]
+            shown = [f"{row['ns_per_point']:.0f} (x{row['per_adam']:.2f})" for row in rows]
             text.append(f"| {step} | " + " | ".join(shown) + " |")
-        text += ["", f"Made by `{bench['command']}`.", ""]
+        text += ["", *goal_table(bench), f"Made by `{bench['command']}`.", ""]
     return "\n".join(text)
+
+
+def goal_table(bench: dict[str, Any]) -> list[str]:
+    """What a step of the defaults costs of what it may cost, by the number of points."""
+    found = {n: bench["results"][n]["defaults"]["per_adam"] for n in bench["goals"]}
+    text = ["| the defaults, times six Adams | " + " | ".join(f"{int(n):,}" for n in found) + " |"]
+    text += ["|---|" + "---:|" * len(found)]
+    text += ["| goal | " + " | ".join(f"{goal:.2f}" for goal in bench["goals"].values()) + " |"]
+    text += ["| measured | " + " | ".join(f"{ratio:.2f}" for ratio in found.values()) + " |"]
+    reached = ["reached" if found[n] <= goal else "missed" for n, goal in bench["goals"].items()]
+    return [*text, "| | " + " | ".join(reached) + " |", ""]
 
 
 PROBLEMS = {

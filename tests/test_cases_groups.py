@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -105,3 +107,29 @@ def test_positions_of_any_shape(shape: tuple[int, ...], layout: str) -> None:
         for adam in adams:
             adam.step()
     assert all(bool(param.isfinite().all()) for param in splats.values())
+
+
+UPGRADE = """
+import logging, torch
+from opt3dgs_optim import PhaseScheduler
+{set_up}
+param = torch.nn.Parameter(torch.zeros(2, 3))
+PhaseScheduler(100, parts=[]).upgrade({{"means": torch.optim.Adam([param])}})
+"""
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    ("set_up", "said"),
+    [
+        ("", True),
+        ('logging.basicConfig(level="INFO")', True),
+        ("logging.basicConfig()", False),
+        ('logging.getLogger("opt3dgs_optim").setLevel(logging.WARNING)', False),
+        ('logging.getLogger("opt3dgs_optim").disabled = True', False),
+    ],
+)
+def test_what_was_taken_is_said_unless_somebody_asks_for_silence(set_up: str, said: bool) -> None:
+    command = [sys.executable, "-c", UPGRADE.format(set_up=set_up)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert ("in the steps of means" in done.stderr) == said

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from placed_training import Training, distance, marked
+from placed_training import Training, distance
 from trainers import AveragedThroughout
 
 from opt3dgs_optim import (
@@ -109,16 +109,13 @@ BESIDE: dict[str, tuple[Made, Made, int]] = {
         90,
     ),
 }
-SHARED = {
-    "PositionNoise": "the noise of one is taken for a trainer's by the other",
-}
 
 
 def trained(made: Made, until: int) -> Training:
     return Training(made, total=90, switch=60).run(until)
 
 
-@pytest.mark.parametrize("name", marked(BESIDE, SHARED))
+@pytest.mark.parametrize("name", BESIDE)
 def test_a_part_beside_another_does_what_it_does_alone(name: str) -> None:
     alone, beside, until = BESIDE[name]
     one, two = trained(alone, until), trained(beside, until)

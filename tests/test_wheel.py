@@ -190,15 +190,19 @@ def test_the_command_is_installed_and_knows_its_version(
 
 
 @pytest.mark.parametrize(
-    ("tags", "expected"),
+    ("tags", "later", "expected"),
     [
-        ([], r"0\.1\.1\.dev1\+g[0-9a-f]+"),
-        (["v3.4.5"], r"3\.4\.5"),
-        (None, r"0\.1\.0"),
+        ([], 0, r"0\.1\.0\+g[0-9a-f]+"),
+        (["v3.4.5"], 0, r"3\.4\.5"),
+        (["v3.4.5"], 1, r"3\.4\.5\+g[0-9a-f]+"),
+        (None, 0, r"0\.1\.0"),
     ],
-    ids=["a checkout without tags", "a tag", "no git at all"],
+    ids=["a checkout without tags", "a tag", "a commit after it", "no git at all"],
 )
-def test_version_comes_from_git(tags: list[str] | None, expected: str, tmp_path: Path) -> None:
+def test_version_comes_from_git(
+    tags: list[str] | None, later: int, expected: str, tmp_path: Path
+) -> None:
+    """Never one that the changelog does not have: the last release's, with the commit after it."""
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, tmp_path)
     shutil.copytree(ROOT / "src", tmp_path / "src", ignore=shutil.ignore_patterns("__pycache__"))
@@ -206,7 +210,8 @@ def test_version_comes_from_git(tags: list[str] | None, expected: str, tmp_path:
         (tmp_path / ".gitignore").write_text("out/\n__pycache__/\n")
         who = ["-c", "user.name=x", "-c", "user.email=x@example.org", "-c", "commit.gpgsign=false"]
         steps = [["init", "-q"], ["add", "-A"], [*who, "commit", "-qm", "x"]]
-        for step in [*steps, *(["tag", tag] for tag in tags)]:
+        after = [[*who, "commit", "-q", "--allow-empty", "-m", "y"]] * later
+        for step in [*steps, *(["tag", tag] for tag in tags), *after]:
             subprocess.run(["git", *step], cwd=tmp_path, check=True)
     assert re.fullmatch(expected, version_of(build(tmp_path, "wheel", tmp_path / "out")))
 

@@ -101,7 +101,7 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
     if len(numbers) != len(params):  # torch says so
         return nothing, {**loaded, "param_groups": groups}
     own, clock = _unpack(call, shared, optimizer, share)  # dict[str, Any], or None
-    state = dict(loaded["state"])
+    state, cast = dict(loaded["state"]), bool(loaded.get("cast"))
     for number, param in zip(numbers, params, strict=True):
         saved = state.get(number)
         if saved or not isinstance(saved, (Mapping, type(None))):
@@ -109,13 +109,15 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
     steps = number_of_steps(value for value in state.values() if isinstance(value, Mapping))
     stale = own is not None and own["steps"] not in (None, steps)
     if stale and own is not None and clock is not None:
-        further = max(steps - int(own["steps"] or 0), 0)
-        clock = {**clock, "iteration": clock["iteration"] + further}
+        # Torch's distributed checkpoints make a step of a fresh optimizer: of no iteration of ours.
+        counted = int(own["steps"] or 0) if clock["iteration"] else 0
+        clock = {**clock, "iteration": clock["iteration"] + max(steps - counted, 0)}
         warn_user(
             f"{call}: Adam's moments have made {steps} steps, but {own['steps']} when our state "
             "was saved: another optimizer has gone on with them. The clock is moved on to "
             f"iteration {clock['iteration']}, and what the parts had kept per point begins anew"
         )
+    by_name = any(isinstance(number, str) for number in state)  # torch's distributed checkpoints
     rows, orphaned = [], False
     for i, (number, param) in enumerate(zip(numbers, params, strict=True)):
         saved = state.get(number)
@@ -128,9 +130,8 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
             orphaned |= bool(kept) and own is None
             rows.append({})
             continue
-        listed = own["kept"].get(str(i), ())
-        rows.append(_rows(call, optimizer.course, own, param, rest, kept, listed, loaded))
-    by_name = any(isinstance(number, str) for number in state)  # torch's distributed checkpoints
+        needed = () if by_name else own["kept"].get(str(i), ())  # of files, see below
+        rows.append(_rows(call, optimizer.course, own, param, rest, kept, needed, cast=cast))
     if own is None and by_name and steps and optimizer.course.keeps_state:
         warn_user(
             f"{call}: a distributed checkpoint of {steps} steps without our state, as flattened "
@@ -252,10 +253,22 @@ def _rows(
     param: Tensor,
     moments: Mapping[str, Any],
     kept: Mapping[str, Any],
-    listed: Iterable[str],
-    loaded: Mapping[str, Any],
+    needed: Iterable[str],
+    *,
+    cast: bool,
 ) -> dict[str, Tensor]:
-    """What parts keep per row of a parameter, checked; without what is not valid any more."""
+    """What parts keep per row of a parameter, checked; without what is not valid any more.
+
+    Args:
+        call: what messages name.
+        course: whose parts they are.
+        own: the optimizer's own part of the checkpoint.
+        param: the parameter.
+        moments: Adam's, which say how many rows there were.
+        kept: what the checkpoint has, under today's keys.
+        needed: keys that it must have.
+        cast: whether a stock optimizer has loaded it, and cast it to the parameter's dtype.
+    """
     found = {}
     first = moments["exp_avg"]
     rows = first.shape[0] if first.dim() else 1
@@ -263,21 +276,17 @@ def _rows(
         window = part.window(course)
         entries = {key_of(name, e): e for e in course.declared[name].values() if e.per == "row"}
         absent = [key for key in entries if not _is_there(kept.get(key))]
-        missing = [key for key in absent if key in listed]
+        missing = [key for key in absent if key in needed]
         if len(absent) < len(entries):
             missing = absent  # what a part keeps is of use together only
-        by_name = any(isinstance(number, str) for number in loaded["state"])
-        if missing and by_name and len(absent) == len(entries):
-            # torch's distributed files give only what a fresh optimizer had, too.
-            warn_user(f"{call}: {missing} are not in this checkpoint: they begin anew")
-        elif missing:
+        if missing:
             raise ValueError(f"{call}: {missing} are missing, which the checkpoint says are there")
         for key, entry in entries.items():
             value = kept.get(key)
             if not _is_there(value):
                 continue
-            if loaded.get("cast") and isinstance(value, Tensor) and value.is_floating_point():
-                value = value.to(entry.dtype_for(param))  # a stock optimizer has loaded it
+            if cast and isinstance(value, Tensor) and value.is_floating_point():
+                value = value.to(entry.dtype_for(param))
             check_kept(call, key, entry, value, param, rows)
             if own["windows"].get(name) != window or _too_many(key, value, own, window):
                 LOGGER.info("%s: %s is of other iterations: it begins anew", call, key)

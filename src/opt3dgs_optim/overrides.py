@@ -1,6 +1,5 @@
 """What a step puts in place of the trainer's values for torch's Adam, and takes back."""
 
-import cmath
 import functools
 import inspect
 import operator
@@ -13,6 +12,7 @@ from torch import Tensor
 from torch.optim import Adam
 
 from opt3dgs_optim.part import Group
+from opt3dgs_optim.state import is_finite_sum
 
 
 class AdamOptions(TypedDict, total=False):
@@ -139,8 +139,7 @@ def zero_nonfinite(grad: Tensor) -> bool | Tensor:
     Returns whether there were any, 0-d where only the device knows.
     """
     if grad.is_cpu:
-        # The sum is finite unless a summand is not, or it overflows.
-        if cmath.isfinite(grad.sum().item()):
+        if is_finite_sum(grad):
             return False
         found = not bool(grad.isfinite().all())
         grad.nan_to_num_(0.0, 0.0, 0.0)

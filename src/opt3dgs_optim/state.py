@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import weakref
 from collections.abc import Iterable, Iterator, Mapping, MutableMapping
 from typing import Any
@@ -31,6 +32,14 @@ def rows_of(param: Tensor) -> int:
 def broadcast_rows(rows: Tensor, like: Tensor) -> Tensor:
     """[N] as [N, 1, ..] for broadcasting over `like` [N, ..]; 0-d as it is."""
     return rows.reshape(-1, *[1] * (like.dim() - 1)) if rows.dim() else rows
+
+
+def is_finite_sum(tensor: Tensor) -> bool:
+    """Whether a tensor's sum is finite, and so all of it: one pass, no copy. Waits for a device.
+
+    False where a summand is not finite, or where the sum of finite ones overflows.
+    """
+    return cmath.isfinite(tensor.sum().item())
 
 
 class RowOwnership:

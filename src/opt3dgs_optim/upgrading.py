@@ -193,6 +193,6 @@ def say(message: str) -> None:
     """A log line (INFO); on stderr where nobody has set logging up, as in most trainers."""
     if LOGGER.hasHandlers():
         LOGGER.info(message)
-    else:
+    elif LOGGER.level <= logging.INFO and not LOGGER.disabled:  # nobody has asked for silence
         record = LOGGER.makeRecord(LOGGER.name, logging.INFO, __file__, 0, message, (), None)
         logging.StreamHandler(sys.stderr).handle(record)

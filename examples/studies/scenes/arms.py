@@ -83,7 +83,7 @@ def adaptive(name: str, what: str, parts: MakeParts | None = None) -> StudyArm:
 
 
 LIST = (
-    StudyArm(BASELINE, "stock 3DGS-MCMC, torch's Adam"),
+    StudyArm(BASELINE, "3DGS-MCMC as published, torch's Adam"),
     *(
         StudyArm(f"rates-x{k:g}", f"all steps times {k:g}", of(ConstantMultiplier(k)))
         for k in (1.5, 2.0, 3.0)
@@ -102,30 +102,51 @@ LIST = (
     StudyArm("faded", "moments of random points faded", of(FADING)),
     *(
         StudyArm(
-            f"frame-{rate:g}", f"own frame, {rate:g} of a deviation a step", of(OwnFrame(rate))
+            f"frame-{rate:g}",
+            f"own frame, {rate:g} of a deviation a step",
+            of(OwnFrame(rate, min_aspect=0.0)),
         )
         for rate in (0.05, 0.1, 0.2, 0.4)
     ),
     *(
         StudyArm(
             f"frame-{rate:g}+faded",
-            "the same, all but the positions faded, points out of view held",
-            of(OwnFrame(rate), FADING_OTHERS, OutOfView()),
+            "as its control, all but the positions faded, points out of view held",
+            of(OwnFrame(rate, min_aspect=0.0), FADING_OTHERS, OutOfView()),
             control=f"frame-{rate:g}",
         )
         for rate in (0.05, 0.1, 0.2)
     ),
-    adaptive(ADAPTIVE, "stock 3DGS with adaptive density control, torch's Adam"),
+    StudyArm(
+        "frame-0.1-not-thin",
+        "own frame, 0.1, an axis counts as a tenth of the longest at least",
+        of(OwnFrame(0.1, min_aspect=0.1)),
+    ),
+    StudyArm(
+        "frame-0.1-not-thin+faded",
+        "as its control, all but the positions faded, points out of view held",
+        of(OwnFrame(0.1, min_aspect=0.1), FADING_OTHERS, OutOfView()),
+        control="frame-0.1-not-thin",
+    ),
+    adaptive(ADAPTIVE, "3DGS with adaptive density control as published, torch's Adam"),
     adaptive(
         "adc+annealed+faded-but-scales",
         "annealed and faded, the positions not annealed, the scales left alone",
         of(ANNEALING_BUT_SCALES, FADING_BUT_SCALES, OutOfView()),
     ),
-    *(adaptive(f"adc+frame-{rate:g}", "own frame", of(OwnFrame(rate))) for rate in (0.1, 0.2)),
+    *(
+        adaptive(f"adc+frame-{rate:g}", "own frame", of(OwnFrame(rate, min_aspect=0.0)))
+        for rate in (0.1, 0.2)
+    ),
+    adaptive(
+        "adc+frame-0.1-not-thin",
+        "own frame, 0.1, an axis counts as a tenth of the longest at least",
+        of(OwnFrame(0.1, min_aspect=0.1)),
+    ),
     adaptive(
         "adc+frame-0.1+faded",
-        "the same, faded, scales and positions left alone",
-        of(OwnFrame(0.1), replace(FADING, names=BUT_SCALES), OutOfView()),
+        "as `adc+frame-0.1`, faded, scales and positions left alone",
+        of(OwnFrame(0.1, min_aspect=0.0), replace(FADING, names=BUT_SCALES), OutOfView()),
     ),
 )
 ADAPTIVE_DEFAULTS = f"adc+annealed+faded-but-scales{AVERAGED}"  # what `DEFAULTS_ADC` is
@@ -140,7 +161,7 @@ def averaged(arm: StudyArm) -> StudyArm:
     return replace(
         arm,
         name=f"{arm.name}{AVERAGED}",
-        what="the same, and the last 1/30 of the iterates averaged",
+        what="as its control, and the last 1/30 of the iterates averaged",
         parts=lambda iterations, nu: [*made(iterations, nu), *held, Averaging()],
         control=arm.name,
         switch=LAST_THIRTIETH,

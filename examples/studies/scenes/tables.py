@@ -9,19 +9,58 @@ from statistics import fmean
 
 from studies.pages import table
 from studies.scenes.analysis import METRICS, Difference, Study, difference
-from studies.scenes.arms import BASELINE, DEFAULTS, arm_of
+from studies.scenes.arms import ADAPTIVE, ADAPTIVE_DEFAULTS, BASELINE, DEFAULTS, arm_of
 from studies.scenes.decisions import MANY_VIEWS_SCENES, PIECES, decide, settings_of
-from studies.scenes.records import Record, Setting
+from studies.scenes.records import Plain, Record, Setting
 
 SIZES = {"images_4": "quarter", "images_2": "half", "images": "full"}
-PAPER = (  # what the pages say of the paper's parts: what, arm, control
-    ("AW-SGLD as here, less a constant of its mean", "awsgld-stable", "awsgld-stable-constant"),
-    ("AW-SGLD as in the paper, likewise", "paper", "paper-constant"),
-    ("L2 in the last thirtieth", "l2@1/30", BASELINE),
-    ("fresh moments there", "l1+reset@1/30", BASELINE),
-    ("L-BFGS directions with both", "l2+reset+lqn@1/30", "l2+reset@1/30"),
-    ("the whole preset", "paper", BASELINE),
+# How pages that are read without the list of variants name them.
+LABELS = {
+    BASELINE: "3DGS-MCMC",
+    DEFAULTS: "the defaults",
+    "paper": "the paper's preset",
+    "faded": "3DGS-MCMC with `Fading`",
+    "faded+out-of-view+averaged": "the defaults",
+    ADAPTIVE: "gsplat's `DefaultStrategy`",
+    "adc+annealed+faded": "with `Annealing` and `Fading`",
+    ADAPTIVE_DEFAULTS: "with `DEFAULTS_ADC`",
+}
+CONSTANT = "a constant multiplier of equal mean"
+PAPER = (  # what the pages say of the paper's parts: the part, what without it, and their arms
+    ("AW-SGLD, this package's form", CONSTANT, "awsgld-stable", "awsgld-stable-constant"),
+    ("AW-SGLD, the paper's settings", CONSTANT, "paper", "paper-constant"),
+    ("L2 loss in the last thirtieth", "3DGS-MCMC", "l2@1/30", BASELINE),
+    ("fresh moments in the last thirtieth", "3DGS-MCMC", "l1+reset@1/30", BASELINE),
+    (
+        "L-BFGS directions in the last thirtieth",
+        "L2 loss and fresh moments there",
+        "l2+reset+lqn@1/30",
+        "l2+reset@1/30",
+    ),
+    ("all of them, the paper's preset", "3DGS-MCMC", "paper", BASELINE),
 )
+LOOKS = 60  # at the training PSNR, of each record of `falls_table`
+FACTORS = (0.1, 0.3, 1.5, 2.0, 3.0, 10.0)  # on learning rates, of `tuned_table`
+TUNED = {
+    **{f"rates-x{k:g}": f"3DGS-MCMC, all learning rates times {k:g}" for k in FACTORS},
+    **{
+        f"positions-x{k:g}": f"3DGS-MCMC, the positions' learning rate times {k:g}" for k in FACTORS
+    },
+}
+OURS = {  # the last lines of `tuned_table`
+    "**`Fading` alone**, learning rates as published": "faded",
+    "**the defaults**, learning rates as published": DEFAULTS,
+}
+
+
+def label(arm: str) -> str:
+    """What an arm is called beside text that explains it; its own name where it has no other."""
+    return LABELS.get(arm, f"`{arm}`")
+
+
+def counted(count: int, what: str) -> str:
+    """As "1 seed" or "1,000 seeds"."""
+    return f"{count:,} {what}{'s' * (count != 1)}"
 
 
 def machines_line(records: Sequence[Record]) -> str:
@@ -33,8 +72,7 @@ def machines_line(records: Sequence[Record]) -> str:
     for machine, dates in days.items():
         first, last = min(dates), max(dates)
         when = first if first == last else f"{first} to {last}"
-        count = "1 training" if len(dates) == 1 else f"{len(dates):,} trainings"
-        said.append(f"{count}, {when}: {machine}, one thread each.")
+        said.append(f"{counted(len(dates), 'training')}, {when}: {machine}, one thread each.")
     return "\n".join(said)
 
 
@@ -44,7 +82,7 @@ def arms_table(study: Study, settings: Sequence[Setting]) -> str:
     for name in study.arms(settings):
         arm, count = arm_of(name), sum(len(study.runs(setting, name)) for setting in settings)
         rows.append((f"`{name}`", arm.what, f"`{arm.control}`", count))
-    return table(("arm", "what it is", "against", "trainings"), "lllr", rows)
+    return table(("variant", "what it is", "compared with", "trainings"), "lllr", rows)
 
 
 def differences_table(study: Study, settings: Sequence[Setting], arms: Iterable[str]) -> str:
@@ -54,8 +92,9 @@ def differences_table(study: Study, settings: Sequence[Setting], arms: Iterable[
         if found.count and found.arm != found.control:
             names = f"`{found.arm}`", f"`{found.control}`"
             counts = f"{len(found.pairs)}, {found.count}"
-            rows.append((*names, counts, *cells_of(found), f"x{found.cost:.2f}", found.verdict))
-    heads = ("arm", "against", "scenes, trainings", "PSNR", "SSIM", "LPIPS", "cost", "by the rule")
+            rows.append((*names, counts, *cells_of(found), f"{found.cost:.2f}", found.verdict))
+    names, metrics = ("variant", "compared with"), ("PSNR", "SSIM", "LPIPS")
+    heads = (*names, "scenes, trainings", *metrics, "time of an iteration, ratio", "by the rule")
     return table(heads, "lllrrrrl", rows)
 
 
@@ -71,12 +110,14 @@ def metrics_table(
     *,
     head: Callable[[Setting], str] = lambda setting: setting.scene,
     seed: int | None = None,
+    plain: bool = False,
 ) -> str:
     """PSNR / SSIM / LPIPS of every arm in every setting.
 
     Args:
         head: what stands above a setting's column.
         seed: of this one, with the last number of Gaussians, which differs; None: means over all.
+        plain: name the arms by `LABELS`.
     """
     rows = []
     for arm in arms:
@@ -84,30 +125,46 @@ def metrics_table(
         found = [[r for key, r in by_seed.items() if seed in (None, key)] for by_seed in runs]
         if any(found):
             cells = [_cell(records, gaussians=seed is not None) for records in found]
-            rows.append((f"`{arm}`", *cells))
-    return table(["arm", *map(head, settings)], "l", rows)
+            rows.append((label(arm) if plain else f"`{arm}`", *cells))
+    first = "training" if plain else "variant"
+    return table([first, *map(head, settings)], "l", rows)
 
 
 def headline_table(study: Study, long: Sequence[Setting], short: int) -> str:
-    """Stock beside the defaults at both lengths: what a reader sees first.
+    """The baseline beside the defaults at both lengths: what a reader sees first.
 
     Means over the seeds that all of a scene's trainings have, since a seed has held-out views of
-    its own.
+    its own. Where the baseline was trained with other learning rates on all of these, the best of
+    them stands between the two.
     """
     lengths = (long[0].iterations, short) if long else ()
-    whats = {"stock": BASELINE, "**defaults**": DEFAULTS}
-    columns: list[list[str]] = []
+    shared = {}
     for setting in long:
-        of = [
-            study.runs(replace(setting, iterations=count), arm)
-            for count in lengths
-            for arm in whats.values()
-        ]
-        shared = set.intersection(*map(set, of))
-        columns.append([_cell([runs[seed] for seed in shared], seeds=False) for runs in of])
-    heads = [f"{what}, {count:,}" for count in lengths for what in whats]
-    rows = list(zip(heads, *columns, strict=True))
-    return table(["iterations", *(setting.scene for setting in long)], "l", rows)
+        of = [replace(setting, iterations=count) for count in lengths]
+        both = [study.runs(each, arm) for each in of for arm in (BASELINE, DEFAULTS)]
+        shared[setting] = set.intersection(*map(set, both))
+    rows = []
+    for count in lengths:
+        lines = {LABELS[BASELINE]: BASELINE, f"**{LABELS[DEFAULTS]}**": DEFAULTS}
+        found = {
+            arm: [
+                [runs[seed] for seed in seeds if seed in runs]
+                for setting, seeds in shared.items()
+                for runs in [study.runs(replace(setting, iterations=count), arm)]
+            ]
+            for arm in (*lines.values(), *TUNED)
+        }
+        best = max(
+            (arm for arm in TUNED if [*map(len, found[arm])] == [*map(len, shared.values())]),
+            key=lambda arm: fmean(fmean(r.final for r in records) for records in found[arm]),
+            default=None,
+        )
+        if best is not None:
+            lines = {LABELS[BASELINE]: BASELINE, TUNED[best]: best, **lines}
+        for what, arm in lines.items():
+            cells = [_cell(records, seeds=False) for records in found[arm]]
+            rows.append((f"{what}, {count:,}", *cells))
+    return table(["training, iterations", *(s.scene for s in long)], "l", rows)
 
 
 def scenes_gain_table(study: Study, settings: Sequence[Setting], arm: str, control: str) -> str:
@@ -121,12 +178,12 @@ def scenes_gain_table(study: Study, settings: Sequence[Setting], arm: str, contr
         for pairs in found.pairs.values():
             stock, ours = _cell([b for _, b, _ in pairs]), _cell([a for a, _, _ in pairs])
             rows.append((setting.scene, crowd(setting), stock, ours, cells_of(found)[0]))
-    names = f"`{control}`", f"`{arm}`"
-    return table(("scene", "Gaussians, images", *names, "gain, dB"), "llllr", rows)
+    names = label(control), label(arm)
+    return table(("scene", "Gaussians, images", *names, "gain in PSNR, dB"), "llllr", rows)
 
 
 def reach_table(study: Study, long: Sequence[Setting], arm: str, shorter: Sequence[int]) -> str:
-    """When an arm has the PSNR that stock has after its last iteration, as a share of its seconds.
+    """When an arm has the PSNR that the baseline has after its last iteration, in its time.
 
     Args:
         shorter: lengths of trainings that were that long from their start, whose last PSNR stands
@@ -134,7 +191,7 @@ def reach_table(study: Study, long: Sequence[Setting], arm: str, shorter: Sequen
     """
     total, rows = long[0].iterations if long else 0, []
     for setting in long:
-        stock, runs = study.runs(setting, BASELINE), study.runs(setting, arm)
+        base, runs = study.runs(setting, BASELINE), study.runs(setting, arm)
         found = difference(study, [setting], arm, BASELINE)
         for pairs in found.pairs.values():
             # The iterates, of an arm that ends at their mean.
@@ -142,17 +199,110 @@ def reach_table(study: Study, long: Sequence[Setting], arm: str, shorter: Sequen
             known = [iteration for iteration in reached if iteration is not None]
             said, beside = "never", []
             if len(known) == len(reached):
-                said = f"x{fmean(known) * found.cost / total:.2f} of its seconds"
+                said = f"{fmean(known) * found.cost / total:.0%} of the time"
             cost = study.cost(replace(setting, iterations=shorter[0]), arm)
             for count in shorter:
                 quick = study.runs(replace(setting, iterations=count), arm)
-                gains = [quick[s].final - stock[s].final for s in quick.keys() & stock.keys()]
+                gains = [quick[s].final - base[s].final for s in quick.keys() & base.keys()]
                 share = count / total * cost
-                beside.append(f"{fmean(gains):+.2f} dB in x{share:.2f}" if gains else "-")
-            ends = f"{fmean(theirs.final for _, theirs, _ in pairs):.2f} dB ({len(pairs)})"
+                text = f"{fmean(gains):+.2f} dB in {share:.0%} of the time" if gains else "-"
+                beside.append(text)
+            seeds = counted(len(pairs), "seed")
+            ends = f"{fmean(theirs.final for _, theirs, _ in pairs):.2f} dB ({seeds})"
             rows.append((setting.scene, ends, said, *beside))
-    heads = ["scene", f"stock, {total:,} iterations", f"`{arm}` has that PSNR after"]
+    first = f"{LABELS[BASELINE]}, {total:,} iterations"
+    heads = ["scene", first, f"{label(arm)} have that PSNR after"]
     return table([*heads, *(f"trained for {n:,} iterations only" for n in shorter)], "l", rows)
+
+
+def tuned_table(
+    study: Study, columns: Sequence[Sequence[Setting]], own: Setting, *, brief: bool = False
+) -> str:
+    """What 3DGS-MCMC gains in PSNR by a factor on its learning rates, beside this package.
+
+    At equal seconds; other rates are taken to cost the same.
+
+    Args:
+        columns: the settings of a column each, where a factor multiplies the steps; those without
+            such trainings are left out.
+        own: one of which other rates of the trainer itself were tried: the last column.
+        brief: only factors above 1, for the README.
+    """
+    factors = [k for k in FACTORS if k > 1 or not brief]
+    every = {what: arm for arm, what in TUNED.items() if float(arm.partition("-x")[2]) in factors}
+    found, base = [], study.runs(own, BASELINE)
+    for settings in columns:
+        if settings:
+            kind = "scene" if settings[0].rotated else "small scene"
+            tuned = {
+                what: difference(study, settings, arm, BASELINE) for what, arm in every.items()
+            }
+            found.append(_tuned_column(study, settings, kind, tuned))
+    pairs = {}
+    for k, what in zip(factors, every, strict=False):
+        runs = study.runs(replace(own, rates=k), BASELINE)
+        both = [(runs[seed], base[seed], 1.0) for seed in sorted(runs.keys() & base.keys())]
+        pairs[what] = Difference(BASELINE, BASELINE, {own.scene: both} if both else {})
+    found = [column for column in [*found, _tuned_column(study, [own], own.scene, pairs)] if column]
+    rows = [("3DGS-MCMC as published", *["0"] * len(found))]
+    for what in (*every, *OURS):
+        cells = [cells.get(what, "-") for _, cells in found]
+        if set(cells) != {"-"}:
+            rows.append((what, *cells))
+    return table(["training", *(head for head, _ in found)], "l" + "r" * len(found), rows)
+
+
+def _tuned_column(
+    study: Study, settings: Sequence[Setting], kind: str, tuned: dict[str, Difference]
+) -> tuple[str, dict[str, str]] | None:
+    """Head and cells of a column of `tuned_table`; None where nothing was tried.
+
+    Those trainings count whose scene and seed were tried with other rates. A cell that has fewer
+    of them than its column says how many.
+    """
+    every = [found.pairs.items() for found in tuned.values()]
+    tried = {(scene, p[0].seed) for found in every for scene, pairs in found for p in pairs}
+    ours = {what: difference(study, settings, arm, BASELINE) for what, arm in OURS.items()}
+    cells = {}
+    for what, found in (tuned | ours).items():
+        of = {s: [p for p in pairs if (s, p[0].seed) in tried] for s, pairs in found.pairs.items()}
+        kept = replace(found, pairs={scene: pairs for scene, pairs in of.items() if pairs})
+        if kept.count:
+            fewer = f" ({counted(kept.count, 'training')})" * (kept.count < len(tried))
+            cells[what] = cells_of(kept)[0] + fewer
+    scenes = len({scene for scene, _ in tried})
+    what = kind if len(settings) == 1 and kind == settings[0].scene else counted(scenes, kind)
+    head = f"{what}, {settings[0].iterations:,} iterations, {counted(len(tried), 'training')}"
+    return (head, cells) if tried else None
+
+
+def falls_table(records: Sequence[Plain]) -> str:
+    """How far trainings fall with two forms of nu and without: the worst of a scene's seeds.
+
+    Args:
+        records: of docs/results/histogram/collapse.json, whose code is gone.
+    """
+    forms = {
+        "stock": "3DGS-MCMC, no ν",
+        "frozen": "range measured once (until 2026-11-22)",
+        "default": "range follows the energy (today)",
+    }
+    by_scene: dict[str, list[Plain]] = {}
+    for record in sorted(records, key=lambda r: (r["scene"], r["seed"])):
+        by_scene.setdefault(record["scene"], []).append(record)
+    rows = []
+    for scene, every in by_scene.items():
+        cells, ends = [], []
+        for form in forms:
+            of = [record for record in every if record["arm"] == form]
+            fall, looks = (max(r[key] for r in of) for key in ("largest_fall", "looks_below_1_db"))
+            clamped = [r["at_clamp"] for r in of if "at_clamp" in r]
+            share = f", {max(clamped):.1%}" if clamped else ""
+            seeds = f" ({counted(len(of), 'seed')})" * (len(of) > 1)
+            cells.append(f"{fall:.2f} dB, {looks} of {LOOKS}{share}{seeds}")
+            ends.append(f"{of[0]['psnr']:.2f}")
+        rows.append((f"{scene}, {every[0]['iterations']:,}", *cells, " / ".join(ends)))
+    return table(("scene, iterations", *forms.values(), "test PSNR, seed 0"), "l", rows)
 
 
 def decisions_table(study: Study, beside: int) -> str:
@@ -163,7 +313,7 @@ def decisions_table(study: Study, beside: int) -> str:
     """
     rows = []
     for part, decision in decide(study).items():
-        by = f"`{decision.arm}` against `{decision.control}`"
+        by = f"`{decision.arm}` and `{decision.control}`"
         found, shown = decision.found, ["-"] * 5
         if found is not None:
             count = f"{len(found.pairs)}, {found.count}"
@@ -175,7 +325,7 @@ def decisions_table(study: Study, beside: int) -> str:
         rows.append((part, by, *shown, f"{on} ({decision.verdict})", short))
     heads = (
         "part",
-        "decided by",
+        "decided by comparing",
         "iterations",
         "scenes, trainings",
         "PSNR",
@@ -194,15 +344,14 @@ def paper_table(study: Study, settings: Sequence[Setting], *, brief: bool = Fals
         brief: the PSNR alone, for the README.
     """
     rows = []
-    for what, arm, control in PAPER:
+    for part, without, arm, control in PAPER:
         found = difference(study, settings, arm, control)
         if found.count:
             psnr, *others = cells_of(found)
             counts = f"{len(found.pairs)}, {found.count}"
-            rows.append((what, psnr) if brief else (what, counts, psnr, *others))
-    if brief:
-        return table(("part", "PSNR, dB"), "lr", rows)
-    return table(("part", "scenes, trainings", "PSNR, dB", "SSIM", "LPIPS"), "llr", rows)
+            rows.append((part, without, counts, psnr, *([] if brief else others)))
+    heads = ("part", "compared with", "scenes, trainings", "PSNR, dB")
+    return table(heads if brief else (*heads, "SSIM", "LPIPS"), "lllr", rows)
 
 
 def _cell(records: Sequence[Record], *, gaussians: bool = False, seeds: bool = True) -> str:
@@ -226,4 +375,5 @@ def _signed(mean: float, spread: float, digits: int) -> str:
     if math.isnan(mean):
         return "-"
     around = "" if math.isnan(spread) else f" ± {spread:.{digits}f}"
-    return f"{mean:+.{digits}f}{around}"
+    text = f"{mean:+.{digits}f}"
+    return f"{text if float(text) else text[1:]}{around}"  # zero has no sign

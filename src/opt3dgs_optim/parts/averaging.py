@@ -11,7 +11,7 @@ from torch import Tensor
 
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Group, Kept, Part, State, Window
-from opt3dgs_optim.state import broadcast_rows
+from opt3dgs_optim.state import broadcast_rows, is_finite_sum
 
 
 @dataclass(frozen=True, repr=False)
@@ -42,10 +42,10 @@ class Averaging(Part):
     def after(self, group: Group, param: Tensor, state: State, course: Course) -> None:
         """Take the parameter [N, ..] into its mean; in the last steps put that in its place."""
         start, end = self.window(course)
-        count = state["count"].add_(1.0)
-        mean, finite = state["mean"], param.isfinite()
-        iterate = torch.where(finite, param, 0.0).to(mean.dtype)
-        mean.lerp_(iterate, 1.0 / broadcast_rows(count, param))
+        count, mean = state["count"].add_(1.0), state["mean"]
+        whole = param.is_cpu and is_finite_sum(param)  # a GPU would have to be waited for
+        iterate = param if whole else param.nan_to_num(0.0, 0.0, 0.0)
+        mean.lerp_(iterate.to(mean.dtype), 1.0 / broadcast_rows(count, param))
         # Trainers save before the last step, or do not make it.
         if end - course.current <= max(2, (end - start) / 10):
-            param.copy_(torch.where(finite, mean, param))
+            param.copy_(mean if whole else torch.where(param.isfinite(), mean, param))

@@ -14,7 +14,7 @@ from opt3dgs_optim.lbfgs.pairs import columns, put, row_chunks
 from opt3dgs_optim.part import Group, Part, Phase, State
 
 GaussianTensors = Mapping[str, Tensor]
-MAX_SETS = 16  # tensors of positions that are watched
+LEFT_AT = "positions_left_at"  # what it publishes from step to step: where, how often written
 GATE_SHARPNESS = 100.0  # k of eq. 2's gate
 GATE_OPACITY = 0.005  # t of eq. 2's gate: the opacity under which a Gaussian counts as dead
 # Steps in a row with positions changed by somebody else before it is said.
@@ -55,8 +55,6 @@ class PositionNoise(Part):
         self.scale = check_number("PositionNoise", "scale", scale, 0.0)
         self.during = during  # pyright: ignore[reportAttributeAccessIssue]
         self.generator = generator
-        # Where positions lay after their last step -> how often they had been written.
-        self._versions: dict[int, int] = {}
         self._num_changed_by_others = 0
 
     def __repr__(self) -> str:
@@ -68,7 +66,8 @@ class PositionNoise(Part):
     ) -> Tensor:
         """Say once that somebody else moves the positions too, as a trainer's own noise does."""
         # Density control puts another tensor in place; noise writes into this one, every time.
-        written = self._versions.get(param.data_ptr(), param._version) != param._version
+        where, version = course.published(LEFT_AT, param, earlier=True) or (None, 0)
+        written = where == param.data_ptr() and version != param._version
         if self._num_changed_by_others <= MIN_STEPS_CHANGED_BY_OTHERS:
             self._num_changed_by_others = self._num_changed_by_others + 1 if written else 0
             if self._num_changed_by_others > MIN_STEPS_CHANGED_BY_OTHERS:
@@ -84,9 +83,7 @@ class PositionNoise(Part):
         """Add the noise to the positions [N, 3] in place."""
         source = self.gaussians if self.gaussians is not None else course.gaussians_of(param)
         self._add(param, group["lr"], source() if callable(source) else source)
-        if len(self._versions) >= MAX_SETS:  # of tensors that density control replaced
-            self._versions.clear()
-        self._versions[param.data_ptr()] = param._version
+        course.publish(LEFT_AT, param, (param.data_ptr(), param._version))
 
     @torch.no_grad()
     def add_to(self, means: Tensor, lr: float | Tensor) -> None:

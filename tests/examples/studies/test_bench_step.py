@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
-from studies.bench.bench_step import goals_line, main
-from studies.bench.steps import BASELINE, COMPARED
+from studies.bench import bench_step
+from studies.bench.bench_step import CPU, GOALS, MAKES, TOGETHER, goals_line, main, rounds_at
+from studies.bench.steps import BASELINE, COMPARED, measure_all
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 
@@ -35,13 +38,55 @@ def test_what_the_defaults_may_cost_stands_beside_what_they_do() -> None:
     assert goals_line({64: {"defaults": {"per_adam": 9.0}}}) == ""
 
 
-def test_the_committed_figures_have_the_rows_that_the_page_shows() -> None:
+def test_more_points_are_measured_by_twos_in_fewer_rounds() -> None:
+    assert rounds_at(TOGETHER, 50) == 50
+    assert rounds_at(TOGETHER + 1, 50) == 10
+    assert rounds_at(TOGETHER + 1, 6) == MAKES  # each of those that are made anew has one
+    assert rounds_at(TOGETHER + 1, 1) == 1
+
+
+def test_what_was_measured_is_written_before_the_next_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def measured(points: int, *_: Any, **__: Any) -> Any:
+        if points > 64:
+            raise KeyboardInterrupt
+        return measure_all(points, CPU, ["six Adams again"], 1)
+
+    monkeypatch.setattr(bench_step, "measure_all", measured)
+    monkeypatch.setattr(bench_step, "goals_line", lambda _: "")
+    assert main(["--points", "64", "128", "--repeats", "1", "--out", str(tmp_path)]) != 0
+    made = json.loads((tmp_path / "step_cpu.json").read_text(encoding="utf-8"))
+    assert list(made["results"]) == ["64"]
+    assert made["goals"] == {str(points): goal for points, goal in GOALS.items()}
+
+
+@pytest.fixture
+def hooks() -> Any:
     spec = importlib.util.spec_from_file_location("docs_hooks", DOCS / "hooks.py")
     assert spec is not None
     assert spec.loader is not None
     hooks = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = hooks
     spec.loader.exec_module(hooks)
+    return hooks
+
+
+def test_the_committed_figures_have_the_rows_that_the_page_shows(hooks: Any) -> None:
     made = json.loads((DOCS / "benchmarks" / "step_cpu.json").read_text(encoding="utf-8"))
+    page = (DOCS / "performance.md").read_text(encoding="utf-8")
+    prose = re.sub(r"```.*?```|`[^`]*`", "", page, flags=re.S)
+    named = set(re.findall(r'"([^"]+)"', prose))
+    assert "defaults, steps of a tenth" in named
     for rows in made["results"].values():
-        assert set(hooks.STEPS) <= set(rows)
+        assert set(hooks.STEPS) | named <= set(rows)
+
+
+def test_the_page_says_which_goals_are_reached(hooks: Any) -> None:
+    rows = {n: {"defaults": {"per_adam": ratio}} for n, ratio in (("1000", 1.41), ("10000", 1.15))}
+    made = {"goals": {"1000": 1.4, "10000": 1.15}, "results": rows}
+    assert hooks.goal_table(made)[2:5] == [
+        "| goal | 1.40 | 1.15 |",
+        "| measured | 1.41 | 1.15 |",
+        "| | missed | reached |",
+    ]

@@ -42,7 +42,14 @@ from studies.scenes.records import (
     write,
 )
 from studies.scenes.run import main as run_study
-from studies.scenes.tables import headline_table, machines_line, reach_table, scenes_gain_table
+from studies.scenes.tables import (
+    headline_table,
+    machines_line,
+    paper_table,
+    reach_table,
+    scenes_gain_table,
+    tuned_table,
+)
 from studies.scenes.training import Spec, fit_of, machine, train
 
 from opt3dgs_optim import DEFAULTS, DEFAULTS_ADC
@@ -219,6 +226,7 @@ def test_every_scene_and_size_has_its_line() -> None:
     unpaired = rotated_record("annealed", "banana", 1, psnr=30.0)
     study = Study([*quarter, *half, other, unpaired])
     table = scenes_gain_table(study, every_scene(study, 7_500), "annealed", BASELINE)
+    assert table.startswith("| scene | Gaussians, images | 3DGS-MCMC | `annealed` | gain in PSNR")
     ends = "20.00 / 0.700 / 0.200 | 20.50 / 0.700 / 0.200 | +0.50"
     assert table.splitlines()[2:] == [
         f"| banana | 4,000, quarter | {ends} |",
@@ -226,17 +234,17 @@ def test_every_scene_and_size_has_its_line() -> None:
     ]
 
 
-def test_when_stocks_quality_is_reached_over_the_seeds_of_both() -> None:
+def test_when_the_baselines_quality_is_reached_over_the_seeds_of_both() -> None:
     runs = (BASELINE, 0, 20.0), ("annealed", 0, 30.0), (BASELINE, 1, 28.0)
     study = Study([rotated_record(arm, "a", seed, psnr=psnr) for arm, seed, psnr in runs])
     said = reach_table(study, study.settings(), "annealed", [3_000, 5_000])
-    assert "| 20.00 dB (1) | x0.50 of its seconds | - | - |" in said
+    assert "| 20.00 dB (1 seed) | 50% of the time | - | - |" in said
     shorter = rotated_record("annealed", "a", 0, psnr=21.0)
     shorter = replace(shorter, setting=replace(shorter.setting, iterations=5_000))
     costs = {("a", "images_4", 3_000, 0, 0, "annealed"): 1.2}
     both = Study([*study.records(), shorter], costs)
     said = reach_table(both, study.settings(), "annealed", [3_000, 5_000])
-    assert "| x0.50 of its seconds | - | +1.00 dB in x0.80 |" in said
+    assert "| 50% of the time | - | +1.00 dB in 80% of the time |" in said
 
 
 def test_the_headline_is_of_the_seeds_that_every_line_has() -> None:
@@ -246,11 +254,80 @@ def test_the_headline_is_of_the_seeds_that_every_line_has() -> None:
     short = [replace(r, setting=setting) for r in long if (r.arm, r.seed) != (BASELINE, 1)]
     rest = " / 0.700 / 0.200 |"
     assert headline_table(Study([*long, *short]), [long[0].setting], 3_000).splitlines()[2:] == [
-        f"| stock, 7,500 | 20.00{rest}",
-        f"| **defaults**, 7,500 | 30.00{rest}",
-        f"| stock, 3,000 | 20.00{rest}",
-        f"| **defaults**, 3,000 | 30.00{rest}",
+        f"| 3DGS-MCMC, 7,500 | 20.00{rest}",
+        f"| **the defaults**, 7,500 | 30.00{rest}",
+        f"| 3DGS-MCMC, 3,000 | 20.00{rest}",
+        f"| **the defaults**, 3,000 | 30.00{rest}",
     ]
+
+
+def test_tuned_rates_stand_beside_the_defaults_of_the_same_seeds() -> None:
+    """Of the seeds that other rates were trained with: seed 1 has no other."""
+    own = rotated_record(BASELINE, "plush", 0, psnr=20.0)
+    tuned = replace(own, setting=replace(own.setting, rates=3.0))
+    tuned = replace(tuned, curve=tuned.curve | {"psnr": tuned.curve["psnr"] + 0.5})
+    other = rotated_record(BASELINE, "plush", 1, psnr=20.0)
+    ours = [rotated_record(DEFAULT_ARM, "plush", s, psnr=21.0 + s) for s in (0, 1)]
+    small = [record(arm, "a", 0, psnr) for arm, psnr in ((BASELINE, 20.0), ("rates-x3", 20.25))]
+    study = Study([own, tuned, other, *ours, *small])
+    lines = tuned_table(study, [[small[0].setting], []], own.setting).splitlines()
+    columns = "1 small scene, 3,000 iterations, 1 training | plush, 7,500 iterations, 1 training"
+    assert lines[0] == f"| training | {columns} |"
+    assert "| 3DGS-MCMC as published | 0 | 0 |" in lines
+    assert "| 3DGS-MCMC, all learning rates times 3 | +0.25 | +0.50 |" in lines
+    assert not any("times 10" in line for line in lines)  # which nobody has trained
+    assert "| **the defaults**, learning rates as published | - | +1.00 |" in lines
+
+
+def test_a_column_of_tuned_rates_appears_with_its_trainings() -> None:
+    """And counts the defaults only on the scenes and seeds that were tried with other rates."""
+    trained = [(BASELINE, 20.0), ("rates-x2", 20.5), ("positions-x3", 20.2), (DEFAULT_ARM, 21.0)]
+    records = [rotated_record(arm, "a", 0, psnr=psnr) for arm, psnr in trained]
+    records += [rotated_record(arm, "b", 0, psnr=psnr + 1) for arm, psnr in trained[:2]]
+    records += [rotated_record(DEFAULT_ARM, "b", 0, psnr=23.0)]
+    records += [rotated_record(arm, "c", 0, psnr=10.0) for arm in (BASELINE, DEFAULT_ARM)]
+    study = Study(records)
+    nowhere = Setting("plush", 4_000, 7_500, "sfm", rotated=True)
+    lines = tuned_table(study, [study.settings()], nowhere, brief=True).splitlines()
+    assert lines[0] == "| training | 2 scenes, 7,500 iterations, 2 trainings |"
+    assert lines[2:] == [
+        "| 3DGS-MCMC as published | 0 |",
+        "| 3DGS-MCMC, all learning rates times 2 | +0.50 ± 0.00 |",
+        "| 3DGS-MCMC, the positions' learning rate times 3 | +0.20 (1 training) |",
+        "| **the defaults**, learning rates as published | +1.50 ± 0.50 |",
+    ]
+
+
+def test_the_headline_has_the_best_tuned_rates_where_every_training_has_them() -> None:
+    arms = {BASELINE: 20.0, "rates-x2": 20.5, "positions-x3": 20.8, DEFAULT_ARM: 21.0}
+    long = [rotated_record(arm, "a", s, psnr=psnr) for arm, psnr in arms.items() for s in (0, 1)]
+    without = [r for r in long if (r.arm, r.seed) != ("positions-x3", 1)]
+    rest = " / 0.700 / 0.200 |"
+    for records, best in ((long, "positions' learning rate times 3"), (without, "rates times 2")):
+        study = Study(records)
+        lines = headline_table(study, study.settings(), 7_500).splitlines()[2:5]
+        psnr = max(p for arm, p in arms.items() if arm.endswith(best[-1]) and "-x" in arm)
+        assert lines[0] == f"| 3DGS-MCMC, 7,500 | 20.00{rest}"
+        assert lines[1].endswith(f"{best}, 7,500 | {psnr:.2f}{rest}")
+        assert lines[2] == f"| **the defaults**, 7,500 | 21.00{rest}"
+
+
+def test_zero_has_no_sign() -> None:
+    ends = {BASELINE: 20.0, "l2@1/30": 20.0 - 1e-4}
+    study = Study([rotated_record(arm, "a", 0, psnr=psnr) for arm, psnr in ends.items()])
+    (row,) = paper_table(study, study.settings(), brief=True).splitlines()[2:]
+    assert row == "| L2 loss in the last thirtieth | 3DGS-MCMC | 1, 1 | 0.00 |"
+
+
+def test_tables_that_a_reader_meets_first_have_plain_names() -> None:
+    """Those of README and evidence page; the list of variants explains the names of the others."""
+    study = STUDY()
+    rotated = [setting for setting in study.settings() if setting.rotated]
+    for name, text in report.conclusions(study, rotated).items():
+        assert not re.search(r"\bstock\b|\barms?\b|less |likewise|\bx\d\.", text), name
+        if name != "decisions":  # whose second column names the variants that were compared
+            names = set(re.findall(r"`([^`]+)`", text))
+            assert names <= {"Fading", "Annealing", "DefaultStrategy", "DEFAULTS_ADC"}, name
 
 
 def test_dots_are_the_ends_of_shorter_trainings_of_every_seed(
@@ -473,3 +550,23 @@ def test_the_readmes_arm_is_all_that_a_new_one_takes(
     assert [type(part).__name__ for part in fit.phases.parts][:2] == ["Fading", "Averaging"]
     with pytest.raises(ValueError, match="'nonsense' is unknown"):
         plan(tmp_path, tmp_path, ["embedded"], arms=["nonsense"])
+
+
+def test_the_readmes_curve_is_of_the_seeds_that_both_have(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    ends = (BASELINE, 0, 20.0), (BASELINE, 1, 22.0), (BASELINE, 2, 90.0)
+    ends = *ends, (DEFAULT_ARM, 0, 23.0), (DEFAULT_ARM, 1, 25.0)
+    study = Study([rotated_record(arm, "a", seed, psnr=psnr) for arm, seed, psnr in ends])
+    kept: list[Any] = []
+    monkeypatch.setattr(plots.plt, "close", kept.append)
+    (setting,) = study.settings()
+    plots.plot_one(study, setting, tmp_path / "one.png")
+    (figure,) = kept
+    (axis,) = figure.axes
+    assert [float(line.get_ydata()[-1]) for line in axis.lines] == [21.0, 24.0]
+    assert [text.get_text() for text in axis.texts] == [
+        "3DGS-MCMC\n21.0 dB",
+        "the defaults\n24.0 dB",
+    ]
+    assert (tmp_path / "one.png").stat().st_size > 1000
