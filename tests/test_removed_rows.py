@@ -44,6 +44,7 @@ REMOVING: dict[str, Callable[[Tensor], Tensor]] = {
     "split three": lambda v: torch.cat([v[3:], v[:3] + 0.5, v[:3] + 0.5]),
     "split most": lambda v: torch.cat([v[::5], *2 * [v[torch.arange(100) % 5 > 0]]]),
     "clone forty, split one": lambda v: torch.cat([v[1:], v[1:41], v[:1] + 0.5, v[:1] + 0.5]),
+    "clone ten, split one, sort": lambda v: torch.cat([v[1:], v[1:11], v[:1], v[:1]]).flip(0),
     "prune one, clone two": lambda v: torch.cat([v[:30], v[31:], v[50:52]]),
 }
 KEEPING: dict[str, Callable[[Tensor], Tensor]] = {
@@ -55,8 +56,11 @@ KEEPING: dict[str, Callable[[Tensor], Tensor]] = {
     # Forks of 3dgs-mcmc leave the opacity as it is.
     "relocate with the same opacity": lambda v: overwritten(v, slice(0, 40), v[40:80]),
     "relocate and grow": lambda v: torch.cat([overwritten(v, slice(0, 30), v[30:60] - 0.3), v[:5]]),
+    "all changed, but two": lambda v: torch.cat([v[50:52], v[2:] - 0.3]),
     "permute": lambda v: v.flip(0),
-    "permute and clone": lambda v: torch.cat([v.flip(0), v[:5]]),
+    "relocate, grow and permute": lambda v: torch.cat(
+        [overwritten(v, slice(0, 30), v[30:60] - 0.3).flip(0), v[:5] - 0.3]
+    ),
 }
 
 

@@ -15,6 +15,7 @@ import argparse
 import datetime
 import json
 import platform
+import re
 import shutil
 import sys
 import tempfile
@@ -82,18 +83,36 @@ def train(
     work = Path(tempfile.mkdtemp(prefix="long_run_"))
     try:
         done = run.start(trainers, scene, work, "out", ours=ours, iterations=iterations)
+        gaussians = number_of_gaussians(done.output, work / "out")
     finally:
         shutil.rmtree(work)
     if done.code != 0 or done.psnr is None:
         raise RuntimeError(f"{run.name} stopped with {done.code}: {done.output[-3000:]}")
     return {
-        "psnr": done.psnr,
+        "psnr": round(done.psnr, 3),
+        "gaussians": gaussians,
         "parts": parts_of(done.output),
         "version": __version__,
         "date": datetime.date.today().isoformat(),
         "torch": torch.__version__,
         "machine": f"{platform.machine()}, Python {platform.python_version()}",
     }
+
+
+def number_of_gaussians(output: str, folder: Path) -> int:
+    """How many there are at the end: gsplat prints it, INRIA's trainer saves them.
+
+    Raises:
+        RuntimeError: the training has done neither.
+    """
+    said = re.findall(r"Number of GS: (\d+)", output)
+    if said:
+        return int(said[-1])
+    for path in sorted(folder.glob("point_cloud/iteration_*/point_cloud.ply")):
+        said = re.findall(rb"element vertex (\d+)", path.read_bytes()[:4096])
+    if not said:
+        raise RuntimeError(f"nothing says how many Gaussians there are: {output[-3000:]}")
+    return int(said[-1])
 
 
 def read_rows(path: Path) -> dict[str, dict[str, Any]]:
@@ -129,8 +148,8 @@ def main() -> None:
             if options.again or any(row.get(key) != value for key, value in about.items()):
                 row = about
             rows[run.name] = row
-            for half, ours in (("stock", False), ("edited", True)):
-                if half not in row:
+            for half, ours in (("edited", True), ("stock", False)):
+                if "gaussians" not in row.get(half, {}):
                     row[half] = train(run, options.trainers, scene, options.iterations, ours=ours)
                     print(f"{run.name}, {half}: {row[half]['psnr']} dB", flush=True)
                 kept = [rows[each.name] for each in LONG_RUNS if each.name in rows]

@@ -24,6 +24,7 @@ EVERY_POINT = 5  # of the scene's sparse points, every fifth: seconds instead of
 LIMIT = 7200  # seconds a training
 SAYS_PARTS = re.compile(r"opt3dgs_optim .*, parts (.*), in the steps of ")
 PART = re.compile(r"(\w+)\(")
+SAYS_OFF = re.compile(r"opt3dgs_optim: iteration \d+: (\S+) is switched off")
 
 INRIA_OPTIONS = (
     *("--images", "images_jpg", "--eval", "--densify_from_iter", "10"),
@@ -329,9 +330,9 @@ def commit_of(folder: Path) -> str:
 
 
 def parts_of(output: str) -> str:
-    """The parts that an edited run says it has, or "-"."""
-    said = SAYS_PARTS.search(output)
-    return ", ".join(PART.findall(said[1])) if said else "-"
+    """The parts that an edited run says it has, without those it switched off; or "-"."""
+    said, off = SAYS_PARTS.search(output), SAYS_OFF.findall(output)
+    return ", ".join(name for name in PART.findall(said[1]) if name not in off) if said else "-"
 
 
 def copy_scene(source: Path, target: Path) -> Path:

@@ -20,8 +20,8 @@ class RemovedRows:
     the smallest, and noise does not move them.
 
     The opacities that density control has replaced are held until the next look. A look costs
-    nothing where they are the same tensor, and two sorts of them where they are not, with one
-    synchronisation with the GPU. A copy, or what comes out of a pickle, has seen nothing yet.
+    nothing where they are the same tensor, and a sort of them where they are not, for which it
+    waits for the GPU. A copy, or what comes out of a pickle, has seen nothing yet.
     """
 
     def __init__(self) -> None:
@@ -50,11 +50,12 @@ class RemovedRows:
 def were_removed(before: Tensor, after: Tensor) -> bool:
     """Whether rows of `before` [N, ..] are missing in `after` [M, ..], so that others moved.
 
-    Half or more of the rows that are known by their value must stand at another place than before,
-    but in their old order, as what is left and then the children of what was split. Relocation
-    moves no row that it keeps, and permutation keeps no order.
+    Half or more of the rows that are known by their value, a tenth of all at least, must stand at
+    another place than before. Either they are in their old order: what is left, then the children
+    of what was split. Or they are sorted anew, as fVDB's are, and more than one in a hundred has a
+    copy. Relocation moves no row that it keeps, and changes the opacity of what it copies.
     """
-    before, after = before.flatten(), after.flatten().to(before.device)
+    before, after = before.flatten(), after.flatten().to(before)
     count = len(before)
     if len(after) < count:
         return True
@@ -66,4 +67,11 @@ def were_removed(before: Tensor, after: Tensor) -> bool:
     known = (values[place] == after[:count]) & ~twice[place]
     was, now = rows[place][known], known.nonzero()[:, 0]
     moved, in_order = (was != now).sum(), (was.diff() > 0).sum()
-    return bool((moved > 0) & (2 * moved >= len(was)) & (10 * in_order >= 9 * (len(was) - 1)))
+    if 10 * len(was) < count or not bool((moved > 0) & (2 * moved >= len(was))):
+        return False
+    if 10 * in_order >= 9 * (len(was) - 1):
+        return True
+    now_sorted = after.sort().values
+    last = torch.searchsorted(now_sorted, values, right=True)
+    copied = (last - torch.searchsorted(now_sorted, values) > 1) & ~twice
+    return bool(100 * copied.sum() > count)
