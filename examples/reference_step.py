@@ -87,7 +87,8 @@ def default_step(
             own["exp_avg_sq"][~in_view] = larger[~in_view]
 
         # OwnFrame: a position is stepped by B z, with Adam's step z in the Gaussian's own frame, in
-        # standard deviations. A full step has 0.1 of them at the start and 0.001 at the end.
+        # standard deviations. A full step has 0.1 of them at the start and 0.001 at the end. An
+        # axis counts as no thinner than a tenth of the longest.
         if own_frame and name == "means":
             axes, z = own_axes(params["quats"], params["scales"]), torch.zeros_like(param)
             rate = rates[name] * (0.1 * 0.01 ** (iteration / total) / rates[name])
@@ -124,7 +125,9 @@ def own_axes(quats: Tensor, scales: Tensor) -> Tensor:
         [x * y + w * z, 1 - (x * x + z * z), y * z - w * x],
         [x * z - w * y, y * z + w * x, 1 - (x * x + y * y)],
     ]
-    return torch.stack([torch.stack(row) for row in rotation]) * scales.T.exp()
+    deviations = scales.T.exp()
+    deviations = torch.maximum(deviations, deviations.amax(0) * 0.1)
+    return torch.stack([torch.stack(row) for row in rotation]) * deviations
 
 
 def products(matrices: Tensor, vectors: Tensor) -> Tensor:

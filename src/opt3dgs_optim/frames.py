@@ -2,7 +2,8 @@
 
 A Gaussian's covariance is Sigma = B B^T with B = R diag(s), R the rotation of its quaternion and s
 its standard deviations. B takes a vector of the own frame into the world, B^T a gradient of the
-world into the own frame. Coordinates are handled as columns [N], which is what a CPU is fast at.
+world into the own frame. An axis may count as no thinner than a share of the longest one.
+Coordinates are handled as columns [N], which is what a CPU is fast at.
 """
 
 from __future__ import annotations
@@ -37,26 +38,29 @@ class Frames:
         scales: [N, 3] log of the standard deviations, world units.
         dtype: of the positions; frames of half precision are float32, where a standard deviation
             of 1e-8 is not zero.
+        min_aspect: share of the longest deviation that a shorter one counts as, at least; 0: none.
     """
 
-    def __init__(self, quats: Tensor, scales: Tensor, dtype: torch.dtype) -> None:
+    def __init__(
+        self, quats: Tensor, scales: Tensor, dtype: torch.dtype, min_aspect: float = 0.0
+    ) -> None:
         self._wide = torch.float64 if dtype == torch.float64 else torch.float32
         self._axes: Tensor | None = None  # B as columns, [3, 3, N]; None: a kernel makes it
         if not cuda.has_own_frames(quats):
-            self._axes = axes_of(quats, scales, self._wide)
+            self._axes = axes_of(quats, scales, self._wide, min_aspect)
         else:
-            self._quats, self._scales = quats.clone(), scales.clone()
+            self._given = quats.clone(), scales.clone(), min_aspect
 
     def gradient(self, grad: Tensor) -> Tensor:
         """B^T g [N, 3]: of gradients per world unit [N, 3], those per standard deviation."""
         if self._axes is None:
-            return cuda.own_frame_gradient(grad, self._quats, self._scales)
+            return cuda.own_frame_gradient(grad, *self._given)
         return self._product(grad, self._axes)
 
     def displacement(self, step: Tensor) -> Tensor:
         """B z [N, 3]: of steps z [N, 3] in standard deviations, those in world units."""
         if self._axes is None:
-            return cuda.own_frame_displacement(step, self._quats, self._scales)
+            return cuda.own_frame_displacement(step, *self._given)
         return self._product(step, self._axes.transpose(0, 1))
 
     def _product(self, vectors: Tensor, matrix: Tensor) -> Tensor:
@@ -70,7 +74,7 @@ class Frames:
         return result
 
 
-def axes_of(quats: Tensor, scales: Tensor, dtype: torch.dtype) -> Tensor:
+def axes_of(quats: Tensor, scales: Tensor, dtype: torch.dtype, min_aspect: float = 0.0) -> Tensor:
     """B = R diag(s) as columns, [3, 3, N]; arguments as in `Frames`."""
     result = torch.empty(3, 3, len(quats), dtype=dtype, device=quats.device)
     for rows in row_chunks(quats):
@@ -85,11 +89,13 @@ def axes_of(quats: Tensor, scales: Tensor, dtype: torch.dtype) -> Tensor:
             *(xz - wy, yz + wx, (xx + yy).neg_().add_(1.0)),
         ]
         b = result[:, :, rows]
-        deviations = columns(scales[rows], dtype).exp_().unbind()
+        deviations = columns(scales[rows], dtype).exp_()
+        if min_aspect:
+            deviations = torch.maximum(deviations, deviations.amax(0) * min_aspect)
         for place, entry, deviation in zip(
             [place for row in b.unbind() for place in row.unbind()],
             rotation,
-            deviations * 3,
+            deviations.unbind() * 3,
             strict=True,
         ):
             torch.mul(entry, deviation, out=place)

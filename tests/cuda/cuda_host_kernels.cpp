@@ -29,11 +29,11 @@ extern "C" void run_take_energy(unsigned block, const Real* energy, const unsign
 }
 
 extern "C" void run_own_frame_gradient(unsigned block, const Real* grads, const Real* quats, const Real* scales,
-                                       Real* results, long long rows) {
-  launch_on_host(block, rows, own_frame_gradient, grads, quats, scales, results, rows);
+                                       Real* results, long long rows, Real min_aspect) {
+  launch_on_host(block, rows, own_frame_gradient, grads, quats, scales, results, rows, min_aspect);
 }
 
 extern "C" void run_own_frame_displacement(unsigned block, const Real* steps, const Real* quats, const Real* scales,
-                                           Real* results, long long rows) {
-  launch_on_host(block, rows, own_frame_displacement, steps, quats, scales, results, rows);
+                                           Real* results, long long rows, Real min_aspect) {
+  launch_on_host(block, rows, own_frame_displacement, steps, quats, scales, results, rows, min_aspect);
 }

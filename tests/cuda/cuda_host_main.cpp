@@ -40,9 +40,9 @@ int main(int, char** arguments) {
   const Buffer quats = take(in, 4 * rows), scales = take(in, 3 * rows), grads = take(in, 3 * rows);
   Buffer turned(3 * rows), moved(3 * rows);
   const long long gaussians = static_cast<long long>(rows);
-  run_own_frame_gradient(128, grads.data(), quats.data(), scales.data(), turned.data(), gaussians);
+  run_own_frame_gradient(128, grads.data(), quats.data(), scales.data(), turned.data(), gaussians, Real(0.1));
   give(out, turned);
-  run_own_frame_displacement(128, turned.data(), quats.data(), scales.data(), moved.data(), gaussians);
+  run_own_frame_displacement(128, turned.data(), quats.data(), scales.data(), moved.data(), gaussians, Real(0.1));
   give(out, moved);
   const Buffer lengths = take(in, 2), sizes = take(in, 3), n = take(in, 9);
   Buffer state = take(in, static_cast<size_t>(lengths[1]) + 3), nu(1), sums(3);

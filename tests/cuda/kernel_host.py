@@ -254,8 +254,11 @@ def frame_case(rows: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, .
     return tuple(each.to(dtype).contiguous() for each in (vectors, quats, 2 * scales - 3))
 
 
-def frames(quats: Tensor, scales: Tensor) -> Tensor:
-    """B = R diag(exp(scales)) as matrices [N, 3, 3], in float64: slow and obvious."""
+def frames(quats: Tensor, scales: Tensor, min_aspect: float = 0.0) -> Tensor:
+    """B = R diag(exp(scales)) as matrices [N, 3, 3], in float64: slow and obvious.
+
+    No deviation counts as less than `min_aspect` of the longest.
+    """
     w, x, y, z = torch.nn.functional.normalize(quats.double(), dim=1).unbind(1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -263,7 +266,9 @@ def frames(quats: Tensor, scales: Tensor) -> Tensor:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     rotation = torch.stack([torch.stack(row, 1) for row in rows], 1)
-    return rotation * scales.double().exp()[:, None, :]
+    deviations = scales.double().exp()
+    least = min_aspect * deviations.max(1, keepdim=True).values
+    return rotation * torch.where(deviations < least, least, deviations)[:, None, :]
 
 
 class There(Tensor):
@@ -272,17 +277,20 @@ class There(Tensor):
     is_cuda = True  # pyright: ignore[reportAssignmentType]
 
 
-def compare_frames(kernels: HostKernels, rows: int) -> float:
+def compare_frames(kernels: HostKernels, rows: int, min_aspect: float) -> float:
     """The largest difference of the own frame's two kernels from matrices of float64.
 
     Relative to the vector times the largest deviation: in a component they may cancel.
     """
     case = frame_case(rows, kernels.dtype)
     with kernels.launched():
-        found = cuda.own_frame_gradient(*case), cuda.own_frame_displacement(*case)
+        found = [
+            function(*case, min_aspect)
+            for function in (cuda.own_frame_gradient, cuda.own_frame_displacement)
+        ]
     vectors, quats, scales = (each.double() for each in case)
     sums = ("nij,ni->nj", "nij,nj->ni")
-    expected = [torch.einsum(each, frames(quats, scales), vectors) for each in sums]
+    expected = [torch.einsum(each, frames(quats, scales, min_aspect), vectors) for each in sums]
     size = vectors.norm(dim=1, keepdim=True) * scales.exp().amax(1, keepdim=True)
     gaps = torch.cat([(a.double() - b) / size for a, b in zip(found, expected, strict=True)])
     return float(gaps.abs().nan_to_num(nan=torch.inf).max()) if rows else 0.0

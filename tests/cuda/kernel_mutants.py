@@ -63,6 +63,8 @@ MUTANTS = (
     Mutant("a gradient of zero", "two_loop.cuh", "size == T(0) ? T(1) : size", "size"),
     Mutant("the frame's quaternion", "own_frame.cu", "{q.v.y, q.v.z, q.spare}", "q.v"),
     Mutant("the inverse rotation", "own_frame.cu", "rotated(v, -w)", "rotated(v, w)"),
+    Mutant("a thin axis", "own_frame.cu", "{larger(s.x, least)", "{s.x"),
+    Mutant("the longest axis", "own_frame.cu", "larger(larger(s.x, s.y), s.z)", "larger(s.x, s.y)"),
     Mutant("a quaternion of zero", "own_frame.cu", "norm > T(1e-12) ? norm : T(1e-12)", "norm"),
     Mutant("one thread", "histogram.cu", "if (blockIdx.x > 0 || threadIdx.x > 0) return;", ""),
     Mutant("mean of the slope", "histogram.cu", "slope - state[2]", "slope"),
@@ -86,7 +88,7 @@ def complaint(kernels: HostKernels) -> str | None:
         recursion = relative_difference(
             kernels.two_loop(grad, history), two_loop(grad, history, SIZE)
         )
-        turned = compare_frames(kernels, ROWS)
+        turned = max(compare_frames(kernels, ROWS, aspect) for aspect in (0.0, 0.1))
         gap = max(compare_energies(kernels, energies(name, 500)) for name in ("spike", "broken"))
     except AssertionError as error:
         return str(error)

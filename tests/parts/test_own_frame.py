@@ -41,28 +41,51 @@ def rotation(quats: Tensor) -> Tensor:
     return torch.stack(rows, 1).reshape(-1, 3, 3)
 
 
-def frame(quats: Tensor, scales: Tensor) -> Tensor:
+def deviations(scales: Tensor, min_aspect: float = 0.0) -> Tensor:
+    """Standard deviations [N, 3], none less than `min_aspect` of the longest, in float64."""
+    found = scales.double().exp()
+    least = min_aspect * found.amax(1, keepdim=True)
+    return torch.where(found < least, least, found)
+
+
+def frame(quats: Tensor, scales: Tensor, min_aspect: float = 0.0) -> Tensor:
     """B [N, 3, 3]."""
-    return rotation(quats) * scales.double().exp()[:, None, :]
+    return rotation(quats) * deviations(scales, min_aspect)[:, None, :]
 
 
 @pytest.mark.parametrize("rows", [0, 1, 7, 255, 4097])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_frame_is_that_of_the_covariance(rows: int, dtype: torch.dtype) -> None:
+@pytest.mark.parametrize("min_aspect", [0.0, 0.1, 1.0])
+def test_the_frame_is_that_of_the_covariance(
+    rows: int, dtype: torch.dtype, min_aspect: float
+) -> None:
     draw = torch.Generator().manual_seed(rows)
     v, quats = (torch.randn(rows, n, generator=draw, dtype=dtype) for n in (3, 4))
     scales = 3 * torch.randn(rows, 3, generator=draw, dtype=dtype)
-    b, frames = frame(quats, scales), Frames(quats, scales, dtype)
+    axes = deviations(scales, min_aspect).to(dtype)
+    b, frames = frame(quats, scales, min_aspect), Frames(quats, scales, dtype, min_aspect)
     tight: dict[str, Any] = (
         {"rtol": 2e-5, "atol": 1e-5} if dtype == torch.float32 else {"rtol": 1e-12, "atol": 1e-12}
     )
     # Rounding is relative to the axis, and in the world to the longest of them.
     for found, expected, size in (
-        (frames.gradient(v), torch.einsum("nij,ni->nj", b, v.double()), scales.exp()),
+        (frames.gradient(v), torch.einsum("nij,ni->nj", b, v.double()), axes),
         (frames.displacement(v), torch.einsum("nij,nj->ni", b, v.double()), None),
     ):
         unit = scales.exp().amax(1, keepdim=True) if size is None else size
         torch.testing.assert_close(found / unit, expected.to(dtype) / unit, **tight)
+
+
+def test_a_thin_axis_counts_as_a_share_of_the_longest() -> None:
+    """A disc, a needle and a ball, each pulled along all of its axes: one full step."""
+    sizes = torch.tensor([[1.0, 1.0, 1e-6], [1.0, 1e-6, 1e-6], [1e-3, 1e-3, 1e-3]])
+    quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(3, 1)
+    for min_aspect, thin in ((0.0, 1e-6), (0.1, 0.1), (1.0, 1.0)):
+        values = {"means": torch.zeros(3, 3), "scales": sizes.log(), "quats": quats.clone()}
+        splats = {name: Parameter(value.double()) for name, value in values.items()}
+        run(splats, pull(torch.full((3, 3), -1.0)), 1, rate=0.1, min_aspect=min_aspect)
+        expected = torch.tensor([[1.0, 1.0, thin], [1.0, thin, thin], [1e-3] * 3]).double()
+        torch.testing.assert_close(splats["means"].data, -0.1 * expected, rtol=1e-5, atol=0.0)
 
 
 def scene(rows: int, seed: int, size: float = 1.0) -> dict[str, Parameter]:

@@ -102,7 +102,9 @@ LIST = (
     StudyArm("faded", "moments of random points faded", of(FADING)),
     *(
         StudyArm(
-            f"frame-{rate:g}", f"own frame, {rate:g} of a deviation a step", of(OwnFrame(rate))
+            f"frame-{rate:g}",
+            f"own frame, {rate:g} of a deviation a step",
+            of(OwnFrame(rate, min_aspect=0.0)),
         )
         for rate in (0.05, 0.1, 0.2, 0.4)
     ),
@@ -110,10 +112,21 @@ LIST = (
         StudyArm(
             f"frame-{rate:g}+faded",
             "as its control, all but the positions faded, points out of view held",
-            of(OwnFrame(rate), FADING_OTHERS, OutOfView()),
+            of(OwnFrame(rate, min_aspect=0.0), FADING_OTHERS, OutOfView()),
             control=f"frame-{rate:g}",
         )
         for rate in (0.05, 0.1, 0.2)
+    ),
+    StudyArm(
+        "frame-0.1-not-thin",
+        "own frame, 0.1, an axis counts as a tenth of the longest at least",
+        of(OwnFrame(0.1, min_aspect=0.1)),
+    ),
+    StudyArm(
+        "frame-0.1-not-thin+faded",
+        "as its control, all but the positions faded, points out of view held",
+        of(OwnFrame(0.1, min_aspect=0.1), FADING_OTHERS, OutOfView()),
+        control="frame-0.1-not-thin",
     ),
     adaptive(ADAPTIVE, "3DGS with adaptive density control as published, torch's Adam"),
     adaptive(
@@ -121,11 +134,19 @@ LIST = (
         "annealed and faded, the positions not annealed, the scales left alone",
         of(ANNEALING_BUT_SCALES, FADING_BUT_SCALES, OutOfView()),
     ),
-    *(adaptive(f"adc+frame-{rate:g}", "own frame", of(OwnFrame(rate))) for rate in (0.1, 0.2)),
+    *(
+        adaptive(f"adc+frame-{rate:g}", "own frame", of(OwnFrame(rate, min_aspect=0.0)))
+        for rate in (0.1, 0.2)
+    ),
+    adaptive(
+        "adc+frame-0.1-not-thin",
+        "own frame, 0.1, an axis counts as a tenth of the longest at least",
+        of(OwnFrame(0.1, min_aspect=0.1)),
+    ),
     adaptive(
         "adc+frame-0.1+faded",
         "as `adc+frame-0.1`, faded, scales and positions left alone",
-        of(OwnFrame(0.1), replace(FADING, names=BUT_SCALES), OutOfView()),
+        of(OwnFrame(0.1, min_aspect=0.0), replace(FADING, names=BUT_SCALES), OutOfView()),
     ),
 )
 ADAPTIVE_DEFAULTS = f"adc+annealed+faded-but-scales{AVERAGED}"  # what `DEFAULTS_ADC` is

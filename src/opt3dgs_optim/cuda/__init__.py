@@ -156,7 +156,9 @@ def has_own_frames(quats: Tensor) -> bool:
     return quats.is_cuda and quats.is_floating_point() and missing() is None
 
 
-def own_frame_gradient(grad: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
+def own_frame_gradient(
+    grad: Tensor, quats: Tensor, scales: Tensor, min_aspect: float = 0.0
+) -> Tensor:
     """Gradients in each Gaussian's own frame, B^T g with B = R diag(exp(scales)).
 
     One launch where all are float32 or all float64. Half precision is cast to float32, and float32
@@ -166,6 +168,7 @@ def own_frame_gradient(grad: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
         grad: [N, 3] of the positions, in units of the loss per world unit.
         quats: [N, 4] rotations, wxyz, need not be normalised, where `has_own_frames` says so.
         scales: [N, 3] log of the standard deviations, world units.
+        min_aspect: share of the longest deviation that a shorter one counts as, at least; 0: none.
 
     Returns:
         [N, 3] of the gradient's dtype, in units of the loss per standard deviation. It has no
@@ -174,20 +177,24 @@ def own_frame_gradient(grad: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
     Raises:
         ValueError: shapes or devices do not fit.
     """
-    return _in_frames("own_frame_gradient", grad, quats, scales)
+    return _in_frames("own_frame_gradient", grad, quats, scales, min_aspect)
 
 
-def own_frame_displacement(step: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
+def own_frame_displacement(
+    step: Tensor, quats: Tensor, scales: Tensor, min_aspect: float = 0.0
+) -> Tensor:
     """Steps that were taken in each Gaussian's own frame, in world units: B z.
 
     Args:
         step: [N, 3] in standard deviations along the Gaussians' own axes.
-        quats, scales: [N, 4] and [N, 3], as in `own_frame_gradient`; so are dtypes and errors.
+        quats, scales, min_aspect: as in `own_frame_gradient`; so are dtypes and errors.
     """
-    return _in_frames("own_frame_displacement", step, quats, scales)
+    return _in_frames("own_frame_displacement", step, quats, scales, min_aspect)
 
 
-def _in_frames(kernel: str, vectors: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
+def _in_frames(
+    kernel: str, vectors: Tensor, quats: Tensor, scales: Tensor, min_aspect: float
+) -> Tensor:
     rows = vectors.shape[0] if vectors.dim() else 0
     given = {"vectors": (vectors, 3), "quats": (quats, 4), "scales": (scales, 3)}
     for name, (tensor, width) in given.items():
@@ -201,7 +208,8 @@ def _in_frames(kernel: str, vectors: Tensor, quats: Tensor, scales: Tensor) -> T
     dtype = torch.float64 if wide else torch.float32
     v, q, s = (each.detach().to(dtype).contiguous() for each in (vectors, quats, scales))
     result = torch.empty_like(v)
-    launch(kernel, v, rows, v, _aligned(q), s, result, np.int64(rows))
+    numbers = (np.int64(rows), real(dtype)(min_aspect))
+    launch(kernel, v, rows, v, _aligned(q), s, result, *numbers)
     return result.to(vectors.dtype)
 
 

@@ -1,5 +1,6 @@
 // Vectors into and out of each Gaussian's own frame B = R diag(s), one thread per Gaussian: R is the rotation of
 // its quaternion, and s are its standard deviations. `two_loop.cuh` goes in front, for Real and its vectors.
+// A deviation counts as no less than min_aspect of the Gaussian's longest.
 // quats: [rows, 4], wxyz, of any length, beginning at a multiple of 16 bytes; scales: [rows, 3], logarithms.
 
 template <typename T> POINT Vec3<T> cross(Vec3<T> a, Vec3<T> b) {
@@ -8,12 +9,14 @@ template <typename T> POINT Vec3<T> cross(Vec3<T> a, Vec3<T> b) {
 
 template <typename T> POINT Vec3<T> product(Vec3<T> a, Vec3<T> b) { return {a.x * b.x, a.y * b.y, a.z * b.z}; }
 
+template <typename T> POINT T larger(T a, T b) { return b > a ? b : a; }
+
 template <typename T> struct Frame {
   T w;
   Vec3<T> axis;  // w and axis: the quaternion, of length 1
   Vec3<T> deviations;
 
-  POINT Frame(const T* quats, const T* scales, long long row) {
+  POINT Frame(const T* quats, const T* scales, long long row, T min_aspect) {
     const Lanes<T> q = load(quats + 4 * row);  // wxy, and z
     const Vec3<T> xyz = {q.v.y, q.v.z, q.spare};
     const T norm = sqrt(q.v.x * q.v.x + dot(xyz, xyz));
@@ -21,7 +24,9 @@ template <typename T> struct Frame {
     w = q.v.x / size;
     axis = over(xyz, size);
     const Vec3<T> log_scale = read_row(scales, row);
-    deviations = {exp(log_scale.x), exp(log_scale.y), exp(log_scale.z)};
+    const Vec3<T> s = {exp(log_scale.x), exp(log_scale.y), exp(log_scale.z)};
+    const T least = min_aspect * larger(larger(s.x, s.y), s.z);
+    deviations = {larger(s.x, least), larger(s.y, least), larger(s.z, least)};
   }
 
   // v + w t + axis x t with t = 2 axis x v; with -w it is the inverse rotation.
@@ -39,17 +44,18 @@ POINT long long this_row() { return static_cast<long long>(blockIdx.x) * blockDi
 // results = B^T grads
 extern "C" __global__ void __launch_bounds__(128)
     own_frame_gradient(const Real* __restrict__ grads, const Real* __restrict__ quats,
-                       const Real* __restrict__ scales, Real* __restrict__ results, long long rows) {
+                       const Real* __restrict__ scales, Real* __restrict__ results, long long rows, Real min_aspect) {
   const long long row = this_row();
   if (row >= rows) return;
-  write_row(results, row, Frame<Real>(quats, scales, row).into(read_row(grads, row)));
+  write_row(results, row, Frame<Real>(quats, scales, row, min_aspect).into(read_row(grads, row)));
 }
 
 // results = B steps
 extern "C" __global__ void __launch_bounds__(128)
     own_frame_displacement(const Real* __restrict__ steps, const Real* __restrict__ quats,
-                           const Real* __restrict__ scales, Real* __restrict__ results, long long rows) {
+                           const Real* __restrict__ scales, Real* __restrict__ results, long long rows,
+                           Real min_aspect) {
   const long long row = this_row();
   if (row >= rows) return;
-  write_row(results, row, Frame<Real>(quats, scales, row).out_of(read_row(steps, row)));
+  write_row(results, row, Frame<Real>(quats, scales, row, min_aspect).out_of(read_row(steps, row)));
 }

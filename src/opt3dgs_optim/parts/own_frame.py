@@ -32,6 +32,10 @@ class OwnFrame(Part):
     positions' learning rate, which counts in one way only: at 0 the positions are held. Position
     noise and everything else that reads that rate are not changed.
 
+    Trained Gaussians are thin, often far thinner than a pixel. Steps in proportion to such an axis
+    would hold the Gaussian fast across its own surface, so that an axis counts as no thinner than
+    `min_aspect` of the longest.
+
     Adam's moments of the positions then belong to the own frame; everything else stays as it is.
     Scales and quaternions are looked up in the groups of the upgraded optimizers (gsplat's,
     INRIA's, nerfstudio's names and others). Where they are not found, it is said once, and the
@@ -44,6 +48,8 @@ class OwnFrame(Part):
         rate: standard deviations of a full step in the first iteration, above 0.
         final: share of `rate` in the last iteration, above 0; 0.01 is the decay that all 3DGS
             trainers give the positions' learning rate.
+        min_aspect: share of a Gaussian's longest standard deviation that a shorter one counts as,
+            at least, in 0..1; 0: every axis counts as it is, 1: a Gaussian counts as a ball.
 
     Raises:
         ValueError: an option is outside what is allowed.
@@ -67,12 +73,14 @@ class OwnFrame(Part):
 
     rate: float = 0.1
     final: float = 0.01
+    min_aspect: float = 0.1
 
     names = ("means",)
 
     def __post_init__(self) -> None:
         check_number(CALL, "rate", self.rate, 0.0, open_low=True)
         check_number(CALL, "final", self.final, 0.0, open_low=True)
+        check_number(CALL, "min_aspect", self.min_aspect, 0.0, 1.0)
 
     def ready(self, group: Group, course: Course) -> bool:
         """Whether scales and quaternions of the same points are there; says it once if not."""
@@ -111,7 +119,7 @@ class OwnFrame(Part):
         # To where the positions are: some trainers keep others on the host.
         quats, scales = (gaussians[name].detach().to(param.device) for name in ("quats", "scales"))
         # Kept for `displacement`: one optimizer of all groups has moved them by then.
-        frames = Frames(quats, scales, param.dtype)
+        frames = Frames(quats, scales, param.dtype, self.min_aspect)
         course.publish(FRAMES, param, frames)
         return frames.gradient(grad)
 
