@@ -58,7 +58,8 @@ class PhaseScheduler(Course):
     optimizer. The state travels inside `param_groups[0]` of every upgraded optimizer's
     `state_dict()`, so that a trainer which saves its optimizers resumes bit for bit.
 
-    Memory: Adam's; in the end the parameters' again; with curvature 32 bytes per point and pair.
+    Memory: that of Adam. In the last thirtieth of a run the defaults keep a copy of the parameters.
+    `Curvature` takes 32 bytes for each point and pair.
 
     Examples:
         >>> import torch

@@ -23,18 +23,20 @@ MIN_ITERATIONS_BETWEEN_EVENTS = 4
 class Fading(Part):
     """Shrink Adam's state of a random share of the points, again and again (after AdamW-GS).
 
-    A point's step is lr * exp_avg / sqrt(exp_avg_sq): with the default factors as long as before
-    at first, then up to five times longer until exp_avg_sq has recovered, a thousand iterations.
+    A point's step is lr * exp_avg / sqrt(exp_avg_sq). With the default factors the first step after
+    an event is as long as before. Later ones are up to five times longer, until exp_avg_sq has
+    recovered, which takes about a thousand iterations.
 
-    The same points are faded in all these parameters. Which ones depends on `seed`, the event
-    and the number of points alone: a resumed run repeats them. It costs no memory.
+    The same points are faded in all these parameters. Which ones depends on `seed`, on the event
+    and on the number of points alone, so that a resumed run repeats them. It costs no memory.
 
     Args:
         share: of the points in each event, chance per point in (0, 1].
         exp_avg, exp_avg_sq: factors on the moments, in [0, 1]. exp_avg^2 <= exp_avg_sq keeps the
             next step from being longer than the last.
-        events: how many over the run, but never less than 4 iterations apart. Many small points
-            lose detail by so many: with N > 10,000, (10,000 / N)^(2/3) of them happen.
+        events: how many over the run, but never less than 4 iterations apart. Where there are many
+            points they are small and lose detail by so many events. So with N > 10,000 points only
+            (10,000 / N)^(2/3) of the events happen.
         start, stop: where the first and the last event are, as shares of the run.
         seed: of the choice of points.
         names: the Gaussian parameters, under gsplat's or INRIA's names.

@@ -21,7 +21,7 @@ MIN_SEEN_SHARE = 0.01  # a view counts as seeing at least so much
 
 @dataclass(frozen=True, repr=False)
 class OutOfView(Part):
-    """Keep the scales and opacities of points that few views see from melting.
+    """Hold the scales and opacities of points out of view, which regularisers would destroy.
 
     3DGS-MCMC's regularisers pull at the scale and the opacity of every point in every iteration,
     and Adam makes a full step of a gradient however small it is. Relocation and `Fading` empty
