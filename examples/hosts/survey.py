@@ -232,7 +232,8 @@ def _long_runs() -> str:
     lines = []
     kinds = ("stock", "edited", "DEFAULTS_ADC")
     for row in rows:
-        stock, edited, adc = (row[kind]["psnr"] if kind in row else None for kind in kinds)
+        stock, edited = (row[kind]["psnr"] for kind in kinds[:2])
+        adc = row["DEFAULTS_ADC"]["psnr"] if "DEFAULTS_ADC" in row else None
         figures = (f"{stock:.2f}", f"{edited:.2f}", f"{edited - stock:+.2f}")
         gaussians = row["edited"].get("gaussians")
         more = [f"{gaussians:,}" if gaussians else "-", "-" if adc is None else f"{adc:.2f}"]

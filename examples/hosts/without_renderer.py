@@ -328,8 +328,8 @@ def fvdb(sources: Path) -> dict[str, Callable[..., Host]]:
     sys.modules["fvdb"].morton = _morton  # pyright: ignore
     scene: Any = stand_ins.Empty("fvdb_reality_capture.sfm_scene")
     scene.SpatialScaleMode = types.SimpleNamespace(MEDIAN_CAMERA_DEPTH=0)
-    names = (scene.__name__, f"{scene.__name__}.sfm_scene")
-    sys.modules.update(dict.fromkeys(names, scene))
+    for name in (scene.__name__, f"{scene.__name__}.sfm_scene"):
+        sys.modules[name] = scene
     model = "fvdb_reality_capture.radiance_fields.gaussian_splatting"
     sys.modules[model] = stand_ins.Empty(model)
     return {"GaussianSplatOptimizer": Fvdb2026, "GaussianSplatOptimizerMCMC": Fvdb2026Mcmc}
