@@ -1,5 +1,7 @@
 """Three trainers for 3,000 iterations each, stock and edited: what the lines do to PSNR.
 
+Those that clone, split and prune are also trained with `parts=DEFAULTS_ADC`.
+
     python examples/hosts/long_runs.py --trainers DIR --scene SCENE
 
 DIR and SCENE are those of `survey.py`. Each training is the trainer's own script, run on a CPU
@@ -19,14 +21,23 @@ import re
 import shutil
 import sys
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torch
-from hosts.trials import GSPLAT, NO_VIDEO, Trial, commit_of, copy_scene, parts_of
+from hosts.trials import (
+    GSPLAT,
+    NO_VIDEO,
+    Done,
+    Trial,
+    commit_of,
+    copy_scene,
+    edited_copy,
+    parts_of,
+)
 
 from opt3dgs_optim import __version__
 
@@ -45,7 +56,34 @@ SCALED_INRIA = {
 
 @dataclass(frozen=True)
 class LongRun(Trial):
-    """A training with its trainer's schedules scaled, and nothing saved."""
+    """A training with its trainer's schedules scaled, and nothing saved.
+
+    Attributes:
+        clones: whether it clones, splits and prunes.
+        adc: whether the edited script has `parts=DEFAULTS_ADC`.
+    """
+
+    clones: bool = True
+    adc: bool = False
+
+    def start(
+        self,
+        trainers: Path,
+        scene: Path,
+        work: Path,
+        out: str,
+        *more: str,
+        ours: bool,
+        iterations: int = ITERATIONS,
+    ) -> Done:
+        """As every trial, with the preset in the edited copy."""
+        if ours and self.adc:
+            script = edited_copy(self, trainers, work / "edited" / self.trainer)
+            text = script.read_text(encoding="utf-8")
+            text = text.replace("import PhaseScheduler", "import DEFAULTS_ADC, PhaseScheduler")
+            text = re.sub(r"(= PhaseScheduler\([^,)]+)", r"\1, parts=DEFAULTS_ADC", text)
+            script.write_text(text, encoding="utf-8")
+        return super().start(trainers, scene, work, out, *more, ours=ours, iterations=iterations)
 
     def command(self, scene: Path, out: Path, iterations: int, *, ours: bool) -> list[str]:
         """The script's arguments."""
@@ -66,7 +104,7 @@ class LongRun(Trial):
 
 
 LONG_RUNS = (
-    LongRun("gsplat-1.5.3", GSPLAT, ("mcmc", "--strategy.cap_max", str(CAP))),
+    LongRun("gsplat-1.5.3", GSPLAT, ("mcmc", "--strategy.cap_max", str(CAP)), clones=False),
     LongRun("gsplat-1.5.3", GSPLAT, ("default",)),
     LongRun("gaussian-splatting", "train.py", ("--disable_viewer",)),
 )
@@ -148,10 +186,13 @@ def main() -> None:
             if options.again or any(row.get(key) != value for key, value in about.items()):
                 row = about
             rows[run.name] = row
-            for half, ours in (("edited", True), ("stock", False)):
-                if "gaussians" not in row.get(half, {}):
-                    row[half] = train(run, options.trainers, scene, options.iterations, ours=ours)
-                    print(f"{run.name}, {half}: {row[half]['psnr']} dB", flush=True)
+            kinds = {"stock": (run, False), "edited": (run, True)}
+            if run.clones:
+                kinds["DEFAULTS_ADC"] = replace(run, adc=True), True
+            for kind, (form, ours) in kinds.items():
+                if kind not in row:
+                    row[kind] = train(form, options.trainers, scene, options.iterations, ours=ours)
+                    print(f"{run.name}, {kind}: {row[kind]['psnr']} dB", flush=True)
                 kept = [rows[each.name] for each in LONG_RUNS if each.name in rows]
                 text = json.dumps({"rows": kept}, indent=1) + "\n"
                 options.json.write_text(text, encoding="utf-8")

@@ -243,6 +243,11 @@ TRIALS = (
     _gsplat("gsplat-main", "mcmc"),
     _gsplat("gsplat-main", "default"),
     _gsplat(
+        *("gsplat-main", "default", "--post_processing", "ppisp"),
+        *("--ppisp_controller_activation_num_steps", "80"),
+        different="a stand-in for ppisp, which freezes the Gaussians",
+    ),
+    _gsplat(
         *("gsplat-main", "default", "--visible_adam"),
         stock_fails=_NO_FUSED,
         different="none: the stock trainer stops too",

@@ -3,12 +3,16 @@
     python examples/hosts/without_renderer.py 3dgrut TRAINERS/3dgrut
     python examples/hosts/without_renderer.py fvdb TRAINERS/fvdb-reality-capture
 
+The folder of fVDB may also be the one where `pip install --no-deps fvdb-reality-capture==0.6.0` has
+put the package, whose form is that of 2026. Both need scipy, 3DGRUT hydra-core.
+
 3DGRUT and fVDB reality capture render with kernels of their own, so that `on_cpu.py` cannot run
 their scripts. What touches an optimizer is Python, and runs here from their sources: how they make
 it, move, add and remove Gaussians in it, save it and load it. In place of a render stands a loss
 with known minima. Printed is what holds, as JSON: that with no parts the steps are the trainer's
 own, bit for bit; that with the default parts it trains on through every edit; and that a training
-resumed from the trainer's own checkpoint ends bit for bit as the uninterrupted one does.
+resumed from the trainer's own checkpoint ends bit for bit as the uninterrupted one does. Besides,
+which parts the scheduler has switched off, since the trainer removes Gaussians.
 """
 
 from __future__ import annotations
@@ -27,6 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torch
 from hosts.cpu_host import cuda, stand_ins
+from hosts.cpu_host.gsplat_modules import masked_adam
 from splatting.relocation import relocated_values
 from torch import Tensor
 from torch.nn import Parameter
@@ -103,6 +108,7 @@ class Threedgrut:
         self.strategy = getattr(strategies, kind)(config, self.model)
         self.strategy.init_densification_buffer()
         self.clones = source == "gs"
+        self.selective = config.optimizer.type == "selective_adam"
 
     def parameters(self) -> dict[str, Tensor]:
         return {g["name"]: g["params"][0] for g in self.model.optimizer.param_groups}
@@ -111,8 +117,12 @@ class Threedgrut:
         self.model.optimizer = phases.upgrade(self.model.optimizer)
 
     def step(self) -> None:
-        self.model.optimizer.step()
-        self.model.optimizer.zero_grad()
+        optimizer = self.model.optimizer
+        if self.selective:
+            optimizer.step(torch.rand(self.model.density.shape) < 0.8)
+        else:
+            optimizer.step()
+        optimizer.zero_grad()
         self.model.scheduler_step(0)
 
     def control(self, iteration: int) -> None:
@@ -147,8 +157,8 @@ def _relocate(
     return new_opacities.reshape(opacities.shape), new_scales
 
 
-def threedgrut(sources: Path, app: str) -> Callable[..., Host]:
-    """A maker of 3DGRUT's model under one of its configurations."""
+def threedgrut(sources: Path, app: str, *changes: str) -> Callable[..., Host]:
+    """A maker of 3DGRUT's model under one of its configurations, with changes to it."""
     from hydra import compose, initialize_config_dir  # pyright: ignore
 
     for name in ("threedgrt_tracer", "threedgut_tracer"):
@@ -156,8 +166,10 @@ def threedgrut(sources: Path, app: str) -> Callable[..., Host]:
     sys.path.insert(0, str(sources))
     bare_package("threedgrut.datasets", sources)
     torch.cuda.nvtx.range_push = torch.cuda.nvtx.range_pop = lambda *_: 0
+    optimizers: Any = importlib.import_module("threedgrut.optimizers")
+    optimizers._optimizer_plugin = types.SimpleNamespace(selective_adam_update=masked_adam)
     with initialize_config_dir(str((sources / "configs").resolve()), version_base=None):
-        config = compose(app)
+        config = compose(app, overrides=list(changes))
     return lambda saved=None: Threedgrut(config, saved)
 
 
@@ -212,6 +224,20 @@ class SplatModel:
     def reset_accumulated_gradient_state(self) -> None:
         """Nothing was accumulated."""
 
+    @torch.no_grad()
+    def add_noise_to_means(self, noise_scale: float) -> None:
+        """Noise of the size that the optimizer says."""
+        means: Tensor = self.means  # pyright: ignore
+        means.add_(torch.randn_like(means), alpha=1e-6 * noise_scale)
+
+    def relocate_gaussians(
+        self, log_scales: Tensor, logit_opacities: Tensor, ratios: Tensor, **others: Any
+    ) -> tuple[Tensor, Tensor]:
+        """Opacities and scales of relocated Gaussians, in the place of the kernel's."""
+        opacities, scales = logit_opacities.sigmoid(), log_scales.exp()
+        new_opacities, new_scales = relocated_values(opacities, scales, ratios.long())
+        return torch.logit(new_opacities.clamp(others["min_opacity"], 1 - 1e-6)), new_scales.log()
+
 
 class Fvdb:
     """`GaussianSplatOptimizer` over a model without a renderer."""
@@ -250,13 +276,72 @@ class Fvdb:
         return {"model": model, "optimizer": self.trainer.state_dict()}
 
 
-def fvdb(sources: Path) -> Callable[..., Host]:
-    """A maker of fVDB's optimizer."""
+class Fvdb2026(Fvdb):
+    """`GaussianSplatOptimizer` of version 0.6, over a model without a renderer."""
+
+    kind = ""  # "_mcmc" for MCMC
+
+    def __init__(self, saved: dict[str, Any] | None = None) -> None:
+        name = f"fvdb_reality_capture.radiance_fields.gaussian_splat_optimizer{self.kind}"
+        module = importlib.import_module(name)
+        kind = f"GaussianSplatOptimizer{self.kind[1:].upper()}"
+        optimizer, config = getattr(module, kind), getattr(module, f"{kind}Config")
+        if saved is None:
+            values = start_values(FVDB)
+            values["logit_opacities"] = values["logit_opacities"].reshape(-1)
+            for name in ("sh0", "shN"):
+                values[name] = values[name].reshape(POINTS, -1, 3)
+            self.model = SplatModel(values)
+            scene = types.SimpleNamespace(spatial_scale=lambda mode: 1.0)
+            self.trainer = optimizer.from_model_and_scene(self.model, scene, config())
+            self.trainer.reset_learning_rates_and_decay(1, ITERATIONS)
+        else:
+            self.model = SplatModel({k: v.clone() for k, v in saved["model"].items()})
+            self.trainer = optimizer.from_state_dict(self.model, saved["optimizer"])
+
+    def upgrade(self, phases: PhaseScheduler) -> None:
+        phases.upgrade(self.trainer._optimizer)
+
+    def control(self, iteration: int) -> None:
+        if iteration % 20 == 5:
+            with torch.no_grad():
+                self.model.logit_opacities[:4] = -8.0  # pyright: ignore  # dead
+            self.trainer.refine()
+
+
+class Fvdb2026Mcmc(Fvdb2026):
+    """With `GaussianSplatOptimizerMCMC`."""
+
+    kind = "_mcmc"
+
+
+def fvdb(sources: Path) -> dict[str, Callable[..., Host]]:
+    """Makers of fVDB's optimizers."""
     sys.path.insert(0, str(sources))
     sys.modules["fvdb"] = stand_ins.Empty("fvdb")
-    for name in ("fvdb_reality_capture", "fvdb_reality_capture.training"):
+    today = (sources / "fvdb_reality_capture" / "radiance_fields").is_dir()
+    folder = "radiance_fields" if today else "training"
+    for name in ("fvdb_reality_capture", f"fvdb_reality_capture.{folder}"):
         bare_package(name, sources)
-    return Fvdb
+    if not today:
+        return {"GaussianSplatOptimizer": Fvdb}
+    sys.modules["fvdb"].morton = _morton  # pyright: ignore
+    scene: Any = stand_ins.Empty("fvdb_reality_capture.sfm_scene")
+    scene.SpatialScaleMode = types.SimpleNamespace(MEDIAN_CAMERA_DEPTH=0)
+    for name in (scene.__name__, f"{scene.__name__}.sfm_scene"):
+        sys.modules[name] = scene
+    model = "fvdb_reality_capture.radiance_fields.gaussian_splatting"
+    sys.modules[model] = stand_ins.Empty(model)
+    return {"GaussianSplatOptimizer": Fvdb2026, "GaussianSplatOptimizerMCMC": Fvdb2026Mcmc}
+
+
+def _morton(cells: Tensor) -> Tensor:
+    """The Morton code of cells [N, 3] of 21 bits each."""
+    code = torch.zeros(len(cells), dtype=torch.int64)
+    for bit in range(21):
+        for axis in range(3):
+            code |= ((cells[:, axis].long() >> bit) & 1) << (3 * bit + axis)
+    return code
 
 
 # -- what is tried ---------------------------------------------------------------------------------
@@ -303,6 +388,7 @@ def try_out(make: Callable[..., Host]) -> dict[str, Any]:
         "points": [POINTS, len(next(iter(whole.parameters().values())))],
         "without parts the trainer's own": _same(stock, plain),
         "with the default parts finite and another": finite and not _same(stock, whole),
+        "switched off": list(phases.switched_off),
         "resumed at": begun,
         "resumed as uninterrupted": _same(whole, resumed),
     }
@@ -322,10 +408,14 @@ def main() -> None:
     stand_ins.install()
     cuda.install()
     if options.trainer == "fvdb":
-        found = {"GaussianSplatOptimizer": try_out(fvdb(options.sources))}
+        found = {name: try_out(make) for name, make in fvdb(options.sources).items()}
     else:
         apps = ("apps/colmap_3dgut_mcmc", "apps/colmap_3dgut")
-        found = {app: try_out(threedgrut(options.sources, app)) for app in apps}
+        found = {
+            " ".join(form): try_out(threedgrut(options.sources, *form))
+            for app in apps
+            for form in ((app,), (app, "optimizer.type=selective_adam"))
+        }
     print(f"{BEFORE}{json.dumps(found, indent=1)}")
 
 

@@ -36,11 +36,14 @@ class RemovedRows:
         found = False
         for optimizer in optimizers:
             groups = [g for g in optimizer.param_groups if gaussian_of(g) == "opacities"]
-            now = [param.detach() for group in groups for param in group["params"]]
-            seen, self._seen[optimizer] = self._seen.get(optimizer, []), now
-            for before, after in zip(seen, now, strict=False):
-                same = before.data_ptr() == after.data_ptr() and before.shape == after.shape
-                found = found or (not same and were_removed(before, after))
+            seen = self._seen.setdefault(optimizer, [])
+            for i, param in enumerate(param for group in groups for param in group["params"]):
+                if i == len(seen):
+                    seen.append(param.detach())
+                before = seen[i]
+                if before.data_ptr() != param.data_ptr() or before.shape != param.shape:
+                    seen[i] = param.detach()
+                    found = were_removed(before, seen[i]) or found
         return found
 
     def __reduce__(self) -> tuple[type[RemovedRows], tuple[()]]:

@@ -20,21 +20,33 @@ TRAINERS = Path(os.environ.get("OPT3DGS_TRAINERS", "/no/trainers"))
 pytestmark = pytest.mark.hosts
 
 
+def installed_fvdb() -> Path:
+    """Where the package index's fVDB reality capture is; skips where it is not."""
+    spec = importlib.util.find_spec("fvdb_reality_capture")
+    if spec is None or spec.origin is None:
+        pytest.skip("no fVDB: pip install --no-deps fvdb-reality-capture==0.6.0")
+    return Path(spec.origin).parents[1]
+
+
 @pytest.mark.parametrize(
-    ("name", "folder"), [("3dgrut", "3dgrut"), ("fvdb", "fvdb-reality-capture")]
+    ("name", "folder"),
+    [("3dgrut", "3dgrut"), ("fvdb", "fvdb-reality-capture"), ("fvdb", "installed")],
 )
 def test_trained_edited_saved_and_resumed(name: str, folder: str) -> None:
     """Bit for bit the trainer's own without parts, and through its checkpoint."""
-    if not (TRAINERS / folder).is_dir():
-        pytest.skip(f"no {TRAINERS / folder}: put its sources there, set OPT3DGS_TRAINERS")
+    sources = installed_fvdb() if folder == "installed" else TRAINERS / folder
+    if not sources.is_dir():
+        pytest.skip(f"no {sources}: put its sources there, set OPT3DGS_TRAINERS")
     if name == "3dgrut" and importlib.util.find_spec("hydra") is None:
         pytest.skip("3dgrut needs hydra-core: pip install it")
-    command = [sys.executable, without_renderer.__file__, name, str(TRAINERS / folder)]
+    command = [sys.executable, without_renderer.__file__, name, str(sources)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
     found = json.loads(done.stdout.partition(without_renderer.BEFORE)[2])
-    assert found
-    for held in found.values():
+    assert len(found) == {"3dgrut": 4, "fvdb-reality-capture": 1, "installed": 2}[folder]
+    for kind, held in found.items():
+        relocates = "mcmc" in kind.lower()
+        assert held["switched off"] == ([] if relocates else ["Fading"]), kind
         assert held["points"][0] != held["points"][1]
         assert held["without parts the trainer's own"]
         assert held["with the default parts finite and another"]

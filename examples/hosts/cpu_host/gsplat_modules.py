@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import importlib.util
+import sys
+import types
 from typing import Any
 
 import torch
@@ -43,6 +46,12 @@ def install() -> None:
     with contextlib.suppress(ImportError):  # gsplat before 1.5 has none
         selective: Any = importlib.import_module("gsplat.optimizers.selective_adam")
         selective.adam = masked_adam
+    if importlib.util.find_spec("ppisp") is None:  # a CUDA extension
+        ppisp: Any = types.ModuleType("ppisp")
+        report: Any = types.ModuleType("ppisp.report")
+        ppisp.PPISP, ppisp.PPISPConfig = FrameGains, types.SimpleNamespace
+        report.export_ppisp_report = lambda *_, **__: []
+        sys.modules.update({"ppisp": ppisp, "ppisp.report": report})
 
 
 def rasterize(
@@ -125,6 +134,30 @@ def _info(
     means2d = _Projected(values, moved, ids if packed else None, absgrad)
     shape = radii if one_radius else torch.stack([radii, radii], -1)
     return {"means2d": means2d.tensor, "radii": shape, "depths": depths, **opacity}
+
+
+class FrameGains(torch.nn.Module):
+    """A gain of each photo, in the place of `ppisp.PPISP`, for what that does to the Gaussians."""
+
+    def __init__(self, num_cameras: int, num_frames: int, config: Any) -> None:
+        super().__init__()
+        self.gains = torch.nn.Parameter(torch.zeros(num_frames))
+
+    def create_optimizers(self) -> list[torch.optim.Adam]:
+        """One for the gains."""
+        return [torch.optim.Adam([self.gains], lr=1e-3)]
+
+    def create_schedulers(self, optimizers: list[Any], max_optimization_iters: int) -> list[Any]:
+        """Their rate falls to a hundredth."""
+        gamma = 0.01 ** (1 / max_optimization_iters)
+        return [torch.optim.lr_scheduler.ExponentialLR(each, gamma) for each in optimizers]
+
+    def get_regularization_loss(self) -> Tensor:
+        """Small where the gains are."""
+        return self.gains.square().mean()
+
+    def forward(self, rgb: Tensor, *, frame_idx: int | None = None, **_: Any) -> Tensor:
+        return rgb if frame_idx is None else rgb * self.gains[frame_idx].exp()
 
 
 class _Projected:
