@@ -21,7 +21,6 @@ from placed_training import (
     TOTAL,
     Training,
     distance,
-    marked,
 )
 from simulated_device import SimulatedDevice, on_host
 
@@ -57,7 +56,6 @@ def trained(arm: str, dropped: set[int], place: str, **options: Any) -> tuple[Tr
     return training, on_host(torch.rand(()))
 
 
-MASKED = "an event of a dropped step fades what the dropped view sees"
 ACTING = [arm for arm in ARMS if arm != "no parts"]  # without parts nothing of ours is done
 
 
@@ -71,10 +69,7 @@ def test_the_device_drops_what_the_host_drops(arm: str, when: str) -> None:
     with SimulatedDevice():
         there, drawn_there = trained(arm, WHEN[when], GPU)
     here, drawn_here = trained(arm, WHEN[when], "cpu")
-    if when == "the last":  # an event of the last step: a device has faded, a host waits for ever
-        assert distance(there.values(), here.values()) <= UNLIKE.get(arm, 0.0)
-    else:
-        kept_alike(there, here, UNLIKE.get(arm, 0.0))
+    kept_alike(there, here, UNLIKE.get(arm, 0.0))
     assert torch.equal(drawn_there, drawn_here)
 
 
@@ -97,7 +92,7 @@ WAYS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("way", marked(WAYS, {"masks": MASKED}))
+@pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("arm", ["everything", "DEFAULTS_ADC"])
 def test_however_it_is_stepped(arm: str, way: str) -> None:
     when = WHEN["every third"]

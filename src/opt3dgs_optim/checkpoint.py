@@ -231,6 +231,8 @@ def _from_format_2(clock: dict[str, Any], optimizer: StepAdam, share: list[Any])
     records = []
     for group, seen in zip(optimizer.param_groups, share, strict=True):
         numbers = {} if seen is None else {"OutOfView.seen_share": float(seen)}
+        if "FreshMoments" in windows:  # those moments were zeroed already
+            numbers["FreshMoments.fresh"] = 1.0
         records.append(
             [{"last_step": last_step, "numbers": dict(numbers)} for _ in group["params"]]
         )

@@ -90,9 +90,8 @@ class Part:
 
     If a step turns out not to count (its loss is not finite, or a GradScaler skips it), its
     gradient is zero, and what hooks have written to the parameter and to what they keep is undone.
-    An edit of Adam's moments is undone on a host, and `last_step` stays, so that an event that was
-    due comes with the next step. A GPU knows too late, and there the edit of the dropped step
-    holds, and `last_step` goes on: the next step finds the same moments either way.
+    An edit of Adam's moments holds, and `last_step` goes on: an event of the iteration has happened
+    whether its step counts or not, on a host as on a GPU, which knows too late.
 
     `docs/write-a-part.md` has examples.
 

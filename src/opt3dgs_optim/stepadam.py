@@ -380,7 +380,7 @@ class StepAdam(Adam):
                 self._prepare(step, moving)
             if moving.buffer is not None:
                 params[i] = moving.buffer
-            if step.acting and counts is not False:
+            if step.acting:
                 record.last_step = now
             step.moving.append(moving)
         if parts.displacement:
@@ -401,8 +401,7 @@ class StepAdam(Adam):
                 step.held.append(HeldRows(moving.rows, param, state))
             fed = torch.where(broadcast_rows(moving.rows, fed), fed, 0.0)
         if moving.guarded and parts.any:
-            own_mask = moving.rows is not None and self._base is not Adam
-            view.guard(moments=moving.counts is False or own_mask)
+            view.guard(moments=moving.rows is not None and self._base is not Adam)
             if moving.counts is not True:  # a step that does not count has no gradient
                 fed = moving.where_it_moves(fed, 0.0)
         # Parts see the gradient of what is minimised, without AMP's scale.

@@ -93,7 +93,7 @@ class Fading(Part):
     ) -> Tensor:
         """Fade the moments by the events since this parameter's last step.
 
-        The events of a step that does not count come with the next one.
+        The events of iterations whose step the trainer left out come with the next step.
         """
         # The step of iteration i comes after i + 1 observations.
         now = self.events_before(course.iteration, course.total_steps)

@@ -58,15 +58,16 @@ class FreshMoments(Part):
         late = course.switch_step + MAX_LATE_ITERATIONS
         if left < self.settling or (state.last_step or 0) >= late:
             return grad
-        last, step = state.last_step, state["step"]
-        if last is None and step.item() <= course.current - course.switch_step:
+        step = state["step"]
+        if state.last_step is None and step.item() <= course.current - course.switch_step:
             return grad  # moments of a checkpoint, which begin at the switch already
-        if step.is_cpu:  # steps that count are known to the host on these paths of torch
-            if last is None or last < course.switch_step:
+        fresh: Tensor = state["fresh"]  # 0 again after a step that turned out not to count
+        if step.is_cpu:  # torch itself waits for the device on these of its paths
+            if fresh.item() == 0:
                 for key in [key for key in ADAM_KEYS if key in state]:
                     state[key].zero_()
+                fresh.fill_(1.0)
             return grad
-        fresh: Tensor = state["fresh"]
         for key in [key for key in ADAM_KEYS if key in state]:
             moment = state[key]
             moment.copy_(torch.where(fresh == 0, 0.0, moment))
