@@ -1,11 +1,11 @@
 """PyTorch optimizers for 3D Gaussian Splatting.
 
-An independent implementation of Opt3DGS (AAAI 2026, whose authors had released no code when this
-was written): the optimizers AWSGLD and LQNAdam, and the PhaseScheduler that puts the paper's two
-phases into an existing trainer.
+It is an independent implementation of Opt3DGS (AAAI 2026, whose authors had released no code when
+this was written): the optimizers AWSGLD and LQNAdam, and the PhaseScheduler that puts the paper's
+two phases into an existing trainer.
 
-Defaults of its own, which go beyond the paper: fading of Adam's moments, a hold on points out of
-view, and the average of the last iterates.
+What is on by default is this package's own, and not the paper's: fading of Adam's moments, a hold
+on points out of view, and the average of the last iterates.
 """
 
 from opt3dgs_optim.awsgld import AWSGLD

@@ -25,7 +25,7 @@ def column(seeds: list[Results], name: str, digits: int, unit: float = 1.0) -> s
 
 def nine(results: Results) -> str:
     """Modes, iterations and KL of every arm on the nine-mode landscape."""
-    header = ["arm", "steps", "modes of 9", "chains with all 9 (%)"]
+    header = ["method", "steps", "modes of 9", "chains with all 9 (%)"]
     header += ["median steps to all 9 (1,000)", "KL of the visits", "KL, re-weighted", "mean nu"]
     rows = []
     for name, entry in results.items():
@@ -86,7 +86,7 @@ def well(results: Results) -> str:
             ]
         )
     rows.sort(key=lambda row: float(row[0]))
-    header = ["h / T", "arm", "KL of the visits", "KL, re-weighted", "left well (%; exact 50)"]
+    header = ["h / T", "method", "KL of the visits", "KL, re-weighted", "left well (%; exact 50)"]
     return table(header, "lr", rows)
 
 
