@@ -101,8 +101,8 @@ with `DEFAULTS_ADC` |
 |---|---|---:|---:|---:|---|---:|---:|
 {rows}
 The photos are 160 pixels wide, and the thresholds of clone and split are made for ten times as \
-many. So these trainers end with far more Gaussians than a photo has pixels, and gsplat 1.5.3 \
-never resets the opacities, so that few of them are pruned. There `Annealing` and `Fading` make \
+many, so that these trainers clone and split far more than on photos of full size. gsplat 1.5.3 \
+never resets the opacities, so that few Gaussians are pruned. There `Annealing` and `Fading` make \
 [still more](../results/study/tables.md#without-resets-of-the-opacities), and the views that were \
 held out get worse. With averaging alone the training is the unchanged one until its last \
 thirtieth."""
@@ -226,18 +226,20 @@ def _outcome(row: dict[str, Any]) -> list[str]:
 def _long_runs() -> str:
     """The table of the long runs, or that there are none."""
     rows = json.loads(LONG.read_text(encoding="utf-8"))["rows"] if LONG.is_file() else []
-    rows = [row for row in rows if "stock" in row and "edited" in row]
+    rows = [row for row in rows if "stock" in row]
     if not rows:
         return "Not run: `python examples/hosts/long_runs.py` makes the table."
     lines = []
     kinds = ("stock", "edited", "DEFAULTS_ADC")
     for row in rows:
-        stock, edited = (row[kind]["psnr"] for kind in kinds[:2])
-        adc = row["DEFAULTS_ADC"]["psnr"] if "DEFAULTS_ADC" in row else None
-        figures = (f"{stock:.2f}", f"{edited:.2f}", f"{edited - stock:+.2f}")
-        gaussians = row["edited"].get("gaussians")
-        more = [f"{gaussians:,}" if gaussians else "-", "-" if adc is None else f"{adc:.2f}"]
-        lines.append(_row(row["name"], row["commit"], *figures, row["edited"]["parts"], *more))
+        stock, edited = row["stock"]["psnr"], row.get("edited")
+        adc = f"{row['DEFAULTS_ADC']['psnr']:.2f}" if "DEFAULTS_ADC" in row else "-"
+        shown = ["not run", "-", "-", "-"]
+        if edited is not None:
+            number = f"{edited['gaussians']:,}" if "gaussians" in edited else "-"
+            psnr = edited["psnr"]
+            shown = [f"{psnr:.2f}", f"{psnr - stock:+.2f}", edited["parts"], number]
+        lines.append(_row(row["name"], row["commit"], f"{stock:.2f}", *shown, adc))
     halves = [{"scene": row["scene"], **row[kind]} for row in rows for kind in kinds if kind in row]
     spans = {key: _span({"rows": halves}, key) for key in ("scene", "date", "torch", "machine")}
     return LONG_TEXT.format(rows="".join(lines), **spans)
