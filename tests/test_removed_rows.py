@@ -122,6 +122,8 @@ def test_each_set_of_gaussians_is_compared_with_itself() -> None:
     group["params"][0] = Parameter(group["params"][0].detach()[5:])
     assert watch.found([other, optimizer])
     assert not watch.found([other, optimizer])
+    del optimizer.param_groups[0]  # the first set goes: what is now first is another one
+    assert not watch.found([optimizer])
 
 
 # -- real strategies ------------------------------------------------------------------------------

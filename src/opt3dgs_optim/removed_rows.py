@@ -36,11 +36,11 @@ class RemovedRows:
         found = False
         for optimizer in optimizers:
             groups = [g for g in optimizer.param_groups if gaussian_of(g) == "opacities"]
-            seen = self._seen.setdefault(optimizer, [])
-            for i, param in enumerate(param for group in groups for param in group["params"]):
-                if i == len(seen):
-                    seen.append(param.detach())
-                before = seen[i]
+            params = [param for group in groups for param in group["params"]]
+            seen = self._seen.get(optimizer, [])
+            if len(seen) != len(params):  # seen first, or a set of Gaussians came or went
+                self._seen[optimizer] = seen = [param.detach() for param in params]
+            for i, (before, param) in enumerate(zip(seen, params, strict=True)):
                 if before.data_ptr() != param.data_ptr() or before.shape != param.shape:
                     seen[i] = param.detach()
                     found = were_removed(before, seen[i]) or found
