@@ -83,8 +83,8 @@ def study(seeds: int) -> tuple[list[dict[str, Any]], dict[str, Any]]:
 
 
 def draw(record: dict[str, Any], path: Path) -> None:
-    """nu against z beside nu's deviation and slope against the number of energies."""
-    fig, (scatter, spread, bias) = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained")
+    """nu against z above nu's deviation and slope against the number of energies, for a phone."""
+    fig, (scatter, spread, bias) = plt.subplots(3, 1, figsize=(5.2, 8.6), layout="constrained")
     label = {name: f"paper's update, ζ = {name}" for name in COLORS} | {"default": "default, any ζ"}
     for name, (z, nu) in record["points"].items():
         scatter.plot(z, nu, ".", ms=2, color=COLORS[name], label=label[name])
@@ -107,10 +107,9 @@ def draw(record: dict[str, Any], path: Path) -> None:
     for axes in (spread, bias):
         axes.set_xticks([1_000, 3_000, 10_000], ["1,000", "3,000", "10,000"])
         axes.minorticks_off()
-    fig.legend(*scatter.get_legend_handles_labels(), loc="outside upper center", ncols=5,
-               frameon=False, markerscale=4, fontsize=8)  # fmt: skip
-    about = f"{record['machine']}, {record['date']}"
-    fig.text(1.005, 0.5, about, rotation=90, va="center", fontsize=6, color="0.5")
+    fig.legend(*scatter.get_legend_handles_labels(), loc="outside upper center", ncols=2,
+               frameon=False, markerscale=4)  # fmt: skip
+    fig.supxlabel(f"{record['machine']}, {record['date']}", fontsize=8, color="0.4")
     fig.savefig(path, dpi=130, bbox_inches="tight")
 
 
