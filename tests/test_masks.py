@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
 from torch.optim.lr_scheduler import ExponentialLR
+from torch.utils._python_dispatch import TorchDispatchMode
 from trainers import (
     AveragedThroughout,
     assert_same,
@@ -136,6 +137,31 @@ def test_visible_rows_go_where_torchs_adam_takes_them(
     assert torch.equal(x, y)
     for key, value in twin.state[y].items():
         assert torch.equal(optimizer.state[x][key], value), key
+
+
+class RowsRooted(TorchDispatchMode):
+    """Notes of how many rows Adam takes a root of the second moments."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rows: list[int] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func is torch.ops.aten.sqrt.default:
+            self.rows.append(args[0].shape[0])
+        return func(*args, **(kwargs or {}))
+
+
+def test_adam_is_given_the_visible_rows_alone() -> None:
+    """On a CPU, where it is known how many they are: the time of a step is that of these rows."""
+    x = points()
+    optimizer: Any = AWSGLD([x], lr=0.1)
+    for step, mask in enumerate([*masks(), torch.zeros(ROWS, dtype=torch.bool)]):
+        x.grad = gradients(x, step)
+        with RowsRooted() as rooted:
+            optimizer.step(visible=mask)
+        assert rooted.rows == [int(mask.sum())]
+    assert optimizer.state[x]["step"] == STEPS + 1
 
 
 def test_pairs_are_kept_between_two_visible_steps_of_a_point() -> None:
@@ -395,11 +421,16 @@ class PooledMoments(Part):
         moment.copy_(moment.mean(1, keepdim=True).expand_as(moment))
 
 
-def test_an_optimizer_with_masked_steps_and_parts_after_the_step() -> None:
-    """A part writes into all moments: those of invisible rows are put back."""
+@pytest.mark.parametrize(
+    ("cls", "options"), [(SelectiveAdam, {}), (Adam, {}), (Adam, {"fused": True})], ids=str
+)
+def test_parts_that_write_into_all_moments_after_a_masked_step(
+    cls: type[Adam], options: dict[str, Any]
+) -> None:
+    """Those of invisible rows are put back, whosever step it is."""
     x = points()
     phases = only(STEPS, PooledMoments(), Annealing(names=GAUSSIAN))
-    optimizer: Any = phases.upgrade(SelectiveAdam([{"params": [x], "lr": 0.1, "name": "means"}]))
+    optimizer: Any = phases.upgrade(cls([{"params": [x], "lr": 0.1, "name": "means"}], **options))
     for step, mask in enumerate(masks()):
         x.grad = gradients(x, step)
         before = [x.detach().clone(), *(v.clone() for v in optimizer.state[x].values())]

@@ -71,7 +71,8 @@ class RowOwnership:
 class HeldRows:
     """Rows of a parameter [N, ..] that a mask holds still in Adam's step: put back after it.
 
-    `moving` [N] bool are the others. Adam's step count is the whole parameter's and goes on.
+    `moving` [N] bool are the others. Adam's step count is the whole parameter's and goes on. It
+    takes a copy of the parameter and of its moments, see `PickedRows`.
     """
 
     def __init__(self, moving: Tensor, param: Tensor, state: Mapping[str, Any]) -> None:
@@ -83,7 +84,43 @@ class HeldRows:
     def put_back(self) -> None:
         """Give the rows that were not to move what they had."""
         for tensor, saved, moving in self._saved:
-            tensor.copy_(torch.where(moving, tensor, saved))
+            torch.where(moving, tensor, saved, out=tensor)
+
+
+class PickedRows:
+    """Rows of a parameter [N, ..] that a mask lets move, in a tensor of their own for Adam's step.
+
+    The time of it is that of these rows. It is for a CPU: a GPU would have to be waited for to know
+    how many they are. torch's fused step rounds the last few numbers of a tensor otherwise than the
+    rest, so that the same rows in another tensor would not get the same bits.
+
+    Args:
+        moving: [N] bool, which rows.
+        grad: what Adam is fed with, of the parameter's shape.
+
+    Attributes:
+        tensor: the rows, with their gradient.
+        state: Adam's of these rows; the step count is the whole parameter's.
+    """
+
+    def __init__(
+        self, moving: Tensor, param: Tensor, grad: Tensor, state: Mapping[str, Any]
+    ) -> None:
+        self._index = moving.nonzero().squeeze(1)
+        # .data: putting back is no write that a part should notice by the version counter.
+        self._rows = param.data
+        self._moments = {key: state[key] for key in MOMENTS if key in state}
+        self.tensor = self._rows.index_select(0, self._index)
+        self.tensor.grad = grad.index_select(0, self._index)
+        picked = {key: each.index_select(0, self._index) for key, each in self._moments.items()}
+        self.state = {"step": state["step"], **picked}
+
+    @torch.no_grad()
+    def put_back(self) -> None:
+        """Put the rows and their moments, as Adam has left them, where they are from."""
+        self._rows.index_copy_(0, self._index, self.tensor)
+        for key, moment in self._moments.items():
+            moment.index_copy_(0, self._index, self.state[key])
 
 
 class ParameterRecord:
@@ -162,6 +199,8 @@ class ParameterState(MutableMapping[str, Any]):
     def settle(self, rows: Tensor | None, counts: Tensor | bool) -> None:
         """Undo what hooks have written to rows that are held still, or in a step that is dropped.
 
+        An edit of Adam's moments holds in a dropped step, too, as it does without a mask.
+
         Args:
             rows: [N] bool, those that move; None: all.
             counts: whether the step counts, 0-d on the parameter's device where it is a tensor.
@@ -169,7 +208,8 @@ class ParameterState(MutableMapping[str, Any]):
         saved, self._saved = self._saved, []
         self._guarded = self._moments_guarded = False
         for store, key, old in saved:
-            new, keep = store.setdefault(key, old), counts
+            new = store.setdefault(key, old)
+            keep = True if store is self.adam and key in ADAM_KEYS else counts
             if rows is not None and old.dim():
                 keep = broadcast_rows(rows, old) & keep
             if keep is not True:

@@ -39,6 +39,7 @@ from opt3dgs_optim.state import (
     HeldRows,
     ParameterRecord,
     ParameterState,
+    PickedRows,
     RowOwnership,
     broadcast_rows,
     check_mask,
@@ -88,6 +89,7 @@ class MovingParameter:
         rows: [N] bool, those that a mask lets move; None: all.
         counts: whether the step counts, 0-d where only the device knows.
         guarded: whether something of what the hooks do is to be undone.
+        masked: what has torch's own step move the rows of a mask alone; None without a mask.
         buffer: where Adam writes its step, if a part says what becomes of it; else None.
     """
 
@@ -99,6 +101,7 @@ class MovingParameter:
     counts: Tensor | bool
     guarded: bool
     state: ParameterState | None = None
+    masked: HeldRows | PickedRows | None = None
     buffer: Tensor | None = None
 
     def where_it_moves(self, new: Tensor, old: Tensor | float) -> Tensor:
@@ -118,7 +121,6 @@ class StepInProgress:
     counts: Tensor | bool
     overrides: TemporaryOverrides
     moving: list[MovingParameter] = field(default_factory=list)
-    held: list[HeldRows] = field(default_factory=list)
 
 
 class StepAdam(Adam):
@@ -215,9 +217,9 @@ class StepAdam(Adam):
     ) -> Any:
         """One step: of all rows, or only of those that a camera saw; return the closure's value.
 
-        With a mask, the other rows keep parameters and state, whatever the parts do, for a copy of
-        both; the bias correction is the whole parameter's. Parameters without a gradient are left
-        alone, whatever the mask, as in INRIA's and gsplat's own masked steps.
+        With a mask, the other rows keep parameters and state, whatever the parts do. A GPU and a
+        fused step take a copy of both for it. The bias correction is the whole parameter's.
+        Parameters without a gradient are left alone, as in INRIA's and gsplat's masked steps.
 
         Args:
             closure: evaluates the model and returns the loss; or the mask, as gsplat
@@ -311,8 +313,6 @@ class StepAdam(Adam):
         for moving in step.moving:
             if moving.state is not None:
                 self._finish(moving, moving.state, course)
-        for rows in reversed(step.held):
-            rows.put_back()
 
     def _parts_of(self, group: Group) -> ActingParts:
         """The parts that act on a group in this step; sought when they change."""
@@ -377,31 +377,26 @@ class StepAdam(Adam):
                 known = known.to(param.device, non_blocking=True)
             moving = MovingParameter(group, param, record, parts, own, known, guarded)
             if needed:
-                self._prepare(step, moving)
-            if moving.buffer is not None:
-                params[i] = moving.buffer
+                params[i] = self._prepare(step, moving)
             if step.acting:
                 record.last_step = now
             step.moving.append(moving)
-        if parts.displacement:
+        if parts.displacement or rows is not None:
             step.overrides.item(group, "params", params)
 
-    def _prepare(self, step: StepInProgress, moving: MovingParameter) -> None:
-        """Put what Adam is to be fed into `param.grad`: zero in rows that a mask holds still."""
+    def _prepare(self, step: StepInProgress, moving: MovingParameter) -> Tensor:
+        """Have Adam fed with what the parts say; return what it moves in the parameter's place."""
         group, param, parts = moving.group, moving.param, moving.parts
         fed, state = cast(Tensor, param.grad), self.state[param]
         if not state:  # torch makes its moments only where there is nothing else yet
             self._init_group({**group, "params": [param]}, [], [], [], [], [], [])
         self._ownership.drop_foreign(param, state, self.course.row_keys)
         course = self.course
-        view = moving.record.view(param, state, course.declared, course.kept_numbers)
-        moving.state = view
+        moving.state = view = moving.record.view(param, state, course.declared, course.kept_numbers)
         if moving.rows is not None:
-            if self._base is Adam:
-                step.held.append(HeldRows(moving.rows, param, state))
             fed = torch.where(broadcast_rows(moving.rows, fed), fed, 0.0)
         if moving.guarded and parts.any:
-            view.guard(moments=moving.rows is not None and self._base is not Adam)
+            view.guard(moments=moving.rows is not None)
             if moving.counts is not True:  # a step that does not count has no gradient
                 fed = moving.where_it_moves(fed, 0.0)
         # Parts see the gradient of what is minimised, without AMP's scale.
@@ -415,16 +410,26 @@ class StepAdam(Adam):
             fed = part.before(group, param, fed, view.of(name), course)
         if unit is not None:
             fed = fed * unit
+        if moving.rows is not None and self._base is Adam:
+            if moving.rows.is_cpu and not (group["fused"] or parts.displacement):
+                moving.masked = PickedRows(moving.rows, param, fed, state)
+                step.overrides.extra_item(self.state, moving.masked.tensor, moving.masked.state)
+                return moving.masked.tensor
+            moving.masked = HeldRows(moving.rows, param, state)
         if parts.displacement:  # Adam moves a buffer, whose state is the parameter's
             moving.buffer = torch.zeros_like(param, requires_grad=False)
             moving.buffer.grad = fed
             step.overrides.extra_item(self.state, moving.buffer, state)
-        elif fed is not param.grad:
+            return moving.buffer
+        if fed is not param.grad:
             step.overrides.attribute(param, "grad", fed)
+        return param
 
     def _finish(self, moving: MovingParameter, view: ParameterState, course: Course) -> None:
         """Move the parameter by what the parts make of Adam's step; have them act after it."""
         group, param, parts = moving.group, moving.param, moving.parts
+        if moving.masked is not None:
+            moving.masked.put_back()
         if moving.buffer is not None:
             step = moving.buffer
             for name, part in parts.displacement:
