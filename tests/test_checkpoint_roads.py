@@ -17,7 +17,7 @@ from typing import Any
 import landed_checkpoints
 import pytest
 import torch
-from placed_training import ROWS, Training, distance, mended_later
+from placed_training import ROWS, Training, distance
 from ranks import free_port
 from torch import Tensor
 from torch.distributed.checkpoint import state_dict as dcp_state
@@ -139,18 +139,11 @@ ROADS: dict[str, Callable[..., None]] = {
 AT = {"no parts": 20, "Fading": 21, "Averaging": 25, "EnergyHistogram": 30, "Curvature": 40}
 AT |= {"FreshMoments": 36, "OutOfView": 20, "DEFAULTS": 88, "DEFAULTS_ADC": 88, "paper": 66}
 ON_DISK = ("Averaging", "Curvature", "EnergyHistogram", "DEFAULTS", "paper")
-BROKEN: dict[str, dict[str, tuple[str, ...]]] = {  # road -> why -> arms
-}
 
 
-def roads() -> list[Any]:
-    found = []
-    for arm, road in itertools.product(AT, ROADS):
-        if "files" in road and arm not in ON_DISK:
-            continue
-        why = [why for why, arms in BROKEN.get(road, {}).items() if arm in arms]
-        found.append(pytest.param(arm, road, marks=mended_later(why[0]) if why else ()))
-    return found
+def roads() -> list[tuple[str, str]]:
+    every = itertools.product(AT, ROADS)
+    return [(arm, road) for arm, road in every if "files" not in road or arm in ON_DISK]
 
 
 @pytest.mark.parametrize(("arm", "road"), roads())

@@ -244,14 +244,15 @@ def two_loop_case(rows: int, size: int, seed: int = 0) -> tuple[Tensor, Tensor]:
     return grad, history_from_pairs(s, y)
 
 
-def frame_case(rows: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, ...]:
+def frame_case(rows: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor, Tensor]:
     """Vectors [N, 3], quats [N, 4] of any length (one is zero) and log scales [N, 3]."""
     g = torch.Generator().manual_seed(rows)
     draw = torch.randn(rows, 10, generator=g, dtype=torch.float64)
     vectors, scales, quats = draw.split([3, 3, 4], 1)
     quats = quats * 10.0 ** torch.randint(-3, 4, (rows, 1), generator=g)
     quats[2:3] = 0.0
-    return tuple(each.to(dtype).contiguous() for each in (vectors, quats, 2 * scales - 3))
+    found = [each.to(dtype).contiguous() for each in (vectors, quats, 2 * scales - 3)]
+    return found[0], found[1], found[2]
 
 
 def frames(quats: Tensor, scales: Tensor, min_aspect: float = 0.0) -> Tensor:

@@ -120,24 +120,24 @@ def test_the_own_frame(rows: int, dtype: torch.dtype, min_aspect: float) -> None
     case = frame_case(rows, dtype)
     vectors, quats, scales = (each.double() for each in case)
     size = vectors.norm(dim=1, keepdim=True) * scales.exp().amax(1, keepdim=True)
-    given = [each.cuda() for each in case]
-    assert cuda.has_own_frames(given[1])
+    v, q, s = (each.cuda() for each in case)
+    assert cuda.has_own_frames(q)
     for function, sums in (
         (cuda.own_frame_gradient, "nij,ni->nj"),
         (cuda.own_frame_displacement, "nij,nj->ni"),
     ):
         expected = torch.einsum(sums, frames(quats, scales, min_aspect), vectors)
-        gap = function(*given, min_aspect).cpu().double() - expected
+        gap = function(v, q, s, min_aspect).cpu().double() - expected
         # In a component they may cancel.
         assert bool((gap.abs() <= size * (2e-15 if dtype == torch.float64 else 1e-6)).all())
 
 
 def test_the_own_frame_does_not_synchronise() -> None:
-    given = [each.cuda() for each in frame_case(1000, torch.float32)]
-    expected = cuda.own_frame_displacement(*given)  # compiles
+    v, q, s = (each.cuda() for each in frame_case(1000, torch.float32))
+    expected = cuda.own_frame_displacement(v, q, s)  # compiles
     torch.cuda.set_sync_debug_mode("error")
     try:
-        found = cuda.own_frame_displacement(*given)
+        found = cuda.own_frame_displacement(v, q, s)
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert torch.equal(found, expected)

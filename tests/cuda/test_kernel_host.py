@@ -233,7 +233,8 @@ def test_the_own_frame_of_several_dtypes(
     wide = torch.float64 if torch.float64 in (of_vectors, of_frames) else torch.float32
     with kernels[5, wide].launched():
         found = cuda.own_frame_gradient(*given)
-        expected = cuda.own_frame_gradient(*(each.to(wide) for each in given))
+        v, q, s = (each.to(wide) for each in given)
+        expected = cuda.own_frame_gradient(v, q, s)
     assert found.dtype == of_vectors
     assert torch.equal(found, expected.to(of_vectors))
 
@@ -261,7 +262,8 @@ def test_shapes_of_the_own_frame_are_checked_first(
         for function in (cuda.own_frame_gradient, cuda.own_frame_displacement):
             message = rf"{function.__name__}: \w+ of shape .* on .* is needed"
             with pytest.raises(ValueError, match=message):
-                function(*{**case, wrong: bad}.values())
+                v, q, s = {**case, wrong: bad}.values()
+                function(v, q, s)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16], ids=str)

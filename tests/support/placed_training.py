@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-import pytest
 import simulated_device
 import torch
 from simulated_device import on_host
@@ -91,16 +90,6 @@ EVERYTHING = (
     *("FreshMoments", "SquaredLoss", "Curvature", "PositionNoise"),
 )
 ARMS["everything"] = _everything
-
-
-def mended_later(reason: str) -> Any:
-    """What fails today, and is to be mended: strict, so that the mending is noticed."""
-    return pytest.mark.xfail(strict=True, reason=reason)
-
-
-def marked(names: Iterable[Any], failing: Mapping[Any, str]) -> list[Any]:
-    """Parameters of a test, those that fail today marked with the reason."""
-    return [pytest.param(n, marks=mended_later(failing[n])) if n in failing else n for n in names]
 
 
 class Training:
