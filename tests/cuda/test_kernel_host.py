@@ -261,8 +261,8 @@ def test_shapes_of_the_own_frame_are_checked_first(
     for bad in (own[:8], own[:, :2], own[0], own[0, 0], own[:, :, None], own.to("meta")):
         for function in (cuda.own_frame_gradient, cuda.own_frame_displacement):
             message = rf"{function.__name__}: \w+ of shape .* on .* is needed"
+            v, q, s = {**case, wrong: bad}.values()
             with pytest.raises(ValueError, match=message):
-                v, q, s = {**case, wrong: bad}.values()
                 function(v, q, s)
 
 
