@@ -368,8 +368,9 @@ def _add_frames(parts: list[Tensor], rows: int) -> list[Tensor]:
     """Put Gaussians into the program's input; B^T g, and B B^T g."""
     grad, quats, scales = frame_case(rows)
     parts += [quats, scales, grad]
-    turned = torch.einsum("nij,ni->nj", frames(quats, scales), grad)
-    return [turned, torch.einsum("nij,nj->ni", frames(quats, scales), turned)]
+    axes = frames(quats, scales, 0.1)  # as in the program
+    turned = torch.einsum("nij,ni->nj", axes, grad)
+    return [turned, torch.einsum("nij,nj->ni", axes, turned)]
 
 
 def _add_energies(parts: list[Tensor], m: int = 24) -> Tensor:
