@@ -46,7 +46,8 @@ def install() -> None:
     with contextlib.suppress(ImportError):  # gsplat before 1.5 has none
         selective: Any = importlib.import_module("gsplat.optimizers.selective_adam")
         selective.adam = masked_adam
-    if importlib.util.find_spec("ppisp") is None:  # a CUDA extension
+    # A CUDA extension; what is there already may be a stand-in.
+    if "ppisp" not in sys.modules and importlib.util.find_spec("ppisp") is None:
         ppisp: Any = types.ModuleType("ppisp")
         report: Any = types.ModuleType("ppisp.report")
         ppisp.PPISP, ppisp.PPISPConfig = FrameGains, types.SimpleNamespace

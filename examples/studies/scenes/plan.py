@@ -98,6 +98,13 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
             for scenes, share in half_sizes
             for spec in at_half(scenes, [arm], seeds, share=share)
         ],
+        # No axis thinner than a tenth of the longest.
+        "own-frame-not-thin": [
+            spec
+            for arm in ("frame-0.1-not-thin", "frame-0.1-not-thin+faded")
+            for scenes, share in half_sizes
+            for spec in at_half(scenes, [f"{arm}{AVERAGED}"], seeds, share=share)
+        ],
         "own-frame-brief": rotated(MANY_VIEWS_SCENES, frames, 1, 7_500),
         "own-frame-quarter": rotated(MANY_VIEWS_SCENES, frames, seeds, 30_000),
         "own-frame-adaptive": rotated(MANY_VIEWS_SCENES, adaptive_frames, 1, 30_000),

@@ -61,9 +61,11 @@ class FreshMoments(Part):
         step = state["step"]
         if state.last_step is None and step.item() <= course.current - course.switch_step:
             return grad  # moments of a checkpoint, which begin at the switch already
-        fresh: Tensor = state["fresh"]  # 0 again after a step that turned out not to count
-        if step.is_cpu:  # torch itself waits for the device on these of its paths
-            if fresh.item() == 0:
+        last, fresh = state.last_step, state["fresh"]
+        if step.is_cpu:  # steps that count are known to the host on these paths of torch
+            first = last is None or last < course.switch_step
+            # It is 0 again after a step that turned out not to count; a device is not waited for.
+            if first or (fresh.is_cpu and fresh.item() == 0):
                 for key in [key for key in ADAM_KEYS if key in state]:
                     state[key].zero_()
                 fresh.fill_(1.0)
