@@ -20,6 +20,7 @@ from opt3dgs_optim.parts.histogram import EnergyHistogram
 from opt3dgs_optim.version import __version__
 
 ROWS, HISTORY_SIZE = 1000, 5
+MIN_ASPECT = 0.1  # of the own frames
 # Sums of a few dozen products, in another order.
 LIMITS = {torch.float64: 1e-10, torch.float32: 1e-4}
 ENERGIES = 400  # of them 150 after the warm-up
@@ -92,13 +93,13 @@ def _recursion(device: torch.device, dtype: torch.dtype, backend: Backend) -> Te
 
 
 def _own_frame(device: torch.device, dtype: torch.dtype, backend: Backend) -> Tensor:
-    """B^T v and B v of the frames B = R diag(exp(scales))."""
+    """B^T v and B v of the frames B = R diag(exp(scales)), whose thin axes have a least length."""
     vectors, scales = _draw(2, ROWS, 3, device=device, seed=7).to(dtype)
     quats = _draw(ROWS, 4, device=device, seed=8).to(dtype)
     if backend == "cuda":
-        given = vectors, quats, scales
+        given = vectors, quats, scales, MIN_ASPECT
         return torch.cat([cuda.own_frame_gradient(*given), cuda.own_frame_displacement(*given)])
-    axes = axes_of(quats, scales, dtype)  # [3, 3, N]
+    axes = axes_of(quats, scales, dtype, MIN_ASPECT)  # [3, 3, N]
     sums = ("ijn,ni->nj", "ijn,nj->ni")
     return torch.cat([torch.einsum(each, axes, vectors) for each in sums])
 
