@@ -200,6 +200,13 @@ def fill(model: Any, splats: dict[str, Parameter]) -> Any:
     return model
 
 
+def made_model(kind: str, splats: dict[str, Parameter]) -> Any:
+    """A model of these Gaussians with its optimizer: "simulated", or that of a project."""
+    model = fill(SimulatedModel() if kind == "simulated" else real_model(kind), splats)
+    model.training_setup(OPTIONS)
+    return model
+
+
 def real_model(project: str) -> Any:
     """The GaussianModel of ../hosts/<project>, on a CPU; skips with the reason."""
     folder = HOSTS / project

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from inria_host import ATTRIBUTES, OPTIONS, SimulatedModel, fill, real_model
+from inria_host import ATTRIBUTES, OPTIONS, made_model
 from torch import Tensor
 from trainers import everything, make_splats
 
@@ -22,10 +22,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*non-writable:UserWarning")
 def make_model(kind: str) -> Any:
     splats = make_splats(POINTS)
     splats["opacities"].data[::6] = -9.0
-    model = SimulatedModel() if kind == "simulated" else real_model(kind)
-    fill(model, splats)
-    model.training_setup(OPTIONS)
-    return model
+    return made_model(kind, splats)
 
 
 def upgrade(model: Any, parts: list[Part] | None = None) -> PhaseScheduler:

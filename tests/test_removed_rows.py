@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 from gsplat_host import Trainer, strategies
-from inria_host import OPTIONS, SimulatedModel, fill, real_model
+from inria_host import OPTIONS, made_model
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 from trainers import gsplat_optimizers, make_splats
@@ -209,10 +209,7 @@ def test_fading_that_is_off_is_as_if_it_were_not_there() -> None:
 def inria_model(kind: str) -> Any:
     splats = make_splats(POINTS)
     splats["opacities"].data[::3] = -9.0
-    model = SimulatedModel() if kind == "simulated" else real_model(kind)
-    fill(model, splats)
-    model.training_setup(OPTIONS)
-    return model
+    return made_model(kind, splats)
 
 
 def densify_and_prune(model: Any, iteration: int) -> None:
@@ -301,6 +298,21 @@ def test_a_resumed_training(at: int, chosen: Any) -> None:
     assert phases.switched_off == again.switched_off
     assert torch.equal(model._xyz, resumed._xyz)
     assert torch.equal(model._scaling, resumed._scaling)
+
+
+def test_an_earlier_checkpoint_is_gone_on_with_by_the_same_scheduler() -> None:
+    """What it does not know of yet is seen again."""
+    model, phases = inria_model("simulated"), PhaseScheduler(TOTAL)
+    phases.upgrade(model.optimizer)
+    state = saved(model)
+    run_inria(model, phases, densify_and_prune, 0, 30)
+    assert set(phases.switched_off) == {"Fading"}
+    model.training_setup(OPTIONS)
+    phases.upgrade(model.optimizer)
+    model.optimizer.load_state_dict(state)
+    assert phases.switched_off == {}
+    run_inria(model, phases, densify_and_prune, 0, 30)
+    assert set(phases.switched_off) == {"Fading"}
 
 
 def test_what_a_checkpoint_says_does_not_switch_off_what_was_chosen() -> None:

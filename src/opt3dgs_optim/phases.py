@@ -101,9 +101,8 @@ class PhaseScheduler(Course):
         if log is not None and not hasattr(log, "step"):
             raise ValueError(f"{CALL}: log={log!r}, but a RunLog or None is needed")
         self.log, self.needs_energies = log, True
-        # Parts that the user has chosen stay as they are.
-        self._removed_rows = RemovedRows() if parts is None else None
-        self._chosen = parts is not None
+        self._chosen = parts is not None  # by the user: they stay as they are
+        self._removed_rows = RemovedRows()
         self._over_ranks = None if process_group is None else RankMean(CALL, process_group)
         self._iterations_without_step = 1
         self._steps_without_energy = 0
@@ -171,8 +170,7 @@ class PhaseScheduler(Course):
             iteration = check_count(f"{CALL}.observe", "iteration", iteration, 0)
             if iteration < self.current:  # what is kept for a time begins anew
                 self.rewinds += 1
-                if self._removed_rows is not None:
-                    self._removed_rows = RemovedRows()
+                self._removed_rows = RemovedRows()
         self.current = self.iteration if iteration is None else iteration
         self._watch_clock()
         self._watch_rows()
@@ -278,9 +276,11 @@ class PhaseScheduler(Course):
 
     def _watch_rows(self) -> None:
         """Switch off what loses with clone, split and prune once the trainer removes Gaussians."""
-        if self._removed_rows is None or not self._removed_rows.found(self.followers()):
+        if self._chosen or REMOVAL in self.switched_off.values():
             return
-        self._removed_rows = None
+        if not self._removed_rows.found(self.followers()):
+            return
+        self._removed_rows = RemovedRows()  # gives the opacities back that it holds
         off = [
             name
             for name, part in self._named.items()
@@ -304,8 +304,7 @@ class PhaseScheduler(Course):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """As `Course.load_state_dict`; parts that the user has chosen are not off for removal."""
         super().load_state_dict(state)
-        if self._removed_rows is not None:
-            self._removed_rows = RemovedRows()
+        self._removed_rows = RemovedRows()
         if self._chosen and REMOVAL in self.switched_off.values():
             left = {name: why for name, why in self.switched_off.items() if why != REMOVAL}
             self.switched_off = left
