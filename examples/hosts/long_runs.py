@@ -28,16 +28,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import torch
-from hosts.trials import (
-    GSPLAT,
-    NO_VIDEO,
-    Done,
-    Trial,
-    commit_of,
-    copy_scene,
-    edited_copy,
-    parts_of,
-)
+from hosts.trials import GSPLAT, NO_VIDEO, Trial, commit_of, copy_scene, parts_of
 
 from opt3dgs_optim import __version__
 
@@ -66,24 +57,15 @@ class LongRun(Trial):
     clones: bool = True
     adc: bool = False
 
-    def start(
-        self,
-        trainers: Path,
-        scene: Path,
-        work: Path,
-        out: str,
-        *more: str,
-        ours: bool,
-        iterations: int = ITERATIONS,
-    ) -> Done:
-        """As every trial, with the preset in the edited copy."""
+    def find_script(self, trainers: Path, work: Path, *, ours: bool) -> Path:
+        """As every trial's, with the preset in the edited copy."""
+        script = super().find_script(trainers, work, ours=ours)
         if ours and self.adc:
-            script = edited_copy(self, trainers, work / "edited" / self.trainer)
             text = script.read_text(encoding="utf-8")
             text = text.replace("import PhaseScheduler", "import DEFAULTS_ADC, PhaseScheduler")
             text = re.sub(r"(= PhaseScheduler\([^,)]+)", r"\1, parts=DEFAULTS_ADC", text)
             script.write_text(text, encoding="utf-8")
-        return super().start(trainers, scene, work, out, *more, ours=ours, iterations=iterations)
+        return script
 
     def command(self, scene: Path, out: Path, iterations: int, *, ours: bool) -> list[str]:
         """The script's arguments."""

@@ -88,6 +88,12 @@ class Trial:
         """The options to go on from a checkpoint; gsplat only evaluates one."""
         return ["--ckpt" if self.gsplat else "--start_checkpoint", str(checkpoint)]
 
+    def find_script(self, trainers: Path, work: Path, *, ours: bool) -> Path:
+        """The script to run: the trainer's own, or one with our lines in a copy in `work`."""
+        if ours:
+            return edited_copy(self, trainers, work / "edited" / self.trainer)
+        return trainers / self.trainer / self.script
+
     def start(
         self,
         trainers: Path,
@@ -99,9 +105,7 @@ class Trial:
         iterations: int = ITERATIONS,
     ) -> Done:
         """Train, stock or with our lines, in `work / out`; copies of the trainers go to `work`."""
-        script = trainers / self.trainer / self.script
-        if ours:
-            script = edited_copy(self, trainers, work / "edited" / self.trainer)
+        script = self.find_script(trainers, work, ours=ours)
         command = self.command(scene, work / out, iterations, ours=ours)
         return run(script, [*command, *more], work / out / "cwd", trusted=True)
 
@@ -186,20 +190,9 @@ class Lightning(Trial):
         """The options to go on from a checkpoint."""
         return ["--ckpt_path", str(checkpoint)]
 
-    def start(
-        self,
-        trainers: Path,
-        scene: Path,
-        work: Path,
-        out: str,
-        *more: str,
-        ours: bool,
-        iterations: int = ITERATIONS,
-    ) -> Done:
-        """Train, stock or with the plugin, in `work / out`."""
-        command = self.command(scene, work / out, iterations, ours=ours)
-        script = trainers / self.trainer / self.script
-        return run(script, [*command, *more], work / out / "cwd", trusted=True)
+    def find_script(self, trainers: Path, work: Path, *, ours: bool) -> Path:
+        """The trainer's own, which takes our plugin as an option."""
+        return super().find_script(trainers, work, ours=False)
 
 
 def _gsplat(version: str, *options: str, **said: str) -> Trial:
