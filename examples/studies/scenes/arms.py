@@ -82,6 +82,17 @@ def adaptive(name: str, what: str, parts: MakeParts | None = None) -> StudyArm:
     return StudyArm(name, what, parts, mcmc=False, control=ADAPTIVE, adaptive=True)
 
 
+OWN_FRAMES: dict[str, tuple[str, Part]] = {  # by the arm's name: what it is, and the part
+    **{
+        f"{rate:g}": (f"own frame, {rate:g} of a deviation a step", OwnFrame(rate, min_aspect=0.0))
+        for rate in (0.05, 0.1, 0.2, 0.4)
+    },
+    "0.1-not-thin": (
+        "own frame, 0.1, an axis counts as a tenth of the longest at least",
+        OwnFrame(0.1, min_aspect=0.1),
+    ),
+}
+
 LIST = (
     StudyArm(BASELINE, "3DGS-MCMC as published, torch's Adam"),
     *(
@@ -100,33 +111,16 @@ LIST = (
     ),
     StudyArm("paper-constant", "a constant multiplier, `paper`'s mean", constant, needs="paper"),
     StudyArm("faded", "moments of random points faded", of(FADING)),
+    *(StudyArm(f"frame-{form}", what, of(part)) for form, (what, part) in OWN_FRAMES.items()),
     *(
         StudyArm(
-            f"frame-{rate:g}",
-            f"own frame, {rate:g} of a deviation a step",
-            of(OwnFrame(rate, min_aspect=0.0)),
-        )
-        for rate in (0.05, 0.1, 0.2, 0.4)
-    ),
-    *(
-        StudyArm(
-            f"frame-{rate:g}+faded",
+            f"frame-{form}+faded",
             "as its control, all but the positions faded, points out of view held",
-            of(OwnFrame(rate, min_aspect=0.0), FADING_OTHERS, OutOfView()),
-            control=f"frame-{rate:g}",
+            of(part, FADING_OTHERS, OutOfView()),
+            control=f"frame-{form}",
         )
-        for rate in (0.05, 0.1, 0.2)
-    ),
-    StudyArm(
-        "frame-0.1-not-thin",
-        "own frame, 0.1, an axis counts as a tenth of the longest at least",
-        of(OwnFrame(0.1, min_aspect=0.1)),
-    ),
-    StudyArm(
-        "frame-0.1-not-thin+faded",
-        "as its control, all but the positions faded, points out of view held",
-        of(OwnFrame(0.1, min_aspect=0.1), FADING_OTHERS, OutOfView()),
-        control="frame-0.1-not-thin",
+        for form, (_, part) in OWN_FRAMES.items()
+        if form != "0.4"
     ),
     adaptive(ADAPTIVE, "3DGS with adaptive density control as published, torch's Adam"),
     adaptive(
@@ -135,18 +129,13 @@ LIST = (
         of(ANNEALING_BUT_SCALES, FADING_BUT_SCALES, OutOfView()),
     ),
     *(
-        adaptive(f"adc+frame-{rate:g}", "own frame", of(OwnFrame(rate, min_aspect=0.0)))
-        for rate in (0.1, 0.2)
-    ),
-    adaptive(
-        "adc+frame-0.1-not-thin",
-        "own frame, 0.1, an axis counts as a tenth of the longest at least",
-        of(OwnFrame(0.1, min_aspect=0.1)),
+        adaptive(f"adc+frame-{form}", OWN_FRAMES[form][0], of(OWN_FRAMES[form][1]))
+        for form in ("0.1", "0.2", "0.1-not-thin")
     ),
     adaptive(
         "adc+frame-0.1+faded",
         "as `adc+frame-0.1`, faded, scales and positions left alone",
-        of(OwnFrame(0.1, min_aspect=0.0), replace(FADING, names=BUT_SCALES), OutOfView()),
+        of(OWN_FRAMES["0.1"][1], replace(FADING, names=BUT_SCALES), OutOfView()),
     ),
 )
 ADAPTIVE_DEFAULTS = f"adc+annealed+faded-but-scales{AVERAGED}"  # what `DEFAULTS_ADC` is

@@ -93,17 +93,10 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         # The positions in their own frame: half size decides, then its rate and what is beside it.
         "own-frame": [
             spec
-            for rate in (0.1, 0.2)
-            for arm in (f"frame-{rate}{AVERAGED}", f"frame-{rate}+faded{AVERAGED}")
+            for form in ("0.1", "0.1-not-thin", "0.2")
+            for arm in (f"frame-{form}{AVERAGED}", f"frame-{form}+faded{AVERAGED}")
             for scenes, share in half_sizes
             for spec in at_half(scenes, [arm], seeds, share=share)
-        ],
-        # No axis thinner than a tenth of the longest.
-        "own-frame-not-thin": [
-            spec
-            for arm in ("frame-0.1-not-thin", "frame-0.1-not-thin+faded")
-            for scenes, share in half_sizes
-            for spec in at_half(scenes, [f"{arm}{AVERAGED}"], seeds, share=share)
         ],
         "own-frame-brief": rotated(MANY_VIEWS_SCENES, frames, 1, 7_500),
         "own-frame-quarter": rotated(MANY_VIEWS_SCENES, frames, seeds, 30_000),

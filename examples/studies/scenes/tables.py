@@ -239,10 +239,11 @@ def tuned_table(
             }
             found.append(_tuned_column(study, settings, kind, tuned))
     pairs = {}
-    for k, what in zip(factors, every, strict=False):
+    for k in factors:
         runs = study.runs(replace(own, rates=k), BASELINE)
         both = [(runs[seed], base[seed], 1.0) for seed in sorted(runs.keys() & base.keys())]
-        pairs[what] = Difference(BASELINE, BASELINE, {own.scene: both} if both else {})
+        same = Difference(BASELINE, BASELINE, {own.scene: both} if both else {})
+        pairs[TUNED[f"rates-x{k:g}"]] = same
     found = [column for column in [*found, _tuned_column(study, [own], own.scene, pairs)] if column]
     rows = [("3DGS-MCMC as published", *["0"] * len(found))]
     for what in (*every, *OURS):
