@@ -130,7 +130,8 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
             orphaned |= bool(kept) and own is None
             rows.append({})
             continue
-        needed = () if by_name else own["kept"].get(str(i), ())  # of files, see below
+        # Distributed files leave out what a fresh optimizer has not; that is said below.
+        needed = () if by_name else own["kept"].get(str(i), ())
         rows.append(_rows(call, optimizer.course, own, param, rest, kept, needed, cast=cast))
     if own is None and by_name and steps and optimizer.course.keeps_state:
         warn_user(

@@ -58,10 +58,10 @@ class FreshMoments(Part):
         late = course.switch_step + MAX_LATE_ITERATIONS
         if left < self.settling or (state.last_step or 0) >= late:
             return grad
-        step = state["step"]
-        if state.last_step is None and step.item() <= course.current - course.switch_step:
+        last, step = state.last_step, state["step"]
+        if last is None and step.item() <= course.current - course.switch_step:
             return grad  # moments of a checkpoint, which begin at the switch already
-        last, fresh = state.last_step, state["fresh"]
+        fresh: Tensor = state["fresh"]
         if step.is_cpu:  # steps that count are known to the host on these paths of torch
             first = last is None or last < course.switch_step
             # It is 0 again after a step that turned out not to count; a device is not waited for.
