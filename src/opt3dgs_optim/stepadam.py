@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
 from itertools import chain
 from typing import Any, cast
 
@@ -22,6 +21,13 @@ from opt3dgs_optim.checkpoint import (
 )
 from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.course import STATE_KEY, Course
+from opt3dgs_optim.in_step import (
+    NO_PARTS,
+    ActingParts,
+    MovingParameter,
+    NamedPart,
+    StepInProgress,
+)
 from opt3dgs_optim.names import NamedGroup, block, gaussian_of, group_name, split_name
 from opt3dgs_optim.overrides import (
     TemporaryOverrides,
@@ -43,84 +49,11 @@ from opt3dgs_optim.state import (
     RowOwnership,
     broadcast_rows,
     check_mask,
+    is_finite_sum,
     rows_of,
 )
 
 DEVICE_LOOK_INTERVAL = 16  # energies between two looks at a device's gradients for NaN
-NamedPart = tuple[str, Part]
-
-
-@dataclass(slots=True)
-class ActingParts:
-    """The parts that act on a group in a step, by their hooks, with their names.
-
-    Attributes:
-        any: whether there are any.
-        shaping: whether Adam may be fed another gradient.
-    """
-
-    before: list[NamedPart]
-    factor: list[NamedPart]
-    displacement: list[NamedPart]
-    after: list[NamedPart]
-    any: bool = field(init=False)
-    shaping: bool = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.shaping = bool(self.before or self.displacement)
-        self.any = bool(self.shaping or self.factor or self.after)
-
-    @classmethod
-    def sought(cls, find: Callable[[str], list[NamedPart]]) -> ActingParts:
-        """What `find` finds for the name of each hook."""
-        return cls(*map(find, STEP_HOOKS))
-
-
-STEP_HOOKS = tuple(each.name for each in fields(ActingParts) if each.init)
-NO_PARTS = ActingParts([], [], [], [])
-
-
-@dataclass(slots=True)
-class MovingParameter:
-    """A parameter in the middle of a step.
-
-    Attributes:
-        state: what the hooks see of its state.
-        rows: [N] bool, those that a mask lets move; None: all.
-        counts: whether the step counts, 0-d where only the device knows.
-        guarded: whether something of what the hooks do is to be undone.
-        masked: what has torch's own step move the rows of a mask alone; None without a mask.
-        buffer: where Adam writes its step, if a part says what becomes of it; else None.
-    """
-
-    group: Group
-    param: Tensor
-    record: ParameterRecord
-    parts: ActingParts
-    rows: Tensor | None
-    counts: Tensor | bool
-    guarded: bool
-    state: ParameterState | None = None
-    masked: HeldRows | PickedRows | None = None
-    buffer: Tensor | None = None
-
-    def where_it_moves(self, new: Tensor, old: Tensor | float) -> Tensor:
-        """`new` in the rows that move, if the step counts, else `old`."""
-        keep: Any = self.counts
-        if self.rows is not None:
-            keep = broadcast_rows(self.rows, new) & keep
-        return torch.where(torch.as_tensor(keep, device=new.device), new, old)
-
-
-@dataclass(slots=True)
-class StepInProgress:
-    """What a step has to finish, or to undo, once Adam has moved the parameters."""
-
-    mask: Tensor | None
-    acting: bool
-    counts: Tensor | bool
-    overrides: TemporaryOverrides
-    moving: list[MovingParameter] = field(default_factory=list)
 
 
 class StepAdam(Adam):
@@ -176,11 +109,12 @@ class StepAdam(Adam):
     def _name_groups(self) -> None:
         """Know what each group holds; of those that came or were exchanged their names say it."""
         groups, records = self.param_groups, self._records
-        if len(groups) == len(records) and all(
-            type(group) is NamedGroup and len(group["params"]) <= len(own)
-            for group, own in zip(groups, records, strict=True)
-        ):
-            return
+        if len(groups) == len(records):
+            for group, own in zip(groups, records, strict=True):
+                if type(group) is not NamedGroup or len(group["params"]) > len(own):
+                    break
+            else:
+                return
         known = vars(self).setdefault("_slots", [])
         for i, group in enumerate(groups):
             if i == len(known):
@@ -311,8 +245,7 @@ class StepAdam(Adam):
                     temporary.attribute(self, "found_inf", (~counts).to(torch.float32))
                 self._step_base(mask)
         for moving in step.moving:
-            if moving.state is not None:
-                self._finish(moving, moving.state, course)
+            self._finish(moving, course)
 
     def _parts_of(self, group: Group) -> ActingParts:
         """The parts that act on a group in this step; sought when they change."""
@@ -364,35 +297,41 @@ class StepAdam(Adam):
             decay_weights(step.overrides, group, step.counts)
         params, counts = list(group["params"]), step.counts
         guarded = rows is not None or counts is not True
-        needed = rows is not None or parts.any or bool(self.course.row_keys)
+        needed = rows is not None or parts.any  # whether more than the gradient's check is
         now = max(self.course.current, 0)  # a course may have no clock
         for i, (param, record) in enumerate(zip(params, records, strict=True)):
-            if param.grad is None or param.grad.is_sparse:
+            grad = param.grad
+            if grad is None or grad.is_sparse:
                 continue
-            self._zero_nonfinite(param)
-            own, known = rows, counts
-            if own is not None:
-                own = own.to(param.device)
-            if isinstance(known, Tensor):
-                known = known.to(param.device, non_blocking=True)
-            moving = MovingParameter(group, param, record, parts, own, known, guarded)
+            if not (grad.is_cpu and is_finite_sum(grad)):
+                self._zero_nonfinite(param)
             if needed:
+                own, known = rows, counts
+                if own is not None:
+                    own = own.to(param.device)
+                if isinstance(known, Tensor):
+                    known = known.to(param.device, non_blocking=True)
+                view = self._view_of(group, param, record)
+                moving = MovingParameter(group, param, view, parts, own, known, guarded)
                 params[i] = self._prepare(step, moving)
+                step.moving.append(moving)
             if step.acting:
                 record.last_step = now
-            step.moving.append(moving)
         if parts.displacement or rows is not None:
             step.overrides.item(group, "params", params)
+
+    def _view_of(self, group: Group, param: Tensor, record: ParameterRecord) -> ParameterState:
+        """What the hooks see of a parameter's state, without what is of other rows."""
+        state, course = self.state[param], self.course
+        if not state:  # torch makes its moments only where there is nothing else yet
+            self._init_group({**group, "params": [param]}, [], [], [], [], [], [])
+        self._ownership.drop_foreign(param, state, course.row_keys)
+        return record.view(param, state, course.declared, course.kept_numbers)
 
     def _prepare(self, step: StepInProgress, moving: MovingParameter) -> Tensor:
         """Have Adam fed with what the parts say; return what it moves in the parameter's place."""
         group, param, parts = moving.group, moving.param, moving.parts
-        fed, state = cast(Tensor, param.grad), self.state[param]
-        if not state:  # torch makes its moments only where there is nothing else yet
-            self._init_group({**group, "params": [param]}, [], [], [], [], [], [])
-        self._ownership.drop_foreign(param, state, self.course.row_keys)
-        course = self.course
-        moving.state = view = moving.record.view(param, state, course.declared, course.kept_numbers)
+        fed, view, course = cast(Tensor, param.grad), moving.state, self.course
         if moving.rows is not None:
             fed = torch.where(broadcast_rows(moving.rows, fed), fed, 0.0)
         if moving.guarded and parts.any:
@@ -412,22 +351,22 @@ class StepAdam(Adam):
             fed = fed * unit
         if moving.rows is not None and self._base is Adam:
             if moving.rows.is_cpu and not (group["fused"] or parts.displacement):
-                moving.masked = PickedRows(moving.rows, param, fed, state)
+                moving.masked = PickedRows(moving.rows, param, fed, view.adam)
                 step.overrides.extra_item(self.state, moving.masked.tensor, moving.masked.state)
                 return moving.masked.tensor
-            moving.masked = HeldRows(moving.rows, param, state)
+            moving.masked = HeldRows(moving.rows, param, view.adam)
         if parts.displacement:  # Adam moves a buffer, whose state is the parameter's
             moving.buffer = torch.zeros_like(param, requires_grad=False)
             moving.buffer.grad = fed
-            step.overrides.extra_item(self.state, moving.buffer, state)
+            step.overrides.extra_item(self.state, moving.buffer, view.adam)
             return moving.buffer
         if fed is not param.grad:
             step.overrides.attribute(param, "grad", fed)
         return param
 
-    def _finish(self, moving: MovingParameter, view: ParameterState, course: Course) -> None:
+    def _finish(self, moving: MovingParameter, course: Course) -> None:
         """Move the parameter by what the parts make of Adam's step; have them act after it."""
-        group, param, parts = moving.group, moving.param, moving.parts
+        group, param, parts, view = moving.group, moving.param, moving.parts, moving.state
         if moving.masked is not None:
             moving.masked.put_back()
         if moving.buffer is not None:

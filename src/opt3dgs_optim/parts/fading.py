@@ -1,5 +1,6 @@
 """Fading: Adam's moments of random points are shrunk, so that their next steps are longer."""
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -66,12 +67,7 @@ class Fading(Part):
 
     def events_before(self, iteration: int, total_steps: int) -> int:
         """Number of events before the step of this iteration (from 0)."""
-        length = self.stop - self.start
-        share = (iteration / total_steps - self.start) / length
-        return int(
-            min(max(share, 0.0), 1.0)
-            * min(self.events, length * total_steps / MIN_ITERATIONS_BETWEEN_EVENTS)
-        )
+        return _events_before(iteration, total_steps, self.start, self.stop, self.events)
 
     def happens(self, event: int, num_points: int) -> bool:
         """Whether an event fades any of so many points: of more than 10,000, some do."""
@@ -122,3 +118,11 @@ class Fading(Part):
         now, total = course.iteration, course.total_steps
         events = self.events_before(now, total) - self.events_before(now - 1, total)
         return {"faded": 1.0 - (1.0 - self.share) ** events}
+
+
+@functools.lru_cache(maxsize=64)  # every parameter asks for the same two iterations
+def _events_before(iteration: int, total_steps: int, start: float, stop: float, events: int) -> int:
+    length = stop - start
+    share = (iteration / total_steps - start) / length
+    most = min(events, length * total_steps / MIN_ITERATIONS_BETWEEN_EVENTS)
+    return int(min(max(share, 0.0), 1.0) * most)

@@ -1,0 +1,88 @@
+"""What is known in the middle of a step: the parts that act, and the parameters that move."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim.overrides import TemporaryOverrides
+from opt3dgs_optim.part import Group, Part
+from opt3dgs_optim.state import HeldRows, ParameterState, PickedRows, broadcast_rows
+
+NamedPart = tuple[str, Part]
+
+
+@dataclass(slots=True)
+class ActingParts:
+    """The parts that act on a group in a step, by their hooks, with their names.
+
+    Attributes:
+        any: whether there are any.
+        shaping: whether Adam may be fed another gradient.
+    """
+
+    before: list[NamedPart]
+    factor: list[NamedPart]
+    displacement: list[NamedPart]
+    after: list[NamedPart]
+    any: bool = field(init=False)
+    shaping: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.shaping = bool(self.before or self.displacement)
+        self.any = bool(self.shaping or self.factor or self.after)
+
+    @classmethod
+    def sought(cls, find: Callable[[str], list[NamedPart]]) -> ActingParts:
+        """What `find` finds for the name of each hook."""
+        return cls(*map(find, STEP_HOOKS))
+
+
+STEP_HOOKS = tuple(each.name for each in fields(ActingParts) if each.init)
+NO_PARTS = ActingParts([], [], [], [])
+
+
+@dataclass(slots=True)
+class MovingParameter:
+    """A parameter in the middle of a step.
+
+    Attributes:
+        state: what the hooks see of its state.
+        rows: [N] bool, those that a mask lets move; None: all.
+        counts: whether the step counts, 0-d where only the device knows.
+        guarded: whether something of what the hooks do is to be undone.
+        masked: what has torch's own step move the rows of a mask alone; None without a mask.
+        buffer: where Adam writes its step, if a part says what becomes of it; else None.
+    """
+
+    group: Group
+    param: Tensor
+    state: ParameterState
+    parts: ActingParts
+    rows: Tensor | None
+    counts: Tensor | bool
+    guarded: bool
+    masked: HeldRows | PickedRows | None = None
+    buffer: Tensor | None = None
+
+    def where_it_moves(self, new: Tensor, old: Tensor | float) -> Tensor:
+        """`new` in the rows that move, if the step counts, else `old`."""
+        keep: Any = self.counts
+        if self.rows is not None:
+            keep = broadcast_rows(self.rows, new) & keep
+        return torch.where(torch.as_tensor(keep, device=new.device), new, old)
+
+
+@dataclass(slots=True)
+class StepInProgress:
+    """What a step has to finish, or to undo, once Adam has moved the parameters."""
+
+    mask: Tensor | None
+    acting: bool
+    counts: Tensor | bool
+    overrides: TemporaryOverrides
+    moving: list[MovingParameter] = field(default_factory=list)
