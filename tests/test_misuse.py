@@ -79,14 +79,82 @@ def test_all_optimizers_made_anew() -> None:
     iterate(splats, phases, optimizers, 3)
     fresh = gsplat_optimizers(splats)
     (message,) = said(lambda: iterate(splats, phases, fresh, 300))
-    assert "no upgraded optimizer has stepped" in message
+    assert "no upgraded optimizer has moved Gaussians" in message
 
 
-def test_gaussians_frozen_before_the_end_are_told_what_to_give() -> None:
+# How trainers freeze Gaussians: gsplat main's `ppisp` does the first, and goes on stepping.
+FREEZING = ("requires_grad", "requires_grad, gradients kept", "no gradient", "rate", "no step")
+
+
+def freeze_and_go_on(how: str, splats: Any, phases: Any, optimizers: Any, count: int) -> None:
+    """Iterations in which something else is trained, so that losses are still observed."""
+    for name, optimizer in optimizers.items():
+        for group in optimizer.param_groups:
+            group["lr"] = 0.0 if how == "rate" else group["lr"]
+        splats[name].requires_grad_(not how.startswith("requires_grad"))
+    for _ in range(count):
+        for param in splats.values():
+            kept = how in ("rate", "requires_grad, gradients kept")
+            param.grad = torch.zeros_like(param) if kept else None
+        phases.observe(0.1)
+        if how != "no step":
+            step_all(optimizers)
+
+
+@pytest.mark.parametrize("how", FREEZING)
+def test_gaussians_frozen_before_the_end_are_told_what_to_give(how: str) -> None:
     splats, phases, optimizers = begun()
     iterate(splats, phases, optimizers, 3)
-    (message,) = said(lambda: iterate(splats, phases, {}, 300))
+    assert said(lambda: freeze_and_go_on(how, splats, phases, optimizers, 200)) == []
+    (message,) = said(lambda: freeze_and_go_on(how, splats, phases, optimizers, 100))
+    assert "no upgraded optimizer has moved Gaussians" in message
     assert "where it freezes the Gaussians before the end, give total_steps" in message
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("how", FREEZING)
+def test_gaussians_frozen_where_the_schedule_ends_are_no_overrun(how: str, first: int) -> None:
+    """Whoever follows that advice gets no other warning when the training goes on."""
+    total = 30
+    splats, phases, optimizers = begun(total)
+    for iteration in range(first, total + first):
+        for param in splats.values():
+            param.grad = torch.ones_like(param)
+        phases.observe(0.1, iteration=iteration)
+        step_all(optimizers)
+    assert said(lambda: freeze_and_go_on(how, splats, phases, optimizers, 300)) == []
+
+
+@pytest.mark.parametrize("how", FREEZING)
+def test_gaussians_thawed_after_the_end_are_an_overrun(how: str) -> None:
+    splats, phases, optimizers = begun(30)
+    iterate(splats, phases, optimizers, 30)
+    freeze_and_go_on(how, splats, phases, optimizers, 20)
+    for name, optimizer in optimizers.items():
+        optimizer.param_groups[0]["lr"] = 0.1
+        splats[name].requires_grad_(True)
+    (message,) = said(lambda: iterate(splats, phases, optimizers, 3))
+    assert "the schedule came too early for this run" in message
+
+
+def test_gaussians_that_wait_at_the_beginning_are_no_mistake() -> None:
+    """Poses are trained first, say: nothing has been missed yet."""
+    splats, phases, optimizers = begun()
+    assert said(lambda: freeze_and_go_on("no gradient", splats, phases, optimizers, 300)) == []
+
+
+def test_one_frozen_parameter_is_no_mistake() -> None:
+    splats, phases, optimizers = begun(400)
+    splats["sh0"].requires_grad_(False)
+
+    def go_on() -> None:
+        for _ in range(300):
+            for name, param in splats.items():
+                param.grad = None if name == "sh0" else torch.ones_like(param)
+            phases.observe(0.1)
+            step_all(optimizers)
+
+    assert said(go_on) == []
 
 
 def test_a_name_that_is_not_known_beside_others_of_as_many_rows() -> None:

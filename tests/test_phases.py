@@ -448,10 +448,11 @@ def test_a_run_longer_than_announced() -> None:
     """A switch that comes too early for the run it is in."""
     splats, optimizers = begun(phases := everything(10))
     train(splats, optimizers, phases, 0, 10)
-    phases.observe(0.1, iteration=10)  # a trainer that counts from 1
+    train(splats, optimizers, phases, 10, 11)  # a trainer that counts from 1
+    train(splats, optimizers, phases, 11, 12)
     with pytest.warns(UserWarning, match=r"total_steps=10.*pass the training's number"):
-        phases.observe(0.1)
-    phases.observe(0.1)  # once
+        train(splats, optimizers, phases, 12, 13)
+    train(splats, optimizers, phases, 13, 20)  # once
 
 
 @pytest.mark.parametrize("iteration", [-1, 1.5, "3", True])

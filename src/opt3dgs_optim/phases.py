@@ -104,7 +104,8 @@ class PhaseScheduler(Course):
         self._chosen = parts is not None  # by the user: they stay as they are
         self._removed_rows = RemovedRows()
         self._over_ranks = None if process_group is None else RankMean(CALL, process_group)
-        self._iterations_without_step = 1
+        self._iterations_without_step = 1  # that has moved Gaussians
+        self._has_moved_gaussians = False
         self._steps_without_energy = 0
         self._losses_not_finite = 0  # in a row
         self._iterations_incomplete = 0  # since an upgraded optimizer does not exist any more
@@ -171,8 +172,9 @@ class PhaseScheduler(Course):
             if iteration < self.current:  # what is kept for a time begins anew
                 self.rewinds += 1
                 self._removed_rows = RemovedRows()
+        before = max(self.current, 0)
         self.current = self.iteration if iteration is None else iteration
-        self._watch_clock()
+        self._watch_clock(before)
         self._watch_rows()
         value = loss if isinstance(loss, Tensor) else torch.tensor(float(loss))
         value = value.detach().reshape(()) if value.dim() else value.detach()
@@ -210,7 +212,8 @@ class PhaseScheduler(Course):
         self.steps += 1
         if closure_value is not None:
             self.observe(closure_value)
-        self._iterations_without_step = 0
+        if not self._has_moved_gaussians:  # in a warm-up of rates that begin at 0, say
+            self._iterations_without_step = 0
         self._steps_without_energy += 1
         if self._steps_without_energy > PATIENCE * max(self._num_optimizers, 1):
             self._report(
@@ -228,14 +231,20 @@ class PhaseScheduler(Course):
         if self.parts:
             self.warn_once(kind, f"{CALL}: {mistake}")
 
-    def _watch_clock(self) -> None:
-        """Look for mistakes that an iteration shows; called with each energy."""
+    def _watch_clock(self, before: int) -> None:
+        """Look for mistakes that an iteration shows; called with each energy.
+
+        Args:
+            before: the iteration of the energy before this one, whose steps have been made.
+        """
         adam_steps, self._adam_steps = self._adam_steps, None
+        if self._gaussians_have_moved_since(before):
+            self._has_moved_gaussians, self._iterations_without_step = True, 0
         patience = LONG_PATIENCE if self.steps else PATIENCE
         if self._iterations_without_step > patience:
             self._report(
                 "no step",
-                f"{patience} losses were observed and no upgraded optimizer has stepped: "
+                f"{patience} losses were observed and no upgraded optimizer has moved Gaussians: "
                 f"{self._names()} do nothing; call upgrade(...) again where the trainer makes its "
                 "optimizers anew; where it freezes the Gaussians before the end, give total_steps "
                 "as the iteration after their last step, since the last thirtieth is averaged",
@@ -247,7 +256,10 @@ class PhaseScheduler(Course):
                 "energy of the iteration before; call observe after backward, before the steps",
             )
         lost, alive = self.num_lost_followers, len(self.followers())
-        incomplete = lost and 0 < alive < self._num_optimizers
+        # A trainer that follows the advice to end the schedule where it freezes the Gaussians goes
+        # on observing: from there on, no step is missed.
+        ended = self.current >= self.total_steps and self.steps > 0
+        incomplete = lost and 0 < alive < self._num_optimizers and not ended
         self._iterations_incomplete = self._iterations_incomplete + 1 if incomplete else 0
         if self._iterations_incomplete > LONG_PATIENCE:
             self._report(
@@ -256,10 +268,11 @@ class PhaseScheduler(Course):
                 "trainer has made some of them anew, whose steps have no parts; call upgrade(...) "
                 "again there",
             )
-        self._iterations_without_step += 1
+        self._iterations_without_step += not ended
         self._steps_without_energy = 0
-        # Trainers that count from 1 end at total_steps.
-        if self.current > self.total_steps:
+        # Trainers that count from 1 end at total_steps. Frozen Gaussians may be rendered longer.
+        beyond = self.total_steps + 1
+        if self.current > beyond and self._gaussians_have_moved_since(beyond):
             self._report(
                 "overrun",
                 f"iteration {self.current} of total_steps={self.total_steps}: the schedule came "
@@ -273,6 +286,10 @@ class PhaseScheduler(Course):
                 f"{self.current} of {self.total_steps}; a training that goes on from a checkpoint "
                 "of the stock trainer needs observe(loss, iteration=...)"
             )
+
+    def _gaussians_have_moved_since(self, iteration: int) -> bool:
+        """Whether an upgraded optimizer has moved Gaussians in that iteration or later."""
+        return any(each.has_moved_since(iteration) for each in self.followers())
 
     def _watch_rows(self) -> None:
         """Switch off what loses with clone, split and prune once the trainer removes Gaussians."""
