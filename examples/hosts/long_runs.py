@@ -51,21 +51,9 @@ class LongRun(Trial):
 
     Attributes:
         clones: whether it clones, splits and prunes.
-        adc: whether the edited script has `parts=DEFAULTS_ADC`.
     """
 
     clones: bool = True
-    adc: bool = False
-
-    def find_script(self, trainers: Path, work: Path, *, ours: bool) -> Path:
-        """As every trial's, with the preset in the edited copy."""
-        script = super().find_script(trainers, work, ours=ours)
-        if ours and self.adc:
-            text = script.read_text(encoding="utf-8")
-            text = text.replace("import PhaseScheduler", "import DEFAULTS_ADC, PhaseScheduler")
-            text = re.sub(r"(= PhaseScheduler\([^,)]+)", r"\1, parts=DEFAULTS_ADC", text)
-            script.write_text(text, encoding="utf-8")
-        return script
 
     def command(self, scene: Path, out: Path, iterations: int, *, ours: bool) -> list[str]:
         """The script's arguments."""
@@ -170,7 +158,7 @@ def main() -> None:
             rows[run.name] = row
             kinds = {"stock": (run, False), "edited": (run, True)}
             if run.clones:
-                kinds["DEFAULTS_ADC"] = replace(run, adc=True), True
+                kinds["DEFAULTS_ADC"] = replace(run, scheduler="parts=DEFAULTS_ADC"), True
             for kind, (form, ours) in kinds.items():
                 if kind not in row:
                     row[kind] = train(form, options.trainers, scene, options.iterations, ours=ours)

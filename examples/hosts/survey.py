@@ -26,8 +26,6 @@ from hosts.trials import (
     ITERATIONS,
     TRIALS,
     Done,
-    Lightning,
-    Nerfstudio,
     Outcome,
     Trial,
     commit_of,
@@ -52,6 +50,9 @@ PAGE_TEXT = """# Which trainers were tried
 
 `python examples/hosts/survey.py --trainers DIR --write` makes this page \
 (opt3dgs_optim {version}, {today}).
+
+In these tables *stock* is a trainer as its authors have published it, and *edited* is the same \
+trainer with the lines, the method or the plugin of this package.
 
 ## 3,000 iterations, stock and edited
 
@@ -191,8 +192,7 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
     ran = []
     for trial in TRIALS:
         if row := trained.get(trial.name):
-            none = "none needed" if isinstance(trial, Nerfstudio | Lightning) else "-"
-            count = lines.get((trial.trainer, trial.script), none)
+            count = lines.get((trial.trainer, trial.script), trial.lines)
             ran.append(_row(trial.name, row["commit"], count, *_outcome(row), trial.different))
     saved = sum(row["checkpoint"] == "yes" for row in trials["rows"])
     said: dict[str, list[str]] = {}

@@ -9,14 +9,17 @@ import shutil
 import struct
 import subprocess
 import sys
+import textwrap
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from PIL import Image
 
 from opt3dgs_optim.hosts import write
 
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "hosts"
 ON_CPU = Path(__file__).resolve().parent / "on_cpu.py"
 ITERATIONS = 100
 GSPLAT = "examples/simple_trainer.py"
@@ -56,6 +59,8 @@ class Trial:
     refused: str | None = None  # what a refusal says, where the edited trainer must refuse
     stock_fails: str | None = None  # what the stock trainer stops with, where it does not run
     different: str = ""  # from the stock run, for the table
+    scheduler: str = ""  # arguments that the edited script's PhaseScheduler has beside its own
+    lines: ClassVar[str] = "-"  # for the table, where `diff` writes none
 
     @property
     def name(self) -> str:
@@ -94,6 +99,12 @@ class Trial:
             return edited_copy(self, trainers, work / "edited" / self.trainer)
         return trainers / self.trainer / self.script
 
+    def edit(self, folder: Path) -> None:
+        """Put our lines into the script of the copy in `folder`."""
+        write(folder / self.script)
+        if self.scheduler:
+            give_to_scheduler(folder / self.script, self.scheduler)
+
     def start(
         self,
         trainers: Path,
@@ -112,6 +123,8 @@ class Trial:
 
 class Nerfstudio(Trial):
     """`ns-train`, then `ns-eval`: nothing is edited, the method has another name."""
+
+    lines = "none needed"
 
     def command(self, scene: Path, out: Path, iterations: int, *, ours: bool) -> list[str]:
         """The script's arguments."""
@@ -164,6 +177,8 @@ class Nerfstudio(Trial):
 class Lightning(Trial):
     """gaussian-splatting-lightning's `main.py fit`: nothing is edited, a configuration is added."""
 
+    lines = "none needed"
+
     def command(self, scene: Path, out: Path, iterations: int, *, ours: bool) -> list[str]:
         """The script's arguments."""
         folder = out.parent / "configurations"
@@ -193,6 +208,69 @@ class Lightning(Trial):
     def find_script(self, trainers: Path, work: Path, *, ours: bool) -> Path:
         """The trainer's own, which takes our plugin as an option."""
         return super().find_script(trainers, work, ours=False)
+
+
+class CityGaussian(Lightning):
+    """CityGaussian's `main.py fit`: a copy of its module has the lines of the page."""
+
+    lines = "4, by hand"
+    module = "internal/gaussian_splatting.py"
+    # Where each of the page's lines goes: below the line that begins so.
+    places = (
+        "from typing import",
+        "self.gaussian_optimizers = gaussian_optimizers",
+        'self.manual_backward(metrics["loss"]',
+    )
+
+    def command(self, scene: Path, out: Path, iterations: int, *, ours: bool) -> list[str]:
+        """The script's arguments: without the plugin, which it could not take."""
+        return super().command(scene, out, iterations, ours=False)
+
+    def find_script(self, trainers: Path, work: Path, *, ours: bool) -> Path:
+        """As every trial's that is edited."""
+        return Trial.find_script(self, trainers, work, ours=ours)
+
+    def edit(self, folder: Path) -> None:
+        """Put the lines that docs/hosts/lightning.md prints where it says."""
+        for place, lines in zip(self.places, lines_of_the_page("lightning"), strict=True):
+            insert_below(folder / self.module, place, lines)
+
+
+def lines_of_the_page(name: str) -> list[str]:
+    """The lines that a page of docs/hosts prints for by hand: one text for each place."""
+    text = (DOCS / f"{name}.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```python\n(# with the imports\n.*?)```", text, re.S)
+    return [lines.strip() for lines in re.split(r"^# .*\n", block, flags=re.M)[1:]]
+
+
+def insert_below(script: Path, beginning: str, lines: str) -> None:
+    """Insert lines below the only one that begins so, with its indentation.
+
+    Raises:
+        ValueError: there is no such line, or more than one.
+    """
+    text = script.read_text(encoding="utf-8").splitlines()
+    found = [at for at, line in enumerate(text) if line.strip().startswith(beginning)]
+    if len(found) != 1:
+        raise ValueError(f"{script}: {len(found)} lines begin with {beginning!r}, not one")
+    spaces = text[found[0]][: -len(text[found[0]].lstrip())]
+    text[found[0] + 1 : found[0] + 1] = textwrap.indent(lines, spaces).splitlines()
+    script.write_text("\n".join([*text, ""]), encoding="utf-8")
+
+
+def give_to_scheduler(script: Path, arguments: str) -> None:
+    """Give arguments to the PhaseScheduler of an edited script, and import what they name.
+
+    Raises:
+        ValueError: it does not have exactly one.
+    """
+    text = script.read_text(encoding="utf-8")
+    names = ", ".join(sorted({*re.findall(r"\b[A-Z]\w+", arguments), "PhaseScheduler"}))
+    text = text.replace("opt3dgs_optim import PhaseScheduler", f"opt3dgs_optim import {names}")
+    text, number = re.subn(r"(= PhaseScheduler\([^,)]+)", rf"\1, {arguments}", text)
+    if number != 1:
+        raise ValueError(f"{script}: {number} calls of PhaseScheduler, not one")
+    script.write_text(text, encoding="utf-8")
 
 
 def _gsplat(version: str, *options: str, **said: str) -> Trial:
@@ -262,6 +340,10 @@ TRIALS = (
     Lightning(
         *("gaussian-splatting-lightning", "main.py", ()),
         different="a plugin, no edit; its own density control, `VanillaDensityController`",
+    ),
+    CityGaussian(
+        *("CityGaussian", "main.py", ()),
+        different="edited by hand, as its page says",
     ),
 )
 
@@ -360,7 +442,7 @@ def edited_copy(trial: Trial, trainers: Path, target: Path) -> Path:
     if not target.is_dir():
         plain = shutil.ignore_patterns(".git", "*.png", "*.jpg", "*.gif", "*.mp4", "*.so")
         shutil.copytree(trainers / trial.trainer, target, ignore=plain)
-        write(target / trial.script)
+        trial.edit(target)
     return target / trial.script
 
 

@@ -4,8 +4,8 @@
 trainer (names in `examples/hosts/trials.py`), and OPT3DGS_SCENE: a scene in COLMAP's layout, with
 photos in `images` and `images_4`. Some sixty trainings, each 20 to 40 seconds of a core to itself.
 With OPT3DGS_RECORD what came of them goes into docs/hosts/survey.json (use `-n 1` then).
-nerfstudio reads images with a Pillow below 13 (11.3 works). gaussian-splatting-lightning needs
-`"lightning<2.4" "jsonargparse[signatures]<4.30" "setuptools<80"`.
+nerfstudio reads images with a Pillow below 13 (11.3 works). gaussian-splatting-lightning and
+CityGaussian need `"lightning<2.4" "jsonargparse[signatures]<4.30" "setuptools<80"`.
 """
 
 from __future__ import annotations
@@ -34,6 +34,8 @@ NEEDED = {
     # Lightning 2.3, whose command line reads its own checkpoints, and what that needs.
     "gaussian-splatting-lightning": "lightning jsonargparse docstring_parser typeshed_client "
     "pkg_resources torchmetrics plyfile tensorboard",
+    "CityGaussian": "lightning jsonargparse docstring_parser typeshed_client pkg_resources "
+    "torchmetrics plyfile tensorboard",
     "nerfstudio": "torchmetrics tyro cv2 sklearn yaml imageio nerfacc pytorch_msssim rawpy mediapy "
     "appdirs requests pyquaternion fpsample",
 }
