@@ -61,6 +61,7 @@ class Trial:
     different: str = ""  # from the stock run, for the table
     scheduler: str = ""  # arguments that the edited script's PhaseScheduler has beside its own
     lines: ClassVar[str] = "-"  # for the table, where `diff` writes none
+    trusted: ClassVar[bool] = True  # its checkpoints may hold more than tensors, as INRIA's do
 
     @property
     def name(self) -> str:
@@ -118,7 +119,7 @@ class Trial:
         """Train, stock or with our lines, in `work / out`; copies of the trainers go to `work`."""
         script = self.find_script(trainers, work, ours=ours)
         command = self.command(scene, work / out, iterations, ours=ours)
-        return run(script, [*command, *more], work / out / "cwd", trusted=True)
+        return run(script, [*command, *more], work / out / "cwd", trusted=self.trusted)
 
 
 class Nerfstudio(Trial):
@@ -236,11 +237,19 @@ class CityGaussian(Lightning):
             insert_below(folder / self.module, place, lines)
 
 
-def lines_of_the_page(name: str) -> list[str]:
-    """The lines that a page of docs/hosts prints for by hand: one text for each place."""
+def lines_of_the_page(name: str, first: str = "# with the imports") -> list[str]:
+    """The lines that a page of docs/hosts prints: those below each comment of a block.
+
+    `first` is what the block's first comment begins with.
+    """
     text = (DOCS / f"{name}.md").read_text(encoding="utf-8")
-    (block,) = re.findall(r"```python\n(# with the imports\n.*?)```", text, re.S)
+    (block,) = re.findall(rf"```python\n({re.escape(first)}.*?)```", text, re.S)
     return [lines.strip() for lines in re.split(r"^# .*\n", block, flags=re.M)[1:]]
+
+
+def lines_that_resume_gsplat() -> list[str]:
+    """Those of gsplat's page that save a training, and those that go on from it."""
+    return lines_of_the_page("gsplat", "# at the end of an iteration")
 
 
 def insert_below(script: Path, beginning: str, lines: str) -> None:

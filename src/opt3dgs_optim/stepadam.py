@@ -638,7 +638,7 @@ def upgraded_class(base: type[Adam]) -> type[StepAdam]:
 
 
 def _is_moving_rate(rate: float | Tensor) -> bool:
-    """Whether a learning rate is another than 0; one on a device is not waited for, and taken so."""
+    """Whether a learning rate is not 0; one on a device is taken for moving, without a wait."""
     return bool((isinstance(rate, Tensor) and not rate.is_cpu) or rate)
 
 

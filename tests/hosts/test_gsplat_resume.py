@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-import textwrap
+import os
 import types
 from pathlib import Path
 from typing import Any
@@ -11,23 +10,15 @@ from typing import Any
 import pytest
 import torch
 from gsplat_host import Trainer, strategies
+from hosts.trials import lines_that_resume_gsplat
 from test_host_gsplat import build, make_strategy, start
 from trainers import gsplat_optimizers
 
 from opt3dgs_optim import PhaseScheduler
 
 TOTAL, HALF = 60, 30
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "hosts" / "gsplat.md"
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
-
-
-def lines_of_the_page() -> tuple[str, str]:
-    """What saves and what resumes, as the page prints them."""
-    text = PAGE.read_text(encoding="utf-8")
-    (block,) = [b for b in re.findall(r"```python\n(.*?)```", text, re.S) if "torch.load(" in b]
-    save, resume = block.split("# instead of init_step = 0")
-    return textwrap.dedent(save), textwrap.dedent(resume.partition("\n")[2])
 
 
 def names_for(trainer: Trainer, path: Path) -> dict[str, Any]:
@@ -47,7 +38,7 @@ def names_for(trainer: Trainer, path: Path) -> dict[str, Any]:
 
 @pytest.mark.parametrize("kind", ["mcmc", "default"])
 def test_the_lines_save_and_resume_bit_for_bit(kind: str, tmp_path: Path) -> None:
-    save, resume = lines_of_the_page()
+    save, resume = lines_that_resume_gsplat()
 
     whole = build("1.5.3", kind, "step, strategy", PhaseScheduler(TOTAL))
     whole.run(0, TOTAL)
@@ -57,19 +48,19 @@ def test_the_lines_save_and_resume_bit_for_bit(kind: str, tmp_path: Path) -> Non
     names = names_for(half, tmp_path / "resume.pt")
     exec(save, names)
 
-    again = PhaseScheduler(TOTAL)
     splats = start(seed=1)  # of another start: everything must come from the file
-    optimizers = again.upgrade(gsplat_optimizers(dict(splats)))
+    optimizers = gsplat_optimizers(dict(splats))
     host = types.SimpleNamespace(splats=splats, optimizers=optimizers)
     strategy = make_strategy(strategies("1.5.3"), kind)
     state = strategy.initialize_state(**({} if kind == "mcmc" else {"scene_scale": 1.0}))
     names = {
-        **{"torch": torch, "PATH": tmp_path / "resume.pt", "device": "cpu", "phases": again},
+        **{"torch": torch, "os": os, "PATH": tmp_path / "resume.pt", "device": "cpu"},
+        **{"PhaseScheduler": PhaseScheduler, "max_steps": TOTAL},
         "self": types.SimpleNamespace(**vars(host), strategy_state=state),
     }
     exec(resume, names)
     assert names["init_step"] == HALF
-    resumed = Trainer(splats, optimizers, strategy, total=TOTAL, phases=again)
+    resumed = Trainer(splats, optimizers, strategy, total=TOTAL, phases=names["phases"])
     resumed.state = names["self"].strategy_state
     resumed.run(names["init_step"], TOTAL)
 

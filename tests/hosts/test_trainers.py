@@ -10,9 +10,7 @@ CityGaussian need `"lightning<2.4" "jsonargparse[signatures]<4.30" "setuptools<8
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import math
 import os
 import subprocess
 import sys
@@ -21,47 +19,17 @@ from pathlib import Path
 import pytest
 import torch
 from hosts.survey import keep, scripts_of
-from hosts.trials import ITERATIONS, TRIALS, Done, Trial, copy_scene, edited_copy, run, try_out
+from hosts.trials import ITERATIONS, TRIALS, Trial, edited_copy, run, try_out
+from real_trainers import OURS, TRAINERS, need, no_worse
 
 from opt3dgs_optim.hosts import diff
 
-TRAINERS = Path(os.environ.get("OPT3DGS_TRAINERS", "/no/trainers"))
-BESIDE = Path(__file__).resolve().parents[3] / "shared" / "scenes" / "banana"
-SCENE = Path(os.environ.get("OPT3DGS_SCENE", BESIDE))
-NEEDED = {
-    "gsplat": "torchmetrics tyro cv2 sklearn yaml imageio",
-    "gsplat-main": "pycolmap piexif",
-    # Lightning 2.3, whose command line reads its own checkpoints, and what that needs.
-    "gaussian-splatting-lightning": "lightning jsonargparse docstring_parser typeshed_client "
-    "pkg_resources torchmetrics plyfile tensorboard",
-    "CityGaussian": "lightning jsonargparse docstring_parser typeshed_client pkg_resources "
-    "torchmetrics plyfile tensorboard",
-    "nerfstudio": "torchmetrics tyro cv2 sklearn yaml imageio nerfacc pytorch_msssim rawpy mediapy "
-    "appdirs requests pyquaternion fpsample",
-}
 GAUSSIANS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
-OURS = 1.5  # dB that an edited run of 100 iterations may be worse than the stock one
-# Likewise one that takes a stock run over at half: opacities that annealing slows do not recover
-# from a reset.
+# dB that one which takes a stock run over at half may be worse: opacities that annealing slows do
+# not recover from a reset.
 TAKEN_OVER = 2.5
 
 pytestmark = pytest.mark.hosts
-
-
-@pytest.fixture(scope="session")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    if not (SCENE / "images_4").is_dir():
-        pytest.skip(f"no scene at {SCENE}: set OPT3DGS_SCENE")
-    return copy_scene(SCENE, tmp_path_factory.mktemp("scene") / "small")
-
-
-def need(trial: Trial) -> None:
-    if not (TRAINERS / trial.trainer / trial.script).is_file():
-        pytest.skip(f"no {TRAINERS / trial.trainer}: put its sources there, set OPT3DGS_TRAINERS")
-    for host, names in NEEDED.items():
-        missing = [name for name in names.split() if not importlib.util.find_spec(name)]
-        if trial.trainer.startswith(host) and missing:
-            pytest.skip(f"{host} needs {', '.join(missing)}: pip install them")
 
 
 @pytest.mark.parametrize("trial", [pytest.param(trial, id=trial.name) for trial in TRIALS])
@@ -70,7 +38,7 @@ def test_stock_edited_and_resumed(trial: Trial, scene: Path, tmp_path: Path) -> 
     need(trial)
     got = try_out(trial, TRAINERS, scene, tmp_path)
     if "OPT3DGS_RECORD" in os.environ:
-        keep(trial, TRAINERS, SCENE.name, got)
+        keep(trial, TRAINERS, scene.name, got)
     if trial.stock_fails is not None:
         assert got.stock.code != 0
         assert trial.stock_fails in got.stock.output
@@ -97,13 +65,6 @@ def test_stock_edited_and_resumed(trial: Trial, scene: Path, tmp_path: Path) -> 
             saved = torch.load(last, weights_only=False)["optimizers"]
             steps = {float(saved[name]["state"][0]["step"]) for name in GAUSSIANS}
             assert steps == {ITERATIONS}
-
-
-def no_worse(done: Done, begun: Done, allowed: float) -> None:
-    assert (done.psnr is None) == (begun.psnr is None)
-    if done.psnr is not None and begun.psnr is not None:
-        assert math.isfinite(done.psnr)
-        assert done.psnr > begun.psnr - allowed
 
 
 def test_edited_scripts_use_no_unknown_name(tmp_path: Path) -> None:
