@@ -73,7 +73,8 @@ what is different |
 been run for this table; {counts[2]} of them left a checkpoint. \
 Resumed: the edited trainer, from its own checkpoint and from the stock one's; \
 gsplat's scripts evaluate a checkpoint and do not go on from one \
-([lines that do](gsplat.md#save-and-resume)).
+([lines that do](gsplat.md#save-and-resume)). `tests/hosts/test_each_part.py` trains \
+gsplat 1.5.3 with these lines, and 3dgs-mcmc, with each part alone, and goes on from what they save.
 
 3DGRUT and fVDB reality capture render with CUDA kernels of their own: \
 `examples/hosts/without_renderer.py` runs how they make, edit, save and load their optimizers \

@@ -199,7 +199,6 @@ REFUSED = {
         "several statements"
     ),
     INRIA + "def f(:\n": "cannot be read as Python",
-    INRIA.replace("import torch", "import nerfstudio"): "needs no change",
     "from opt3dgs_optim import AWSGLD\n" + INRIA: "imports opt3dgs_optim already",
 }
 
@@ -215,6 +214,30 @@ def test_what_is_not_certain_is_refused(
     assert "phases = PhaseScheduler(TOTAL_STEPS)" in said  # the lines to add by hand
     assert path.read_text() == text
     assert not (tmp_path / "train.py.orig").exists()
+
+
+@pytest.mark.parametrize(
+    ("module", "page"),
+    [
+        ("nerfstudio.engine", "nerfstudio"),
+        ("threedgrut.utils", "3dgrut"),
+        ("fvdb", "fvdb"),
+        ("fvdb.utils", "fvdb"),
+        ("internal.models", "lightning"),
+    ],
+)
+def test_a_trainer_with_a_page_of_its_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture, module: str, page: str
+) -> None:
+    """The general lines would be wrong there: one is named that exists, and has the right ones."""
+    text = INRIA.replace("range(first_iter, opt.iterations + 1)", "loader")
+    path = saved(tmp_path, text.replace("import torch", f"import {module}\nimport torch"))
+    assert main(["diff", str(path)]) == 1
+    said = capsys.readouterr().err
+    assert f"docs/hosts/{page}.md" in said
+    assert "by hand" not in said
+    pages = Path(__file__).resolve().parents[2] / "docs" / "hosts"
+    assert (pages / f"{page}.md").is_file()
 
 
 def test_other_files_and_folders(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -22,7 +22,8 @@ from opt3dgs_optim.hosts.syntax import FUNCTIONS, refusal, scopes, spots
 COMMAND = """Print the lines to change in a training script as a diff; --write applies them.
 
 gsplat's simple_trainer.py, the train.py of INRIA's gaussian-splatting, 3dgs-mcmc and derivatives. A
-file whose names cannot be read with certainty is refused, with the lines to add by hand.
+file whose names cannot be read with certainty is refused, with the lines to add by hand or the page
+that has them.
 """
 SCHEDULER = "PhaseScheduler"
 LINES_BY_HAND = (
@@ -34,8 +35,15 @@ LINES_BY_HAND = (
 )
 IMPORTS = {  # where it is refused, and why
     "opt3dgs_optim": "it imports opt3dgs_optim already; start from the trainer's own file",
-    "nerfstudio": "nerfstudio needs no change: ns-train splatfacto-opt3dgs "
-    "(docs/hosts/nerfstudio.md)",
+    "nerfstudio": "nerfstudio needs no change: ns-train splatfacto-opt3dgs",
+}
+# Modules of trainers that need other lines than these, or none, and the page of docs/hosts that has
+# what they need.
+PAGES = {
+    "nerfstudio": "nerfstudio",
+    "threedgrut": "3dgrut",
+    "fvdb": "fvdb",
+    "internal": "lightning",  # gaussian-splatting-lightning and CityGaussian
 }
 NOT_PYTHON = {".cpp", ".cu", ".cuh", ".cc", ".h", ".hpp", ".rs"}
 
@@ -72,7 +80,7 @@ def diff(path: Path) -> Edited:
     except (SyntaxError, ValueError) as error:
         raise ValueError(f"it cannot be read as Python: {error}") from None
     for name, reason in IMPORTS.items():
-        if re.search(rf"^\s*(from|import) {name}\b", text, re.MULTILINE):
+        if _imports(text, name):
             raise ValueError(reason)
     trainer = read_trainer(tree, path.parent)
     new = b"".join(_edited_lines(source.splitlines(keepends=True), tree, trainer))
@@ -83,6 +91,20 @@ def diff(path: Path) -> Edited:
     before, after = ([x.decode() for x in y.splitlines(keepends=True)] for y in (source, new))
     shown = difflib.unified_diff(before, after, str(path), str(path), n=1)
     return Edited(new, "".join(shown), trainer.notes)
+
+
+def _imports(text: str, module: str) -> bool:
+    """Whether a file imports a module, or from it."""
+    return bool(re.search(rf"^\s*(from|import) {module}\b", text, re.MULTILINE))
+
+
+def _help_by_hand(path: Path) -> list[str]:
+    """What to do with a script that is refused."""
+    text = path.read_text(encoding="utf-8", errors="ignore")
+    for module, page in PAGES.items():
+        if _imports(text, module):
+            return [f"docs/hosts/{page}.md says what this trainer needs."]
+    return ["The lines to add by hand:", *LINES_BY_HAND]
 
 
 def write(path: Path) -> Path:
@@ -242,7 +264,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ValueError as error:
         print(f"opt3dgs hosts: {options.path}: {error}", file=sys.stderr)
         if options.path.is_file() and options.path.suffix == ".py":
-            print("\n".join(["The lines to add by hand:", *LINES_BY_HAND]), file=sys.stderr)
+            print("\n".join(_help_by_hand(options.path)), file=sys.stderr)
         return 1
     print(done.diff, end="")
     for note in done.notes:

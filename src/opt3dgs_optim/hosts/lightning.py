@@ -1,7 +1,7 @@
-"""Opt3DGS in gaussian-splatting-lightning (yzslab) and CityGaussian: the plugin `Opt3DGS`.
+"""Opt3DGS in gaussian-splatting-lightning (yzslab): the plugin `Opt3DGS`.
 
 Nothing of the trainer is edited. With the package installed beside it, the plugin is named in the
-trainer's configuration:
+trainer's configuration. (CityGaussian, which derives from it, has no plugins.)
 
     model:
       plugins:
