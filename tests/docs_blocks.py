@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import tempfile
 from dataclasses import dataclass
@@ -102,6 +103,7 @@ def trainer_names() -> dict[str, Any]:
     strategy = SimpleNamespace(method="GSStrategy")
     return {
         "torch": torch,
+        "os": os,
         "self": trainer,
         "conf": SimpleNamespace(n_iterations=100, strategy=strategy),
         "opt_args": SimpleNamespace(iterations=100),
@@ -122,6 +124,7 @@ def trainer_names() -> dict[str, Any]:
         "world_size": 1,
         "masks": torch.ones(3, 8, 8, dtype=torch.bool),
         "iteration": 1,
+        "step": 0,
         "gaussians": SimpleNamespace(
             optimizer=torch.optim.Adam(
                 [o.param_groups[0] for o in adams(names).values()], lr=0.0, eps=1e-15

@@ -29,7 +29,11 @@ class Runner:
         ]
         pbar = tqdm.tqdm(range(init_step, max_steps))
         for step in pbar:
-            colors, pixels, masks = next(loader)
+            try:
+                colors, pixels, masks = next(loader)
+            except StopIteration:
+                loader = iter(trainloader)
+                colors, pixels, masks = next(loader)
             l1loss = F.l1_loss(colors, pixels)
             loss = l1loss
             loss.backward()

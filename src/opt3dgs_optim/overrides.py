@@ -60,6 +60,11 @@ def _delete(owner: Any, key: Any, _: Any) -> None:
     owner.pop(key, None)
 
 
+def is_moving_rate(rate: float | Tensor) -> bool:
+    """Whether a learning rate is not 0; one on a device is taken for moving, without a wait."""
+    return bool((isinstance(rate, Tensor) and not rate.is_cpu) or rate)
+
+
 def scale_learning_rate(
     overrides: TemporaryOverrides,
     group: Group,

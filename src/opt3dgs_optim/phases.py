@@ -12,7 +12,8 @@ from torch.optim import Optimizer
 
 from opt3dgs_optim.checks import check_choice, check_count, check_number, warn_user
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.names import block
+from opt3dgs_optim.names import block, gaussian_of
+from opt3dgs_optim.overrides import is_moving_rate
 from opt3dgs_optim.part import Part, Phase
 from opt3dgs_optim.presets import (
     DEFAULTS,
@@ -288,8 +289,21 @@ class PhaseScheduler(Course):
             )
 
     def _gaussians_have_moved_since(self, iteration: int) -> bool:
-        """Whether an upgraded optimizer has moved Gaussians in that iteration or later."""
-        return any(each.has_moved_since(iteration) for each in self.followers())
+        """Whether an upgraded optimizer has moved Gaussians in that iteration or later.
+
+        Frozen are those that require no gradient, and those whose learning rate is 0. Those without
+        a gradient make no step.
+        """
+        return any(
+            param.requires_grad
+            and (record := optimizer.record_of(param)) is not None
+            and record.last_step is not None
+            and record.last_step >= iteration
+            for optimizer in self.followers()
+            for group in optimizer.param_groups
+            if gaussian_of(group) is not None and is_moving_rate(group["lr"])
+            for param in group["params"]
+        )
 
     def _watch_rows(self) -> None:
         """Switch off what loses with clone, split and prune once the trainer removes Gaussians."""

@@ -33,6 +33,7 @@ from opt3dgs_optim.overrides import (
     TemporaryOverrides,
     can_be_fused,
     decay_weights,
+    is_moving_rate,
     own_step,
     refuse_capture,
     scale_learning_rate,
@@ -132,22 +133,6 @@ class StepAdam(Adam):
             while len(self._records[i]) < len(group["params"]):
                 self._records[i].append(ParameterRecord())
 
-    def has_moved_since(self, iteration: int) -> bool:
-        """Whether a Gaussian parameter that is not frozen has made a step in `iteration` or later.
-
-        Frozen are those that require no gradient, and those whose learning rate is 0. Those without
-        a gradient make no step.
-        """
-        return any(
-            record.last_step is not None
-            and record.last_step >= iteration
-            and param.requires_grad
-            and _is_moving_rate(group["lr"])
-            for group, records in zip(self.param_groups, self._records, strict=False)
-            if gaussian_of(group) is not None
-            for param, record in zip(group["params"], records, strict=False)
-        )
-
     def acts_on(self, part: Part, group: Group) -> bool:
         """Whether a part acts on a group."""
         name = gaussian_of(group)
@@ -204,7 +189,7 @@ class StepAdam(Adam):
 
     def _is_held(self) -> bool:
         """Whether no learning rate moves anything."""
-        return not any(_is_moving_rate(group["lr"]) for group in self.param_groups)
+        return not any(is_moving_rate(group["lr"]) for group in self.param_groups)
 
     # Learning-rate schedulers, which would wrap `step` on the instance, need not: `step` tells.
     step._wrapped_by_lr_sched = True  # pyright: ignore[reportFunctionMemberAccess]
@@ -635,11 +620,6 @@ def upgraded_class(base: type[Adam]) -> type[StepAdam]:
     bases = (StepAdam,) if base is Adam else (StepAdam, base)
     about = {"__module__": base.__module__, "__qualname__": base.__qualname__, "_made_of": base}
     return type(base.__name__, bases, about)
-
-
-def _is_moving_rate(rate: float | Tensor) -> bool:
-    """Whether a learning rate is not 0; one on a device is taken for moving, without a wait."""
-    return bool((isinstance(rate, Tensor) and not rate.is_cpu) or rate)
 
 
 def _new_upgraded(base: type[Adam]) -> StepAdam:

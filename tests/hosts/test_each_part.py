@@ -62,16 +62,15 @@ class Gsplat(Trial):
         script = folder / self.script
         text = script.read_text(encoding="utf-8")
         save, resume = lines_that_resume_gsplat()
-        made = re.search(r"^ +phases = (.*)\n +self\.optimizers = phases\.upgrade.*\n", text, re.M)
+        made = re.search(r"^ +phases = .*\n +self\.optimizers = phases\.upgrade.*\n", text, re.M)
         assert made is not None
         text = text.replace(made[0], "")
-        resume = resume.replace("PhaseScheduler(max_steps)", made[1])
         resume = resume.replace("PATH", 'f"{cfg.result_dir}/begun.pt"')
         save = save.replace("PATH", 'f"{cfg.result_dir}/whole_{step + 1}.pt"')
         save = f"if step + 1 in (max_steps // 2, max_steps):\n{textwrap.indent(save, '    ')}"
         start, end = "        init_step = 0\n", "            # eval the full set\n"
         assert text.count(start) == text.count(end) == 1
-        text = text.replace(start, textwrap.indent(resume, " " * 8) + "\n")
+        text = text.replace(start, made[0] + textwrap.indent(resume, " " * 8) + "\n")
         text = text.replace(end, textwrap.indent(save, " " * 12) + f"\n\n{end}")
         script.write_text(text, encoding="utf-8")
 

@@ -66,7 +66,7 @@ def test_the_lines_of_gsplat(tmp_path: Path) -> None:
         f"phases = PhaseScheduler(max_steps{ranks})",
         "self.optimizers = phases.upgrade(self.optimizers)",
         "l1loss = phases.pixel_loss(colors, pixels)",
-        "phases.observe(loss)",
+        "phases.observe(loss, iteration=step)",
     ]
     assert added(diff(path).diff) == lines
     assert diff(path).notes == ["left alone: self.pose_optimizers"]

@@ -48,19 +48,20 @@ def test_the_lines_save_and_resume_bit_for_bit(kind: str, tmp_path: Path) -> Non
     names = names_for(half, tmp_path / "resume.pt")
     exec(save, names)
 
+    again = PhaseScheduler(TOTAL)
     splats = start(seed=1)  # of another start: everything must come from the file
-    optimizers = gsplat_optimizers(dict(splats))
+    optimizers = again.upgrade(gsplat_optimizers(dict(splats)))
     host = types.SimpleNamespace(splats=splats, optimizers=optimizers)
     strategy = make_strategy(strategies("1.5.3"), kind)
     state = strategy.initialize_state(**({} if kind == "mcmc" else {"scene_scale": 1.0}))
     names = {
         **{"torch": torch, "os": os, "PATH": tmp_path / "resume.pt", "device": "cpu"},
-        **{"PhaseScheduler": PhaseScheduler, "max_steps": TOTAL},
+        "phases": again,
         "self": types.SimpleNamespace(**vars(host), strategy_state=state),
     }
     exec(resume, names)
     assert names["init_step"] == HALF
-    resumed = Trainer(splats, optimizers, strategy, total=TOTAL, phases=names["phases"])
+    resumed = Trainer(splats, optimizers, strategy, total=TOTAL, phases=again)
     resumed.state = names["self"].strategy_state
     resumed.run(names["init_step"], TOTAL)
 

@@ -174,4 +174,4 @@ def test_a_method_called_for_each_epoch(tmp_path: Path) -> None:
 
 def test_a_trainer_of_its_own_for_each_scene(tmp_path: Path) -> None:
     text = GSPLAT + "\n\nfor scene in scenes:\n    runner = Runner(scene)\n    runner.train()\n"
-    assert "phases.observe(loss)" in lines_for(tmp_path, text)
+    assert "phases.observe(loss, iteration=step)" in lines_for(tmp_path, text)
