@@ -14,7 +14,8 @@ from opt3dgs_optim.lbfgs.pairs import columns, put, row_chunks
 from opt3dgs_optim.part import Group, Part, Phase, State
 
 GaussianTensors = Mapping[str, Tensor]
-LEFT_AT = "positions_left_at"  # what it publishes from step to step: where, how often written
+# What it publishes from step to step: where, how often written, and a copy where one is needed.
+LEFT_AT = "positions_left_at"
 GATE_SHARPNESS = 100.0  # k of eq. 2's gate
 GATE_OPACITY = 0.005  # t of eq. 2's gate: the opacity under which a Gaussian counts as dead
 # Steps in a row with positions changed by somebody else before it is said.
@@ -66,11 +67,17 @@ class PositionNoise(Part):
     ) -> Tensor:
         """Say once that somebody else moves the positions too, as a trainer's own noise does."""
         # Density control puts another tensor in place; noise writes into this one, every time.
-        where, version = course.published(LEFT_AT, param, earlier=True) or (None, 0)
+        left = course.published(LEFT_AT, param, earlier=True) or (None, 0, None)
+        where, version, copy = left
         written = where == param.data_ptr() and version != param._version
-        if self._num_changed_by_others <= MIN_STEPS_CHANGED_BY_OTHERS:
+        if self._num_changed_by_others < MIN_STEPS_CHANGED_BY_OTHERS:
             self._num_changed_by_others = self._num_changed_by_others + 1 if written else 0
-            if self._num_changed_by_others > MIN_STEPS_CHANGED_BY_OTHERS:
+        elif self._num_changed_by_others == MIN_STEPS_CHANGED_BY_OTHERS and not written:
+            self._num_changed_by_others = 0
+        elif copy is not None:
+            self._num_changed_by_others += 1  # never looked at again
+            # Trainers write noise of a rate of 0 as they write any other.
+            if not torch.equal(copy, param):
                 warn_user(
                     f"PositionNoise: the positions were changed in place between "
                     f"{MIN_STEPS_CHANGED_BY_OTHERS} steps in a row, while this part adds noise in "
@@ -83,7 +90,9 @@ class PositionNoise(Part):
         """Add the noise to the positions [N, 3] in place."""
         source = self.gaussians if self.gaussians is not None else course.gaussians_of(param)
         self._add(param, group["lr"], source() if callable(source) else source)
-        course.publish(LEFT_AT, param, (param.data_ptr(), param._version))
+        looked_at = self._num_changed_by_others == MIN_STEPS_CHANGED_BY_OTHERS
+        copy = param.detach().clone() if looked_at else None
+        course.publish(LEFT_AT, param, (param.data_ptr(), param._version, copy))
 
     @torch.no_grad()
     def add_to(self, means: Tensor, lr: float | Tensor) -> None:
