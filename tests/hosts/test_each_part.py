@@ -130,7 +130,10 @@ TRAINERS_WITH_A_TRIAL: dict[str, Gsplat | Mcmc] = {
     ),
     "3dgs-mcmc": Mcmc(
         *("3dgs-mcmc", "train.py"),
-        (*INRIA_OPTIONS, "--cap_max", "2500", "--init_type", "sfm", "--noise_lr", "0"),
+        (
+            *(*INRIA_OPTIONS, "--cap_max", "2500", "--init_type", "sfm", "--noise_lr", "0"),
+            *("--opacity_lr", "0.3"),  # from 0.5, so that some fade enough to be moved by noise
+        ),
     ),
 }
 WithoutParts = Callable[[str, int], Path]
