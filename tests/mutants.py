@@ -44,11 +44,17 @@ ENERGY = ["test_partitions.py", "parts/test_histogram.py", "parts/test_histogram
 CURVATURE = [
     f"lbfgs/test_{name}.py" for name in ("history", "two_loop", "lqn_direction", "foresight")
 ]
-DEFAULTS = ("annealing", "averaging", "fading", "out_of_view")
+PARTS = ("annealing", "averaging", "fading", "out_of_view", "own_frame")
+STATE = [
+    *(f"test_{name}.py" for name in ("masks", "part", "dropped_steps", "row_edits", "checkpoints")),
+    *(f"test_cases_{name}.py" for name in ("two_instances", "several_tensors", "windows")),
+    *(f"test_cases_{name}.py" for name in ("dtypes", "copies")),
+]
 # Of these tests: those that compile C++, a law that the loop oracle sees sooner, other classes.
 LEFT_OUT = "not sanitizers and not mutants and not kernel and not compiles and not power_four"
 OPTIONS_OF = ("EnergyHistogram", "IsotropicNoise", "PositionNoise", "Annealing", "Fading")
-LEFT_OUT += f" and not (test_options and not {' and not '.join(OPTIONS_OF)})"
+OPTIONS_OF += ("OwnFrame",)
+LEFT_OUT += f" and not (test_options.py and not {' and not '.join(OPTIONS_OF)})"
 # Module: the tests that are meant to notice. What energy, curvature and noise are made of included.
 TARGETS = {
     "partitions.py": ENERGY,
@@ -61,7 +67,11 @@ TARGETS = {
         "parts/test_noise_covariance.py",
         "test_options.py",
     ],
-    **{f"parts/{name}.py": [f"parts/test_{name}.py", "test_options.py"] for name in DEFAULTS},
+    **{f"parts/{name}.py": [f"parts/test_{name}.py", "test_options.py"] for name in PARTS},
+    "frames.py": ["parts/test_own_frame.py", "parts/test_noise_covariance.py"],
+    "removed_rows.py": ["test_removed_rows.py"],
+    "state.py": STATE,
+    "stepadam.py": [*STATE, "test_stepadam.py", "test_reference_step.py", "test_cases_groups.py"],
 }
 
 

@@ -27,6 +27,7 @@ from opt3dgs_optim import (
     IsotropicNoise,
     LQNAdam,
     OutOfView,
+    OwnFrame,
     PhaseScheduler,
     PositionNoise,
     SquaredLoss,
@@ -93,6 +94,15 @@ TABLE: dict[str, tuple[Callable[..., Any], type, dict[str, Any]]] = {
     "FreshMoments": (FreshMoments, FreshMoments, {"settling": COUNTS}),
     "Averaging": (Averaging, Averaging, {}),
     "OutOfView": (OutOfView, OutOfView, {}),
+    "OwnFrame": (
+        OwnFrame,
+        OwnFrame,
+        {
+            "rate": [*NOT_NUMBERS, 0.0, -1.0],
+            "final": [*NOT_NUMBERS, 0.0, -1.0],
+            "min_aspect": [*NOT_NUMBERS, -0.1, 1.1],
+        },
+    ),
     "SquaredLoss": (SquaredLoss, SquaredLoss, {}),
     "PhaseScheduler": (
         phases,
@@ -226,7 +236,7 @@ def test_a_backend_that_there_is_not() -> None:
 
 
 # Bases that nobody constructs, the enum, and those that have such tests of their own.
-OTHERS = {"Kept", "OwnFrame", "Course", "Part", "Phase", "StepAdam", "EnergyHistogram", "RunLog"}
+OTHERS = {"Kept", "Course", "Part", "Phase", "StepAdam", "EnergyHistogram", "RunLog"}
 
 
 def test_every_public_class_is_here() -> None:

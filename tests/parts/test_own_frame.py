@@ -371,7 +371,26 @@ def test_noise_and_the_trainers_schedule_read_the_trainers_rate() -> None:
     assert set(optimizers["means"].state) == {splats["means"]}
 
 
-@pytest.mark.parametrize("options", [{"rate": 0.0}, {"rate": float("nan")}, {"final": -1.0}])
-def test_options_are_checked(options: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=f"OwnFrame: {next(iter(options))}="):
-        OwnFrame(**options)
+def test_the_rate_falls_by_a_hundred_over_the_run() -> None:
+    """By default a full step is a tenth of a deviation at first, a thousandth in the end."""
+    splats = scene(5, 2)
+    phases = only(TOTAL, OwnFrame(min_aspect=0.0))
+    adams = {n: torch.optim.Adam([p], lr=1e-3, eps=1e-30) for n, p in splats.items()}
+    phases.upgrade(adams)
+    inverse = torch.linalg.inv(frame(splats["quats"].data, splats["scales"].data))
+    for i in range(TOTAL):
+        before = splats["means"].detach().clone()
+        # In the own frame the gradient is 1 along every axis, always, so that Adam's steps are full.
+        splats["means"].grad = inverse.transpose(1, 2) @ torch.ones(3, dtype=torch.float64)
+        phases.observe(0.1)
+        adams["means"].step()
+        moved = torch.einsum("nij,nj->ni", inverse, splats["means"].detach() - before)
+        expected = torch.full((5, 3), -0.1 * 0.01 ** (i / TOTAL), dtype=torch.float64)
+        torch.testing.assert_close(moved, expected, rtol=1e-6, atol=0.0)
+        assert phases.numbers()["own_frame_rate"] == pytest.approx(
+            -expected[0, 0].item(), rel=1e-12
+        )
+    assert [OwnFrame().at(progress) for progress in (-1.0, 0.0, 1.0, 2.0)] == [
+        *(0.1, 0.1),
+        *(pytest.approx(0.001), pytest.approx(0.001)),
+    ]
