@@ -42,7 +42,7 @@ class Frames:
     """
 
     def __init__(
-        self, quats: Tensor, scales: Tensor, dtype: torch.dtype, min_aspect: float = 0.0
+        self, quats: Tensor, scales: Tensor, dtype: torch.dtype, min_aspect: float
     ) -> None:
         self._wide = torch.float64 if dtype == torch.float64 else torch.float32
         self._axes: Tensor | None = None  # B as columns, [3, 3, N]; None: a kernel makes it
@@ -74,7 +74,7 @@ class Frames:
         return result
 
 
-def axes_of(quats: Tensor, scales: Tensor, dtype: torch.dtype, min_aspect: float = 0.0) -> Tensor:
+def axes_of(quats: Tensor, scales: Tensor, dtype: torch.dtype, min_aspect: float) -> Tensor:
     """B = R diag(s) as columns, [3, 3, N]; arguments as in `Frames`."""
     result = torch.empty(3, 3, len(quats), dtype=dtype, device=quats.device)
     for rows in row_chunks(quats):

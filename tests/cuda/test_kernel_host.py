@@ -271,9 +271,9 @@ def test_a_part_has_the_same_frames_from_kernels_and_from_torch(
     kernels: dict, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vectors, quats, scales = (each.to(dtype) for each in frame_case(300))
-    plain = Frames(quats, scales, dtype)
+    plain = Frames(quats, scales, dtype, 0.0)
     monkeypatch.setattr(cuda, "has_own_frames", lambda _: True)
-    by_kernel = Frames(quats, scales, dtype)
+    by_kernel = Frames(quats, scales, dtype, 0.0)
     quats += 1  # as one optimizer of all groups moves them before the step is asked for
     unit = vectors.double().norm(dim=1, keepdim=True) * scales.double().exp().amax(1, keepdim=True)
     wide = torch.float64 if dtype == torch.float64 else torch.float32

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import gc
+from functools import partial
 from typing import Any
 
 import devices
@@ -104,7 +106,7 @@ def scene(rows: int, seed: int, size: float = 1.0) -> dict[str, Parameter]:
 
 
 def run(
-    splats: dict[str, Parameter], grad_of: Any, steps: int = 20, lr: float = 1e-3, **options: Any
+    splats: dict[str, Parameter], grad_of: Any, steps: int = 20, lr: Any = 1e-3, **options: Any
 ) -> None:
     """Steps of the positions by the own frame; `grad_of(means, i)` is their gradient."""
     phases = only(TOTAL, OwnFrame(**options))
@@ -193,20 +195,25 @@ def test_a_step_is_a_share_of_a_standard_deviation(magnitude: int, dtype: torch.
     torch.testing.assert_close(moved, torch.full_like(moved, -0.1 * size), rtol=tolerance, atol=0)
 
 
+RATES = [float, partial(torch.tensor, dtype=torch.float64)]  # torch takes a rate as either
+
+
+@pytest.mark.parametrize("kind", RATES)
 @pytest.mark.parametrize("factor", [0.1, 0.3, 3.0, 10.0])
-def test_the_trainers_rate_does_not_count(factor: float) -> None:
+def test_the_trainers_rate_does_not_count(factor: float, kind: Any) -> None:
     ends = []
-    for lr in (1e-3, 1e-3 * factor):
+    for lr in (1e-3, kind(1e-3 * factor)):
         splats = scene(6, 2)
         run(splats, pull(torch.ones(6, 3).double()), lr=lr)
         ends.append(splats["means"].detach())
     torch.testing.assert_close(ends[0], ends[1], rtol=1e-12, atol=1e-12)
 
 
-def test_positions_with_a_rate_of_zero_are_held() -> None:
+@pytest.mark.parametrize("kind", RATES)
+def test_positions_with_a_rate_of_zero_are_held(kind: Any) -> None:
     splats = scene(6, 3)
     before = splats["means"].detach().clone()
-    run(splats, pull(torch.ones(6, 3).double()), lr=0.0)
+    run(splats, pull(torch.ones(6, 3).double()), lr=kind(0.0))
     assert torch.equal(splats["means"], before)
 
 
@@ -342,21 +349,52 @@ def test_weight_decay_is_of_the_positions_themselves(decoupled: bool) -> None:
     torch.testing.assert_close(splats["means"].detach(), plain.detach(), rtol=1e-12, atol=1e-12)
 
 
-def test_where_no_frame_is_found_it_says_so_and_the_step_is_adams() -> None:
-    x, y = Parameter(torch.ones(4, 3)), Parameter(torch.ones(4, 3))
+SHAPES = {
+    "the positions alone": ((4, 3), {}),
+    "no quaternions": ((4, 3), {"scales": (4, 3)}),
+    "no scales": ((4, 3), {"quats": (4, 4)}),
+    "scales of other points": ((4, 3), {"scales": (5, 3), "quats": (4, 4)}),
+    "quaternions of other points": ((4, 3), {"scales": (4, 3), "quats": (5, 4)}),
+    "one scale for all axes": ((4, 3), {"scales": (4, 1), "quats": (4, 4)}),
+    "angles": ((4, 3), {"scales": (4, 3), "quats": (4, 3)}),
+    "Gaussians of a plane": ((4, 2), {"scales": (4, 2), "quats": (4, 4)}),
+}
+
+
+@pytest.mark.parametrize("case", SHAPES)
+def test_where_no_frame_is_found_it_says_so_and_the_step_is_adams(case: str) -> None:
+    shape, others = SHAPES[case]
+    x, y = Parameter(torch.ones(shape)), Parameter(torch.ones(shape))
+    splats = {"means": x, **{name: Parameter(torch.ones(size)) for name, size in others.items()}}
     phases = only(TOTAL, OwnFrame())
-    ours: Any = phases.upgrade({"means": torch.optim.Adam([x], lr=0.1)})["means"]
+    adams: Any = {name: torch.optim.Adam([param], lr=0.1) for name, param in splats.items()}
+    ours = phases.upgrade(adams)["means"]
     theirs = torch.optim.Adam([y], lr=0.1)
     for i in range(3):
         phases.observe(0.1)
         for param, adam in ((x, ours), (y, theirs)):
-            param.grad = torch.full((4, 3), 1.0 + i)
+            param.grad = torch.full(shape, 1.0 + i)
             if i == 0 and adam is ours:
                 with pytest.warns(UserWarning, match=r"need scales \[N, 3\] and quats \[N, 4\]"):
                     adam.step()
             else:
                 adam.step()
     assert torch.equal(x, y)
+
+
+def test_nothing_is_kept_from_step_to_step() -> None:
+    def alive() -> int:
+        gc.collect()
+        return sum(type(each) is Frames for each in gc.get_objects())
+
+    others = alive()
+    phases, splats = only(TOTAL, OwnFrame()), scene(6, 3)
+    adams: Any = phases.upgrade({n: torch.optim.Adam([p]) for n, p in splats.items()})
+    splats["means"].grad = torch.ones_like(splats["means"])
+    phases.observe(0.1)
+    adams["means"].step()
+    assert alive() == others
+    assert set(adams["means"].state[splats["means"]]) == {"step", "exp_avg", "exp_avg_sq"}
 
 
 def test_noise_and_the_trainers_schedule_read_the_trainers_rate() -> None:
@@ -379,17 +417,16 @@ def test_the_rate_falls_by_a_hundred_over_the_run() -> None:
     phases.upgrade(adams)
     inverse = torch.linalg.inv(frame(splats["quats"].data, splats["scales"].data))
     for i in range(TOTAL):
+        rate = 0.1 * 0.01 ** (i / TOTAL)
         before = splats["means"].detach().clone()
-        # In the own frame the gradient is 1 along every axis, always, so that Adam's steps are full.
+        # In the own frame the gradient is 1 along every axis, always: Adam's steps are full.
         splats["means"].grad = inverse.transpose(1, 2) @ torch.ones(3, dtype=torch.float64)
         phases.observe(0.1)
         adams["means"].step()
         moved = torch.einsum("nij,nj->ni", inverse, splats["means"].detach() - before)
-        expected = torch.full((5, 3), -0.1 * 0.01 ** (i / TOTAL), dtype=torch.float64)
+        expected = torch.full((5, 3), -rate, dtype=torch.float64)
         torch.testing.assert_close(moved, expected, rtol=1e-6, atol=0.0)
-        assert phases.numbers()["own_frame_rate"] == pytest.approx(
-            -expected[0, 0].item(), rel=1e-12
-        )
+        assert phases.numbers()["own_frame_rate"] == pytest.approx(rate, rel=1e-12)
     assert [OwnFrame().at(progress) for progress in (-1.0, 0.0, 1.0, 2.0)] == [
         *(0.1, 0.1),
         *(pytest.approx(0.001), pytest.approx(0.001)),
