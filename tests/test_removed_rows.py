@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import copy
 import io
+import itertools
+import random
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -58,6 +61,7 @@ KEEPING: dict[str, Callable[[Tensor], Tensor]] = {
     "relocate and grow": lambda v: torch.cat([overwritten(v, slice(0, 30), v[30:60] - 0.3), v[:5]]),
     "all changed, but two": lambda v: torch.cat([v[50:52], v[2:] - 0.3]),
     "permute": lambda v: v.flip(0),
+    "the highest rises": lambda v: overwritten(v, slice(99, 100), v[99:] + 1.0),
     "relocate, grow and permute": lambda v: torch.cat(
         [overwritten(v, slice(0, 30), v[30:60] - 0.3).flip(0), v[:5] - 0.3]
     ),
@@ -81,6 +85,93 @@ def test_rows_that_are_removed_are_found(edit: str, shape: tuple[int, ...]) -> N
 @pytest.mark.parametrize("edit", KEEPING)
 def test_rows_that_are_kept_are_not_taken_for_removed(edit: str) -> None:
     assert not were_removed(ROWS, KEEPING[edit](ROWS))
+
+
+def removed_by_the_rule(before: list[int], after: list[int]) -> bool:
+    """The rule of `were_removed`, row by row."""
+    count = len(before)
+    if len(after) < count:
+        return True
+    # Where rows were, in the order in which they are now, of those that are known by their value.
+    known = [
+        (before.index(value), now)
+        for now, value in enumerate(after[:count])
+        if before.count(value) == 1
+    ]
+    moved = sum(was != now for was, now in known)
+    if 10 * len(known) < count or moved == 0 or 2 * moved < len(known):
+        return False
+    steps = [later - earlier for (earlier, _), (later, _) in itertools.pairwise(known)]
+    if 10 * sum(step > 0 for step in steps) >= 9 * len(steps):
+        return True
+    copied = sum(before.count(value) == 1 and after.count(value) > 1 for value in before)
+    return 100 * copied > count
+
+
+NEW = range(1000, 2000)  # values that no row had
+AT_THE_BOUNDS: dict[str, tuple[list[int], list[int], bool]] = {
+    "one known of ten, moved": ([*range(10)], [*NEW[:3], 2, *NEW[4:10]], True),
+    "one known of eleven, moved": ([*range(11)], [*NEW[:3], 2, *NEW[4:11]], False),
+    "half of the known have moved": ([*range(10)], [0, 2, *NEW[:8]], True),
+    "a third of the known have moved": ([*range(10)], [0, 1, 3, *NEW[:7]], False),
+    "one in ten out of order": ([*range(11)], [*range(1, 10), 0, 10], True),
+    "one in nine out of order": ([*range(10)], [*range(1, 9), 0, 9], False),
+    "sorted anew, one in a hundred copied": ([*range(100)], [*range(99, -1, -1), 5], False),
+    "sorted anew, two in a hundred copied": ([*range(100)], [*range(99, -1, -1), 5, 6], True),
+    "sorted anew, one in ten copied": ([*range(10)], [*range(9, -1, -1), 5], True),
+    # Two rows of one value are known by nothing.
+    "pairs exchanged": ([0, 0, 1, 1, 2, 2, 3], [1, 1, 0, 0, 2, 2, 3], False),
+    "pairs sorted anew and copied": ([*range(7), 7, 7], [7, 7, 7, *range(6, -1, -1)], False),
+}
+
+
+@pytest.mark.parametrize("case", AT_THE_BOUNDS)
+def test_the_bounds_of_the_rule(case: str) -> None:
+    before, after, removed = AT_THE_BOUNDS[case]
+    assert removed_by_the_rule(before, after) is removed
+    assert were_removed(Tensor(before), Tensor(after)) is removed
+
+
+def test_it_is_the_rule() -> None:
+    found = Counter[bool]()
+    for seed in range(2_000):
+        chance = random.Random(seed)
+        count = chance.randrange(1, 25)
+        before = [chance.randrange(chance.choice((5, 1000))) for _ in range(count)]
+        after = [value for value in before if chance.random() < 0.9]
+        after = [chance.choice(NEW) if chance.random() < 0.1 else value for value in after]
+        if chance.random() < 0.4:
+            chance.shuffle(after)
+        after += [chance.choice([*before, *NEW[:5]]) for _ in range(count - len(after))]
+        after += [chance.choice(before) for _ in range(chance.randrange(3))]
+        expected = removed_by_the_rule(before, after)
+        assert were_removed(Tensor(before), Tensor(after)) is expected, (before, after)
+        found[expected] += 1
+    assert min(found[True], found[False]) > 200
+
+
+def test_a_look_at_the_same_tensor_costs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked: list[Tensor] = []
+
+    def look(before: Tensor, after: Tensor) -> bool:
+        looked.append(after)
+        return were_removed(before, after)
+
+    monkeypatch.setattr("opt3dgs_optim.removed_rows.were_removed", look)
+    watch, optimizer = RemovedRows(), optimizer_of(row_numbers(10))
+    (group,) = optimizer.param_groups
+    for _ in range(3):
+        assert not watch.found([optimizer])
+    assert not looked
+    # Pruned and cloned: in other memory, and as many as before.
+    rows = group["params"][0].detach()
+    group["params"][0] = Parameter(torch.cat([rows[2:], rows[8:]]))
+    assert watch.found([optimizer])
+    # In the same memory, and fewer.
+    group["params"][0] = Parameter(group["params"][0].detach()[:7])
+    assert watch.found([optimizer])
+    assert not watch.found([optimizer])
+    assert len(looked) == 2
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
