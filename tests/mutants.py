@@ -45,10 +45,9 @@ CURVATURE = [
     f"lbfgs/test_{name}.py" for name in ("history", "two_loop", "lqn_direction", "foresight")
 ]
 PARTS = ("annealing", "averaging", "fading", "out_of_view", "own_frame")
-STATE = [
-    *(f"test_{name}.py" for name in ("masks", "part", "dropped_steps", "row_edits", "checkpoints")),
-    *(f"test_cases_{name}.py" for name in ("two_instances", "several_tensors", "windows")),
-    *(f"test_cases_{name}.py" for name in ("dtypes", "copies")),
+STATE = [  # the fast ones of those that are about it
+    *(f"test_{name}.py" for name in ("state", "masks", "part", "checkpoints")),
+    *(f"test_cases_{name}.py" for name in ("several_tensors", "moved_rows", "copies")),
 ]
 # Of these tests: those that compile C++, a law that the loop oracle sees sooner, other classes.
 LEFT_OUT = "not sanitizers and not mutants and not kernel and not compiles and not power_four"
@@ -71,7 +70,6 @@ TARGETS = {
     "frames.py": ["parts/test_own_frame.py", "parts/test_noise_covariance.py"],
     "removed_rows.py": ["test_removed_rows.py"],
     "state.py": STATE,
-    "stepadam.py": [*STATE, "test_stepadam.py", "test_reference_step.py", "test_cases_groups.py"],
 }
 
 
