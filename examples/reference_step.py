@@ -62,8 +62,7 @@ def default_step(
     # A point is out of view if its position has no gradient. At most 16,384 points are asked, and
     # the share of those in view is a mean over the last 100 views or so.
     in_view = grads["means"].any(1)
-    asked = grads["means"][:: 1 + num_points // 16_384]
-    now = (asked.count_nonzero() / asked.numel()).clamp(min=0.01)
+    now = in_view[:: 1 + num_points // 16_384].float().mean().clamp(min=0.01)
     state["share"] = torch.lerp(state.get("share", torch.tensor(1.0)), now, 1 / 100)
     share = state["share"].item()
 

@@ -92,9 +92,9 @@ class OutOfView(Part):
 def _seen_share(grad: Tensor) -> Tensor:
     """The share of the points that this view sees, 0-d."""
     stride = 1 + grad.shape[0] // MAX_POINTS_LOOKED_AT
-    looked_at = grad[::stride] if stride > 1 else grad
-    # Of their numbers, since the three of a point are zero together: one operator instead of two.
-    share = torch.count_nonzero(looked_at) / looked_at.numel()
+    seen = _has_gradient(grad[::stride] if stride > 1 else grad)
+    # Not `mean`, which takes twice as long.
+    share = seen.sum(dtype=torch.float32).div_(seen.shape[0])
     return share.clamp_(min=MIN_SEEN_SHARE)
 
 
