@@ -42,7 +42,10 @@ SCRIPTS = ("*train*.py", "prune_finetune.py")
 OTHERS = re.compile(
     r"(^|/)(submodules|tests?|scripts|docs|utils?|preprocess|ext|internal|Tracking[^/]*)/"
 )
-MORE = ("sugar_trainers/*.py", "nerfstudio/engine/trainer.py", "internal/gaussian_splatting.py")
+MORE = (
+    *("sugar_trainers/*.py", "nerfstudio/engine/trainer.py", "internal/gaussian_splatting.py"),
+    "fvdb_reality_capture/training/scene_optimization_runner.py",
+)
 FIGURE = re.compile(r"-?[\d.]+ dB|\bruns\b")
 GROUPS = re.compile(r" \(all: [^)]*\)")  # the names of an optimizer's groups: long
 STOPS = re.compile(r"(?<=stops: )(\w+):.*")  # what an exception says after its name
