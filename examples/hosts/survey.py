@@ -87,7 +87,7 @@ gsplat 1.5.3 with these lines, and 3dgs-mcmc, with each part alone, and goes on 
 
 {counts[3]} training scripts of {counts[4]} repositories: {counts[5]} are edited \
 (each result compiles and defines every name it uses), the others are refused; \
-for these the lines to add by hand are printed.
+for these the lines to add by hand are printed, or the page that has them is named.
 
 <details markdown><summary>All scripts, with their commits</summary>
 
