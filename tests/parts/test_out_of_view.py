@@ -173,8 +173,44 @@ def test_of_many_points_some_are_asked_and_all_are_held() -> None:
     assert torch.equal(found > 0, grad[:, 2] == 0)
 
 
+def test_of_twice_as_many_points_as_are_looked_at_every_second_is_asked() -> None:
+    _, phases, optimizers = large(2_000, OutOfView())
+    grad = torch.zeros(MAX_POINTS_LOOKED_AT + 1, 3)
+    grad[1::2] = 1.0  # the others
+    phases.take(torch.tensor(0.1))
+    hook(phases, optimizers["means"], torch.zeros_like(grad), grad)
+    assert share_of(optimizers) == pytest.approx(0.02 + 0.01 * (0.01 - 0.02))
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (3,), (2, 3)])
+def test_positions_of_any_shape(shape: tuple[int, ...]) -> None:
+    """One number of a point is enough to be seen."""
+    _, phases, optimizers = large(2_000, OutOfView())
+    grad = torch.zeros(POINTS, *shape)
+    grad.view(POINTS, -1)[:SEEN, -1] = 1.0
+    phases.take(torch.tensor(0.1))
+    hook(phases, optimizers["means"], torch.zeros_like(grad), grad)
+    found = hook(phases, optimizers["opacities"], torch.zeros(POINTS), torch.full((POINTS,), PULL))
+    assert torch.equal(found > 0, torch.arange(POINTS) >= SEEN)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5])
+def test_a_share_that_is_not_read_from_a_gpu(share: float) -> None:
+    """There it is a tensor, and it is the factor that says whether anything is raised."""
+    splats, phases, optimizers = large(2_000, OutOfView())
+    iterate(splats, optimizers, phases, 0, 1, seen=SEEN)
+    unseen = torch.arange(POINTS) >= SEEN
+    phases.publish("seen_share", splats["means"], torch.tensor(share))
+    phases.publish("out_of_view", splats["means"], unseen)
+    pull = torch.full((POINTS,), PULL)
+    found = hook(phases, optimizers["opacities"], torch.zeros(POINTS), pull)
+    least = (PULL / (3 * share)) ** 2 if share < MAX_SEEN_SHARE else 0.0
+    torch.testing.assert_close(found, torch.where(unseen, least, 0.0), rtol=1e-5, atol=0.0)
+
+
 def test_the_run_log_has_the_share() -> None:
     splats, phases, optimizers = upgraded(60, OutOfView())
+    assert phases.numbers() == {"visible_share": 1.0}, "before the first view"
     iterate(splats, optimizers, phases, 0, 3, seen=3)
     assert phases.numbers() == {"visible_share": pytest.approx(1 - 0.75 * (1 - 0.99**3))}
 
@@ -205,13 +241,28 @@ def fused(splats: dict[str, Parameter]) -> Any:
 def test_where_the_positions_come_later_it_looks_at_their_gradient() -> None:
     splats, phases, optimizers = large(2_000, OutOfView())
     iterate(splats, optimizers, phases, 0, 3, seen=SEEN)
+    set_share(optimizers, 0.2)
     phases.take(torch.tensor(0.1))
     phases.current += 1
     splats["means"].grad = torch.zeros(POINTS, 3)
     splats["means"].grad[:SEEN] = 1.0
     pull = torch.full((POINTS,), PULL)
     found = hook(phases, optimizers["opacities"], torch.zeros(POINTS), pull)
-    assert torch.equal(found > 0, torch.arange(POINTS) >= SEEN)
+    share = 0.2 + 0.01 * (SEEN / POINTS - 0.2)  # what it will be after the positions' step
+    least = torch.full((POINTS,), (PULL / (3 * share)) ** 2)
+    least[:SEEN] = 0.0
+    torch.testing.assert_close(found, least, rtol=1e-5, atol=0.0)
+    assert share_of(optimizers) == pytest.approx(0.2), "this view is counted at the positions"
+
+
+@pytest.mark.parametrize(("seen", "looks"), [(SEEN, True), (POINTS, False)])
+def test_where_views_see_much_nobody_asks_who_is_out_of_view(seen: int, looks: bool) -> None:
+    """It would be a tensor of all points, for nothing."""
+    splats, phases, optimizers = large(2_000, OutOfView())
+    set_share(optimizers, seen / POINTS)
+    iterate(splats, optimizers, phases, 0, 1, seen=seen)
+    published = phases.published("out_of_view", splats["means"])
+    assert (published is not None) is looks
 
 
 def test_without_the_positions_of_this_iteration_it_does_nothing() -> None:
