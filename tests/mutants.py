@@ -1,6 +1,6 @@
 """Break the arithmetic on purpose, one place at a time, and see the tests notice.
 
-    python tests/mutants.py                    # all of TARGETS; half an hour on one core
+    python tests/mutants.py                    # all of TARGETS; three quarters of an hour on a core
     python tests/mutants.py --only partitions.py  # one module; the others' last result is kept
     python tests/mutants.py --again            # the survivors of the last result, after new tests
     python tests/mutants.py --share 0.1        # a random tenth; writes nothing
@@ -268,7 +268,12 @@ def main() -> int:
         found = examine(PACKAGE, module, chosen, [ROOT / "tests" / t for t in TARGETS[module]])
         alive = [described(m) for m, killer in zip(chosen, found, strict=True) if not killer]
         many = len(every) if options.again else len(chosen)
-        modules[module] = {"mutants": many, "killed": many - len(alive), "survivors": alive}
+        modules[module] = {
+            "date": date.today().isoformat(),
+            "mutants": many,
+            "killed": many - len(alive),
+            "survivors": alive,
+        }
         print(f"{module}: {many - len(alive)} of {many} killed", flush=True)
         if options.share == 1.0:
             write(modules, torch.__version__)
@@ -281,7 +286,6 @@ def main() -> int:
 def write(modules: dict[str, Any], torch_version: str) -> None:
     about = {
         "command": "python tests/mutants.py",
-        "date": date.today().isoformat(),
         "machine": f"{platform.system()} {platform.machine()}, torch {torch_version}",
     }
     ordered = {name: modules[name] for name in TARGETS if name in modules}

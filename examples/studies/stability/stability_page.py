@@ -112,8 +112,10 @@ def mutants_block(result: dict[str, Any]) -> str:
         for one in entry["survivors"]
         if not (one.get("why") or why.get((name, *survivor_key(one))))
     ]
+    dates = sorted({entry["date"] for entry in modules.values()})  # several, after --only
+    when = " to ".join(dates[:: max(len(dates) - 1, 1)])
     text = (
-        f"Last run {about['date']} ({about['machine']}): {many} places were changed, one at a "
+        f"Last run {when} ({about['machine']}): {many} places were changed, one at a "
         f"time, and the tests noticed {dead} ({100 * dead / many:.1f} %). Of the others "
         f"{many - dead - len(gaps)} change nothing that a test could see, {len(gaps)} are gaps.\n"
     )

@@ -76,6 +76,16 @@ def test_what_failed_and_gaps_are_listed() -> None:
     assert "| `x < nowhere` | `x > nowhere` |" in text
 
 
+@pytest.mark.parametrize(
+    ("dates", "said"),
+    [("3", "run 3 ("), ("33", "run 3 ("), ("42", "run 2 to 4 ("), ("243", "run 2 to 4 (")],
+)
+def test_modules_may_be_of_several_days(dates: str, said: str) -> None:
+    entry = {"mutants": 5, "killed": 5, "survivors": []}
+    modules = {f"{i}.py": {**entry, "date": date} for i, date in enumerate(dates)}
+    assert said in stability_page.mutants_block({"about": {"machine": "M"}, "modules": modules})
+
+
 def test_long_tests_passed() -> None:
     tests = result("slow")["tests"]
     assert {test["outcome"] for test in tests} == {"passed"}
