@@ -70,10 +70,10 @@ class PositionNoise(Part):
         left = course.published(LEFT_AT, param, earlier=True) or (None, 0, None)
         where, version, copy = left
         written = where == param.data_ptr() and version != param._version
-        if self._num_changed_by_others < MIN_STEPS_CHANGED_BY_OTHERS:
-            self._num_changed_by_others = self._num_changed_by_others + 1 if written else 0
-        elif self._num_changed_by_others == MIN_STEPS_CHANGED_BY_OTHERS and not written:
+        if self._num_changed_by_others <= MIN_STEPS_CHANGED_BY_OTHERS and not written:
             self._num_changed_by_others = 0
+        elif self._num_changed_by_others < MIN_STEPS_CHANGED_BY_OTHERS:
+            self._num_changed_by_others += 1
         elif copy is not None:
             self._num_changed_by_others += 1  # never looked at again
             # Trainers write noise of a rate of 0 as they write any other.
