@@ -91,6 +91,17 @@ OWN_FRAMES: dict[str, tuple[str, Part]] = {  # by the arm's name: what it is, an
         "own frame, 0.1, an axis counts as a tenth of the longest at least",
         OwnFrame(0.1, min_aspect=0.1),
     ),
+    **{
+        f"{rate:g}-aspect-{aspect:g}": (
+            f"own frame, {rate:g}, an axis counts as {aspect:g} of the longest at least",
+            OwnFrame(rate, min_aspect=aspect),
+        )
+        for rate, aspect in ((0.2, 0.1), (0.4, 0.1), (0.2, 0.3), (0.05, 1.0), (0.1, 1.0))
+    },
+    "0.1-not-thin-final-0.05": (
+        "own frame, 0.1, not thin, and the last step a twentieth of the first",
+        OwnFrame(0.1, final=0.05, min_aspect=0.1),
+    ),
 }
 
 LIST = (
