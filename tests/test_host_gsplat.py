@@ -186,7 +186,7 @@ def test_scene_of_main(kind: str) -> None:
     phases = phased()
     strategy = make_strategy(strategies("main"), kind)
     scene = scene_of_main(start())
-    optimizers = phases.upgrade(gsplat_optimizers(dict(scene.splats)))
+    optimizers = phases.upgrade(gsplat_optimizers(dict(scene.splats)), scene=scene)
     trainer = Trainer(scene.splats, optimizers, strategy, total=TOTAL, phases=phases, scene=scene)
     trainer.run(0, 43)
     scene.validate()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import io
 import itertools
+import pickle
 import random
 from collections import Counter
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from typing import Any
 
 import pytest
 import torch
-from gsplat_host import Trainer, strategies
+from gsplat_host import Trainer, scene_of_main, strategies
 from inria_host import OPTIONS, made_model
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
@@ -217,17 +218,118 @@ def test_each_set_of_gaussians_is_compared_with_itself() -> None:
     assert not watch.found([optimizer])
 
 
+# -- a scene that is told -------------------------------------------------------------------------
+
+
+class Scene:
+    """As gsplat's main branch has it: told of every edit of rows, which it notes."""
+
+    def __init__(self) -> None:
+        self.edits: list[str] = []
+
+    def on_split(self, chosen: Tensor, rest: Tensor) -> None:
+        self.edits.append("split")
+
+    def on_remove(self, mask: Tensor) -> None:
+        self.edits.append("remove")
+
+    def on_relocate(self, dead: Tensor, sampled: Tensor) -> None:
+        self.edits.append("relocate")
+
+
+NOTHING = torch.zeros(0)
+SORTED = row_numbers(10)
+
+
+@pytest.mark.parametrize(
+    ("tell", "rows", "found"),
+    [
+        (lambda scene: scene.on_relocate(NOTHING, sampled=NOTHING), SORTED.flip(0), False),
+        (lambda scene: scene.on_remove(NOTHING), SORTED.flip(0), True),
+        (lambda scene: scene.on_split(NOTHING, rest=NOTHING), None, True),
+        (lambda scene: None, SORTED[1:], True),  # an edit of which the scene was not told
+        (lambda scene: scene.on_relocate(NOTHING, NOTHING), SORTED[1:], True),  # and two edits
+    ],
+)
+def test_what_a_scene_is_told_decides(
+    monkeypatch: pytest.MonkeyPatch, tell: Callable[[Scene], None], rows: Any, found: bool
+) -> None:
+    looks: list[bool] = []
+    monkeypatch.setattr(
+        "opt3dgs_optim.removed_rows.were_removed",
+        lambda *both: looks.append(were_removed(*both)) or looks[-1],
+    )
+    watch, scene, optimizer = RemovedRows(), Scene(), optimizer_of(SORTED)
+    for _ in range(2):  # twice is once
+        watch.listen(scene)
+    assert not watch.found([optimizer])
+    if rows is not None:
+        optimizer.param_groups[0]["params"][0] = Parameter(rows)
+    tell(scene)
+    assert watch.found([optimizer]) is found
+    assert len(looks) == int(rows is not None and len(rows) < 10)
+    assert not watch.found([optimizer])
+    assert len(scene.edits) <= 1
+    optimizer.param_groups[0]["params"][0] = Parameter(optimizer.param_groups[0]["params"][0][2:])
+    assert watch.found([optimizer])  # the next exchange is looked at again
+
+
+def test_what_was_told_before_a_rewind_holds_no_more() -> None:
+    watch, scene, optimizer = RemovedRows(), Scene(), optimizer_of(SORTED)
+    watch.listen(scene)
+    scene.on_remove(NOTHING)
+    watch.forget()
+    assert not watch.found([optimizer])
+    scene.on_remove(NOTHING)  # it still listens
+    assert watch.found([optimizer])
+
+
+@pytest.mark.parametrize("road", [copy.deepcopy, lambda scene: pickle.loads(pickle.dumps(scene))])
+def test_a_scene_that_is_listened_to_can_be_copied(road: Callable[[Scene], Scene]) -> None:
+    watch, scene = RemovedRows(), Scene()
+    watch.listen(scene)
+    other = road(scene)
+    other.on_remove(NOTHING)
+    assert (scene.edits, other.edits) == ([], ["remove"])
+    assert not watch.found([])
+
+
+def test_an_object_that_is_told_of_nothing_is_refused() -> None:
+    phases = PhaseScheduler(TOTAL)
+    optimizers = gsplat_optimizers(make_splats(3))
+    with pytest.raises(TypeError, match=r"upgrade: scene is a dict that has none of on_duplicate"):
+        phases.upgrade(optimizers, scene={})
+    assert {type(each) for each in optimizers.values()} == {torch.optim.Adam}
+
+
+@pytest.mark.parametrize("kind", ["mcmc", "default"])
+def test_the_real_scene_of_gsplat_main(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    """Its strategy tells of every edit: nothing is compared, and the answer is the same."""
+
+    def look(*_: Tensor) -> bool:
+        raise AssertionError("the scene had told of it")
+
+    monkeypatch.setattr("opt3dgs_optim.removed_rows.were_removed", look)
+    phases, scene = PhaseScheduler(TOTAL), scene_of_main(ParameterDict(make_splats(POINTS, 0)))
+    scene.splats["opacities"].data[::3] = -9.0
+    optimizers = phases.upgrade(gsplat_optimizers(dict(scene.splats)), scene=scene)
+    strategy = gsplat_strategy(kind, "main", **({"reset_every": 1_000} if kind == "default" else {}))
+    Trainer(scene.splats, optimizers, strategy, total=TOTAL, phases=phases, scene=scene).run(0, 45)
+    scene.validate()
+    assert set(phases.switched_off) == ({"Fading"} if kind == "default" else set())
+
+
 # -- real strategies ------------------------------------------------------------------------------
 
 
-def gsplat_strategy(kind: str, **options: Any) -> Any:
-    """gsplat 1.5.3's strategy, which edits every 7th iteration after the 5th."""
+def gsplat_strategy(kind: str, version: str = "1.5.3", **options: Any) -> Any:
+    """gsplat's strategy, which edits every 7th iteration after the 5th."""
     times = {"refine_start_iter": FIRST, "refine_stop_iter": 50, "refine_every": EVERY}
     if kind == "mcmc":
-        return strategies("1.5.3").MCMCStrategy(cap_max=400, noise_lr=1.0, **times)
+        return strategies(version).MCMCStrategy(cap_max=400, noise_lr=1.0, **times)
     default: dict[str, Any] = {"grow_grad2d": 1e-4, "grow_scale3d": 0.6, "prune_opa": 0.3}
     default |= {"reset_every": 20, "prune_scale3d": 1e9, **options}
-    return strategies("1.5.3").DefaultStrategy(**times, **default)
+    return strategies(version).DefaultStrategy(**times, **default)
 
 
 def gsplat_trainer(kind: str, phases: PhaseScheduler, **options: Any) -> Trainer:

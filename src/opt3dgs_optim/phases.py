@@ -22,7 +22,7 @@ from opt3dgs_optim.presets import (
     PAPER_SWITCH,
     paper_parts,
 )
-from opt3dgs_optim.removed_rows import RemovedRows
+from opt3dgs_optim.removed_rows import EDITS, RemovedRows, is_told_of_edits
 from opt3dgs_optim.upgrading import say, upgrade
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ class PhaseScheduler(Course):
         """The phase of the iteration whose loss comes next; what `pixel_loss` goes by."""
         return cast(Phase, self.phase_of(self.iteration))
 
-    def upgrade(self, optimizers: Optimizers) -> Optimizers:
+    def upgrade(self, optimizers: Optimizers, *, scene: Any = None) -> Optimizers:
         """Put the parts into the trainer's optimizer(s), in place; return the argument.
 
         Options and state are kept, and a learning-rate scheduler built before goes on working. May
@@ -148,13 +148,25 @@ class PhaseScheduler(Course):
                 keys say what they hold; one Adam with named groups (INRIA, 3dgs-mcmc); or a list
                 of such (gaussian-splatting-lightning). What holds no Gaussian parameter (camera
                 poses, exposures) stays as it is.
+            scene: the object that a trainer tells of its row edits, as gsplat's main branch tells
+                its `GaussianScene` (`on_remove`, `on_split`, ...). It is listened to; whether
+                Gaussians were removed is then known without a look at them, and without a wait
+                for the GPU. None: the opacities are looked at.
 
         Raises:
             TypeError: an optimizer of Gaussian parameters is no Adam, has parts of another
-                scheduler, or is of a class that cannot be kept.
+                scheduler, or is of a class that cannot be kept; the scene has none of these methods.
             ValueError: nothing holds a Gaussian parameter, or a name occurs twice.
         """
+        if scene is not None and not is_told_of_edits(scene):
+            raise TypeError(
+                f"{CALL}.upgrade: scene is a {type(scene).__name__} that has none of "
+                f"{', '.join(EDITS)}, but an object that a strategy tells of its row edits, or "
+                "None, is needed"
+            )
         self._num_optimizers += upgrade(optimizers, self)
+        if scene is not None:
+            self._removed_rows.listen(scene)
         return optimizers
 
     def observe(self, loss: Tensor | float, *, iteration: int | None = None) -> None:
@@ -172,7 +184,7 @@ class PhaseScheduler(Course):
             iteration = check_count(f"{CALL}.observe", "iteration", iteration, 0)
             if iteration < self.current:  # what is kept for a time begins anew
                 self.rewinds += 1
-                self._removed_rows = RemovedRows()
+                self._removed_rows.forget()
         before = max(self.current, 0)
         self.current = self.iteration if iteration is None else iteration
         self._watch_clock(before)
@@ -311,7 +323,7 @@ class PhaseScheduler(Course):
             return
         if not self._removed_rows.found(self.followers()):
             return
-        self._removed_rows = RemovedRows()  # gives the opacities back that it holds
+        self._removed_rows.forget()  # gives the opacities back that it holds
         off = [
             name
             for name, part in self._named.items()
@@ -335,7 +347,7 @@ class PhaseScheduler(Course):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """As `Course.load_state_dict`; parts that the user has chosen are not off for removal."""
         super().load_state_dict(state)
-        self._removed_rows = RemovedRows()
+        self._removed_rows.forget()
         if self._chosen and REMOVAL in self.switched_off.values():
             left = {name: why for name, why in self.switched_off.items() if why != REMOVAL}
             self.switched_off = left

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import torch
@@ -10,6 +11,17 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from opt3dgs_optim.names import gaussian_of
+
+# The methods of a scene that gsplat's strategies (main, 2026-08) call after an edit of rows, and
+# whether the edit removes some.
+EDITS = {
+    "on_duplicate": False,
+    "on_split": True,
+    "on_remove": True,
+    "on_relocate": False,
+    "on_sample_add": False,
+    "on_permute": False,
+}
 
 
 class RemovedRows:
@@ -21,11 +33,29 @@ class RemovedRows:
 
     The opacities that density control has replaced are held until the next look. A look costs
     nothing where they are the same tensor, and a sort of them where they are not, for which it
-    waits for the GPU. A copy, or what comes out of a pickle, has seen nothing yet.
+    waits for the GPU. Where a scene tells of the edits, nothing is sorted. A copy, or what comes
+    out of a pickle, has seen nothing yet, and listens to no scene.
     """
 
     def __init__(self) -> None:
         self._seen: WeakKeyDictionary[Optimizer, list[Tensor]] = WeakKeyDictionary()
+        self._told: set[bool] = set()  # of the edits since the last look: whether they remove rows
+
+    def listen(self, scene: Any) -> None:
+        """Be told of the edits that a strategy tells `scene` of.
+
+        Its methods for this, as many as it has, are replaced by others that call them. Listening
+        twice is once.
+        """
+        for name, removes in EDITS.items():
+            method = getattr(scene, name, None)
+            if callable(method) and getattr(method, "told", None) is not self._told:
+                setattr(scene, name, _Telling(method, removes, self._told))
+
+    def forget(self) -> None:
+        """Begin anew, as after a rewind: what was seen and told holds no more."""
+        self._seen.clear()
+        self._told.clear()
 
     def found(self, optimizers: Iterable[Optimizer]) -> bool:
         """Whether rows were removed since the last look.
@@ -33,7 +63,8 @@ class RemovedRows:
         Args:
             optimizers: those that hold the Gaussian parameters; each is compared with itself.
         """
-        found = False
+        found, was_told = any(self._told), bool(self._told)
+        self._told.clear()
         for optimizer in optimizers:
             groups = [g for g in optimizer.param_groups if gaussian_of(g) == "opacities"]
             params = [param for group in groups for param in group["params"]]
@@ -43,11 +74,29 @@ class RemovedRows:
             for i, (before, param) in enumerate(zip(seen, params, strict=True)):
                 if before.data_ptr() != param.data_ptr() or before.shape != param.shape:
                     seen[i] = param.detach()
-                    found = were_removed(before, seen[i]) or found
+                    # A scene has one set of Gaussians, and what it tells explains one exchange.
+                    explained = was_told and len(seen) == 1 and len(param) >= len(before)
+                    found = found or (not explained and were_removed(before, seen[i]))
         return found
 
     def __reduce__(self) -> tuple[type[RemovedRows], tuple[()]]:
         return RemovedRows, ()
+
+
+def is_told_of_edits(scene: Any) -> bool:
+    """Whether a trainer's object has a method that a strategy calls after its row edits."""
+    return any(callable(getattr(scene, name, None)) for name in EDITS)
+
+
+class _Telling:
+    """A method of a scene that also tells that it was called."""
+
+    def __init__(self, method: Callable[..., Any], removes: bool, told: set[bool]) -> None:
+        self.method, self.removes, self.told = method, removes, told
+
+    def __call__(self, *args: Any, **options: Any) -> Any:
+        self.told.add(self.removes)
+        return self.method(*args, **options)
 
 
 def were_removed(before: Tensor, after: Tensor) -> bool:

@@ -223,7 +223,6 @@ def test_what_is_not_certain_is_refused(
         ("threedgrut.utils", "3dgrut"),
         ("fvdb", "fvdb"),
         ("fvdb.utils", "fvdb"),
-        ("internal.models", "lightning"),
     ],
 )
 def test_a_trainer_with_a_page_of_its_own(
@@ -238,6 +237,50 @@ def test_a_trainer_with_a_page_of_its_own(
     assert "by hand" not in said
     pages = Path(__file__).resolve().parents[2] / "docs" / "hosts"
     assert (pages / f"{page}.md").is_file()
+
+
+def test_what_the_module_internal_is_decides_its_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """Other projects have a package of that name too, and need the general lines."""
+    text = INRIA.replace("range(first_iter, opt.iterations + 1)", "loader")
+    text = text.replace("import torch", "import internal.models\nimport torch")
+    path = saved(tmp_path, text)
+    assert main(["diff", str(path)]) == 1
+    assert "lines to add by hand" in capsys.readouterr().err
+    (tmp_path / "internal").mkdir()
+    (tmp_path / "internal" / "gaussian_splatting.py").touch()
+    assert main(["diff", str(path)]) == 1
+    said = capsys.readouterr().err
+    assert "docs/hosts/lightning.md" in said
+    assert "by hand" not in said
+
+
+@pytest.mark.parametrize(
+    ("given", "added_line"),
+    [
+        ("scene=self.scene", "self.optimizers = phases.upgrade(self.optimizers, scene=self.scene)"),
+        ("scene=scenes[0]", "self.optimizers = phases.upgrade(self.optimizers)"),  # no such name
+        ("scene=self.scene()", "self.optimizers = phases.upgrade(self.optimizers)"),
+        ("scene=None", "self.optimizers = phases.upgrade(self.optimizers)"),
+    ],
+)
+def test_a_scene_that_is_told_of_row_edits_is_given(
+    tmp_path: Path, given: str, added_line: str
+) -> None:
+    """As gsplat's main branch has one; only where it is certain what that is."""
+    edit = "self.cfg.strategy.step_post_backward("
+    assert GSPLAT.count(edit) == 1
+    text = GSPLAT.replace(edit, f"{edit}{given}, ")
+    assert added_line in lines_for(tmp_path, text)
+
+
+def test_two_scenes_are_one_too_many(tmp_path: Path) -> None:
+    edit = "self.cfg.strategy.step_post_backward("
+    (line,) = [line for line in GSPLAT.splitlines() if edit in line]
+    both = [line.replace(edit, f"{edit}scene=self.{name}, ") for name in ("left", "right")]
+    lines = lines_for(tmp_path, GSPLAT.replace(line, "\n".join(both)))
+    assert "self.optimizers = phases.upgrade(self.optimizers)" in lines
 
 
 def test_other_files_and_folders(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -43,8 +43,9 @@ PAGES = {
     "nerfstudio": "nerfstudio",
     "threedgrut": "3dgrut",
     "fvdb": "fvdb",
-    "internal": "lightning",  # gaussian-splatting-lightning and CityGaussian
 }
+# What tells gaussian-splatting-lightning and CityGaussian from others with a package `internal`.
+LIGHTNING = Path("internal", "gaussian_splatting.py")
 NOT_PYTHON = {".cpp", ".cu", ".cuh", ".cc", ".h", ".hpp", ".rs"}
 
 
@@ -101,9 +102,11 @@ def _imports(text: str, module: str) -> bool:
 def _help_by_hand(path: Path) -> list[str]:
     """What to do with a script that is refused."""
     text = path.read_text(encoding="utf-8", errors="ignore")
-    for module, page in PAGES.items():
-        if _imports(text, module):
-            return [f"docs/hosts/{page}.md says what this trainer needs."]
+    pages = [page for module, page in PAGES.items() if _imports(text, module)]
+    if any((folder / LIGHTNING).is_file() for folder in path.resolve().parents):
+        pages.append("lightning")
+    if pages:
+        return [f"docs/hosts/{pages[0]}.md says what this trainer needs."]
     return ["The lines to add by hand:", *LINES_BY_HAND]
 
 
@@ -137,12 +140,14 @@ def _edited_lines(lines: list[bytes], tree: ast.Module, trainer: Trainer) -> lis
     name = _unused("phases", used)
     scheduler = SCHEDULER if SCHEDULER not in used else _unused("TwoPhaseScheduler", used)
     first, *second = trainer.optimizers
-    upgrade = [f"{first} = {name}.upgrade({first})"]
+    point = trainer.loop  # below all that may make the optimizers anew
+    known = _known(tree, trainer, point)
+    is_known = trainer.scene.split(".")[0].split("[")[0] in known
+    scene = f", scene={trainer.scene}" if is_known else ""
+    upgrade = [f"{first} = {name}.upgrade({first}{scene})"]
     for other in second:  # None where the trainer's options leave it out
         upgrade += [f"if {other} is not None:", f"    {other} = {name}.upgrade({other})"]
-    point = trainer.loop  # below all that may make the optimizers anew
     _check_total(trainer, point)
-    known = _known(tree, trainer, point)
     call = ast.unparse(trainer.total)
     if "world_size" in known:
         call += ", process_group=torch.distributed.group.WORLD if world_size > 1 else None"

@@ -49,6 +49,7 @@ class Trainer:
     iteration: str  # an expression, from 0, where the observed losses may not be as many; else ""
     optimizers: list[str] = field(default_factory=list)  # expressions, the positions' first
     setups: list[ast.stmt] = field(default_factory=list)  # in the loop: they make them anew
+    scene: str = ""  # an expression: what the strategy tells of its row edits
     pixel: list[PixelLoss] = field(default_factory=list)  # what to replace
     notes: list[str] = field(default_factory=list)  # what a user should know of this file
 
@@ -96,6 +97,7 @@ def read_trainer(tree: ast.Module, folder: Path) -> Trainer:
     _check_calls(tree, scope, trainer)
     each_turn = _is_in_each_turn(backwards, inside, loop)
     trainer.total, trainer.iteration = read_count(loop, own, found[-1], each_turn=each_turn)
+    trainer.scene = _scene(inside)
     trainer.pixel = find_pixel_loss(inside, loop, max(s.lineno for s in found))
     if not trainer.pixel:
         trainer.notes.append(
@@ -103,6 +105,17 @@ def read_trainer(tree: ast.Module, folder: Path) -> Trainer:
             "needs phases.pixel_loss(render, photo) in its place, the defaults do not"
         )
     return trainer
+
+
+def _scene(inside: list[Spot]) -> str:
+    """What gsplat's strategy tells of its row edits; "": nothing, or more than one thing."""
+    found: set[str] = set()
+    for spot in inside:
+        match spot.node:
+            case ast.Call(ast.Attribute(_, "step_post_backward"), _, keywords):
+                given = [k.value for k in keywords if k.arg == "scene"]
+                found |= {ast.unparse(value) if is_reference(value) else "" for value in given}
+    return found.pop() if len(found) == 1 else ""
 
 
 # -- the loop --------------------------------------------------------------------------------------
