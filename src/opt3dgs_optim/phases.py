@@ -155,7 +155,7 @@ class PhaseScheduler(Course):
 
         Raises:
             TypeError: an optimizer of Gaussian parameters is no Adam, has parts of another
-                scheduler, or is of a class that cannot be kept; the scene has none of these methods.
+                scheduler, or is of a class that cannot be kept; or `scene` is no such object.
             ValueError: nothing holds a Gaussian parameter, or a name occurs twice.
         """
         if scene is not None and not is_told_of_edits(scene):
