@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from studies.scenes.analysis import Difference, Study, difference
 from studies.scenes.arms import BASELINE, DEFAULTS
 from studies.scenes.records import Setting
 
-LENGTHS = (30_000, 7_500)
 QUARTER, HALF = "images_4", "images_2"
-POINTS = 4_000
+# What decides: the first of these that enough scenes and seeds were trained at.
+LADDER = ((HALF, 30_000), (QUARTER, 30_000), (QUARTER, 7_500))
+POINTS, HALF_POINTS = 4_000, 50_000
 NUM_POINTS = {"embedded": 2_000, "bonsai": 10_000, "lego": 10_000}
 MANY_VIEWS_SCENES = ("bonsai", "lego", "plush")  # forty training views or more
 MIN_SCENES, MIN_SEEDS = 3, 2
@@ -40,6 +41,7 @@ class Decision:
     control: str
     iterations: int | None  # None: not measured on enough scenes
     found: Difference | None
+    size: str = QUARTER  # of the photos
 
     @property
     def verdict(self) -> str:
@@ -60,11 +62,13 @@ def points_of(scene: str) -> int:
     return NUM_POINTS.get(scene, POINTS)
 
 
-def settings_of(study: Study, iterations: int, tiled: int = 0) -> list[Setting]:
-    """The rule's scenes, with rotated views at a quarter of their size and their own points."""
+def settings_of(
+    study: Study, iterations: int, tiled: int = 0, size: str = QUARTER
+) -> list[Setting]:
+    """The rule's scenes, with rotated views and the points that belong to a size."""
     every = every_scene(study, iterations, tiled=tiled)
-    every = [s for s in every if s.scene in MANY_VIEWS_SCENES and s.size == QUARTER]
-    return [s for s in every if s.points == points_of(s.scene)]
+    every = [s for s in every if s.scene in MANY_VIEWS_SCENES and s.size == size]
+    return [s for s in every if s.points == (HALF_POINTS if size == HALF else points_of(s.scene))]
 
 
 def every_scene(study: Study, iterations: int, **others: int) -> list[Setting]:
@@ -80,19 +84,20 @@ def every_scene(study: Study, iterations: int, **others: int) -> list[Setting]:
 
 
 def decide(study: Study) -> dict[str, Decision]:
-    """The decision on every part, at the longest trainings that three scenes have.
+    """The decision on every part, at the largest and longest trainings that three scenes have.
 
     Each part is judged against the same training without it: the multiplier against a constant of
     its mean, curvature against the same phase without it, annealing and pooling on top of the
-    defaults.
+    defaults. At half size one seed decides nothing while there are several at a quarter.
     """
     made = {}
     for part, (arm, control) in COMPARISONS.items():
         made[part] = Decision(arm, control, None, None)
-        for iterations in LENGTHS:
-            settings = settings_of(study, iterations, PIECES.get(part, 0))
+        for size, iterations in LADDER:
+            settings = settings_of(study, iterations, PIECES.get(part, 0), size)
             found = difference(study, settings, arm, control)
-            if len(found.pairs) >= MIN_SCENES:
-                made[part] = replace(made[part], iterations=iterations, found=found)
+            seeds = min(map(len, found.pairs.values()), default=0)
+            if len(found.pairs) >= MIN_SCENES and (size != HALF or seeds >= MIN_SEEDS):
+                made[part] = Decision(arm, control, iterations, found, size)
                 break
     return made

@@ -315,10 +315,11 @@ def decisions_table(study: Study, beside: int) -> str:
     rows = []
     for part, decision in decide(study).items():
         by = f"`{decision.arm}` and `{decision.control}`"
-        found, shown = decision.found, ["-"] * 5
+        found, shown = decision.found, ["-"] * 6
         if found is not None:
             count = f"{len(found.pairs)}, {found.count}"
-            shown = [f"{decision.iterations:,}", count, *cells_of(found)]
+            size = SIZES[decision.size]
+            shown = [size, f"{decision.iterations:,}", count, *cells_of(found)]
         on = "on" if decision.on else "off"
         brief = settings_of(study, beside, PIECES.get(part, 0))
         shorter = difference(study, brief, decision.arm, decision.control)
@@ -327,6 +328,7 @@ def decisions_table(study: Study, beside: int) -> str:
     heads = (
         "part",
         "decided by comparing",
+        "images",
         "iterations",
         "scenes, trainings",
         "PSNR",
@@ -335,7 +337,7 @@ def decisions_table(study: Study, beside: int) -> str:
         "default",
         f"PSNR at {beside:,}",
     )
-    return table(heads, "llrlrrrlr", rows)
+    return table(heads, "lllrlrrrlr", rows)
 
 
 def paper_table(study: Study, settings: Sequence[Setting], *, brief: bool = False) -> str:

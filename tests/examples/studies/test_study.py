@@ -218,6 +218,24 @@ def test_the_longest_trainings_decide() -> None:
     assert (decision.iterations, decision.verdict) == (30_000, "loses PSNR")
 
 
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_half_size_decides_where_it_was_trained_with_two_seeds(seeds: int) -> None:
+    small = [
+        rotated_record(arm, scene, seed, psnr=20.0 + (arm == WITH))
+        for scene in MANY_VIEWS_SCENES
+        for seed in (0, 1)
+        for arm in (WITHOUT, WITH)
+    ]
+    half = [
+        replace(r, setting=replace(r.setting, size="images_2", points=50_000, iterations=30_000))
+        for r in small
+    ]
+    half = [replace(r, arm=WITH if r.arm == WITHOUT else WITHOUT) for r in half if r.seed < seeds]
+    decision = decide(Study([*small, *half]))["Fading"]
+    expected = ("images_4", "pays") if seeds == 1 else ("images_2", "loses PSNR")
+    assert (decision.size, decision.verdict) == expected
+
+
 def test_every_scene_and_size_has_its_line() -> None:
     arms = ((BASELINE, 20.0), ("annealed", 20.5))
     quarter = [rotated_record(arm, "banana", 0, psnr=psnr) for arm, psnr in arms]
