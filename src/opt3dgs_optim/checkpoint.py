@@ -5,7 +5,8 @@ under `"optimizer"` what belongs to this optimizer,
 
     steps      how many steps Adam's moments have made
     windows    for which iterations each part's state is valid, see `Part.window`
-    records    by group and parameter: the iteration of its last step, the numbers kept for it
+    records    by group and parameter: the iteration of its last step, the numbers kept for it, and
+               the parts in whose units Adam's moments are, where there are such
     kept       by parameter: the keys of what parts keep per row, beside the moments
 
 All are plain numbers, strings, lists and dicts, so that `torch.load(weights_only=True)` and torch's
@@ -40,12 +41,20 @@ SHARE_OF_FORMAT_2 = "visible_share"
 GROUP_KEYS_OF_FORMAT_2 = (SLOT, "faded", "fresh_since", SHARE_OF_FORMAT_2)
 
 
+class SavedRecord(NamedTuple):
+    """What a checkpoint has for one parameter's record, checked."""
+
+    last_step: int | None
+    numbers: dict[str, float]
+    units: tuple[str, ...] = ()
+
+
 class Saved(NamedTuple):
     """What a checkpoint has for one optimizer, checked."""
 
     course: dict[str, Any] | None  # None: it is no checkpoint of ours
     windows: dict[str, Window | None]
-    records: list[list[tuple[int | None, dict[str, float]]]]  # by group, by parameter
+    records: list[list[SavedRecord]]  # by group, by parameter
     rows: list[dict[str, Tensor]]  # by parameter: what parts keep per row
 
 
@@ -73,6 +82,7 @@ def pack_optimizer(
                 {
                     "last_step": record.last_step,
                     "numbers": {key: value.item() for key, value in record.numbers.items()},
+                    **({"units": list(record.units)} if record.units else {}),
                 }
                 for record in group
             ]
@@ -147,22 +157,28 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
     if by_name and own is not None and clock is not None:
         _warn_of_rows_left_out(call, optimizer.course, clock["iteration"] - 1, rows)
     windows = {} if own is None or stale else own["windows"]
-    records = [] if own is None else own["records"]
+    # Another optimizer's gradients were in the parameters' own units.
+    records = [] if own is None else _without_units(own["records"]) if stale else own["records"]
     rest = {**loaded, "state": state, "param_groups": groups}
     return Saved(clock, windows, records, rows), rest
 
 
-def restore_numbers(
+def restore_records(
     optimizer: StepAdam, records: list[list[ParameterRecord]], saved: Saved
 ) -> None:
     """Give each parameter's record what a checkpoint has for it."""
     entries = optimizer.course.number_entries("parameter")
+    for group, own in zip(optimizer.param_groups, records, strict=True):
+        for param, record in zip(group["params"], own, strict=True):
+            record.units = () if optimizer.state.get(param) else None
     for group, own, theirs in zip(optimizer.param_groups, records, saved.records, strict=False):
-        for param, record, (last_step, numbers) in zip(group["params"], own, theirs, strict=False):
-            record.last_step = last_step
+        for param, record, found in zip(group["params"], own, theirs, strict=False):
+            record.last_step = found.last_step
+            if record.units is not None:
+                record.units = found.units
             record.numbers = {
                 key: torch.tensor(value, dtype=entries[key].dtype_for(param), device=param.device)
-                for key, value in numbers.items()
+                for key, value in found.numbers.items()
             }
 
 
@@ -204,21 +220,33 @@ def _unpack(
             raise ValueError(f"{call}: records has {group!r}, but a list is needed")
         records.append([])
         for entry in group:
-            check_keys(f"{call}: records", entry, ("last_step", "numbers"))
-            check_keys(f"{call}: records", entry["numbers"], ())
-            last_step = entry["last_step"]
-            if last_step is not None:
-                check_count(call, "last_step", last_step, -1)
-            numbers = {
-                key: check_number(call, key, value)
-                for key, value in entry["numbers"].items()
-                if key in keys
-            }
-            records[-1].append((last_step, numbers))
+            records[-1].append(_record(call, entry, keys))
     if own["steps"] is not None:
         check_count(call, "steps", own["steps"], 0)
     check_keys(f"{call}: kept", own["kept"], ())
     return {**own, "windows": windows, "records": records}, clock
+
+
+def _record(call: str, entry: Any, keys: set[str]) -> SavedRecord:
+    """One parameter's record, checked; of the numbers those under `keys`."""
+    check_keys(f"{call}: records", entry, ("last_step", "numbers"))
+    check_keys(f"{call}: records", entry["numbers"], ())
+    last_step, units = entry["last_step"], entry.get("units", [])
+    if last_step is not None:
+        check_count(call, "last_step", last_step, -1)
+    if not isinstance(units, (list, tuple)) or not all(isinstance(name, str) for name in units):
+        raise ValueError(f"{call}: units={units!r}, but names of parts are needed")
+    numbers = {
+        key: check_number(call, key, value)
+        for key, value in entry["numbers"].items()
+        if key in keys
+    }
+    return SavedRecord(last_step, numbers, tuple(units))
+
+
+def _without_units(records: list[list[SavedRecord]]) -> list[list[SavedRecord]]:
+    """The same, of moments in the parameters' own units."""
+    return [[each._replace(units=()) for each in group] for group in records]
 
 
 def _from_format_2(clock: dict[str, Any], optimizer: StepAdam, share: list[Any]) -> dict[str, Any]:

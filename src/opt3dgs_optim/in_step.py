@@ -23,6 +23,7 @@ class ActingParts:
     Attributes:
         any: whether there are any.
         shaping: whether Adam may be fed another gradient.
+        units: the names of those in whose units Adam's moments are, see `Part.own_units`.
     """
 
     before: list[NamedPart]
@@ -31,8 +32,10 @@ class ActingParts:
     after: list[NamedPart]
     any: bool = field(init=False)
     shaping: bool = field(init=False)
+    units: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
+        self.units = tuple(name for name, part in self.before if part.own_units)
         self.shaping = bool(self.before or self.displacement)
         self.any = bool(self.shaping or self.factor or self.after)
 

@@ -99,9 +99,13 @@ class Part:
         during: the phase in which the part acts; None: in both.
         names: the Gaussian parameters that it acts on, gsplat's names; None: every group.
         keeps: what it keeps.
+        own_units: whether `before` feeds Adam a gradient in other units than the parameter's. Then
+            Adam's moments are in these units, too, and begin anew where the part begins to act on
+            a parameter or ends, in a checkpoint of the stock trainer, say.
     """
 
     during: ClassVar[Phase | None] = None
+    own_units: ClassVar[bool] = False
     keeps: tuple[Kept, ...] = ()
     names: Any = GAUSSIAN  # tuple[str, ...] | None
 

@@ -132,11 +132,13 @@ class ParameterRecord:
     Attributes:
         last_step: the iteration of the parameter's last step, whether that counted or not; None
             before the first.
+        units: the parts in whose units Adam's moments are; None where there are no moments yet.
         numbers: what parts keep per parameter, key -> 0-d tensor.
     """
 
     def __init__(self) -> None:
         self.last_step: int | None = None
+        self.units: tuple[str, ...] | None = None
         self.numbers: dict[str, Tensor] = {}
         self._view: ParameterState | None = None
 

@@ -17,7 +17,7 @@ from opt3dgs_optim.checkpoint import (
     inspect_checkpoint,
     number_of_steps,
     pack_optimizer,
-    restore_numbers,
+    restore_records,
 )
 from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.course import STATE_KEY, Course
@@ -42,6 +42,7 @@ from opt3dgs_optim.overrides import (
 )
 from opt3dgs_optim.part import Group, Part, Window
 from opt3dgs_optim.state import (
+    ADAM_KEYS,
     MOMENTS,
     HeldRows,
     ParameterRecord,
@@ -305,6 +306,8 @@ class StepAdam(Adam):
                 continue
             if not (grad.is_cpu and is_finite_sum(grad)):
                 self._zero_nonfinite(param)
+            if record.units != parts.units:
+                self._take_units(group, param, record, parts.units)
             if needed:
                 own, known = rows, counts
                 if own is not None:
@@ -319,6 +322,22 @@ class StepAdam(Adam):
                 record.last_step = now
         if parts.displacement or rows is not None:
             step.overrides.item(group, "params", params)
+
+    def _take_units(
+        self, group: Group, param: Tensor, record: ParameterRecord, units: tuple[str, ...]
+    ) -> None:
+        """Begin Adam's moments anew, which are in the units of other parts than those that act."""
+        known, record.units = record.units, units
+        state = self.state.get(param)
+        if known is None or not state:
+            return
+        for key in [key for key in ADAM_KEYS if key in state]:
+            state[key] = state[key].zero_() if isinstance(state[key], Tensor) else 0
+        LOGGER.info(
+            "iteration %d: Adam's moments of %s begin anew, since %s %s to act",
+            *(self.course.current, gaussian_of(group), ", ".join(units or known)),
+            "begins" if units else "ceases",
+        )
 
     def _view_of(self, group: Group, param: Tensor, record: ParameterRecord) -> ParameterState:
         """What the hooks see of a parameter's state, without what is of other rows."""
@@ -586,7 +605,12 @@ class StepAdam(Adam):
             self.course.load_state_dict(saved.course)
         else:
             self.course.expect(number_of_steps(self.state.values()))
-        restore_numbers(self, self._records, saved)
+        restore_records(self, self._records, saved)
+        known = self.course.named().keys()
+        for group, records in zip(self.param_groups, self._records, strict=True):
+            for param, record in zip(group["params"], records, strict=True):
+                if not known >= set(record.units or ()):  # without parts no step would notice
+                    self._take_units(group, param, record, ())
         self._open_windows = dict(saved.windows)
         self._rewinds = self.course.rewinds
         self._claim_rows()

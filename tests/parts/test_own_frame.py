@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import gc
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -250,6 +251,151 @@ def test_a_resumed_training_is_the_same_bit_for_bit(make: Any, at: int) -> None:
         train(splats, optimizers, phases, at, TOTAL)
         ends.append(splats)
     assert_same(ends[0], ends[1])
+
+
+# -- whose units Adam's moments are in ---------------------------------------------------------
+
+
+def positions_after(
+    change: Callable[[Any, Any], Any] | None, *, first: tuple[Part, ...], second: tuple[Part, ...]
+) -> tuple[Tensor, Tensor]:
+    """The step of the positions after a change from some parts to others, and their step count.
+
+    The moments before it are those of thirty steps.
+
+    Args:
+        change: makes other optimizers of these, with the parts `second`; None: only `second` acts,
+            from zero moments on.
+    """
+    splats = scene(6, 7)
+    adams: Any = {n: torch.optim.Adam([p], lr=1e-3, eps=1e-30) for n, p in splats.items()}
+    phases = only(TOTAL, *(first if change else second))
+    adams = phases.upgrade(adams)
+    grad = pull(torch.ones(6, 3).double())
+    start = splats["means"].detach().clone()
+    for i in range(30 if change else 0):
+        splats["means"].grad = grad(splats["means"].detach(), i)
+        phases.observe(0.1)
+        adams["means"].step()
+    splats["means"].data.copy_(start)
+    if change:
+        phases, adams = change(phases, adams)
+    splats["means"].grad = grad(start, 0)
+    phases.observe(0.1, iteration=30)
+    adams["means"].step()
+    return splats["means"].detach() - start, adams["means"].state[splats["means"]]["step"]
+
+
+def resumed(*second: Part) -> Callable[[Any, Any], Any]:
+    """A checkpoint that a training with other parts goes on from."""
+
+    def change(_: Any, adams: Any) -> Any:
+        phases = only(TOTAL, *second)
+        params = {name: adam.param_groups[0]["params"][0] for name, adam in adams.items()}
+        again: Any = {n: torch.optim.Adam([p], lr=1e-3, eps=1e-30) for n, p in params.items()}
+        again = phases.upgrade(again)
+        again["means"].load_state_dict(adams["means"].state_dict())
+        return phases, again
+
+    return change
+
+
+@pytest.mark.filterwarnings("ignore:.*steps, but this is iteration")
+@pytest.mark.parametrize(
+    ("first", "second"), [((), (OwnFrame(),)), ((OwnFrame(),), ()), ((OwnFrame(),), (Fading(),))]
+)
+def test_moments_of_other_units_begin_anew(
+    first: tuple[Part, ...], second: tuple[Part, ...]
+) -> None:
+    """Those of the world would hold a small Gaussian for thousands of steps, or throw it."""
+    fresh, _ = positions_after(None, first=first, second=second)
+    moved, count = positions_after(resumed(*second), first=first, second=second)
+    assert count.item() == 1
+    torch.testing.assert_close(moved, fresh, rtol=1e-12, atol=0.0)
+
+
+@pytest.mark.parametrize("parts", [(), (OwnFrame(),)])
+def test_moments_of_the_same_units_go_on(parts: tuple[Part, ...]) -> None:
+    _, count = positions_after(resumed(*parts), first=parts, second=parts)
+    assert count.item() == 31
+
+
+def test_moments_begin_anew_where_it_is_switched_off_and_on() -> None:
+    splats, phases, optimizers = upgraded(TOTAL, OwnFrame())
+    steps = []
+    for i, off in enumerate((False, False, True, True, False, False)):
+        phases.switched_off = {"OwnFrame": "a reason"} if off else {}
+        phases._plan()
+        train(splats, optimizers, phases, i, i + 1)
+        steps.append(int(state_of(optimizers, splats["means"])["step"]))
+    assert steps == [1, 2, 1, 2, 1, 2]
+    assert int(state_of(optimizers, splats["scales"])["step"]) == 6
+
+
+@pytest.mark.parametrize("on_device", [False, True])
+def test_a_dropped_first_step_does_not_count(
+    on_device: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends = []
+    if on_device:
+        devices.on_a_device(monkeypatch)
+    for dropped in (False, True):
+        splats, stock, optimizers = upgraded(TOTAL, fused=True)
+        train(splats, optimizers, stock, 0, 5)
+        saved = {name: copy.deepcopy(each.state_dict()) for name, each in optimizers.items()}
+        values = {name: param.detach().clone() for name, param in splats.items()}
+        splats, phases, optimizers = upgraded(TOTAL, OwnFrame(), fused=True)
+        for name, param in splats.items():
+            param.data.copy_(values[name])
+            optimizers[name].load_state_dict(saved[name])
+        if dropped:
+            for param in splats.values():
+                param.grad = torch.ones_like(param)
+            phases.observe(float("nan"), iteration=5)
+            for each in optimizers.values():
+                each.step()
+        phases.observe(0.1, iteration=6)
+        for param in splats.values():
+            param.grad = torch.ones_like(param)
+        for each in optimizers.values():
+            each.step()
+        ends.append(splats)
+    assert_same(ends[0], ends[1])
+
+
+def test_moments_that_the_stock_trainer_has_gone_on_with_begin_anew() -> None:
+    """Ours, stock, ours: the stock steps between were in the units of the world."""
+    splats, phases, optimizers = upgraded(TOTAL, OwnFrame())
+    train(splats, optimizers, phases, 0, 5)
+    saved = {name: copy.deepcopy(each.state_dict()) for name, each in optimizers.items()}
+    stock = gsplat_optimizers(splats)
+    for name, each in stock.items():
+        each.load_state_dict(saved[name])
+        splats[name].grad = torch.ones_like(splats[name])
+        each.step()
+    saved = {name: copy.deepcopy(each.state_dict()) for name, each in stock.items()}
+    again = only(TOTAL, OwnFrame())
+    optimizers: Any = again.upgrade(gsplat_optimizers(splats))
+    for name, each in optimizers.items():
+        with pytest.warns(UserWarning, match="another optimizer has gone on with them"):
+            each.load_state_dict(saved[name])
+    train(splats, optimizers, again, 6, 7)
+    assert int(state_of(optimizers, splats["means"])["step"]) == 1
+    assert int(state_of(optimizers, splats["scales"])["step"]) == 7
+
+
+@pytest.mark.parametrize("units", ["OwnFrame", [1], None, {"OwnFrame": 1}])
+def test_damaged_units_are_refused(units: Any) -> None:
+    splats, phases, optimizers = upgraded(TOTAL, OwnFrame())
+    train(splats, optimizers, phases, 0, 3)
+    saved = copy.deepcopy(optimizers["means"].state_dict())
+    record = saved["param_groups"][0]["opt3dgs"]["optimizer"]["records"][0][0]
+    assert record["units"] == ["OwnFrame"]
+    record["units"] = units
+    before = state_of(optimizers, splats["means"])["exp_avg"].clone()
+    with pytest.raises(ValueError, match=r"units=.*, but names of parts are needed"):
+        optimizers["means"].load_state_dict(saved)
+    assert torch.equal(state_of(optimizers, splats["means"])["exp_avg"], before)
 
 
 def test_density_control_between_steps() -> None:

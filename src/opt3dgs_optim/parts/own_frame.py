@@ -37,6 +37,8 @@ class OwnFrame(Part):
     `min_aspect` of the longest.
 
     Adam's moments of the positions then belong to the own frame; everything else stays as it is.
+    Where a training begins with it in the middle, from a checkpoint of the stock trainer, say, they
+    begin anew. The stock trainer would have to zero them to go on without it.
     Scales and quaternions are looked up in the groups of the upgraded optimizers (gsplat's,
     INRIA's, nerfstudio's names and others). Where they are not found, it is said once, and the
     positions are stepped as the trainer would.
@@ -76,6 +78,7 @@ class OwnFrame(Part):
     min_aspect: float = 0.1
 
     names = ("means",)
+    own_units = True
 
     def __post_init__(self) -> None:
         check_number(CALL, "rate", self.rate, 0.0, open_low=True)
