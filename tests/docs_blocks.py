@@ -87,6 +87,7 @@ def trainer_names() -> dict[str, Any]:
     trainer = SimpleNamespace(
         optimizers=dict_of_adams,
         cfg=SimpleNamespace(strategy={}),
+        scene=SimpleNamespace(on_remove=print),  # told of row edits, as gsplat's
         splats=torch.nn.ParameterDict(
             {name: o.param_groups[0]["params"][0] for name, o in dict_of_adams.items()}
         ),

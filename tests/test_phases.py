@@ -385,7 +385,7 @@ def test_an_energy_that_nobody_steps_after() -> None:
 def test_optimizers_that_step_without_an_energy() -> None:
     splats, optimizers = begun(PhaseScheduler(500))
     train(splats, optimizers, None, 0, 20)
-    with pytest.warns(UserWarning, match=r"20 times without an energy: Fading, Out") as told:
+    with pytest.warns(UserWarning, match=r"20 times without a loss: Fading, Out") as told:
         train(splats, optimizers, None, 20, 21)
     (warning,) = told
     assert warning.filename.endswith("trainers.py")  # the user's line, not ours or torch's
@@ -395,7 +395,7 @@ def test_optimizers_that_step_without_an_energy() -> None:
 def test_an_energy_that_stops_coming() -> None:
     splats, optimizers = begun(phases := PhaseScheduler(500))
     train(splats, optimizers, phases, 0, 5)
-    with pytest.warns(UserWarning, match="without an energy: Fading, OutOfView, Averaging stand"):
+    with pytest.warns(UserWarning, match="without a loss: Fading, OutOfView, Averaging stand"):
         train(splats, optimizers, None, 5, 30)
 
 

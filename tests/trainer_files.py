@@ -60,7 +60,7 @@ GSPLAT_16 = GSPLAT.replace(
             else:
                 l1loss = l1_loss(colors, pixels).mean()
 """,
-)
+).replace("params=self.splats", "params=self.splats, scene=self.scene")
 GSPLAT_2DGS = (
     GSPLAT.replace("        world_size = self.world_size\n", "")
     .replace("            if isinstance(self.cfg.strategy, DefaultStrategy):\n    ", "")

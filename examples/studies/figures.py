@@ -1,7 +1,7 @@
-"""The figures of the explanation pages: python examples/studies/figures.py [NAME...]
+"""Figures and tables of the explanation pages: python examples/studies/figures.py [NAME...]
 
-`performance.png`, `stability.png` and `collapse.png` in docs/figures, each from committed JSON
-records; nothing is trained or timed here.
+`performance.png`, `stability.png` and `collapse.png` in docs/figures, and the tables of the pages
+on performance and stability, all from committed JSON records; nothing is trained or timed here.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 from splatting.stopping import command
+
+from studies.pages import filled, table
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 FIGURES = DOCS / "figures"
@@ -168,6 +170,78 @@ MADE: dict[str, Callable[[Path], None]] = {
 }
 
 
+ROWS = (  # of the benchmark, on the page
+    *("six Adams", "defaults", "defaults, a tenth in view", "defaults, last thirtieth"),
+    *("defaults, steps of a tenth", "the paper's exploration", "the paper's exploitation"),
+)
+
+
+def step_costs() -> str:
+    """What whole steps cost, of every docs/benchmarks/step_*.json, and whether that is the goal."""
+    text = []
+    for path in sorted(BENCHMARK.parent.glob("step_*.json")):
+        bench = json.loads(path.read_text(encoding="utf-8"))
+        sizes = list(bench["results"])
+        rows = [
+            (step, *(f"{r['ns_per_point']:.0f} (x{r['per_adam']:.2f})" for r in of))
+            for step in ROWS
+            for of in [[bench["results"][n][step] for n in sizes]]
+        ]
+        heads = ("ns per point", *(f"{int(n):,} points" for n in sizes))
+        text += [f"{bench['device']}, torch {bench['torch']}, {bench['date']}:", ""]
+        text += [table(heads, "lr", rows), "", goal_table(bench), ""]
+        text += [f"Made by `{bench['command']}`.", ""]
+    return "\n".join(text).rstrip()
+
+
+def goal_table(bench: dict[str, Any]) -> str:
+    """What a step of the defaults costs of what it may cost, by the number of points."""
+    goals = bench["goals"]
+    found = {n: bench["results"][n]["defaults"]["per_adam"] for n in goals}
+    rows = [
+        ("goal", *(f"{goal:.2f}" for goal in goals.values())),
+        ("measured", *(f"{ratio:.2f}" for ratio in found.values())),
+        ("", *("reached" if found[n] <= goal else "missed" for n, goal in goals.items())),
+    ]
+    return table(("the defaults, times six Adams", *(f"{int(n):,}" for n in found)), "lr", rows)
+
+
+PROBLEMS = {
+    "Adam": "Adam",
+    "LQNAdam": "LQNAdam",
+    "two-loop + line search": "the recursion with a line search",
+    "LBFGS (torch)": "`torch.optim.LBFGS`",
+}
+
+
+def digits_table() -> str:
+    """Digits reached on the test functions."""
+    results = json.loads(STABILITY.read_text(encoding="utf-8"))
+    rows = []
+    for kind in ("problems", "quadratics"):
+        for name, courses in results[kind].items():
+            digits = (-math.log10(max(courses[arm][-1][2], 1e-40)) for arm in PROBLEMS)
+            cells = ("over 30" if d > 30 else f"{abs(d):.1f}" for d in digits)
+            rows.append((name if kind == "problems" else f"quadratic, {name}", *cells))
+    about = results["about"]
+    return (
+        f"{table(('problem', *PROBLEMS.values()), 'lr', rows)}\n\n"
+        f"Digits: -log10 of what is left of the error after {about['steps']:,} steps\n"
+        f"(line searches: up to 150), median of {about['rows']} rows.\n"
+        f"{about['machine']}, {about['date']}."
+    )
+
+
+MARK = "<!-- figures:{} -->"
+TABLES: dict[str, Callable[[], str]] = {"step-costs": step_costs, "digits": digits_table}
+PAGES = (DOCS / "performance.md", DOCS / "stability.md")
+
+
+def tabled(page: str) -> str:
+    """A page with its tables."""
+    return filled(page, {name: make() for name, make in TABLES.items()}, MARK, every=False)
+
+
 @command("figures")
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line."""
@@ -182,6 +256,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in args.names or MADE:
         MADE[name](args.out / name)
         print(args.out / name)
+    for page in PAGES:
+        page.write_text(tabled(page.read_text(encoding="utf-8")), encoding="utf-8")
+        print(page)
     return 0
 
 

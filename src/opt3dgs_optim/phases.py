@@ -231,7 +231,7 @@ class PhaseScheduler(Course):
         if self._steps_without_energy > PATIENCE * max(self._num_optimizers, 1):
             self._report(
                 "no energy",
-                f"the optimizers have stepped {PATIENCE} times without an energy: {self._names()} "
+                f"the optimizers have stepped {PATIENCE} times without a loss: {self._names()} "
                 "stand still; call observe(loss) once per iteration, before the steps",
             )
         return self.num_observed > 0
@@ -266,7 +266,7 @@ class PhaseScheduler(Course):
             self._report(
                 "late",
                 "the optimizers had stepped before the first observe(loss), so each step has the "
-                "energy of the iteration before; call observe after backward, before the steps",
+                "loss of the iteration before; call observe after backward, before the steps",
             )
         lost, alive = self.num_lost_followers, len(self.followers())
         # A trainer that follows the advice to end the schedule where it freezes the Gaussians goes

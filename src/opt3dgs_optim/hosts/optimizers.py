@@ -92,6 +92,11 @@ def find_optimizers(
     setups = _remade(inside, found[0], _makers([tree, *models]))
     if others := [text for text in stepped if text not in found]:
         notes.append(f"left alone: {', '.join(others)}")
+    if any(_steps_at_times(model) for model in models):
+        notes.append(
+            "the model's optimizer_step() steps in some iterations only; between these the loss is "
+            "observed, but the mean of the last thirtieth has as few iterates as there are steps"
+        )
     return Optimizers(found, setups, notes)
 
 
@@ -147,6 +152,19 @@ def read_step(spot: Spot, own: list[Spot]) -> Step | None:
             f"{ast.unparse(call)} is no step of an Adam; only step() and step(mask, ...) are known",
         )
     return Step(name, spot, loops)
+
+
+def _steps_at_times(model: ast.Module) -> bool:
+    """Whether its `optimizer_step` steps in every so many iterations, as FastGS's does."""
+    for function in ast.walk(model):
+        if isinstance(function, FUNCTIONS) and function.name == "optimizer_step":
+            for spot in spots(function):
+                match spot.node:
+                    case ast.Call(ast.Attribute(ast.Attribute(_, "optimizer"), "step")):
+                        tests = [n.test for n in spot.above if isinstance(n, ast.If)]
+                        if any(isinstance(n, ast.Mod) for test in tests for n in ast.walk(test)):
+                            return True
+    return False
 
 
 def _goes_over_optimizers(loop: ast.AST, name: str) -> str:
