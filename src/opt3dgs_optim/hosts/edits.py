@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from opt3dgs_optim.hosts.reading import Trainer, read_trainer
-from opt3dgs_optim.hosts.syntax import FUNCTIONS, refusal, scopes, spots
+from opt3dgs_optim.hosts.syntax import FUNCTIONS, NothingToAddError, refusal, scopes, spots
 
 COMMAND = """Print the lines to change in a training script as a diff; --write applies them.
 
@@ -34,7 +34,7 @@ LINES_BY_HAND = (
     "phases.observe(LOSS)  # after LOSS.backward(), before OPTIMIZER.step()",
 )
 IMPORTS = {  # where it is refused, and why
-    "opt3dgs_optim": "it imports opt3dgs_optim already; start from the trainer's own file",
+    "opt3dgs_optim": "it imports opt3dgs_optim already; to begin anew, take the trainer's own file",
     "nerfstudio": "nerfstudio needs no change: ns-train splatfacto-opt3dgs",
 }
 # Modules of trainers that need other lines than these, or none, and the page of docs/hosts that has
@@ -82,7 +82,7 @@ def diff(path: Path) -> Edited:
         raise ValueError(f"it cannot be read as Python: {error}") from None
     for name, reason in IMPORTS.items():
         if _imports(text, name):
-            raise ValueError(reason)
+            raise (ValueError if name in PAGES else NothingToAddError)(reason)
     trainer = read_trainer(tree, path.parent)
     new = b"".join(_edited_lines(source.splitlines(keepends=True), tree, trainer))
     try:
@@ -268,7 +268,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         backup = write(options.path) if options.write else None
     except ValueError as error:
         print(f"opt3dgs hosts: {options.path}: {error}", file=sys.stderr)
-        if options.path.is_file() and options.path.suffix == ".py":
+        more = options.path.is_file() and options.path.suffix == ".py"
+        if more and not isinstance(error, NothingToAddError):
             print("\n".join(_help_by_hand(options.path)), file=sys.stderr)
         return 1
     print(done.diff, end="")

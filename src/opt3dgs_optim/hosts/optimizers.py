@@ -8,6 +8,7 @@ from typing import NamedTuple
 from opt3dgs_optim.hosts.syntax import (
     COMPREHENSIONS,
     FUNCTIONS,
+    NothingToAddError,
     Spot,
     is_reference,
     loops_around,
@@ -147,9 +148,9 @@ def read_step(spot: Spot, own: list[Spot]) -> Step | None:
     elif not name.endswith("optimizer") and not _is_adam(own, name):
         return None
     if not scaled and (options or len(given) > 2 or any(_is_closure(each, own) for each in given)):
-        raise refusal(
-            call,
-            f"{ast.unparse(call)} is no step of an Adam; only step() and step(mask, ...) are known",
+        raise NothingToAddError(
+            f"line {call.lineno}: {ast.unparse(call)} is no step of an Adam; only step() and "
+            "step(mask, ...) are known, and other optimizers get no parts"
         )
     return Step(name, spot, loops)
 

@@ -128,6 +128,10 @@ def values(own: list[Spot], name: str) -> Iterator[tuple[int, ast.expr | None]]:
                     yield node.lineno, None
 
 
+class NothingToAddError(ValueError):
+    """A file is refused, and there are no lines that would make it work."""
+
+
 def refusal(line: int | ast.AST, reason: str) -> ValueError:
     """The error that says which line cannot be read with certainty, and why."""
     number = line if isinstance(line, int) else getattr(line, "lineno", 1)
