@@ -42,7 +42,7 @@ PAPER = (  # what the pages say of the paper's parts: the part, what without it,
 LOOKS = 60  # at the training PSNR, of each record of `falls_table`
 FACTORS = (0.1, 0.3, 1.5, 2.0, 3.0, 10.0)  # on learning rates, of `tuned_table`
 TUNED = {
-    **{f"rates-x{k:g}": f"3DGS-MCMC, all steps (last column: rates) times {k:g}" for k in FACTORS},
+    **{f"rates-x{k:g}": f"3DGS-MCMC, all steps times {k:g}" for k in FACTORS},
     **{f"positions-x{k:g}": f"3DGS-MCMC, the positions' steps times {k:g}" for k in FACTORS},
 }
 OURS = {  # the last lines of `tuned_table`

@@ -292,7 +292,7 @@ def test_tuned_rates_stand_beside_the_defaults_of_the_same_seeds() -> None:
     columns = "1 small scene, 3,000 iterations, 1 training | plush, 7,500 iterations, 1 training"
     assert lines[0] == f"| training | {columns} |"
     assert "| 3DGS-MCMC as published | 0 | 0 |" in lines
-    assert "| 3DGS-MCMC, all steps (last column: rates) times 3 | +0.25 | +0.50 |" in lines
+    assert "| 3DGS-MCMC, all steps times 3 | +0.25 | +0.50 |" in lines
     assert not any("times 10" in line for line in lines)  # which nobody has trained
     assert "| **the defaults**, learning rates as published | - | +1.00 |" in lines
 
@@ -310,7 +310,7 @@ def test_a_column_of_tuned_rates_appears_with_its_trainings() -> None:
     assert lines[0] == "| training | 2 scenes, 7,500 iterations, 2 trainings |"
     assert lines[2:] == [
         "| 3DGS-MCMC as published | 0 |",
-        "| 3DGS-MCMC, all steps (last column: rates) times 2 | +0.50 ± 0.00 |",
+        "| 3DGS-MCMC, all steps times 2 | +0.50 ± 0.00 |",
         "| 3DGS-MCMC, the positions' steps times 3 | +0.20 (1 training) |",
         "| **the defaults**, learning rates as published | +1.50 ± 0.50 |",
     ]
@@ -321,7 +321,7 @@ def test_the_headline_has_the_best_tuned_rates_where_every_training_has_them() -
     long = [rotated_record(arm, "a", s, psnr=psnr) for arm, psnr in arms.items() for s in (0, 1)]
     without = [r for r in long if (r.arm, r.seed) != ("positions-x3", 1)]
     rest = " / 0.700 / 0.200 |"
-    for records, best in ((long, "positions' steps times 3"), (without, "rates times 2")):
+    for records, best in ((long, "positions' steps times 3"), (without, "steps times 2")):
         study = Study(records)
         lines = headline_table(study, study.settings(), 7_500).splitlines()[2:5]
         psnr = max(p for arm, p in arms.items() if arm.endswith(best[-1]) and "-x" in arm)
