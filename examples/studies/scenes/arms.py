@@ -42,6 +42,7 @@ BUT_SCALES = ("quats", "opacities", "sh0", "shN")
 FADING = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=300)
 FADING_OTHERS = replace(FADING, names=OTHERS)
 ANNEALING_BUT_SCALES = Annealing(4.0, 0.4, 1.0, names=BUT_SCALES)
+OWN_FRAME, OWN = "frame-0.1-not-thin", OwnFrame(0.1, final=0.01, min_aspect=0.1)
 FADING_BUT_SCALES = replace(FADING, names=("means", *BUT_SCALES))
 
 
@@ -82,28 +83,6 @@ def adaptive(name: str, what: str, parts: MakeParts | None = None) -> StudyArm:
     return StudyArm(name, what, parts, mcmc=False, control=ADAPTIVE, adaptive=True)
 
 
-OWN_FRAMES: dict[str, tuple[str, Part]] = {  # by the arm's name: what it is, and the part
-    **{
-        f"{rate:g}": (f"own frame, {rate:g} of a deviation a step", OwnFrame(rate, min_aspect=0.0))
-        for rate in (0.05, 0.1, 0.2, 0.4)
-    },
-    "0.1-not-thin": (
-        "own frame, 0.1, an axis counts as a tenth of the longest at least",
-        OwnFrame(0.1, min_aspect=0.1),
-    ),
-    **{
-        f"{rate:g}-aspect-{aspect:g}": (
-            f"own frame, {rate:g}, an axis counts as {aspect:g} of the longest at least",
-            OwnFrame(rate, min_aspect=aspect),
-        )
-        for rate, aspect in ((0.2, 0.1), (0.4, 0.1), (0.2, 0.3), (0.05, 1.0), (0.1, 1.0))
-    },
-    "0.1-not-thin-final-0.05": (
-        "own frame, 0.1, not thin, and the last step a twentieth of the first",
-        OwnFrame(0.1, final=0.05, min_aspect=0.1),
-    ),
-}
-
 LIST = (
     StudyArm(BASELINE, "3DGS-MCMC as published, torch's Adam"),
     *(
@@ -112,7 +91,7 @@ LIST = (
     ),
     *(
         StudyArm(f"positions-x{k:g}", f"the positions' steps times {k:g}", of(on_positions(k)))
-        for k in (1.5, 2.0, 3.0)
+        for k in (2.0, 3.0)
     ),
     StudyArm(
         "paper",
@@ -122,16 +101,16 @@ LIST = (
     ),
     StudyArm("paper-constant", "a constant multiplier, `paper`'s mean", constant, needs="paper"),
     StudyArm("faded", "moments of random points faded", of(FADING)),
-    *(StudyArm(f"frame-{form}", what, of(part)) for form, (what, part) in OWN_FRAMES.items()),
-    *(
-        StudyArm(
-            f"frame-{form}+faded",
-            "as its control, all but the positions faded, points out of view held",
-            of(part, FADING_OTHERS, OutOfView()),
-            control=f"frame-{form}",
-        )
-        for form, (_, part) in OWN_FRAMES.items()
-        if form != "0.4"
+    StudyArm(
+        OWN_FRAME,
+        "own frame, 0.1 of a deviation a step, an axis counts as a tenth of the longest at least",
+        of(OWN),
+    ),
+    StudyArm(
+        f"{OWN_FRAME}+faded",
+        "as its control, all but the positions faded, points out of view held",
+        of(OWN, FADING_OTHERS, OutOfView()),
+        control=OWN_FRAME,
     ),
     adaptive(ADAPTIVE, "3DGS with adaptive density control as published, torch's Adam"),
     adaptive(
@@ -139,15 +118,7 @@ LIST = (
         "annealed and faded, the positions not annealed, the scales left alone",
         of(ANNEALING_BUT_SCALES, FADING_BUT_SCALES, OutOfView()),
     ),
-    *(
-        adaptive(f"adc+frame-{form}", OWN_FRAMES[form][0], of(OWN_FRAMES[form][1]))
-        for form in ("0.1", "0.2", "0.1-not-thin")
-    ),
-    adaptive(
-        "adc+frame-0.1+faded",
-        "as `adc+frame-0.1`, faded, scales and positions left alone",
-        of(OWN_FRAMES["0.1"][1], replace(FADING, names=BUT_SCALES), OutOfView()),
-    ),
+    adaptive(f"adc+{OWN_FRAME}", "own frame, as without clone and split", of(OWN)),
 )
 ADAPTIVE_DEFAULTS = f"adc+annealed+faded-but-scales{AVERAGED}"  # what `DEFAULTS_ADC` is
 TRAINED = {arm.name: arm for arm in LIST}

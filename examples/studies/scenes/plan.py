@@ -15,6 +15,7 @@ from studies.scenes.arms import (
     BASELINE,
     DEFAULTS,
     LIST,
+    OWN_FRAME,
     find_study_arm,
 )
 from studies.scenes.decisions import MANY_VIEWS_SCENES, points_of
@@ -23,7 +24,7 @@ from studies.scenes.training import Spec
 FEW_VIEWS_SCENES = ("embedded", "banana", "lund_door", "brighton_beach")
 STOCK = (BASELINE, f"{BASELINE}{AVERAGED}")
 TODAY = (*STOCK, "faded", DEFAULTS)
-FRAMES = tuple(arm.name for arm in LIST if arm.name.startswith("frame-"))
+FRAMES = (f"{OWN_FRAME}{AVERAGED}", f"{OWN_FRAME}+faded{AVERAGED}")
 RATES = tuple(arm.name for arm in LIST if arm.name.startswith(("rates-", "positions-")))
 ADAPTIVE_ARMS = (ADAPTIVE, ADAPTIVE_DEFAULTS)
 
@@ -56,11 +57,6 @@ def cross(
     ]
 
 
-def with_averaging(arms: Sequence[str]) -> list[str]:
-    """The arms' branches that average; the arms themselves are their trunks."""
-    return [f"{arm}{AVERAGED}" for arm in arms]
-
-
 def stages(seeds: int = 3) -> dict[str, list[Spec]]:
     """The trainings of every stage; their scenes are names, not yet folders.
 
@@ -69,8 +65,6 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
     """
     rotated = partial(cross, rotated=True)
     at_half = partial(rotated, iterations=30_000, size="images_2")
-    frames = with_averaging(FRAMES)
-    adaptive_frames = with_averaging([a.name for a in LIST if a.name.startswith("adc+frame-")])
     half_sizes = ((("bonsai",), 5), (("plush",), 12.5), (("lego",), 5))
     return {
         "embedded": rotated(("embedded",), TODAY, 1, 1_500),  # needs no download
@@ -90,36 +84,34 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         ],
         "adaptive": rotated(MANY_VIEWS_SCENES, [*ADAPTIVE_ARMS, "adc+averaged"], seeds, 30_000),
         "sh3": rotated(MANY_VIEWS_SCENES, TODAY, 1, 30_000, sh_degree=3),
-        # The positions in their own frame: half size decides, then its rate and what is beside it.
+        # The positions in their own frame: half size decides.
         "own-frame": [
             spec
-            for form in ("0.1", "0.1-not-thin", "0.2")
-            for arm in (f"frame-{form}{AVERAGED}", f"frame-{form}+faded{AVERAGED}")
+            for arm in FRAMES
             for scenes, share in half_sizes
             for spec in at_half(scenes, [arm], seeds, share=share)
         ],
-        "own-frame-brief": rotated(MANY_VIEWS_SCENES, frames, 1, 7_500),
-        "own-frame-quarter": rotated(MANY_VIEWS_SCENES, frames, seeds, 30_000),
-        "own-frame-adaptive": rotated(MANY_VIEWS_SCENES, adaptive_frames, 1, 30_000),
+        "own-frame-quarter": rotated(MANY_VIEWS_SCENES, FRAMES, seeds, 30_000),
         # Stock with other constant rates: what a longer step is to be compared with.
         "rates-tuned": [
-            *rotated(MANY_VIEWS_SCENES, RATES, 1, 7_500),
+            *rotated(MANY_VIEWS_SCENES, RATES, 1, 30_000),
             *(s for x, share in half_sizes for s in at_half(x, RATES, 1, share=share)),
         ],
         "half-adaptive": [
             spec
             for scenes, share in half_sizes
-            for spec in at_half(scenes, [*ADAPTIVE_ARMS, *adaptive_frames], 1, share=share)
+            for spec in at_half(
+                scenes, [*ADAPTIVE_ARMS, f"adc+{OWN_FRAME}{AVERAGED}"], 1, share=share
+            )
         ],
-        "whole": rotated(  # 800x800 and 800x532
-            ("lego", "bonsai"),
-            [*STOCK, DEFAULTS, *with_averaging(["frame-0.1", "frame-0.1+faded"])],
-            1,
-            30_000,
-            20,
-            size="images",
-            sh_degree=3,
-        ),
+        # 800x800 and 800x532. The shorter ones first: one of the others takes three core-hours.
+        "whole": [
+            spec
+            for scenes, iterations in ((("bonsai",), 7_500), (("lego", "bonsai"), 30_000))
+            for spec in rotated(
+                scenes, [*STOCK, DEFAULTS, *FRAMES], 1, iterations, 20, size="images", sh_degree=3
+            )
+        ],
         # One size of a training after the other.
         "crowded": [  # 40,000 Gaussians on images of a quarter of their size
             *rotated(("bonsai",), TODAY, 1, 7_500, 4),
