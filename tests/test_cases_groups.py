@@ -5,12 +5,13 @@ from __future__ import annotations
 import itertools
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 import torch
 from torch.nn import Parameter
 
-from opt3dgs_optim import PhaseScheduler
+from opt3dgs_optim import Kept, OwnFrame, Part, PhaseScheduler
 
 # In the order of gsplat's names.
 GSPLAT = ("means", "scales", "quats", "opacities", "sh0", "shN")
@@ -133,3 +134,86 @@ def test_what_was_taken_is_said_unless_somebody_asks_for_silence(set_up: str, sa
     command = [sys.executable, "-c", UPGRADE.format(set_up=set_up)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert ("in the steps of means" in done.stderr) == said
+
+
+# -- groups that are put in another order, exchanged or removed -----------------------------------
+
+
+class Memory(Part):
+    """Keeps a number per parameter: how often it was stepped, of which kind."""
+
+    keeps = (Kept("steps", per="parameter"), Kept("rows", shape=()))
+    names = None
+
+    def before(self, group, param, grad, state, course):
+        state["steps"] += 1 + 100 * list(GSPLAT).index(group["gaussian"])
+        state["rows"] += 1.0
+        return grad
+
+
+def reverse(adam: torch.optim.Adam) -> None:
+    adam.param_groups.reverse()
+
+
+def put_first(adam: torch.optim.Adam) -> None:
+    adam.add_param_group({"params": [Parameter(torch.ones(3))], "name": "pose"})
+    adam.param_groups.insert(0, adam.param_groups.pop())
+
+
+def remove(adam: torch.optim.Adam) -> None:
+    adam.param_groups = [group for group in adam.param_groups if group["name"] != "f_rest"]
+
+
+def exchange(adam: torch.optim.Adam) -> None:
+    adam.param_groups[:] = [dict(group) for group in adam.param_groups]
+
+
+def exchange_in_another_order(adam: torch.optim.Adam) -> None:
+    adam.param_groups = [dict(group) for group in reversed(adam.param_groups)]
+
+
+CHANGES = (reverse, put_first, remove, exchange, exchange_in_another_order)
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("frame", [False, True])
+def test_what_is_kept_for_a_parameter_stays_its_own(change: Any, frame: bool) -> None:
+    names = TRAINERS["INRIA"]
+    params = {name: Parameter(torch.ones(8, *s)) for name, s in zip(names, SHAPES, strict=True)}
+    own: list[Part] = [OwnFrame()] if frame else []
+    phases = PhaseScheduler(300, parts=[Memory(), *own])
+    groups = [{"params": [param], "name": name} for name, param in params.items()]
+    adam = phases.upgrade(torch.optim.Adam(groups))
+    for i in range(6):
+        if i == 3:
+            change(adam)
+        for param in params.values():
+            param.grad = torch.ones_like(param)
+        phases.observe(0.1)
+        adam.step()
+    for number, (name, param) in enumerate(params.items()):
+        if change is remove and name == "f_rest":
+            continue
+        record = adam.record_of(param)
+        assert record is not None
+        assert record.numbers["Memory.steps"].item() == 6 * (1 + 100 * number)
+        assert adam.state[param]["step"].item() == 6
+        assert adam.state[param]["Memory.rows"].tolist() == 8 * [6.0]
+
+
+def test_a_tensor_may_leave_its_group() -> None:
+    """Poses of a camera that is not optimized any more; the others keep what is theirs."""
+    poses = [Parameter(torch.zeros(6)) for _ in range(3)]
+    means = Parameter(torch.ones(4, 3))
+    phases = PhaseScheduler(300)
+    groups = [{"params": [means], "name": "xyz"}, {"params": poses, "name": "pose"}]
+    adam = phases.upgrade(torch.optim.Adam(groups))
+    for i in range(6):
+        if i == 3:
+            adam.param_groups[1]["params"].pop(0)
+        for param in (means, *poses):
+            param.grad = torch.ones_like(param)
+        phases.observe(0.1)
+        adam.step()
+    assert [adam.state[pose]["step"].item() for pose in poses] == [3, 6, 6]
+    assert adam.state[means]["step"].item() == 6

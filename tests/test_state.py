@@ -200,7 +200,7 @@ def test_a_pickled_record_has_no_view() -> None:
     place.record.last_step = 4
     other = copy.deepcopy(place.record)
     known = {"last_step": 4, "units": None, "numbers": {"Mine.count": 2}}
-    assert vars(other) == {**known, "_view": None}
+    assert vars(other) == {**known, "param": None, "_view": None}
 
 
 # -- what is undone -------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from opt3dgs_optim import cuda
 from opt3dgs_optim.lbfgs.pairs import columns, put, row_chunks
+from opt3dgs_optim.state import is_finite_sum
 
 MIN_QUATERNION = 1e-12  # as torch.nn.functional.normalize: a zero quaternion is no rotation
 
@@ -79,6 +80,8 @@ def axes_of(quats: Tensor, scales: Tensor, dtype: torch.dtype, min_aspect: float
     result = torch.empty(3, 3, len(quats), dtype=dtype, device=quats.device)
     for rows in row_chunks(quats):
         q = columns(quats[rows], dtype)
+        deviations = columns(scales[rows], dtype).exp_()
+        _hold_broken(q, deviations)
         size = (q * q).sum(0).sqrt_().clamp_(min=MIN_QUATERNION)
         w, x, y, z = (q * (2**0.5 / size)).unbind()  # so that products are already doubled
         xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
@@ -89,7 +92,6 @@ def axes_of(quats: Tensor, scales: Tensor, dtype: torch.dtype, min_aspect: float
             *(xz - wy, yz + wx, (xx + yy).neg_().add_(1.0)),
         ]
         b = result[:, :, rows]
-        deviations = columns(scales[rows], dtype).exp_()
         if min_aspect:
             deviations = torch.maximum(deviations, deviations.amax(0) * min_aspect)
         for place, entry, deviation in zip(
@@ -100,6 +102,19 @@ def axes_of(quats: Tensor, scales: Tensor, dtype: torch.dtype, min_aspect: float
         ):
             torch.mul(entry, deviation, out=place)
     return result
+
+
+def _hold_broken(quats: Tensor, deviations: Tensor) -> None:
+    """Take Gaussians whose frame is not finite for points: nothing is fed, and nothing moves.
+
+    Else a gradient of zero would become a NaN, which stays in Adam's moments for ever. In place, of
+    columns [4, N] and [3, N].
+    """
+    if quats.is_cpu and is_finite_sum(quats) and is_finite_sum(deviations):
+        return
+    broken = ~(quats.isfinite().all(0) & deviations.isfinite().all(0))
+    quats.masked_fill_(broken, 0.0)
+    deviations.masked_fill_(broken, 0.0)
 
 
 def _cross(a: list[Tensor], b: list[Tensor]) -> list[Tensor]:

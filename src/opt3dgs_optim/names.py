@@ -61,16 +61,25 @@ def is_known_other(name: Any) -> bool:
 
 
 class NamedGroup(dict[str, Any]):
-    """A parameter group that knows which Gaussian parameter it holds.
+    """A parameter group that knows which Gaussian parameter it holds, and what is kept for it.
 
     `group["gaussian"]` is gsplat's name of it, or None, but no key of the group: torch's flat
     distributed checkpoints ask every stored checkpoint for all keys of the present groups, so that
     one of a stock trainer could not be loaded any more.
+
+    Attributes:
+        records: by parameter, a `state.ParameterRecord`.
     """
 
-    def __init__(self, group: Mapping[str, Any], set_name: str, gaussian: str | None) -> None:
+    def __init__(
+        self,
+        group: Mapping[str, Any],
+        set_name: str,
+        gaussian: str | None,
+        records: Iterable[Any] = (),
+    ) -> None:
         super().__init__(group)
-        self.set_name, self.gaussian = set_name, gaussian
+        self.set_name, self.gaussian, self.records = set_name, gaussian, list(records)
 
     def __missing__(self, key: str) -> Any:
         if key == SLOT:
@@ -81,7 +90,7 @@ class NamedGroup(dict[str, Any]):
         return self.gaussian if key == SLOT else super().get(key, default)
 
     def __reduce__(self) -> Any:
-        return NamedGroup, (dict(self), self.set_name, self.gaussian)
+        return NamedGroup, (dict(self), self.set_name, self.gaussian, self.records)
 
 
 def gaussian_of(group: Mapping[str, Any]) -> str | None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.optim import Adam
 
 from opt3dgs_optim.part import Group
-from opt3dgs_optim.state import is_finite_sum
+from opt3dgs_optim.state import broadcast_rows, is_finite_sum
 
 
 class AdamOptions(TypedDict, total=False):
@@ -96,17 +96,29 @@ def scale_learning_rate(
 
 
 @torch.no_grad()
-def decay_weights(overrides: TemporaryOverrides, group: Group, counts: Tensor | bool) -> None:
-    """Decoupled weight decay of a group, made now with the trainer's own learning rate."""
+def decay_weights(
+    overrides: TemporaryOverrides,
+    group: Group,
+    counts: Tensor | bool,
+    rows: Tensor | None = None,
+) -> None:
+    """Decoupled weight decay of a group, made now with the trainer's own learning rate.
+
+    Of the rows [N] bool that a mask lets move; None: of all.
+    """
     if counts is False:
         return
     kept = 1 - group["lr"] * group["weight_decay"]
     for param in group["params"]:
-        if param.grad is not None:
-            if isinstance(counts, Tensor):
-                param.mul_(torch.where(counts.to(param.device), kept, 1.0))
-            else:
-                param.mul_(kept)
+        if param.grad is None:
+            continue
+        made: Any = True if rows is None else broadcast_rows(rows.to(param.device), param)
+        if isinstance(counts, Tensor):
+            made = counts.to(param.device) & made
+        if made is True:
+            param.mul_(kept)
+        else:
+            torch.where(made, param * kept, param, out=param)
     overrides.item(group, "weight_decay", 0.0)
 
 

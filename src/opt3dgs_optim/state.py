@@ -133,12 +133,14 @@ class ParameterRecord:
         last_step: the iteration of the parameter's last step, whether that counted or not; None
             before the first.
         units: the parts in whose units Adam's moments are; None where there are no moments yet.
+        param: the parameter that was there last, weakly; None before any.
         numbers: what parts keep per parameter, key -> 0-d tensor.
     """
 
     def __init__(self) -> None:
         self.last_step: int | None = None
         self.units: tuple[str, ...] | None = None
+        self.param: weakref.ref[Tensor] | None = None
         self.numbers: dict[str, Tensor] = {}
         self._view: ParameterState | None = None
 
@@ -155,11 +157,27 @@ class ParameterRecord:
         view = self._view
         if view is None or view.param is not param or view.adam is not adam:
             view = ParameterState(param, adam, self, declared, training)
-            self._view = view
+            self._view, self.param = view, weakref.ref(param)
         return view
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_view": None}
+        return {**vars(self), "_view": None, "param": None}
+
+
+def records_of(params: list[Tensor], records: list[ParameterRecord]) -> list[ParameterRecord]:
+    """One record for each of a group's parameters, of the records that it has had.
+
+    They belong to places, where density control puts other parameters. Where places have gone, the
+    parameters that are still the same tell which are left.
+    """
+    if len(records) > len(params):
+        by_param = {id(record.param()): record for record in records if record.param is not None}
+        records = [by_param.get(id(param)) or ParameterRecord() for param in params]
+    else:
+        records = [*records, *(ParameterRecord() for _ in range(len(params) - len(records)))]
+    for param, record in zip(params, records, strict=True):
+        record.param = weakref.ref(param)
+    return records
 
 
 class ParameterState(MutableMapping[str, Any]):

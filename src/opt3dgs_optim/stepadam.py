@@ -52,6 +52,7 @@ from opt3dgs_optim.state import (
     broadcast_rows,
     check_mask,
     is_finite_sum,
+    records_of,
     rows_of,
 )
 
@@ -73,8 +74,8 @@ class StepAdam(Adam):
     any_group = False  # whether the parts act on groups that are no Gaussian parameter's, too
     _base: type[Adam] = Adam  # whose step it is that the parts surround
     _ownership: RowOwnership
-    _records: list[list[ParameterRecord]]  # by group, and by parameter in it
     _slots: list[tuple[str, str | None]]  # by group: the set of Gaussians, and which parameter
+    _known: list[NamedGroup]  # the groups at the last look
     _open_windows: dict[str, Window | None]
     _rewinds = 0
     _nonfinite_reported = False
@@ -90,7 +91,7 @@ class StepAdam(Adam):
         self.course, self._base, self._ownership = course, base, RowOwnership()
         if "_slots" not in vars(self):
             self._slots = []
-        self._records, self._open_windows = [], {}
+        self._known, self._open_windows = [], {}
         self._name_groups()
         self._patch_step_function()  # torch's, for a class that was given to a made optimizer
         if base is Adam and course.parts and can_be_fused(self):
@@ -109,30 +110,46 @@ class StepAdam(Adam):
             self._name_groups()
 
     def _name_groups(self) -> None:
-        """Know what each group holds; of those that came or were exchanged their names say it."""
-        groups, records = self.param_groups, self._records
-        if len(groups) == len(records):
-            for group, own in zip(groups, records, strict=True):
-                if type(group) is not NamedGroup or len(group["params"]) > len(own):
+        """Know what each group holds; of those that came or were exchanged their names say it.
+
+        A group that takes the place of another goes on with what was kept for that one. It is the
+        one of its name, or else the one that stood where it stands.
+        """
+        groups = self.param_groups
+        if len(groups) == len(self._known):
+            for group in groups:
+                if type(group) is not NamedGroup or len(group["params"]) != len(group.records):
                     break
             else:
                 return
-        known = vars(self).setdefault("_slots", [])
+        gone = [old for old in self._known if all(old is not group for group in groups)]
         for i, group in enumerate(groups):
-            if i == len(known):
-                known.append(split_name(group.get("name")))
-                if i < len(self._records) or self._records:
-                    taken = known[i][1] or "left alone"
-                    LOGGER.info("a group was added: %s, %s", group_name(i, group), taken)
-            if type(group) is not NamedGroup:
-                name = split_name(group.get("name"))
-                known[i] = name if name[1] is not None else known[i]
-                groups[i] = NamedGroup(group, *known[i])
-                self._acting = (None, None, {})
-            if i == len(self._records):
-                self._records.append([])
-            while len(self._records[i]) < len(group["params"]):
-                self._records[i].append(ParameterRecord())
+            if type(group) is NamedGroup:
+                continue
+            slot = split_name(group.get("name"))
+            heir = next((o for o in gone if slot[1] and (o.set_name, o.gaussian) == slot), None)
+            if slot[1] is None:
+                place = self._known[i] if i < len(self._known) else None
+                heir = next((old for old in gone if old is place), None)
+                if heir is not None:
+                    slot = heir.set_name, heir.gaussian
+                elif i < len(self._slots):
+                    slot = self._slots[i]
+            groups[i] = NamedGroup(group, *slot, () if heir is None else heir.records)
+            gone = [old for old in gone if old is not heir]
+            self._acting = (None, None, {})
+            if self._known and heir is None:
+                taken = slot[1] or "left alone"
+                LOGGER.info("a group was added: %s, %s", group_name(i, group), taken)
+        self._known, self._slots = cast(list[NamedGroup], list(groups)), []
+        for group in self._known:
+            if len(group["params"]) != len(group.records):
+                group.records = records_of(group["params"], group.records)
+
+    @property
+    def _records(self) -> list[list[ParameterRecord]]:
+        """By group, and by parameter in it."""
+        return [getattr(group, "records", []) for group in self.param_groups]
 
     def acts_on(self, part: Part, group: Group) -> bool:
         """Whether a part acts on a group."""
@@ -231,11 +248,11 @@ class StepAdam(Adam):
             self._check_mask(mask)
         with TemporaryOverrides() as temporary:
             step = StepInProgress(mask, acting, counts, temporary)
-            for group, records in zip(self.param_groups, self._records, strict=True):
+            for group in self.param_groups:
                 parts = self._parts_of(group) if acting else NO_PARTS
                 if acting and course.asks_parts:
                     parts = self._ready(parts, group)
-                self._prepare_group(step, group, records, parts)
+                self._prepare_group(step, cast(NamedGroup, group), parts)
                 if parts.factor:
                     found = [part.factor(group, course) for _, part in parts.factor]
                     factors = [factor for factor in found if factor is not None]
@@ -285,8 +302,7 @@ class StepAdam(Adam):
     def _prepare_group(
         self,
         step: StepInProgress,
-        group: Group,
-        records: list[ParameterRecord],
+        group: NamedGroup,
         parts: ActingParts,
     ) -> None:
         """Have the base's step read what the parts say of a group's gradients."""
@@ -295,12 +311,12 @@ class StepAdam(Adam):
         rows = step.mask if masked and (self._base is Adam or parts.any) else None
         if parts.displacement and group["weight_decay"] and group.get("decoupled_weight_decay"):
             # Of the parameter itself, not of the buffer that Adam will move.
-            decay_weights(step.overrides, group, step.counts)
+            decay_weights(step.overrides, group, step.counts, rows)
         params, counts = list(group["params"]), step.counts
         guarded = rows is not None or counts is not True
         needed = rows is not None or parts.any  # whether more than the gradient's check is
         now = max(self.course.current, 0)  # a course may have no clock
-        for i, (param, record) in enumerate(zip(params, records, strict=True)):
+        for i, (param, record) in enumerate(zip(params, group.records, strict=True)):
             grad = param.grad
             if grad is None or grad.is_sparse:
                 continue
@@ -512,6 +528,11 @@ class StepAdam(Adam):
                 "mask of their first dimension is needed"
             )
 
+    def _drop_foreign(self) -> None:
+        """Forget what parts have kept of other rows than the parameters' present ones."""
+        for param, state in self.state.items():
+            self._ownership.drop_foreign(param, state, self.course.row_keys)
+
     def _claim_rows(self) -> None:
         """Take what the parts have kept as that of the parameters' present rows."""
         for param, state in self.state.items():
@@ -527,20 +548,21 @@ class StepAdam(Adam):
         return _new_upgraded, (made_of,), self.__getstate__()
 
     def __getstate__(self) -> dict[str, Any]:
-        names = ("course", "_base", "_records", "_slots", "_open_windows", "_rewinds")
+        names = ("course", "_base", "_slots", "_open_windows", "_rewinds")
+        self._drop_foreign()  # what is of other rows must not be the copy's own
         return {**super().__getstate__(), **{name: getattr(self, name) for name in names}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         if "course" in state:  # a copy: the parameters are other objects, the rows the same
-            self._ownership = RowOwnership()
+            self._ownership, self._known = RowOwnership(), []
+            self._name_groups()
             self._claim_rows()
             self.course.register(self)
 
     def state_dict(self) -> dict[str, Any]:
         """torch's, with the course's inside `param_groups[0]`, and nothing of foreign rows."""
-        for param, state in self.state.items():
-            self._ownership.drop_foreign(param, state, self.course.row_keys)
+        self._drop_foreign()
         if self._nonfinite is not None and bool(self._nonfinite):
             self._report_nonfinite("a gradient")
         self._nonfinite = None
@@ -559,7 +581,7 @@ class StepAdam(Adam):
         Raises:
             ValueError: it does not fit; then nothing has been loaded.
         """
-        before = self.state, self.param_groups, self._records, self._open_windows
+        before = self.state, self.param_groups, self._known, self._open_windows
         found: list[Saved] = []
 
         def inspect(_: Any, loaded: dict[str, Any]) -> dict[str, Any]:
@@ -577,7 +599,7 @@ class StepAdam(Adam):
             # A base class with a load_state_dict of its own may have called no hook.
             self._restore(found[0] if found else None)
         except ValueError:
-            self.state, self.param_groups, self._records, self._open_windows = before
+            self.state, self.param_groups, self._known, self._open_windows = before
             raise
         if self._base is Adam and self.defaults["fused"]:
             use_fused(self)
@@ -592,8 +614,10 @@ class StepAdam(Adam):
         if saved is None:
             saved = inspect_checkpoint(self, _as_loaded(self))[0]
             self.param_groups[0].pop(STATE_KEY, None)
-        self._acting, self._records = (None, None, {}), []
+        self._acting = (None, None, {})
         self._name_groups()
+        for group in self._known:
+            group.records = records_of(group["params"], [])
         params = chain.from_iterable(group["params"] for group in self.param_groups)
         for param, rows in zip(params, saved.rows, strict=True):
             own = self.state.get(param)

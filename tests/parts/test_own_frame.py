@@ -253,6 +253,53 @@ def test_a_resumed_training_is_the_same_bit_for_bit(make: Any, at: int) -> None:
     assert_same(ends[0], ends[1])
 
 
+BROKEN = [
+    ("scales", float("nan")),
+    ("scales", float("inf")),
+    ("scales", 800.0),
+    ("quats", float("nan")),
+]
+
+
+@pytest.mark.parametrize(("name", "value"), [*BROKEN, ("quats", float("inf"))])
+@pytest.mark.parametrize("grad", [0.0, 1.0])
+def test_a_frame_that_is_not_finite_holds_its_gaussian_alone(
+    name: str, value: float, grad: float
+) -> None:
+    """Until it is mended: nothing of it stays in Adam's moments."""
+    ends = []
+    for broken in (False, True):
+        splats = scene(6, 8)
+        phases = only(TOTAL, OwnFrame())
+        adams: Any = phases.upgrade({n: torch.optim.Adam([p]) for n, p in splats.items()})
+        whole, start = splats[name].detach().clone(), splats["means"].detach().clone()
+        if broken:
+            splats[name].data[2, 1] = value
+        for i in range(6):
+            if i == 3:
+                if broken:
+                    assert torch.equal(splats["means"][2], start[2])
+                splats[name].data.copy_(whole)
+            splats["means"].grad = torch.full_like(splats["means"], grad)
+            phases.observe(0.1)
+            adams["means"].step()
+        assert all(bool(param.isfinite().all()) for param in splats.values())
+        ends.append(splats["means"].detach())
+    others = torch.arange(6) != 2
+    assert torch.equal(ends[0][others], ends[1][others])
+    assert bool((ends[1][2] != start[2]).all()) == (grad != 0)
+
+
+def test_two_of_them_have_frames_of_their_own() -> None:
+    splats = scene(6, 8)
+    phases = only(TOTAL, OwnFrame(min_aspect=0.0), OwnFrame(min_aspect=1.0))
+    adams: Any = phases.upgrade({n: torch.optim.Adam([p]) for n, p in splats.items()})
+    splats["means"].grad = torch.ones_like(splats["means"])
+    phases.observe(0.1)
+    adams["means"].step()
+    assert bool(splats["means"].isfinite().all())
+
+
 # -- whose units Adam's moments are in ---------------------------------------------------------
 
 
@@ -434,6 +481,22 @@ def test_rows_that_a_mask_holds_stand_still(make: Any) -> None:
     assert not bool((splats["means"][mask] == before[mask]).any())
     after = state_of(optimizers, splats["means"])
     assert torch.equal(after["exp_avg"][~mask], moments["exp_avg"][~mask])
+
+
+@pytest.mark.parametrize("options", [{}, {"foreach": True}, {"fused": True}])
+def test_rows_that_a_mask_holds_do_not_decay_either(options: dict[str, bool]) -> None:
+    splats = scene(6, 8)
+    phases = only(TOTAL, OwnFrame())
+    asked: dict[str, Any] = {"weight_decay": 0.1, **options}
+    adams: Any = phases.upgrade({n: torch.optim.AdamW([p], **asked) for n, p in splats.items()})
+    mask, before = torch.arange(6) < 3, splats["means"].detach().clone()
+    for _ in range(3):
+        splats["means"].grad = torch.zeros_like(splats["means"])
+        phases.observe(0.1)
+        adams["means"].step(mask)
+    kept = before[:3] * (1 - 1e-3 * 0.1) ** 3
+    torch.testing.assert_close(splats["means"][:3].detach(), kept, rtol=1e-12, atol=0.0)
+    assert torch.equal(splats["means"][3:], before[3:])
 
 
 @pytest.mark.parametrize("on_device", [False, True])

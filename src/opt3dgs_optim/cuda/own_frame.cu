@@ -27,6 +27,12 @@ template <typename T> struct Frame {
     const Vec3<T> s = {exp(log_scale.x), exp(log_scale.y), exp(log_scale.z)};
     const T least = min_aspect * larger(larger(s.x, s.y), s.z);
     deviations = {larger(s.x, least), larger(s.y, least), larger(s.z, least)};
+    // What is not finite less itself is no zero. Such a Gaussian counts as a point: nothing moves it.
+    const T total = norm + s.x + s.y + s.z;
+    if (!(total - total == T(0))) {
+      w = T(0);
+      axis = deviations = {T(0), T(0), T(0)};
+    }
   }
 
   // v + w t + axis x t with t = 2 axis x v; with -w it is the inverse rotation.

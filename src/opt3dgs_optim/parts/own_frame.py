@@ -14,7 +14,7 @@ from opt3dgs_optim.frames import Frames
 from opt3dgs_optim.part import Group, Part, State
 
 CALL = "OwnFrame"
-FRAMES = "own_frames"  # what it publishes from gradient to step
+FRAMES = "frames"  # what it publishes from gradient to step
 
 
 @dataclass(frozen=True, repr=False)
@@ -123,7 +123,7 @@ class OwnFrame(Part):
         quats, scales = (gaussians[name].detach().to(param.device) for name in ("quats", "scales"))
         # Kept for `displacement`: one optimizer of all groups has moved them by then.
         frames = Frames(quats, scales, param.dtype, self.min_aspect)
-        course.publish(FRAMES, param, frames)
+        course.publish(_name(self, course), param, frames)
         return frames.gradient(grad)
 
     def factor(self, group: Group, course: Course) -> float | Tensor:
@@ -137,10 +137,16 @@ class OwnFrame(Part):
         self, group: Group, param: Tensor, step: Tensor, state: State, course: Course
     ) -> Tensor:
         """B z [N, 3], of Adam's step z in standard deviations."""
-        frames: Frames = course.published(FRAMES, param)
-        course.publish(FRAMES, param, None)  # gives their memory back
+        name = _name(self, course)
+        frames: Frames = course.published(name, param)
+        course.publish(name, param, None)  # gives their memory back
         return frames.displacement(step)
 
     def numbers(self, course: Course) -> Mapping[str, float]:
         """`own_frame_rate`: standard deviations of a full step."""
         return {"own_frame_rate": self.at(course.progress)}
+
+
+def _name(part: OwnFrame, course: Course) -> str:
+    """Under which the frames are published: two such parts have frames of their own."""
+    return f"{course.name_of(part)}.{FRAMES}"
