@@ -183,7 +183,7 @@ def test_what_is_kept_for_a_parameter_stays_its_own(change: Any, frame: bool) ->
     own: list[Part] = [OwnFrame()] if frame else []
     phases = PhaseScheduler(300, parts=[Memory(), *own])
     groups = [{"params": [param], "name": name} for name, param in params.items()]
-    adam = phases.upgrade(torch.optim.Adam(groups))
+    adam: Any = phases.upgrade(torch.optim.Adam(groups))
     for i in range(6):
         if i == 3:
             change(adam)

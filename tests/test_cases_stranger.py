@@ -13,8 +13,9 @@ import torch
 from placed_training import GPU, ROWS, VIEWS, Training, distance
 from simulated_device import SimulatedDevice
 from torch import Tensor
+from torch.nn import Parameter
 
-from opt3dgs_optim import Kept, Part
+from opt3dgs_optim import Kept, Part, Phase, PhaseScheduler
 
 
 class Cautious(Part):
@@ -122,6 +123,84 @@ def test_dropped_steps_leave_no_trace(parts: Any, masked: bool, dropped: set[int
         found, expected = there.kept(), other.kept()
         assert set(found) == set(expected)
         assert [key for key in found if not torch.equal(found[key], expected[key])] == []
+
+
+class Total(Part):
+    """Counts the steps of all parameters in the last phase, in tenths."""
+
+    names, during, keeps = None, Phase.EXPLOITATION, (Kept("steps", per="training"),)
+
+    def before(self, group, param, grad, state, course):
+        state["steps"] += 0.1
+        return grad
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("late", [(), ("scales",)])
+@pytest.mark.parametrize("cut", [None, 55, 65])
+def test_a_number_per_training_is_all_optimizers(
+    dtype: torch.dtype, late: tuple[str, ...], cut: int | None
+) -> None:
+    """One that steps for the first time late in the window forgets nothing; nor does a resume."""
+    expected = torch.zeros((), dtype=dtype)
+    params = {k: Parameter(torch.ones(4, 3, dtype=dtype)) for k in ("means", "scales", "quats")}
+
+    def begin() -> tuple[PhaseScheduler, Any]:
+        phases = PhaseScheduler(100, 50, parts=[Total()])
+        return phases, phases.upgrade({k: torch.optim.Adam([p]) for k, p in params.items()})
+
+    phases, adams = begin()
+    for i in range(70):
+        if i == cut:
+            saved = {k: adam.state_dict() for k, adam in adams.items()}
+            phases, adams = begin()
+            for k, adam in adams.items():
+                adam.load_state_dict(saved[k])
+        phases.observe(0.1)
+        for k, adam in adams.items():
+            if k not in late or i == 69:
+                params[k].grad = torch.ones_like(params[k])
+                adam.step()
+                expected = expected + 0.1 if i >= 50 else expected
+    found = phases.kept_numbers["Total.steps"]
+    assert found.dtype == dtype
+    assert found.item() == expected.item()
+
+
+def test_an_exception_in_a_masked_step_leaves_nothing_to_undo() -> None:
+    part = Stumbling()
+    param = Parameter(torch.zeros(4, 3))
+    phases = PhaseScheduler(300, parts=[part])
+    adam: Any = phases.upgrade(torch.optim.Adam([{"params": [param], "name": "xyz"}]))
+
+    def step(*mask: Tensor) -> None:
+        param.grad = torch.ones_like(param)
+        phases.observe(0.1)
+        adam.step(*mask)
+
+    mask = torch.tensor([True, True, False, False])
+    step()
+    part.stumbles = True
+    with pytest.raises(KeyboardInterrupt):
+        step(mask)
+    part.stumbles = False
+    for _ in range(5):
+        step()
+    before = adam.state[param]["Stumbling.visits"].clone()
+    step(mask)
+    assert (adam.state[param]["Stumbling.visits"] - before).tolist() == [1.0, 1.0, 0.0, 0.0]
+
+
+class Stumbling(Part):
+    """Is interrupted in the middle of a step, as in a notebook."""
+
+    names, keeps, stumbles = ("means",), (Kept("visits", shape=()),), False
+
+    def before(self, group, param, grad, state, course):
+        state["visits"] += 1
+        if self.stumbles:
+            raise KeyboardInterrupt
+        return grad
 
 
 def test_its_numbers_per_parameter_count_the_steps_that_count() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import warnings
 from typing import Any
 
@@ -72,6 +73,97 @@ def test_some_optimizers_made_anew() -> None:
     (message,) = said(go_on)
     assert "1 of 6 upgraded optimizers do not exist any more" in message
     assert "call upgrade(...) again" in message
+
+
+def test_some_optimizers_made_anew_while_a_rates_schedule_holds_the_old() -> None:
+    splats, phases, optimizers = begun(1_000)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizers["scales"], 0.99)
+    iterate(splats, phases, optimizers, 3)
+    optimizers["scales"] = torch.optim.Adam([splats["scales"]])
+    (message,) = said(lambda: iterate(splats, phases, optimizers, 700))
+    assert schedule is not None
+    assert "1 of 6 upgraded optimizers have made no step for more than 200" in message
+    assert "call upgrade(...) again" in message
+
+
+@pytest.mark.parametrize("every", [16, 64])
+def test_an_optimizer_that_steps_rarely_is_no_mistake(every: int) -> None:
+    """taming-3dgs's and FastGS's."""
+    splats, phases, optimizers = begun(1_000)
+
+    def train() -> None:
+        for i in range(700):
+            for param in splats.values():
+                param.grad = torch.ones_like(param)
+            phases.observe(0.1)
+            step_all({k: o for k, o in optimizers.items() if k != "shN" or i % every == every - 1})
+
+    assert said(train) == []
+
+
+@pytest.mark.parametrize("made", ["before the old ones are gone", "after"])
+def test_all_optimizers_made_anew_and_upgraded_again_is_no_mistake(made: str) -> None:
+    """mini-splatting's training_setup in the middle of a training, with our advice followed."""
+    splats, phases, optimizers = begun(1_000)
+    iterate(splats, phases, optimizers, 3)
+    if made == "after":
+        optimizers = None
+        gc.collect()
+    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    assert said(lambda: iterate(splats, phases, optimizers, 700)) == []
+    del optimizers["scales"]
+    gc.collect()
+    (message,) = said(lambda: iterate(splats, phases, optimizers, 250))
+    assert "1 of 6 upgraded optimizers do not exist any more" in message
+
+
+@pytest.mark.parametrize("closure", [False, True])
+def test_observe_after_the_step_where_one_optimizer_steps_rarely(closure: bool) -> None:
+    splats, phases, optimizers = begun()
+
+    def train() -> None:
+        for i in range(20):
+            for param in splats.values():
+                param.grad = torch.ones_like(param)
+            stepped = [o for k, o in optimizers.items() if k != "shN" or i % 16 == 15]
+            if closure:
+                stepped[0].step(lambda: torch.tensor(0.1))
+            for optimizer in stepped[closure:]:
+                optimizer.step()
+            if not closure:
+                phases.observe(0.1)
+
+    messages = said(train)
+    assert len(messages) == (0 if closure else 1)
+    assert all("call observe after backward, before the steps" in each for each in messages)
+
+
+@pytest.mark.parametrize("count", [lambda i: 7, lambda i: i % 100])
+def test_a_count_that_does_not_advance(count: Any) -> None:
+    splats, phases, optimizers = begun(1_000)
+
+    def train() -> None:
+        for i in range(900):
+            for param in splats.values():
+                param.grad = torch.ones_like(param)
+            phases.observe(0.1, iteration=count(i))
+            step_all(optimizers)
+
+    (message,) = said(train)
+    assert "the schedule does not advance; give the iteration of the whole training" in message
+
+
+def test_a_few_rewinds_are_no_mistake() -> None:
+    splats, phases, optimizers = begun(1_000)
+
+    def train() -> None:
+        for i in range(300):
+            for param in splats.values():
+                param.grad = torch.ones_like(param)
+            phases.observe(0.1, iteration=i if i < 150 else i - 100)
+            step_all(optimizers)
+
+    assert said(train) == []
 
 
 def test_all_optimizers_made_anew() -> None:

@@ -302,6 +302,39 @@ def test_an_object_that_is_told_of_nothing_is_refused() -> None:
     assert {type(each) for each in optimizers.values()} == {torch.optim.Adam}
 
 
+class Sealed:
+    """A scene whose methods cannot be replaced."""
+
+    __slots__ = ()
+
+    def on_remove(self, mask: Tensor) -> None: ...
+
+
+def test_a_scene_that_cannot_be_listened_to_is_refused() -> None:
+    optimizers = gsplat_optimizers(make_splats(3))
+    with pytest.raises(TypeError, match=r"methods of scene, a Sealed, cannot be replaced.*leave"):
+        PhaseScheduler(TOTAL).upgrade(optimizers, scene=Sealed())
+    assert {type(each) for each in optimizers.values()} == {torch.optim.Adam}
+
+
+def test_a_scene_is_left_alone_where_the_upgrade_fails() -> None:
+    scene, other = Scene(), gsplat_optimizers(make_splats(3))
+    PhaseScheduler(TOTAL).upgrade(other)
+    with pytest.raises(TypeError, match="with parts of its own"):
+        PhaseScheduler(TOTAL).upgrade(other, scene=scene)
+    assert scene.on_remove.__func__ is Scene.on_remove
+
+
+def test_many_schedulers_listen_to_one_scene_one_after_the_other() -> None:
+    scene, watch = Scene(), RemovedRows()
+    for _ in range(2_000):
+        watch = RemovedRows()
+        watch.listen(scene)
+    scene.on_remove(NOTHING)
+    assert watch.found([])
+    assert scene.edits == ["remove"]
+
+
 @pytest.mark.parametrize("kind", ["mcmc", "default"])
 def test_the_real_scene_of_gsplat_main(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     """Its strategy tells of every edit: nothing is compared, and the answer is the same."""

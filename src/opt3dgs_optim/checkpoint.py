@@ -19,11 +19,10 @@ from collections.abc import Iterable, Mapping
 from itertools import chain
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import torch
 from torch import Tensor
 
 from opt3dgs_optim.checks import LOGGER, check_count, check_keys, check_number, warn_user
-from opt3dgs_optim.course import READABLE_FORMATS, STATE_KEY, Course
+from opt3dgs_optim.course import READABLE_FORMATS, STATE_KEY, Course, restored_number
 from opt3dgs_optim.names import SLOT
 from opt3dgs_optim.part import Window
 from opt3dgs_optim.state import ParameterRecord, check_kept, check_moments, key_of, rows_of
@@ -177,7 +176,9 @@ def restore_records(
             if record.units is not None:
                 record.units = found.units
             record.numbers = {
-                key: torch.tensor(value, dtype=entries[key].dtype_for(param), device=param.device)
+                key: restored_number(value, entries[key]).to(
+                    param.device, entries[key].dtype_for(param)
+                )
                 for key, value in found.numbers.items()
             }
 

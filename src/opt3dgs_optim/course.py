@@ -80,7 +80,7 @@ class Course:
         self._windows: tuple[int | None, dict[str, Window | None]] = (None, {})  # at an iteration
         self.num_observed = 0
         self.steps = 0  # of all optimizers
-        self.rewinds = 0  # how often the clock has been set back
+        self.rewinds = self._rewinds_followed = 0  # how often the clock has been set back
         self.valid: Tensor | bool = True  # whether the last energy was finite
         self.energy_device = torch.device("cpu")
         self.needs_energies = False  # whether the parts stand still before the first energy
@@ -89,7 +89,8 @@ class Course:
         self._reported: set[str] = set()  # kinds of mistakes that were said
         self._published: dict[tuple[str, Place], tuple[int, Any]] = {}
         self._places: dict[int, tuple[weakref.ref[Tensor], Place]] = {}  # id of a tensor -> where
-        self._followers: list[weakref.ref[StepAdam]] = []
+        # With what they held: a lost one is not missed where another one holds that.
+        self._followers: list[tuple[weakref.ref[StepAdam], frozenset[Any]]] = []
         self._named = _by_name(self._parts)
         self.declared = {name: _declared(call, part) for name, part in self._named.items()}
         self.row_keys = tuple(
@@ -180,9 +181,14 @@ class Course:
             window = self._named[name].window(self)
             if window is not None:
                 found[name] = window if window[0] <= self.current < window[1] else None
-        if found == self._windows[1]:
-            found = self._windows[1]  # the same object: nothing has changed
-        self._windows = self._current, found
+        known, rewound = self._windows[1], self._rewinds_followed != self.rewinds
+        if found == known:
+            found = known  # the same object: nothing has changed
+        for name, window in found.items():  # once, whichever optimizer asks first
+            if rewound or window is None or known.get(name) != window:
+                for key in [key for key in self.kept_numbers if key.startswith(f"{name}.")]:
+                    del self.kept_numbers[key]
+        self._windows, self._rewinds_followed = (self._current, found), self.rewinds
         return found
 
     # -- the parts -------------------------------------------------------------------------------
@@ -204,16 +210,20 @@ class Course:
     def register(self, optimizer: StepAdam) -> None:
         """Know an optimizer whose steps have these parts, for as long as somebody else holds it."""
         if optimizer not in self.followers():
-            self._followers.append(weakref.ref(optimizer))
+            self._followers.append((weakref.ref(optimizer), _held(optimizer)))
 
     def followers(self) -> list[StepAdam]:
         """The optimizers whose steps have these parts, the latest last."""
-        return [each for ref in self._followers if (each := ref()) is not None]
+        return [each for ref, _ in self._followers if (each := ref()) is not None]
 
     @property
     def num_lost_followers(self) -> int:
-        """How many optimizers that had these parts do not exist any more."""
-        return sum(ref() is None for ref in self._followers)
+        """How many optimizers that had these parts do not exist any more, without another's."""
+        lost = [own for ref, own in self._followers if ref() is None]
+        if not lost:
+            return 0
+        held = frozenset[Any]().union(*map(_held, self.followers()))
+        return sum(not own <= held for own in lost)
 
     def place_of(self, param: Tensor) -> Place | None:
         """Where a Gaussian parameter stands; None for any other tensor."""
@@ -389,6 +399,7 @@ class Course:
             "num_observed": self.num_observed,
             "switched_off": dict(self.switched_off),
             "kept": {key: value.item() for key, value in self.kept_numbers.items()},
+            "windows": {name: list(w) for name, w in self._windows[1].items() if w is not None},
             "parts": {
                 name: state for name, part in self._named.items() if (state := part.state_dict())
             },
@@ -412,9 +423,11 @@ class Course:
             check_keys(f"{call}: {name}", state[name], ())
         kept = state.get("kept", {})
         check_keys(f"{call}: kept", kept, ())
+        saved_windows = state.get("windows", {})  # earlier versions did not say
+        check_keys(f"{call}: windows", saved_windows, ())
         entries = self.number_entries("training")
         numbers = {
-            key: torch.tensor(check_number(call, key, kept[key]), dtype=entries[key].dtype)
+            key: restored_number(check_number(call, key, kept[key]), entries[key])
             for key in entries
             if key in kept
         }
@@ -427,8 +440,14 @@ class Course:
                 self._named[name].load_state_dict(old[name])
             raise ValueError(f"{call}: {error}") from None
         self.current, self.num_observed = state["iteration"] - 1, state["num_observed"]
+        self._rewinds_followed = self.rewinds
+        windows = self.open_windows()
         self.kept_numbers.clear()
-        self.kept_numbers.update(numbers)
+        for key, number in numbers.items():
+            name = key.rpartition(".")[0]
+            window, saved = windows.get(name), saved_windows.get(name)
+            if name not in windows or (window and saved in (None, list(window), window)):
+                self.kept_numbers[key] = number
         known = {name: why for name, why in state["switched_off"].items() if name in self._named}
         self.switched_off = {name: str(why) for name, why in known.items()}
         self._plan()
@@ -451,6 +470,17 @@ class Course:
             "_published": {},
             "_numbers_read": {},
         }
+
+
+def _held(optimizer: StepAdam) -> frozenset[Any]:
+    """Which parameters of which sets of Gaussians an optimizer holds."""
+    groups = optimizer.param_groups
+    return frozenset((set_of(each), name) for each in groups if (name := gaussian_of(each)))
+
+
+def restored_number(value: float, kept: Kept) -> Tensor:
+    """A number of a checkpoint, as wide as it may be until a parameter says how wide it is."""
+    return torch.tensor(value, dtype=torch.float64 if kept.dtype.is_floating_point else kept.dtype)
 
 
 def _by_name(parts: Iterable[Part]) -> dict[str, Part]:

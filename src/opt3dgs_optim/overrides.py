@@ -82,7 +82,7 @@ def scale_learning_rate(
         return
     rate, factor = group["lr"], functools.reduce(operator.mul, factors)
     if isinstance(factor, Tensor):
-        device = group["params"][0].device
+        device = next((param.device for param in group["params"]), torch.device("cpu"))
         # Fused Adam reads a float32 rate from the device. Other paths need a number on the host, as
         # do parameters there, where a copy that is not waited for may be read before it is made.
         on_device = device.type != "cpu" and factor.device.type != "cpu"
@@ -115,10 +115,11 @@ def decay_weights(
         made: Any = True if rows is None else broadcast_rows(rows.to(param.device), param)
         if isinstance(counts, Tensor):
             made = counts.to(param.device) & made
+        # .data: no write of the trainer's that a part should notice by the version counter.
         if made is True:
-            param.mul_(kept)
+            param.data.mul_(kept)
         else:
-            torch.where(made, param * kept, param, out=param)
+            param.data.copy_(torch.where(made, param * kept, param))
     overrides.item(group, "weight_decay", 0.0)
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import torch
 from torch import Tensor
+from torch._compile import _disable_dynamo
 from torch.optim import Optimizer
 
 from opt3dgs_optim.checks import check_choice, check_count, check_number, warn_user
@@ -32,6 +33,7 @@ CALL = "PhaseScheduler"
 # How long a trainer may do something by design before it is taken for a mistake.
 PATIENCE = 20  # iterations without a step, steps without an energy, or losses that are not finite
 LONG_PATIENCE = 200  # iterations without a step in a training that has stepped
+MAX_REWINDS = 5  # how often a trainer may go back to an earlier iteration
 REMOVAL = "the trainer removes Gaussians, as clone, split and prune does"  # why a part is off
 Optimizers = TypeVar("Optimizers", bound="Optimizer | Mapping[str, Optimizer] | list[Optimizer]")
 
@@ -111,6 +113,7 @@ class PhaseScheduler(Course):
         self._losses_not_finite = 0  # in a row
         self._iterations_incomplete = 0  # since an upgraded optimizer does not exist any more
         self._num_optimizers = 0
+        self._observed_again = 0  # the same iteration, in a row
         self._adam_steps: int | None = None  # of moments that came without a state of ours
 
     @classmethod
@@ -164,11 +167,24 @@ class PhaseScheduler(Course):
                 f"{', '.join(EDITS)}, but an object that a strategy tells of its row edits, or "
                 "None, is needed"
             )
-        self._num_optimizers += upgrade(optimizers, self)
         if scene is not None:
-            self._removed_rows.listen(scene)
+            try:
+                self._removed_rows.listen(scene)
+            except (AttributeError, TypeError) as error:
+                raise TypeError(
+                    f"{CALL}.upgrade: the methods of scene, a {type(scene).__name__}, cannot be "
+                    f"replaced ({error}); leave scene out"
+                ) from None
+        try:
+            found = upgrade(optimizers, self)
+        except (TypeError, ValueError):
+            self._removed_rows.leave(scene)
+            raise
+        self._num_optimizers += found
         return optimizers
 
+    # In a compiled function it runs as it is: what it looks at changes from iteration to iteration.
+    @_disable_dynamo
     def observe(self, loss: Tensor | float, *, iteration: int | None = None) -> None:
         """Take the loss of this iteration: once, after backward, before the optimizers step.
 
@@ -185,6 +201,7 @@ class PhaseScheduler(Course):
             if iteration < self.current:  # what is kept for a time begins anew
                 self.rewinds += 1
                 self._removed_rows.forget()
+            self._watch_count(iteration)
         before = max(self.current, 0)
         self.current = self.iteration if iteration is None else iteration
         self._watch_clock(before)
@@ -222,9 +239,9 @@ class PhaseScheduler(Course):
 
     def stepping(self, closure_value: Any) -> bool:
         """As `Course.stepping`; before the first energy the steps are plain Adam's."""
-        self.steps += 1
         if closure_value is not None:
             self.observe(closure_value)
+        self.steps += 1
         if not self._has_moved_gaussians:  # in a warm-up of rates that begin at 0, say
             self._iterations_without_step = 0
         self._steps_without_energy += 1
@@ -272,12 +289,14 @@ class PhaseScheduler(Course):
         # A trainer that follows the advice to end the schedule where it freezes the Gaussians goes
         # on observing: from there on, no step is missed.
         ended = self.current >= self.total_steps and self.steps > 0
-        incomplete = lost and 0 < alive < self._num_optimizers and not ended
+        if self.num_observed % LONG_PATIENCE == 0 and not ended:
+            self._watch_optimizers()
+        incomplete = lost and alive and not ended
         self._iterations_incomplete = self._iterations_incomplete + 1 if incomplete else 0
         if self._iterations_incomplete > LONG_PATIENCE:
             self._report(
                 "lost",
-                f"{lost} of {self._num_optimizers} upgraded optimizers do not exist any more: the "
+                f"{lost} of {lost + alive} upgraded optimizers do not exist any more: the "
                 "trainer has made some of them anew, whose steps have no parts; call upgrade(...) "
                 "again there",
             )
@@ -298,6 +317,31 @@ class PhaseScheduler(Course):
                 f"{CALL}: Adam's moments have made {adam_steps} steps, but this is iteration "
                 f"{self.current} of {self.total_steps}; a training that goes on from a checkpoint "
                 "of the stock trainer needs observe(loss, iteration=...)"
+            )
+
+    def _watch_count(self, iteration: int) -> None:
+        """Say once that the trainer's count stands still, or begins anew again and again."""
+        stands = iteration == self.current and self.steps > 0
+        self._observed_again = self._observed_again + 1 if stands else 0
+        if self._observed_again > PATIENCE or self.rewinds > MAX_REWINDS:
+            what = f"was {iteration} {PATIENCE} times in a row" if stands else "was set back again"
+            self._report(
+                "count",
+                f"observe(iteration=...) {what}, so that the schedule does not advance; give the "
+                "iteration of the whole training, from 0",
+            )
+
+    def _watch_optimizers(self) -> None:
+        """Say once that one of several optimizers has stopped, as one that was made anew has."""
+        every = {id(each): each.stepped_at for each in self.followers()}
+        last = max(every.values(), default=-1)
+        stopped = [at for at in every.values() if 0 <= at < last - LONG_PATIENCE]
+        if stopped:
+            self._report(
+                "stopped",
+                f"{len(stopped)} of {len(every)} upgraded optimizers have made no step for more "
+                f"than {LONG_PATIENCE} iterations, while others have: where the trainer has made "
+                "them anew, their steps have no parts; call upgrade(...) again there",
             )
 
     def _gaussians_have_moved_since(self, iteration: int) -> bool:
@@ -354,8 +398,8 @@ class PhaseScheduler(Course):
             self._plan()
 
     def _stepped_before_first_energy(self) -> bool:
-        """Whether each optimizer made one step before there was a loss."""
-        return 0 < self.steps == self._num_optimizers
+        """Whether optimizers made one step each before there was a loss; some may step rarely."""
+        return 0 < self.steps <= self._num_optimizers
 
     def _watch_losses(self) -> None:
         """Say once that losses have not been finite for long, as far as the host knows them."""

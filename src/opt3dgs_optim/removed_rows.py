@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Iterable
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -49,8 +50,21 @@ class RemovedRows:
         """
         for name, removes in EDITS.items():
             method = getattr(scene, name, None)
-            if callable(method) and getattr(method, "told", None) is not self._told:
-                setattr(scene, name, _Telling(method, removes, self._told))
+            while isinstance(method, _Telling) and method.watch() in (None, self):
+                method = method.method  # of a scheduler that is gone
+            if callable(method):
+                setattr(scene, name, _Telling(method, removes, self))
+
+    def leave(self, scene: Any) -> None:
+        """Listen no more to a scene."""
+        for name in EDITS:
+            method = getattr(scene, name, None)
+            if isinstance(method, _Telling) and method.watch() is self:
+                setattr(scene, name, method.method)
+
+    def tell(self, removes: bool) -> None:
+        """Note an edit of rows, and whether it removes some."""
+        self._told.add(removes)
 
     def forget(self) -> None:
         """Begin anew, as after a rewind: what was seen and told holds no more."""
@@ -91,12 +105,22 @@ def is_told_of_edits(scene: Any) -> bool:
 class _Telling:
     """A method of a scene that also tells that it was called."""
 
-    def __init__(self, method: Callable[..., Any], removes: bool, told: set[bool]) -> None:
-        self.method, self.removes, self.told = method, removes, told
+    def __init__(self, method: Callable[..., Any], removes: bool, watch: RemovedRows) -> None:
+        self.method, self.removes = method, removes
+        self.watch: Callable[[], RemovedRows | None] = weakref.ref(watch)
 
     def __call__(self, *args: Any, **options: Any) -> Any:
-        self.told.add(self.removes)
+        watch = self.watch()
+        if watch is not None:
+            watch.tell(self.removes)
         return self.method(*args, **options)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _plain, (self.method,)  # a copy of the scene is not listened to
+
+
+def _plain(method: Callable[..., Any]) -> Callable[..., Any]:
+    return method
 
 
 def were_removed(before: Tensor, after: Tensor) -> bool:

@@ -214,6 +214,7 @@ class ParameterState(MutableMapping[str, Any]):
     def guard(self, moments: bool) -> None:
         """Save what hooks read from now on, until `settle`; Adam's moments too if `moments`."""
         self._guarded, self._moments_guarded = True, moments
+        self._saved = []  # of a step that an exception has ended
 
     @torch.no_grad()
     def settle(self, rows: Tensor | None, counts: Tensor | bool) -> None:
@@ -247,6 +248,8 @@ class ParameterState(MutableMapping[str, Any]):
             tensor = store[key] = kept.make(self.param)
         elif tensor.device != self.param.device:  # numbers of a checkpoint, offloaded parameters
             tensor = store[key] = tensor.to(self.param.device)
+        if kept.per != "row" and tensor.dtype != kept.dtype_for(self.param):
+            tensor = store[key] = tensor.to(kept.dtype_for(self.param))  # read of a checkpoint
         if self._guarded:
             self._save(store, key, tensor)
         return tensor

@@ -77,6 +77,7 @@ class StepAdam(Adam):
     _slots: list[tuple[str, str | None]]  # by group: the set of Gaussians, and which parameter
     _known: list[NamedGroup]  # the groups at the last look
     _open_windows: dict[str, Window | None]
+    stepped_at = -1  # the iteration of its last step, of whatever parameters
     _rewinds = 0
     _nonfinite_reported = False
     _nonfinite: Tensor | None = None  # seen on a device, and not looked at yet
@@ -184,6 +185,7 @@ class StepAdam(Adam):
             ValueError: several masks, or one that fits no parameter with a gradient.
             RuntimeError: a CUDA graph is being captured, and there are parts.
         """
+        self.stepped_at = self.course.current
         self._opt_called = True  # what learning-rate schedulers would note by wrapping this method
         refuse_capture(self)
         masks: list[Any] = [each for each in (visible, visibility) if each is not None]
@@ -462,10 +464,10 @@ class StepAdam(Adam):
         self._open_windows = now
 
     def _drop_kept(self, part: str) -> None:
-        """Forget all that a part keeps, and give its memory back."""
+        """Forget all that a part keeps for these parameters, and give its memory back."""
         prefix = f"{part}."
         numbers = [record.numbers for records in self._records for record in records]
-        for store in (*self.state.values(), *numbers, self.course.kept_numbers):
+        for store in (*self.state.values(), *numbers):
             for key in [key for key in store if str(key).startswith(prefix)]:
                 del store[key]
 

@@ -132,7 +132,10 @@ def _look_at(
     """How an optimizer gets the parts (None: it has them already); what each group holds."""
     if isinstance(optimizer, StepAdam):
         if optimizer.course is not course:
-            raise TypeError(f"{CALL}: {shown} is a {optimizer.call_name} with parts of its own")
+            raise TypeError(
+                f"{CALL}: {shown} is a {optimizer.call_name} with parts of its own; use the "
+                "scheduler that it has, or make a new optimizer"
+            )
         groups = optimizer.param_groups
         return None, [(set_of(group), gaussian_of(group)) for group in groups]
     base = _base_of(optimizer, shown)

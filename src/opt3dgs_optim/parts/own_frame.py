@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -128,10 +129,10 @@ class OwnFrame(Part):
 
     def factor(self, group: Group, course: Course) -> float | Tensor:
         """What makes of the positions' learning rate the one of the own frame."""
-        lr = group["lr"]
+        lr = group["lr"]  # one that is subnormal counts as 0
         if isinstance(lr, Tensor):
-            return torch.where(lr == 0, 1.0, self.at(course.progress) / lr)
-        return self.at(course.progress) / lr if lr else 1.0
+            return torch.where(lr < torch.finfo(lr.dtype).tiny, 1.0, self.at(course.progress) / lr)
+        return self.at(course.progress) / lr if lr >= sys.float_info.min else 1.0
 
     def displacement(
         self, group: Group, param: Tensor, step: Tensor, state: State, course: Course
