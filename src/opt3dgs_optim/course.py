@@ -219,7 +219,7 @@ class Course:
     @property
     def num_lost_followers(self) -> int:
         """How many optimizers that had these parts do not exist any more, without another's."""
-        lost = [own for ref, own in self._followers if ref() is None]
+        lost = {own for ref, own in self._followers if ref() is None}
         if not lost:
             return 0
         held = frozenset[Any]().union(*map(_held, self.followers()))
