@@ -153,6 +153,17 @@ def test_a_count_that_does_not_advance(count: Any) -> None:
     assert "the schedule does not advance; give the iteration of the whole training" in message
 
 
+def test_moments_that_came_past_our_load_state_dict() -> None:
+    """As ZeRO's wrapper puts them into an optimizer that was upgraded before."""
+    splats, phases, optimizers = begun()
+    for name, param in splats.items():
+        moments = {"exp_avg": torch.zeros_like(param), "exp_avg_sq": torch.ones_like(param)}
+        optimizers[name].state[param] = {"step": torch.tensor(250.0), **moments}
+    (message,) = said(lambda: iterate(splats, phases, optimizers, 5))
+    assert "moments have made 250 steps, but this is iteration 1 of" in message
+    assert "needs observe(loss, iteration=...)" in message
+
+
 def test_a_few_rewinds_are_no_mistake() -> None:
     splats, phases, optimizers = begun(1_000)
 

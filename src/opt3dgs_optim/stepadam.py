@@ -347,7 +347,12 @@ class StepAdam(Adam):
         """Begin Adam's moments anew, which are in the units of other parts than those that act."""
         known, record.units = record.units, units
         state = self.state.get(param)
-        if known is None or not state:
+        if not state:
+            return
+        if known is None:  # moments that somebody has put there, past our load_state_dict
+            self.course.expect(number_of_steps([state]))
+            known = ()
+        if known == units:
             return
         for key in [key for key in ADAM_KEYS if key in state]:
             state[key] = state[key].zero_() if isinstance(state[key], Tensor) else 0
