@@ -69,3 +69,28 @@ def test_it_is_compiled_once_for_each_phase(parts: str, compiled: str) -> None:
     assert torch.allclose(found, expected, rtol=0, atol=1e-6)
     # Once for the first, once for the phase's other term, and once where a size becomes symbolic.
     assert compilations <= 3
+
+
+@pytest.mark.filterwarnings("ignore:The .grad attribute:UserWarning")  # the compiler's own look
+@pytest.mark.compiles
+def test_observe_and_the_step_in_a_compiled_function() -> None:
+    """They run as they are, in a break of its graph."""
+    ends = []
+    for is_compiled in (False, True):
+        torch._dynamo.reset()
+        p = Parameter(torch.ones(4, 3))
+        phases = PhaseScheduler(20)
+        adam = phases.upgrade(torch.optim.Adam([{"params": [p], "name": "means"}], lr=0.01))
+
+        def iterate(p: Any = p, phases: Any = phases) -> torch.Tensor:
+            loss = p.square().sum()
+            phases.observe(loss)
+            return loss
+
+        run = torch.compile(iterate, backend="eager") if is_compiled else iterate
+        for _ in range(20):
+            run().backward()
+            adam.step()
+            adam.zero_grad()
+        ends.append(p.detach())
+    assert torch.equal(*ends)
