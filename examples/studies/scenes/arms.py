@@ -43,6 +43,7 @@ FADING = Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=300)
 FADING_OTHERS = replace(FADING, names=OTHERS)
 ANNEALING_BUT_SCALES = Annealing(4.0, 0.4, 1.0, names=BUT_SCALES)
 OWN_FRAME, OWN = "frame-0.1-not-thin", OwnFrame(0.1, final=0.01, min_aspect=0.1)
+OWN_FRAME_ARM = f"{OWN_FRAME}+faded{AVERAGED}"  # what the defaults would be with `OwnFrame`
 FADING_BUT_SCALES = replace(FADING, names=("means", *BUT_SCALES))
 
 

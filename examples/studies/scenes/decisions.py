@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from studies.scenes.analysis import Difference, Study, difference
-from studies.scenes.arms import BASELINE, DEFAULTS
+from studies.scenes.arms import BASELINE, DEFAULTS, OWN_FRAME_ARM
 from studies.scenes.records import Setting
 
 QUARTER, HALF = "images_4", "images_2"
@@ -27,6 +27,7 @@ COMPARISONS = {
     "FreshMoments": ("l1+reset@1/30", BASELINE),
     "Curvature": ("l2+reset+lqn@1/30", "l2+reset@1/30"),
     "OutOfView": ("faded+out-of-view", "faded"),
+    "OwnFrame": (OWN_FRAME_ARM, DEFAULTS),
 }
 # Parts that change no bit of an ordinary training are judged where they act: with every view cut
 # into so many.

@@ -16,6 +16,7 @@ from studies.scenes.arms import (
     DEFAULTS,
     LIST,
     OWN_FRAME,
+    OWN_FRAME_ARM,
     find_study_arm,
 )
 from studies.scenes.decisions import MANY_VIEWS_SCENES, points_of
@@ -24,7 +25,7 @@ from studies.scenes.training import Spec
 FEW_VIEWS_SCENES = ("embedded", "banana", "lund_door", "brighton_beach")
 STOCK = (BASELINE, f"{BASELINE}{AVERAGED}")
 TODAY = (*STOCK, "faded", DEFAULTS)
-FRAMES = (f"{OWN_FRAME}{AVERAGED}", f"{OWN_FRAME}+faded{AVERAGED}")
+FRAMES = (OWN_FRAME_ARM, f"{OWN_FRAME}{AVERAGED}")
 RATES = tuple(arm.name for arm in LIST if arm.name.startswith(("rates-", "positions-")))
 ADAPTIVE_ARMS = (ADAPTIVE, ADAPTIVE_DEFAULTS)
 

@@ -21,8 +21,16 @@ from splatting.stopping import command
 
 from studies.pages import filled
 from studies.scenes.analysis import Study
-from studies.scenes.arms import ADAPTIVE, ADAPTIVE_DEFAULTS, BASELINE, DEFAULTS, arm_of
+from studies.scenes.arms import (
+    ADAPTIVE,
+    ADAPTIVE_DEFAULTS,
+    BASELINE,
+    DEFAULTS,
+    OWN_FRAME_ARM,
+    arm_of,
+)
 from studies.scenes.decisions import (
+    HALF,
     PIECES,
     QUARTER,
     decide,
@@ -93,6 +101,7 @@ def conclusions(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
     long, every = settings_of(study, LONG), every_scene(study, LONG)
     quarter = [setting for setting in every if setting.size == QUARTER]
     degrees = [*every, *every_scene(study, LONG, sh_degree=3)]
+    half = settings_of(study, LONG, size=HALF)
     nine = settings_of(study, LONG, PIECES["OutOfView"])
     trained = [r for r in study.records() if r.setting.rotated]
     tuned = [small_trainings(study), settings_of(study, BRIEF), long]
@@ -100,6 +109,8 @@ def conclusions(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
         "rotated-machines": machines_line(trained),
         "decisions": decisions_table(study, BRIEF),
         "every-scene": scenes_gain_table(study, degrees, DEFAULTS, BASELINE),
+        "own-frame": scenes_gain_table(study, half, OWN_FRAME_ARM, BASELINE),
+        "own-frame-or-not": scenes_gain_table(study, half, OWN_FRAME_ARM, DEFAULTS),
         "headline": headline_table(study, long, BRIEF),
         "reach": reach_table(study, long, DEFAULTS, SHORTER),
         "tuned": tuned_table(study, tuned, PLUSH),
