@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,18 @@ from torch.nn import Parameter
 from torch.utils._pytree import tree_leaves
 
 from opt3dgs_optim import (
+    Annealing,
     ConstantMultiplier,
     Curvature,
     EnergyHistogram,
     Fading,
     FreshMoments,
+    IsotropicNoise,
     LQNAdam,
+    OwnFrame,
+    Part,
     PhaseScheduler,
+    PositionNoise,
     paper_parts,
 )
 from opt3dgs_optim.lbfgs import two_loop
@@ -92,6 +98,78 @@ def test_a_trainers_own_iteration_may_be_numpys(kind: Any) -> None:
 def test_the_recursions_history_size(kind: Any) -> None:
     grad, history = torch.ones(4, 3), torch.zeros(4, 5, 8)
     assert torch.equal(two_loop(grad, history, kind(5)), two_loop(grad, history, 5))
+
+
+def parts_of(kind: Any) -> dict[str, list[Part]]:
+    """Parts whose options are numbers of a kind, each with what it acts on."""
+    half, one, two = kind(0.5), kind(1), kind(2)
+    return {
+        "Fading": [Fading(half, half, half, start=kind(0), stop=one)],
+        "Annealing": [Annealing(two, half, two)],
+        "OwnFrame": [OwnFrame(half, half, half)],
+        "ConstantMultiplier": [ConstantMultiplier(two)],
+        "IsotropicNoise of a temperature": [IsotropicNoise(one)],
+        "IsotropicNoise of a deviation": [IsotropicNoise(std=half)],
+        "PositionNoise": [PositionNoise(scale=two)],
+        "EnergyHistogram": [
+            EnergyHistogram(
+                energy_range=(kind(0), two), temperature=half, zeta=half, clamp=(kind(0), two)
+            )
+        ],
+        "Curvature": [Curvature(min_cosine=half)],
+    }
+
+
+NUMBERS = (np.float16, np.float32, np.float64, np.longdouble, Fraction)
+
+
+def moved(parts: Sequence[Part]) -> dict[str, torch.Tensor]:
+    """Where a small training with these parts ends, and the options that they then have."""
+    torch.manual_seed(0)
+    sizes = {"means": (4, 3), "scales": (4, 3), "quats": (4, 4), "opacities": (4,)}
+    splats = {name: Parameter(1 + torch.rand(size)) for name, size in sizes.items()}
+    phases = PhaseScheduler(12, 6, parts=parts)
+    optimizers = phases.upgrade({n: torch.optim.Adam([p], lr=0.01) for n, p in splats.items()})
+    for i in range(12):
+        for p in splats.values():
+            p.grad = p.detach() * (1 + i % 3)
+        phases.observe(0.1 * i)
+        for adam in optimizers.values():
+            adam.step()
+    return {name: p.detach() for name, p in splats.items()}
+
+
+@pytest.mark.parametrize("kind", NUMBERS)
+@pytest.mark.parametrize("name", parts_of(float))
+def test_options_are_used_as_plain_numbers(name: str, kind: Any) -> None:
+    """Whatever kind of number is given, the training is the same, and so is what it says."""
+    plain, given = parts_of(float)[name], parts_of(kind)[name]
+    assert repr(given) == repr(plain)
+    expected, found = moved(plain), moved(given)
+    assert all(torch.equal(found[key], expected[key]) for key in expected)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_counts_are_used_as_plain_numbers(kind: Any) -> None:
+    """A generator of torch takes no other seed."""
+    for make in (
+        lambda n: [Fading(events=n(5), seed=n(3), start=0.0, stop=1.0)],
+        lambda n: [FreshMoments(settling=n(2))],
+        lambda n: [ConstantMultiplier(2.0, n(3))],
+    ):
+        assert repr(make(kind)) == repr(make(int))
+        expected, found = moved(make(int)), moved(make(kind))
+        assert all(torch.equal(found[key], expected[key]) for key in expected)
+
+
+@pytest.mark.parametrize("option", ["share", "exp_avg", "events", "seed"])
+def test_a_number_beyond_every_float_is_refused_in_plain_words(option: str) -> None:
+    low, high = ({option: sign * 10**400} for sign in (-1, 1))
+    with pytest.raises(ValueError, match=f"Fading: {option}=-1000"):
+        Fading(**low)  # pyright: ignore[reportArgumentType]
+    if option not in ("events", "seed"):
+        with pytest.raises(ValueError, match=f"Fading: {option}=1000"):
+            Fading(**high)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.int64])

@@ -14,6 +14,16 @@ import torch
 LOGGER = logging.getLogger("opt3dgs_optim")  # what the package says of itself
 
 
+def as_float(value: Any) -> float:
+    """A real number as a float; infinity for one beyond all floats, NaN for what is no number."""
+    if not isinstance(value, Real) or isinstance(value, bool):  # numpy's scalars are numbers, too
+        return math.nan
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
+
+
 def check_number(
     call: str,
     name: str,
@@ -25,8 +35,7 @@ def check_number(
     open_high: bool = False,
 ) -> float:
     """Return `value` as a float, or raise ValueError if it lies outside the interval."""
-    number = isinstance(value, Real) and not isinstance(value, bool)  # numpy's scalars, too
-    found = float(value) if number else math.nan
+    found = as_float(value)
     outside = not low <= found <= high or not math.isfinite(found)
     if outside or (open_low and found == low) or (open_high and found == high):
         left, right = ("(" if open_low else "["), (")" if open_high else "]")
@@ -52,6 +61,16 @@ def check_choice(call: str, name: str, value: Any, allowed: Sequence[Any] = (Tru
         listed = " or ".join(map(repr, allowed))
         raise ValueError(f"{call}: {name}={value!r}, but {listed} is needed")
     return value
+
+
+def set_options(part: Any, **checked: Any) -> None:
+    """Put checked options in the place of those that were given, in a frozen dataclass, too.
+
+    What is checked may be a number of numpy, a fraction or another kind, which torch does not take
+    everywhere.
+    """
+    for name, value in checked.items():
+        object.__setattr__(part, name, value)
 
 
 def check_interval(call: str, name: str, value: Any) -> tuple[float, float]:

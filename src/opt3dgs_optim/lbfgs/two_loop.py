@@ -66,7 +66,7 @@ def two_loop(
         True
     """
     check_choice("two_loop", "backend", backend, BACKENDS)
-    check_count("two_loop", "history_size", history_size, 1)
+    history_size = check_count("two_loop", "history_size", history_size, 1)
     check_history("two_loop", grad, history, history_size)
     # torch.compile cannot trace the kernel's launch, and makes kernels of its own.
     given = grad.is_cuda and history.dtype == grad.dtype and not torch.compiler.is_compiling()

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from opt3dgs_optim.checks import check_number
+from opt3dgs_optim.checks import check_number, set_options
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import GAUSSIAN, SLOT, canonical_name, check_names
 from opt3dgs_optim.part import Group, Part
@@ -41,9 +41,13 @@ class Annealing(Part):
     names: tuple[str, ...] = ANNEALED
 
     def __post_init__(self) -> None:
-        for option in ("peak", "final", "opacity_peak"):
-            check_number(CALL, option, getattr(self, option), 0.0, open_low=True)
-        object.__setattr__(self, "names", check_names(CALL, self.names))
+        set_options(
+            self,
+            peak=check_number(CALL, "peak", self.peak, 0.0, open_low=True),
+            final=check_number(CALL, "final", self.final, 0.0, open_low=True),
+            opacity_peak=check_number(CALL, "opacity_peak", self.opacity_peak, 0.0, open_low=True),
+            names=check_names(CALL, self.names),
+        )
 
     def at(self, name: str | None, progress: float) -> float:
         """The factor on a parameter's step.

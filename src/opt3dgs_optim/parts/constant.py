@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from opt3dgs_optim.checks import check_count, check_number
+from opt3dgs_optim.checks import check_count, check_number, set_options
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Group, Part, Phase
 
@@ -29,8 +29,11 @@ class ConstantMultiplier(Part):
     during = Phase.EXPLORATION
 
     def __post_init__(self) -> None:
-        check_number("ConstantMultiplier", "value", self.value)
-        check_count("ConstantMultiplier", "warmup", self.warmup, 0)
+        set_options(
+            self,
+            value=check_number("ConstantMultiplier", "value", self.value),
+            warmup=check_count("ConstantMultiplier", "warmup", self.warmup, 0),
+        )
 
     def factor(self, group: Group, course: Course) -> float:
         return 1.0 if course.num_observed <= self.warmup else self.value

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import check_count, check_number
+from opt3dgs_optim.checks import check_count, check_number, set_options
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import GAUSSIAN, check_names
 from opt3dgs_optim.part import Group, Part, State
@@ -56,14 +56,18 @@ class Fading(Part):
     names: tuple[str, ...] = GAUSSIAN
 
     def __post_init__(self) -> None:
-        check_number(CALL, "share", self.share, 0.0, 1.0, open_low=True)
-        check_number(CALL, "exp_avg", self.exp_avg, 0.0, 1.0)
-        check_number(CALL, "exp_avg_sq", self.exp_avg_sq, 0.0, 1.0)
-        check_count(CALL, "events", self.events, 1)
-        check_number(CALL, "start", self.start, 0.0, 1.0)
-        check_number(CALL, "stop", self.stop, self.start, 1.0, open_low=True)
-        check_count(CALL, "seed", self.seed, 0)
-        object.__setattr__(self, "names", check_names(CALL, self.names))
+        start = check_number(CALL, "start", self.start, 0.0, 1.0)
+        set_options(
+            self,
+            share=check_number(CALL, "share", self.share, 0.0, 1.0, open_low=True),
+            exp_avg=check_number(CALL, "exp_avg", self.exp_avg, 0.0, 1.0),
+            exp_avg_sq=check_number(CALL, "exp_avg_sq", self.exp_avg_sq, 0.0, 1.0),
+            events=check_count(CALL, "events", self.events, 1),
+            start=start,
+            stop=check_number(CALL, "stop", self.stop, start, 1.0, open_low=True),
+            seed=check_count(CALL, "seed", self.seed, 0),
+            names=check_names(CALL, self.names),
+        )
 
     def events_before(self, iteration: int, total_steps: int) -> int:
         """Number of events before the step of this iteration (from 0)."""

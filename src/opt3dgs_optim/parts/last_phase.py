@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import check_count
+from opt3dgs_optim.checks import check_count, set_options
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Group, Kept, Part, Phase, State
 from opt3dgs_optim.state import ADAM_KEYS
@@ -48,7 +48,8 @@ class FreshMoments(Part):
     keeps = (Kept("fresh", per="parameter"),)
 
     def __post_init__(self) -> None:
-        check_count("FreshMoments", "settling", self.settling, 0)
+        settling = check_count("FreshMoments", "settling", self.settling, 0)
+        set_options(self, settling=settling)
 
     def before(
         self, group: Group, param: Tensor, grad: Tensor, state: State, course: Course

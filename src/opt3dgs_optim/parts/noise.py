@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import check_number, warn_user
+from opt3dgs_optim.checks import check_number, set_options, warn_user
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.frames import rotate, unit_quaternion
 from opt3dgs_optim.lbfgs.pairs import columns, put, row_chunks
@@ -146,7 +146,7 @@ class IsotropicNoise(Part):
             given = f"temperature={self.temperature!r} and std={self.std!r}"
             raise ValueError(f"IsotropicNoise: {given}, but exactly one of the two is needed")
         name = "std" if self.temperature is None else "temperature"
-        check_number("IsotropicNoise", name, getattr(self, name), 0.0)
+        set_options(self, **{name: check_number("IsotropicNoise", name, getattr(self, name), 0.0)})
 
     def after(self, group: Group, param: Tensor, state: State, course: Course) -> None:
         """Add the noise to the parameter (any shape) in place."""

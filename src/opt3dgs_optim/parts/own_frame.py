@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import check_number
+from opt3dgs_optim.checks import check_number, set_options
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.frames import Frames
 from opt3dgs_optim.part import Group, Part, State
@@ -82,9 +82,12 @@ class OwnFrame(Part):
     own_units = True
 
     def __post_init__(self) -> None:
-        check_number(CALL, "rate", self.rate, 0.0, open_low=True)
-        check_number(CALL, "final", self.final, 0.0, open_low=True)
-        check_number(CALL, "min_aspect", self.min_aspect, 0.0, 1.0)
+        set_options(
+            self,
+            rate=check_number(CALL, "rate", self.rate, 0.0, open_low=True),
+            final=check_number(CALL, "final", self.final, 0.0, open_low=True),
+            min_aspect=check_number(CALL, "min_aspect", self.min_aspect, 0.0, 1.0),
+        )
 
     def ready(self, group: Group, course: Course) -> bool:
         """Whether scales and quaternions of the same points are there; says it once if not."""
