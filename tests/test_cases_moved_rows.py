@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from placed_training import ADAMS
@@ -28,6 +29,20 @@ ROWS: dict[str, Any] = {
     "a mask": torch.tensor([True, False, False, True, False, False]),
     "one": torch.tensor([3]),
     "none": torch.tensor([], dtype=torch.long),
+    "a list": [0, 3],
+    "an empty list": [],
+    "an empty tuple": (),
+    "an empty range": range(0),
+    "a range": range(2),
+    "a list of bools": [True, False, False, True, False, False],
+    "numpy's indices": np.array([0, 3]),
+    "numpy's indices of 32 bits": np.array([0, 3], dtype=np.int32),
+    "numpy's unsigned indices": np.array([0, 3], dtype=np.uint16),
+    "numpy's mask": np.array([True, False, False, True, False, False]),
+    "numpy's mask from behind": np.array([True, False, False, True, False, False])[::-1],
+    "none of numpy's": np.array([]),
+    "where numpy finds some": np.nonzero(np.array([1, 0, 1, 0, 0, 0]))[0],
+    "from behind": [-1],
 }
 
 
@@ -54,7 +69,9 @@ def test_the_rows_begin_anew_and_the_others_do_not(parts: str, rows: str) -> Non
     before = {key: each.clone() for key, each in adam.state[p].items()}
     adam.reset_rows(p, ROWS[rows])
     chosen = torch.zeros(6, dtype=torch.bool)
-    chosen[ROWS[rows]] = True
+    given = ROWS[rows] if isinstance(ROWS[rows], Tensor) else np.array(ROWS[rows])
+    if len(given):
+        chosen[torch.as_tensor(given if isinstance(given, Tensor) else given.tolist())] = True
     for key, each in adam.state[p].items():
         if key == "step":
             assert torch.equal(each, before[key])
@@ -76,7 +93,28 @@ def test_a_point_that_was_moved_ends_where_it_was_put(parts: str, at: int) -> No
 
 
 @pytest.mark.parametrize(
-    "rows", [torch.tensor([6]), torch.tensor([-7]), torch.ones(5, dtype=torch.bool), torch.ones(1)]
+    "rows",
+    [
+        torch.tensor([6]),
+        torch.tensor([-7]),
+        torch.ones(5, dtype=torch.bool),
+        torch.ones(1),
+        torch.ones(6, dtype=torch.uint8),  # a mask for torch, indices for numpy
+        np.ones(6, dtype=np.uint8),
+        np.ones(5, dtype=bool),
+        np.array([0.5]),
+        np.array(["0"]),
+        np.array([None]),
+        [0.0],
+        ["0"],
+        [None],
+        [[0], [1, 2]],
+        [6],
+        {0},
+        "0",
+        3,
+        None,
+    ],
 )
 def test_rows_that_are_not_there_are_refused_and_nothing_is_changed(rows: Any) -> None:
     p, adam, _ = trained("all", 250)

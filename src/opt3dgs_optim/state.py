@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import cmath
 import weakref
-from collections.abc import Iterable, Iterator, Mapping, MutableMapping
+from collections.abc import Iterable, Iterator, Mapping, MutableMapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
@@ -16,6 +17,7 @@ from opt3dgs_optim.part import Kept
 
 MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # torch's names of Adam's, the last amsgrad's
 ADAM_KEYS = ("step", *MOMENTS)
+Rows = Tensor | np.ndarray | Sequence[int] | Sequence[bool]  # indices, or a mask
 Declared = Mapping[str, Mapping[str, Kept]]  # a part's name -> a name -> what it keeps under it
 
 
@@ -313,6 +315,38 @@ def check_mask(call: str, masks: list[Any], num_points: int | None) -> Tensor:
             f"{call}.step: num_points={num_points}, but the mask has {mask.numel()} rows"
         )
     return mask if mask.dtype == torch.bool else mask != 0
+
+
+def check_rows(call: str, rows: Rows, param: Tensor) -> Tensor:
+    """Which rows of a parameter [N, ..] are meant: [K] int64 indices, or an [N] bool mask.
+
+    Raises:
+        ValueError: they are none, or there are no such rows.
+    """
+    needed = f"indices of, or a bool mask over, {rows_of(param)} rows are needed"
+    if not isinstance(rows, (Tensor, np.ndarray, list, tuple, range)):
+        raise ValueError(f"{call}: rows={rows!r}, but {needed}")
+    try:
+        # A copy: torch takes no array of numpy with negative strides, and warns of read-only ones.
+        given = np.array(rows) if isinstance(rows, np.ndarray) else rows
+        index = torch.as_tensor(given, device=param.device)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise ValueError(f"{call}: rows={rows!r}, but {needed}") from error
+    if not index.numel() and not isinstance(rows, Tensor):
+        index = index.to(torch.bool if index.dtype == torch.bool else torch.int64)  # [] is of float
+    if index.dtype == torch.uint8:
+        raise ValueError(
+            f"{call}: rows={rows!r} may be indices or, as torch takes uint8, a mask; int64 or bool "
+            "is needed"
+        )
+    if index.dtype == torch.bool:
+        if index.shape == param.shape[:1]:
+            return index
+    elif not index.is_floating_point() and not index.is_complex() and param.dim():
+        index, count = index.to(torch.int64), rows_of(param)
+        if not index.numel() or (-count <= int(index.min()) and int(index.max()) < count):
+            return index
+    raise ValueError(f"{call}: rows={rows!r}, but {needed}")
 
 
 def check_moments(call: str, param: Tensor, saved: Any) -> None:

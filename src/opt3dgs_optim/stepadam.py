@@ -49,11 +49,12 @@ from opt3dgs_optim.state import (
     ParameterState,
     PickedRows,
     RowOwnership,
+    Rows,
     broadcast_rows,
     check_mask,
+    check_rows,
     is_finite_sum,
     records_of,
-    rows_of,
 )
 
 DEVICE_LOOK_INTERVAL = 16  # energies between two looks at a device's gradients for NaN
@@ -477,7 +478,7 @@ class StepAdam(Adam):
                 del store[key]
 
     @torch.no_grad()
-    def reset_rows(self, param: Tensor, rows: Tensor) -> None:
+    def reset_rows(self, param: Tensor, rows: Rows) -> None:
         """Zero Adam's moments, and what the parts keep, of rows that the trainer has written.
 
         For trainers that move points *in place* (`param.data[dead] = ...`): one call, instead of
@@ -485,7 +486,7 @@ class StepAdam(Adam):
 
         Args:
             param: a parameter of this optimizer, [N, ..].
-            rows: their indices, or an [N] bool mask.
+            rows: their indices, or an [N] bool mask; a tensor, an array of numpy, or a list.
 
         Raises:
             ValueError: the parameter is not one of this optimizer's, or there are no such rows.
@@ -493,23 +494,10 @@ class StepAdam(Adam):
         call = f"{self.call_name}.reset_rows"
         if not any(param is each for group in self.param_groups for each in group["params"]):
             raise ValueError(f"{call}: a parameter of shape {tuple(param.shape)} is none of these")
-        if not isinstance(rows, (Tensor, list, tuple, range)):
-            raise ValueError(f"{call}: rows={rows!r}, but a tensor of indices or a mask is needed")
-        rows = torch.as_tensor(rows, device=param.device)
-        whole = not rows.is_floating_point() and not rows.is_complex()
-        fits = rows.dtype == torch.bool and rows.shape == param.shape[:1]
-        if rows.dtype != torch.bool and whole and param.dim():
-            count = rows_of(param)
-            fits = not rows.numel() or (-count <= int(rows.min()) and int(rows.max()) < count)
-        if not fits:
-            raise ValueError(
-                f"{call}: rows={rows!r}, but indices of, or a bool mask over, {rows_of(param)} "
-                "rows are needed"
-            )
-        state = self.state.get(param, {})
+        index, state = check_rows(call, rows, param), self.state.get(param, {})
         for key in (*MOMENTS, *self.course.row_keys):
             if key in state:
-                state[key][rows] = 0
+                state[key][index] = 0
 
     def _takes_mask(self, group: Group, rows: int) -> bool:
         """Whether a mask of so many rows is about this group."""
