@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
@@ -239,3 +240,66 @@ def test_a_second_group_takes_the_positions_noise_from_an_unnamed_one() -> None:
         optimizer.step()
         moved.append(not torch.equal(means, before))
     assert moved == [True, False]
+
+
+def by_adam(x: torch.nn.Parameter) -> torch.optim.Optimizer:
+    return torch.optim.Adam([x], lr=0.01, betas=(0.8, 0.99), eps=1e-6)
+
+
+def by_adams_drift(x: torch.nn.Parameter) -> torch.optim.Optimizer:
+    return AWSGLD([x], lr=0.01, betas=(0.8, 0.99), eps=1e-6)
+
+
+def by_plain_drift(x: torch.nn.Parameter) -> torch.optim.Optimizer:
+    return AWSGLD([x], lr=0.01, preconditioner="none")
+
+
+def begun(make: Any) -> tuple[torch.nn.Parameter, Any]:
+    x = torch.nn.Parameter(torch.ones(3, dtype=torch.float64))
+    optimizer = make(x)
+    x.grad = torch.tensor([1.0, 2.0, -4.0], dtype=torch.float64)
+    optimizer.step()
+    return x, optimizer
+
+
+@pytest.mark.parametrize("groups", ["as they are", "with eps and betas of their own"])
+@pytest.mark.parametrize("theirs", [by_adam, by_adams_drift, by_plain_drift])
+def test_the_plain_drift_stays_one_whatever_the_checkpoint(theirs: Any, groups: str) -> None:
+    """Its betas and eps are no options: those of a checkpoint of Adam would hold it still."""
+    saved = begun(theirs)[1].state_dict()
+    y = torch.nn.Parameter(torch.ones(3, dtype=torch.float64))
+    own = {"betas": (0.5, 0.99), "eps": 1e-8} if "own" in groups else {}
+    optimizer = AWSGLD([{"params": [y], **own}], lr=0.01, preconditioner="none")
+    if theirs is by_plain_drift:
+        optimizer.load_state_dict(saved)
+    else:
+        with pytest.warns(UserWarning, match="another preconditioner.* it stays 'none'"):
+            optimizer.load_state_dict(saved)
+    y.grad = torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
+    before = y.detach().clone()
+    optimizer.step()
+    assert torch.allclose(y.detach(), before - 0.01 * y.grad, rtol=0, atol=1e-12)
+
+
+def test_adams_drift_stays_one_after_a_checkpoint_of_the_plain_one() -> None:
+    saved = begun(by_plain_drift)[1].state_dict()
+    y = torch.nn.Parameter(torch.ones(3, dtype=torch.float64))
+    optimizer = by_adams_drift(y)
+    with pytest.warns(UserWarning, match="another preconditioner.* it stays 'adam'"):
+        optimizer.load_state_dict(saved)
+    assert (optimizer.param_groups[0]["betas"], optimizer.param_groups[0]["eps"]) == (
+        (0.8, 0.99),
+        1e-6,
+    )
+    y.grad = torch.ones(3, dtype=torch.float64)
+    optimizer.step()
+    assert bool(((1.0 - y.detach()).abs() > 1e-4).all())
+
+
+def test_options_of_a_stock_adam_are_loaded_as_torch_loads_them() -> None:
+    saved = begun(by_adam)[1].state_dict()
+    y = torch.nn.Parameter(torch.ones(3, dtype=torch.float64))
+    optimizer = AWSGLD([y], lr=0.5)
+    optimizer.load_state_dict(saved)
+    group = optimizer.param_groups[0]
+    assert (group["lr"], group["betas"], group["eps"]) == (0.01, (0.8, 0.99), 1e-6)

@@ -114,6 +114,37 @@ class AWSGLD(StepAdam):
         self.histogram, self.noise = histogram, noise
         self.follow(_ObservedCourse(parts))
 
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """As torch's; with `preconditioner="none"` betas and eps are not a group's own either."""
+        super().add_param_group(param_group)
+        if self.defaults["eps"] == PLAIN_EPS:
+            group = self.param_groups[-1]
+            group.update(betas=(0.0, group["betas"][1]), eps=PLAIN_EPS)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """As torch's; but `preconditioner` stays, whichever the checkpoint was made with.
+
+        It lies in betas and eps, which torch takes from the checkpoint: with Adam's own eps the
+        plain drift would stand still, and so would Adam's with that of the plain drift.
+
+        Raises:
+            ValueError: it does not fit; then nothing has been loaded.
+        """
+        own = [(group["betas"], group["eps"]) for group in self.param_groups]
+        super().load_state_dict(state_dict)
+        changed = False
+        for group, (betas, eps) in zip(self.param_groups, own, strict=True):
+            if (group["eps"] == PLAIN_EPS) != (eps == PLAIN_EPS):
+                group.update(betas=betas, eps=eps)
+                changed = True
+        if changed:
+            plain = self.defaults["eps"] == PLAIN_EPS
+            name = "none" if plain else "adam"
+            warn_user(
+                "AWSGLD.load_state_dict: the checkpoint was made with another preconditioner, or "
+                f"by Adam; here it stays {name!r}, with the betas and eps that belong to it"
+            )
+
     def acts_on(self, part: Part, group: Group) -> bool:
         """All parts on all groups, but the positions' noise on positions."""
         if isinstance(part, PositionNoise):
