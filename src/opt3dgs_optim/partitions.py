@@ -19,6 +19,7 @@ from torch import Tensor
 from opt3dgs_optim import cuda
 from opt3dgs_optim.backend import obstacle
 
+RELATIVE_ROUNDING = 1e-5  # of a saved range; more than that of float32
 FLOOR = 1e-8  # smallest weight of a fixed range before renormalisation; log theta never sees 0
 # Of the moving partitions; lengths are in deviations of the energy.
 MEMORY = 100  # energies that mean, deviation and density remember
@@ -159,16 +160,32 @@ class FixedPartitions(Partitions):
         return {"weights": self.weights.tolist(), "scalars": self._scalars.tolist()}
 
     def check(self, call: str, state: Mapping[str, Any]) -> None:
-        """ValueError unless the weights are weights, and the range is one."""
-        if min(state["weights"]) <= 0 or abs(math.fsum(state["weights"]) - 1) > 1e-6:
+        """ValueError unless the weights are weights, and of this range.
+
+        Theta is of the partitions in which it was learnt. The temperature only scales what is read
+        from it, and is the present one.
+        """
+        theta = state["weights"]
+        if min(theta) <= 0 or max(theta) > 2 or abs(math.fsum(theta) - 1) > 1e-6:
             raise ValueError(f"{call}: weights must be positive with sum 1")
-        _, width, tau, count, _ = state["scalars"]
+        low, width, tau, count, _ = state["scalars"]
         if not (width > 0 and tau >= 0 and count >= 0):
             raise ValueError(f"{call}: scalars={state['scalars']!r}, but width > 0 is needed")
+        # A device without float64 has rounded what it saves.
+        near, m = max(map(abs, self.energy_range)) * RELATIVE_ROUNDING, self.num_partitions
+        ends = zip(self.energy_range, (low, low + width * m), strict=True)
+        if any(abs(own - theirs) > near for own, theirs in ends):
+            raise ValueError(
+                f"{call}: it has learnt with energy_range=({low:g}, {low + width * m:g}), but "
+                f"energy_range={self.energy_range}, as it is here, is needed"
+            )
 
     def load(self, state: Mapping[str, Any]) -> None:
         self.weights.copy_(torch.tensor(state["weights"], dtype=torch.float64))
-        self._scalars.copy_(torch.tensor(state["scalars"], dtype=torch.float64))
+        # Range and temperature are there already, with all their digits.
+        _, _, _, count, nu = state["scalars"]
+        self._count.fill_(count)
+        self.nu.fill_(nu)
 
 
 class Pace(NamedTuple):
@@ -314,7 +331,7 @@ class MovingPartitions(Partitions):
     def check(self, call: str, state: Mapping[str, Any]) -> None:
         """ValueError unless the density is one."""
         _, deviation, _, *q = state["recent"]
-        if deviation < 0 or min(q) < 0 or abs(math.fsum(q) - 1) > 1e-3:
+        if deviation < 0 or min(q) < 0 or max(q) > 2 or abs(math.fsum(q) - 1) > 1e-3:
             raise ValueError(f"{call}: recent={state['recent']!r}, but a density is needed")
 
     def load(self, state: Mapping[str, Any]) -> None:

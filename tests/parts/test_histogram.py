@@ -662,6 +662,48 @@ def test_state_dict_is_plain_and_checked(options: dict[str, Any]) -> None:
     assert histogram.state_dict() == state
 
 
+RANGES: dict[str, Any] = {
+    "another high end": {"energy_range": (0.0, 0.2)},
+    "another low end": {"energy_range": (-1.0, 1.0)},
+    "moved": {"energy_range": (5.0, 6.0)},
+    "of another unit": {"energy_range": (0.0, 1e-3)},
+    "more partitions": {"num_partitions": 64},
+    "fewer partitions": {"num_partitions": 30},
+    "automatic": {"energy_range": "auto", "temperature": "auto", "warmup": 4},
+}
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+@pytest.mark.parametrize("other", RANGES)
+def test_what_was_learnt_of_other_partitions_is_refused(other: str, reverse: bool) -> None:
+    """Nothing is changed then; what was counted elsewhere would be read in the wrong place."""
+    made = [{"num_partitions": 32, **FIXED}, {"num_partitions": 32, **FIXED, **RANGES[other]}]
+    here, there = (EnergyHistogram(**options) for options in (made[::-1] if reverse else made))
+    nus_of(here, stream(80))
+    nus_of(there, stream(5, seed=1))
+    before = there.state_dict()
+    with pytest.raises(ValueError, match=r"EnergyHistogram\.load_state_dict: "):
+        there.load_state_dict(here.state_dict())
+    assert there.state_dict() == before
+
+
+def test_the_range_may_be_rounded_and_the_temperature_is_the_present_one() -> None:
+    """A device without float64 saves a range of float32; tau scales nu, and Theta is without it."""
+    options: dict[str, Any] = {**FIXED, "num_partitions": 32, "energy_range": (0.1, 0.7)}
+    here = EnergyHistogram(**options)
+    nus_of(here, stream(80))
+    state = here.state_dict()
+    rounded = [float(np.float32(number)) for number in state["scalars"]]
+    there = EnergyHistogram(**{**options, "temperature": 0.2})
+    there.load_state_dict({**state, "scalars": rounded})
+    assert there.coordinates == pytest.approx((0.1, 0.7, 0.2), rel=1e-12)
+    again = EnergyHistogram(**options)
+    again.load_state_dict(state)
+    assert again.state_dict() == state
+    energies = stream(40, seed=2)
+    assert nus_of(again, energies).tolist() == nus_of(here, energies).tolist()
+
+
 class Elsewhere(Tensor):
     """A tensor on another device, as far as it says."""
 

@@ -9,7 +9,13 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import check_count, check_interval, check_keys, check_number
+from opt3dgs_optim.checks import (
+    as_float,
+    check_count,
+    check_interval,
+    check_keys,
+    check_number,
+)
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Group, Part, Phase
 from opt3dgs_optim.partitions import FixedPartitions, MovingPartitions, Tally
@@ -21,6 +27,7 @@ CALL = "EnergyHistogram"
 CLAMP = (-1.0, 3.0)  # twice as far from 1 as nu is two deviations out
 # Where nu does nothing: so little for so many energies, or for this share of the run.
 EFFECT, WINDOW, WINDOW_SHARE = 0.1, 300, 1 / 30
+MAX_COUNT = 2**53 - 1  # of energies
 TOP_SHARE = 0.5  # of Theta, in the open partition above the range: the loss may yet fall into it
 
 
@@ -244,10 +251,12 @@ class EnergyHistogram(Part):
         for name, own in here.items():
             saved = state[name]
             rows, length = (saved, len(own)) if isinstance(own, list) else ([saved], 1)
-            plain = isinstance(rows, list) and all(isinstance(v, (int, float)) for v in rows)
-            if not plain or len(rows) != length or not all(map(math.isfinite, rows)):
+            plain = isinstance(rows, list) and len(rows) == length
+            if not plain or not all(math.isfinite(as_float(number)) for number in rows):
                 needed = f"num_partitions={self.num_partitions} has {length} finite numbers there"
                 raise ValueError(f"{call}: {name}={saved!r}, but a histogram with {needed}")
+        observed = check_count(call, "num_observed", state["num_observed"], 0, MAX_COUNT)
+        check_count(call, "num_taken", state["num_taken"], 0, observed)
         self._law.check(call, state)
         self._restore(self._device, state)
 
