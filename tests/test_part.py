@@ -25,6 +25,7 @@ from trainers import (
 import opt3dgs_optim
 from opt3dgs_optim import Annealing, Kept, Part, Phase, PhaseScheduler, RunLog
 from opt3dgs_optim.names import GAUSSIAN
+from opt3dgs_optim.runs.log import RESERVED
 
 SOURCE = Path(opt3dgs_optim.__file__).parent
 TOTAL = 40
@@ -158,6 +159,45 @@ def test_its_numbers_are_columns_of_the_run_log(tmp_path: Path) -> None:
     lines = [json.loads(line) for line in (tmp_path / "run.jsonl").read_text().splitlines()]
     columns = [set(line) & {"disagreeing", "annealing"} for line in lines if line["kind"] == "step"]
     assert columns == [{"annealing"}] * 20 + [{"annealing", "disagreeing"}] * 20
+
+
+class Column(Part):
+    """Says one thing of itself, from an iteration on."""
+
+    names = None
+
+    def __init__(self, said: Any, first: int = 0) -> None:
+        self.said, self.first = said, first
+
+    def numbers(self, course: Any) -> Any:
+        return self.said if course.current >= self.first else {}
+
+
+@pytest.mark.parametrize("first", [0, 3])
+@pytest.mark.parametrize(
+    "said",
+    [
+        *({name: 1.0} for name in RESERVED),
+        {"energy": 1.0},
+        {"self": 1.0},
+        {"mine": 1.0, "energy": torch.ones(())},
+        None,
+        [("mine", 1.0)],
+        "mine",
+        1.0,
+    ],
+)
+def test_a_column_of_the_logs_own_is_refused_and_the_part_is_named(
+    said: Any, first: int, tmp_path: Path
+) -> None:
+    with RunLog(tmp_path / "run.jsonl") as log:
+        phases = PhaseScheduler(TOTAL, 20, [Column({"mine": 1.0}), Column(said, first)], log=log)
+        for _ in range(first):
+            phases.observe(0.1)
+        with pytest.raises(ValueError, match=r"Column#2\.numbers: .* but a dict is needed"):
+            phases.observe(0.1)
+    steps = [line for line in (tmp_path / "run.jsonl").read_text().splitlines() if "mine" in line]
+    assert len(steps) == first
 
 
 def test_an_adaptive_training_switches_it_off() -> None:

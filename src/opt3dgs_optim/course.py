@@ -25,6 +25,8 @@ READABLE_FORMATS = (2, 3)
 STATE_KEY = "opt3dgs"  # in param_groups[0] of an optimizer's state_dict: the course's state
 NEVER = 2**62  # an iteration that no training reaches
 MAX_CACHED_PLACES = 64
+# What a line of the run log has of each iteration, and what `RunLog.step` is called with.
+COLUMNS_OF_THE_LOG = frozenset(("self", "kind", "iteration", "seconds", "phase", "event", "energy"))
 P = TypeVar("P", bound=Part)
 
 
@@ -354,10 +356,20 @@ class Course:
         """Called where Adam's moments come without our state: they have made so many steps."""
 
     def numbers(self) -> dict[str, float | Tensor]:
-        """What the parts that act say of themselves: columns of the run log."""
+        """What the parts that act say of themselves: columns of the run log.
+
+        Raises:
+            ValueError: those of a part are no dict, or have a name of the log's own.
+        """
         columns: dict[str, float | Tensor] = {}
         for part in self.hooks["numbers"]:
-            columns.update(part.numbers(self))
+            own = part.numbers(self)
+            if not isinstance(own, Mapping) or not COLUMNS_OF_THE_LOG.isdisjoint(own):
+                raise ValueError(
+                    f"{self.name_of(part)}.numbers: {own!r}, but a dict is needed, without the "
+                    f"log's own columns {sorted(COLUMNS_OF_THE_LOG)}"
+                )
+            columns.update(own)
         return columns
 
     def judge(self, over_ranks: Any = None) -> list[Change]:

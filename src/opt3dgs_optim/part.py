@@ -165,7 +165,10 @@ class Part:
         """After the parameter has moved. The group's learning rate is the trainer's own again."""
 
     def numbers(self, course: Course) -> Mapping[str, float | Tensor]:
-        """Columns of the run log for the iteration observed last: numbers or 0-d tensors."""
+        """Columns of the run log for the iteration observed last: numbers or 0-d tensors.
+
+        The log's own are `kind`, `iteration`, `seconds`, `phase`, `event` and `energy`.
+        """
         return {}
 
     def state_dict(self) -> dict[str, Any]:
