@@ -162,6 +162,18 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
     return Saved(clock, windows, records, rows), rest
 
 
+def as_loaded(optimizer: StepAdam) -> dict[str, Any]:
+    """The state of an optimizer as a checkpoint has it, without a copy."""
+    params = _parameters(optimizer)
+    numbers = iter(range(len(params)))
+    groups = [
+        {**group, "params": [next(numbers) for _ in group["params"]]}
+        for group in optimizer.param_groups
+    ]
+    state = {i: optimizer.state[p] for i, p in enumerate(params) if p in optimizer.state}
+    return {"state": state, "param_groups": groups, "cast": True}
+
+
 def restore_records(
     optimizer: StepAdam, records: list[list[ParameterRecord]], saved: Saved
 ) -> None:

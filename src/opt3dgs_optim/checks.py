@@ -5,7 +5,8 @@ import math
 import os
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from numbers import Integral, Real
 from typing import Any
 
@@ -53,6 +54,23 @@ def check_count(call: str, name: str, value: Any, low: int, high: int | None = N
         allowed = f"at least {low}" if high is None else f"in {low}..{high}"
         raise ValueError(f"{call}: {name}={value!r}, but an integer {allowed} is needed")
     return count
+
+
+@contextmanager
+def as_damage(call: str) -> Iterator[None]:
+    """Errors within are those of a damaged checkpoint: ValueErrors that begin with `call`.
+
+    Warnings that are errors are not, nor is want of memory: a second try may go well.
+    """
+    try:
+        yield
+    except (Warning, MemoryError, torch.cuda.OutOfMemoryError):
+        raise
+    except Exception as error:
+        said = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+        if isinstance(error, ValueError) and said.startswith(call):
+            raise
+        raise ValueError(f"{call}: {said}") from error
 
 
 def check_choice(call: str, name: str, value: Any, allowed: Sequence[Any] = (True, False)) -> Any:

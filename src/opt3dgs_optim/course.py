@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from numbers import Integral
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import LOGGER, check_count, check_keys, check_number, warn_user
+from opt3dgs_optim.checks import LOGGER, as_damage, check_count, check_keys, check_number, warn_user
 from opt3dgs_optim.names import gaussian_of, set_of
 from opt3dgs_optim.part import Kept, Part, Phase, Window, overrides
 from opt3dgs_optim.state import ADAM_KEYS, key_of
@@ -425,12 +427,8 @@ class Course:
         """
         call = f"{type(self).__name__}.load_state_dict"
         check_keys(call, state, ("iteration", "num_observed", "switched_off", "parts"))
-        if state.get("format") not in READABLE_FORMATS:
-            raise ValueError(
-                f"{call}: format={state.get('format')!r}, but one of {READABLE_FORMATS} is needed"
-            )
-        for name in ("iteration", "num_observed"):
-            check_count(call, name, state[name], 0)
+        check_format(call, state.get("format"))
+        counts = [check_count(call, n, state[n], 0, NEVER) for n in ("iteration", "num_observed")]
         for name in ("parts", "switched_off"):
             check_keys(f"{call}: {name}", state[name], ())
         kept = state.get("kept", {})
@@ -439,30 +437,42 @@ class Course:
         check_keys(f"{call}: windows", saved_windows, ())
         entries = self.number_entries("training")
         numbers = {
-            key: restored_number(check_number(call, key, kept[key]), entries[key])
-            for key in entries
+            key: restored_number(check_number(call, key, kept[key]), entry)
+            for key, entry in entries.items()
             if key in kept
         }
-        old = {name: part.state_dict() for name, part in self._named.items()}
-        try:
+        with self.undone_on_error(), as_damage(call):
             for name in [name for name in self._named if name in state["parts"]]:
                 self._named[name].load_state_dict(state["parts"][name])
-        except (ValueError, LookupError, TypeError, AttributeError) as error:
-            for name in [name for name in self._named if old[name]]:
-                self._named[name].load_state_dict(old[name])
-            raise ValueError(f"{call}: {error}") from None
-        self.current, self.num_observed = state["iteration"] - 1, state["num_observed"]
-        self._rewinds_followed = self.rewinds
-        windows = self.open_windows()
-        self.kept_numbers.clear()
-        for key, number in numbers.items():
-            name = key.rpartition(".")[0]
-            window, saved = windows.get(name), saved_windows.get(name)
-            if name not in windows or (window and saved in (None, list(window), window)):
-                self.kept_numbers[key] = number
-        known = {name: why for name, why in state["switched_off"].items() if name in self._named}
-        self.switched_off = {name: str(why) for name, why in known.items()}
-        self._plan()
+            self.current, self.num_observed = counts[0] - 1, counts[1]
+            self._rewinds_followed = self.rewinds
+            windows = self.open_windows()
+            self.kept_numbers.clear()
+            for key, number in numbers.items():
+                name = key.rpartition(".")[0]
+                window, saved = windows.get(name), saved_windows.get(name)
+                if name not in windows or (window and saved in (None, list(window), window)):
+                    self.kept_numbers[key] = number
+            off = state["switched_off"]
+            self.switched_off = {name: str(off[name]) for name in off if name in self._named}
+            self._plan()
+
+    @contextmanager
+    def undone_on_error(self) -> Iterator[None]:
+        """Undo what happens within to the clock, to the parts and to the followers, if it fails."""
+        known, numbers, followers = dict(vars(self)), dict(self.kept_numbers), [*self._followers]
+        parts = [(part, {**vars(part)}, part.state_dict()) for part in self._parts]
+        try:
+            yield
+        except BaseException:
+            vars(self).update(known)
+            self.kept_numbers.clear()
+            self.kept_numbers.update(numbers)
+            self._followers[:] = followers
+            self._places.clear()
+            for part, attributes, state in parts:
+                _put_back(part, attributes, state)
+            raise
 
     def number_entries(self, per: str) -> dict[str, Kept]:
         """What the parts keep as numbers, `per` "parameter" or "training", by its keys."""
@@ -502,6 +512,25 @@ def _by_name(parts: Iterable[Part]) -> dict[str, Part]:
         again = sum(name.split("#")[0] == kind for name in named)
         named[f"{kind}#{again + 1}" if again else kind] = part
     return named
+
+
+def _put_back(part: Part, attributes: dict[str, Any], state: dict[str, Any]) -> None:
+    """Give a part the attributes that it had, and what it had learnt."""
+    vars(part).clear()
+    vars(part).update(attributes)
+    if not state:  # nothing was learnt, and few parts can load that
+        return
+    try:
+        part.load_state_dict(state)  # it may have changed its lists and tensors in place
+    except Exception as error:  # the others are put back all the same
+        LOGGER.warning("%s cannot load what it has saved: %r", type(part).__name__, error)
+
+
+def check_format(call: str, value: Any) -> None:
+    """ValueError unless it is the number of a format of checkpoints that can be read."""
+    whole = isinstance(value, Integral) and not isinstance(value, bool)
+    if not whole or value not in READABLE_FORMATS:
+        raise ValueError(f"{call}: format={value!r}, but one of {READABLE_FORMATS} is needed")
 
 
 def _declared(call: str, part: Part) -> dict[str, Kept]:

@@ -159,7 +159,8 @@ class PhaseScheduler(Course):
         Raises:
             TypeError: an optimizer of Gaussian parameters is no Adam, has parts of another
                 scheduler, or is of a class that cannot be kept; or `scene` is no such object.
-            ValueError: nothing holds a Gaussian parameter, or a name occurs twice.
+            ValueError: nothing holds a Gaussian parameter, a name occurs twice, or what an
+                optimizer has loaded is damaged. Then none of them has parts.
         """
         if scene is not None and not is_told_of_edits(scene):
             raise TypeError(

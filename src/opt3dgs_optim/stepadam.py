@@ -14,12 +14,13 @@ from torch.optim import Adam
 
 from opt3dgs_optim.checkpoint import (
     Saved,
+    as_loaded,
     inspect_checkpoint,
     number_of_steps,
     pack_optimizer,
     restore_records,
 )
-from opt3dgs_optim.checks import LOGGER
+from opt3dgs_optim.checks import LOGGER, as_damage
 from opt3dgs_optim.course import STATE_KEY, Course
 from opt3dgs_optim.in_step import (
     NO_PARTS,
@@ -356,7 +357,8 @@ class StepAdam(Adam):
         if known == units:
             return
         for key in [key for key in ADAM_KEYS if key in state]:
-            state[key] = state[key].zero_() if isinstance(state[key], Tensor) else 0
+            # Not in place: where a load fails later on, all of it is undone.
+            state[key] = torch.zeros_like(state[key]) if isinstance(state[key], Tensor) else 0
         LOGGER.info(
             "iteration %d: Adam's moments of %s begin anew, since %s %s to act",
             *(self.course.current, gaussian_of(group), ", ".join(units or known)),
@@ -577,27 +579,30 @@ class StepAdam(Adam):
             ValueError: it does not fit; then nothing has been loaded.
         """
         before = self.state, self.param_groups, self._known, self._open_windows
-        found: list[Saved] = []
+        call, found = f"{self.call_name}.load_state_dict", list[Saved]()
 
         def inspect(_: Any, loaded: dict[str, Any]) -> dict[str, Any]:
             # torch would cast what parts keep to the parameters' dtype.
-            saved, rest = inspect_checkpoint(self, loaded)
+            with as_damage(call):
+                saved, rest = inspect_checkpoint(self, loaded)
             found.append(saved)
             return rest
 
         handle = self.register_load_state_dict_pre_hook(inspect)  # after those of others
         try:
-            super().load_state_dict(state_dict)
+            with self.course.undone_on_error():
+                super().load_state_dict(state_dict)
+                with as_damage(call):
+                    # A base class with a load_state_dict of its own may have called no hook.
+                    self._restore(found[0] if found else None)
+                    if self._base is Adam and self.defaults["fused"]:
+                        use_fused(self)
+        except BaseException:
+            self.state, self.param_groups, self._known, self._open_windows = before
+            self._acting = (None, None, {})
+            raise
         finally:
             handle.remove()
-        try:
-            # A base class with a load_state_dict of its own may have called no hook.
-            self._restore(found[0] if found else None)
-        except ValueError:
-            self.state, self.param_groups, self._known, self._open_windows = before
-            raise
-        if self._base is Adam and self.defaults["fused"]:
-            use_fused(self)
 
     def _restore(self, saved: Saved | None) -> None:
         """Take the clock and what parts have kept, once torch has loaded the moments.
@@ -607,7 +612,7 @@ class StepAdam(Adam):
                 where a stock optimizer has loaded it.
         """
         if saved is None:
-            saved = inspect_checkpoint(self, _as_loaded(self))[0]
+            saved = inspect_checkpoint(self, as_loaded(self))[0]
             self.param_groups[0].pop(STATE_KEY, None)
         self._acting = (None, None, {})
         self._name_groups()
@@ -635,8 +640,13 @@ class StepAdam(Adam):
         self._claim_rows()
 
     def take_loaded(self) -> None:
-        """Take what a checkpoint of ours has left in a stock optimizer, before it was upgraded."""
-        self._restore(None)
+        """Take what a checkpoint of ours has left in a stock optimizer, before it was upgraded.
+
+        Raises:
+            ValueError: it is damaged. The optimizer and its course are half changed then.
+        """
+        with as_damage(f"{self.call_name}: a checkpoint that was loaded before the upgrade"):
+            self._restore(None)
 
     @property
     def call_name(self) -> str:
@@ -668,15 +678,3 @@ def upgraded_class(base: type[Adam]) -> type[StepAdam]:
 def _new_upgraded(base: type[Adam]) -> StepAdam:
     made = upgraded_class(base)
     return made.__new__(made)
-
-
-def _as_loaded(optimizer: StepAdam) -> dict[str, Any]:
-    """The state of an optimizer as a checkpoint has it, without a copy."""
-    params = list(chain.from_iterable(group["params"] for group in optimizer.param_groups))
-    numbers = iter(range(len(params)))
-    groups = [
-        {**group, "params": [next(numbers) for _ in group["params"]]}
-        for group in optimizer.param_groups
-    ]
-    state = {i: optimizer.state[p] for i, p in enumerate(params) if p in optimizer.state}
-    return {"state": state, "param_groups": groups, "cast": True}

@@ -78,14 +78,8 @@ def upgrade(optimizers: Any, course: Course) -> int:
             f"{CALL}: none of the names {left} is a Gaussian parameter's; allowed are "
             f"{', '.join(names)}"
         )
-    for plan in plans:
-        optimizer: Any = plan.optimizer
-        vars(optimizer).pop("step", None)  # a learning-rate scheduler's wrapper of the old class's
-        optimizer.__class__ = plan.made
-        optimizer.hold(plan.slots)
-        optimizer.follow(course, plan.base)
-        optimizer.take_loaded()
     _warn_of_unknown(unknown, known_rows)
+    _carry_out(plans, course)
     parts = ", ".join(str(part) for part in course.parts) or "none"
     others = f"; left alone: {', '.join(left)}" if left else ""
     again = f" from iteration {course.iteration}" if course.iteration else ""
@@ -94,6 +88,56 @@ def upgrade(optimizers: Any, course: Course) -> int:
         f"in the steps of {', '.join(taken)}{others}"
     )
     return len(plans)
+
+
+def _carry_out(plans: list[Plan], course: Course) -> None:
+    """Give all optimizers their parts, or none: what a stock trainer has loaded may be damaged."""
+    before = [Unchanged(plan.optimizer) for plan in plans]
+    try:
+        with course.undone_on_error():
+            for plan in plans:
+                optimizer: Any = plan.optimizer
+                # A learning-rate scheduler's wrapper of the old class's.
+                vars(optimizer).pop("step", None)
+                optimizer.__class__ = plan.made
+                optimizer.hold(plan.slots)
+                optimizer.follow(course, plan.base)
+                optimizer.take_loaded()
+    except BaseException:
+        for each in before:
+            each.put_back()
+        raise
+
+
+class Unchanged:
+    """An optimizer as it was, to be put back if it cannot get its parts.
+
+    Its tensors are not copied: an upgrade writes into none of them.
+    """
+
+    def __init__(self, optimizer: Optimizer) -> None:
+        self._optimizer, self._class = optimizer, type(optimizer)
+        self._attributes, self._defaults = dict(vars(optimizer)), dict(optimizer.defaults)
+        self._groups = list(optimizer.param_groups)
+        # By parameter: its state, and what is in it.
+        self._state = {
+            param: (own, dict(own) if isinstance(own, dict) else {})
+            for param, own in optimizer.state.items()
+        }
+
+    def put_back(self) -> None:
+        """Make it again what it was, in the same lists and dicts."""
+        optimizer: Any = self._optimizer
+        vars(optimizer).clear()
+        vars(optimizer).update(self._attributes)
+        optimizer.__class__ = self._class
+        optimizer.param_groups[:] = self._groups
+        for into, was in ((optimizer.defaults, self._defaults), *self._state.values()):
+            if isinstance(into, dict):
+                into.clear()
+                into.update(was)
+        for param in [param for param in optimizer.state if param not in self._state]:
+            del optimizer.state[param]
 
 
 def _candidates(optimizers: Any) -> list[Candidate]:

@@ -1,5 +1,6 @@
 """Curvature: a per-point L-BFGS direction as the gradient that Adam is fed (eq. 17)."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -8,12 +9,13 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.backend import BACKENDS, Backend, obstacle
-from opt3dgs_optim.checks import check_choice, check_count, check_number
+from opt3dgs_optim.checks import check_choice, check_count, check_keys, check_number
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.lbfgs.history import MAX_HISTORY, history_shape, laid_out, new_history
 from opt3dgs_optim.lbfgs.two_loop import foresight, lqn_direction
 from opt3dgs_optim.names import check_names
 from opt3dgs_optim.part import Group, Kept, Part, Phase, State
+from opt3dgs_optim.state import rows_of
 
 HISTORY = "history"
 PROBE_STEPS = 10  # exploitation steps between two looks at what the pairs foretell
@@ -22,11 +24,14 @@ MIN_ACCEPTED = 0.1  # share of the candidate pairs
 # Pairs that are mostly the difference between views reach 0.03 to 0.07, exact ones of a quadratic
 # with condition 100 reach 0.2.
 MIN_FORESIGHT = 0.1
+FORESIGHT = 2  # which number of the evidence is the sum of the foresight
+MAX_SEEN = torch.finfo(torch.float32).max  # of each number of the evidence
 
 
 def points_of(param: Tensor) -> Tensor:
     """A parameter [N, ..] as points [N, D]; a number alone is one point."""
-    return param.detach().reshape(param.shape[0] if param.dim() else 1, -1)
+    # Not -1: of no rows, torch could not tell how many coordinates they would have.
+    return param.detach().reshape(rows_of(param), math.prod(param.shape[1:]))
 
 
 @dataclass(frozen=True)
@@ -85,7 +90,8 @@ class Curvature(Part):
         self.keeps = (KeptHistory(HISTORY, history_size=self.history_size),)
         self._step = -1  # of the tally
         self._tally = torch.zeros(2)  # [accepted, candidates] of the last step
-        self._seen = torch.zeros(4)  # those and [foresight, points looked at], of all steps
+        # Those and [foresight, points looked at], of all steps.
+        self._seen = torch.zeros(4, dtype=torch.float32)
         self._probes = 0
 
     def __repr__(self) -> str:
@@ -146,9 +152,22 @@ class Curvature(Part):
         """What `adaptive` judges by; the pairs are in the optimizers' state."""
         return {"seen": self._seen.tolist(), "probes": self._probes}
 
-    def load_state_dict(self, state: Any) -> None:
-        """Restore `state_dict()`."""
-        self._seen, self._probes = torch.tensor(state["seen"]), int(state["probes"])
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore `state_dict()`.
+
+        Raises:
+            ValueError: it is damaged; nothing is changed then.
+        """
+        call = "Curvature.load_state_dict"
+        check_keys(call, state, ("seen", "probes"))
+        seen = state["seen"]
+        if not isinstance(seen, (list, tuple)) or len(seen) != len(self._seen):
+            raise ValueError(f"{call}: seen={seen!r}, but {len(self._seen)} numbers are needed")
+        for i, number in enumerate(seen):  # the foresight alone may be below 0
+            low = -MAX_SEEN if i == FORESIGHT else 0.0
+            check_number(call, f"seen[{i}]", number, low, MAX_SEEN)
+        probes = check_count(call, "probes", state["probes"], 0)
+        self._seen, self._probes = torch.tensor(seen, dtype=torch.float32), probes
 
     def evidence(self, course: Course) -> Tensor:
         """[4]: pairs accepted, candidates, sum of their foresight, points looked at."""
