@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
+import warnings
 from typing import Any
 
 import pytest
@@ -36,6 +38,44 @@ def test_a_training_is_resumed(case: tuple[str, str]) -> None:
         assert torch.equal(each, expected[key]), key
     second.run()
     assert distance(second.values(), first.run().values()) == 0.0
+
+
+@pytest.mark.parametrize("road", ["load_state_dict", "upgrade"])
+@pytest.mark.parametrize("case", list(itertools.product(QUIET, DTYPES)))
+def test_a_checkpoint_that_a_stock_trainer_has_saved_again(
+    case: tuple[str, str], road: str
+) -> None:
+    """Its load casts what parts keep to the parameter's dtype; they go on, and it is said."""
+    arm, dtype = case
+    options: dict[str, Any] = {**EPS, "dtype": DTYPES[dtype], "layout": "single"}
+    first = Training(arm, **options).run(stop_of(arm))
+    stock = Training(arm, upgrade=False, **options)
+    stock.optimizers.load_state_dict(copy.deepcopy(first.optimizers.state_dict()))
+    second = Training(arm, upgrade=road == "load_state_dict", **options)
+    for name, value in first.values().items():
+        second.splats[name].data.copy_(value)
+    second.iteration = first.iteration
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        second.optimizers.load_state_dict(stock.optimizers.state_dict())
+        if road == "upgrade":
+            second.phases.upgrade(second.optimizers)
+            second.upgraded = True
+    kept = {key: each for key, each in second.kept().items() if key.split(".", 1)[1] not in ADAMS}
+    expected = {key: each for key, each in first.kept().items() if key in kept}
+    assert {key: each.dtype for key, each in kept.items()} == {
+        key: each.dtype for key, each in expected.items()
+    }
+    for key, each in kept.items():
+        # What the parameter's dtype holds has come: a history's pairs are of length 1.
+        rounded = expected[key].to(DTYPES[dtype]).to(each.dtype)
+        assert torch.equal(each, rounded) or not bool(rounded.isfinite().all()), key
+    has_rounded = bool(kept) and dtype != "float64"
+    assert has_rounded == any("was rounded to torch." in str(each.message) for each in said)
+    second.run()
+    assert all(bool(each.isfinite().all()) for each in second.values().values())
+    if not has_rounded:
+        assert distance(second.values(), first.run().values()) == 0.0
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

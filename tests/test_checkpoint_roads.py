@@ -337,7 +337,7 @@ def of_other_columns(value: Tensor) -> Any:
     return torch.ones(*value.shape, 2) if value.dim() < 2 else value[:, :-1].clone()
 
 
-def not_finite(value: Tensor) -> Any:
+def not_finite(value: Tensor) -> Tensor:
     damaged = value.clone()
     damaged[(0,) * damaged.dim()] = float("nan")  # a view would copy what is not contiguous
     return damaged
@@ -349,14 +349,17 @@ DAMAGE: dict[str, Callable[[Tensor], Any]] = {
     "a string": lambda value: "state",
     "a number": lambda value: 3.0,
     "0-d": lambda value: torch.zeros(()) if value.dim() else torch.zeros(2),
-    "other rows": lambda value: torch.zeros(ROWS + 1, *value.shape[1:]),
-    "no rows": lambda value: torch.zeros(0, *value.shape[1:]),
     "other columns": of_other_columns,
     "integers": lambda value: value.long(),
     "complex": lambda value: value.to(torch.complex64),
     "booleans": lambda value: value.bool(),
-    "not finite": not_finite,
     "missing": lambda value: MISSING,
+}
+# What a healthy training can have: a stock trainer's edit of the moments, and a lost point.
+OUT_OF_DATE: dict[str, Callable[[Tensor], Any]] = {
+    "other rows": lambda value: torch.zeros(ROWS + 1, *value.shape[1:]),
+    "no rows": lambda value: torch.zeros(0, *value.shape[1:]),
+    "not finite": not_finite,
 }
 MISSING = object()
 KEEPERS = ("Averaging", "Curvature", "Fading", "FreshMoments", "OutOfView", "DEFAULTS", "paper")
@@ -418,6 +421,34 @@ def test_damaged_state_of_a_part_is_refused_and_nothing_is_loaded(
             checkpoints.pop(arm)
             saved, other = checkpoint(checkpoints, arm)
     assert loaded == []
+
+
+@pytest.mark.parametrize("how", OUT_OF_DATE)
+@pytest.mark.parametrize("arm", ["Averaging", "Curvature"])
+def test_state_of_a_part_that_holds_no_more_begins_anew_and_it_is_said(
+    arm: str, how: str, checkpoints: dict[str, Any]
+) -> None:
+    saved, _ = checkpoint(checkpoints, arm)
+    part = kept_keys(saved["state"])[0][1].split(".")[0]
+    for i, key in kept_keys(saved["state"]):
+        changed = copy.deepcopy(saved)
+        changed["state"][i][key] = OUT_OF_DATE[how](changed["state"][i][key])
+        other = begun(arm).run(3)
+        with pytest.warns(UserWarning, match=f"{part}.*anew"):
+            other.optimizers.load_state_dict(changed)
+        state = other.optimizers.state_dict()["state"]
+        assert other.phases.iteration == AT[arm]
+        if how == "not finite":  # this row alone, in all that the part keeps
+            for each in [each for number, each in kept_keys(state) if number == i]:
+                assert not state[i][each][0].any()
+                assert torch.equal(state[i][each][1:], saved["state"][i][each][1:])
+        else:
+            assert {number for number, _ in kept_keys(state)} == {
+                number for number, _ in kept_keys(saved["state"]) if number != i
+            }
+        other.iteration = AT[arm]
+        other.run()
+        assert all(bool(value.isfinite().all()) for value in other.values().values())
 
 
 def test_all_that_is_kept_has_been_looked_at(checkpoints: dict[str, Any]) -> None:

@@ -19,13 +19,22 @@ from collections.abc import Iterable, Mapping
 from itertools import chain
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from opt3dgs_optim.checks import LOGGER, check_count, check_keys, check_number, warn_user
-from opt3dgs_optim.course import READABLE_FORMATS, STATE_KEY, Course, restored_number
-from opt3dgs_optim.names import SLOT
-from opt3dgs_optim.part import Window
-from opt3dgs_optim.state import ParameterRecord, check_kept, check_moments, key_of, rows_of
+from opt3dgs_optim.course import NEVER, STATE_KEY, Course, check_format, restored_number
+from opt3dgs_optim.names import SLOT, group_name
+from opt3dgs_optim.part import Kept, Window
+from opt3dgs_optim.state import (
+    ParameterRecord,
+    check_kept,
+    check_kept_number,
+    check_moments,
+    key_of,
+    restart_rows,
+    rows_of,
+)
 
 if TYPE_CHECKING:
     from opt3dgs_optim.stepadam import StepAdam
@@ -44,7 +53,7 @@ class SavedRecord(NamedTuple):
     """What a checkpoint has for one parameter's record, checked."""
 
     last_step: int | None
-    numbers: dict[str, float]
+    numbers: dict[str, Any]  # Python's, of the kinds that the parts keep
     units: tuple[str, ...] = ()
 
 
@@ -111,11 +120,7 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
         return nothing, {**loaded, "param_groups": groups}
     own, clock = _unpack(call, shared, optimizer, share)  # dict[str, Any], or None
     state, cast = dict(loaded["state"]), bool(loaded.get("cast"))
-    for number, param in zip(numbers, params, strict=True):
-        saved = state.get(number)
-        if saved or not isinstance(saved, (Mapping, type(None))):
-            check_moments(call, param, saved)
-    steps = number_of_steps(value for value in state.values() if isinstance(value, Mapping))
+    steps = number_of_steps(_checked_states(call, groups, params, state))
     stale = own is not None and own["steps"] not in (None, steps)
     if stale and own is not None and clock is not None:
         # Torch's distributed checkpoints make a step of a fresh optimizer: of no iteration of ours.
@@ -127,7 +132,7 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
             f"iteration {clock['iteration']}, and what the parts had kept per point begins anew"
         )
     by_name = any(isinstance(number, str) for number in state)  # torch's distributed checkpoints
-    rows, orphaned = [], False
+    rows, orphaned, rounded = [], False, set[torch.dtype]()
     for i, (number, param) in enumerate(zip(numbers, params, strict=True)):
         saved = state.get(number)
         if not saved:
@@ -141,7 +146,14 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
             continue
         # Distributed files leave out what a fresh optimizer has not; that is said below.
         needed = () if by_name else own["kept"].get(str(i), ())
-        rows.append(_rows(call, optimizer.course, own, param, rest, kept, needed, cast=cast))
+        kept = _cast_back(optimizer.course, kept, param, rounded, cast=cast)
+        rows.append(_rows(call, optimizer.course, own, param, rest, kept, needed))
+    if rounded:
+        warn_user(
+            f"{call}: what the parts keep was rounded to {', '.join(map(str, rounded))} by an "
+            "optimizer without them, which had loaded it; one that is upgraded before it loads "
+            "keeps all digits"
+        )
     if own is None and by_name and steps and optimizer.course.keeps_state:
         warn_user(
             f"{call}: a distributed checkpoint of {steps} steps without our state, as flattened "
@@ -172,6 +184,21 @@ def as_loaded(optimizer: StepAdam) -> dict[str, Any]:
     ]
     state = {i: optimizer.state[p] for i, p in enumerate(params) if p in optimizer.state}
     return {"state": state, "param_groups": groups, "cast": True}
+
+
+def _checked_states(
+    call: str, groups: list[dict[str, Any]], params: list[Tensor], state: Mapping[Any, Any]
+) -> list[Mapping[str, Any]]:
+    """The states of the parameters that have been stepped, checked; groups are the checkpoint's."""
+    found = []
+    numbers = [(number, group) for group in groups for number in group["params"]]
+    for (number, group), param in zip(numbers, params, strict=True):
+        saved = state.get(number)
+        if saved is None or (isinstance(saved, Mapping) and not saved):
+            continue
+        check_moments(call, param, saved, amsgrad=group.get("amsgrad") is True)
+        found.append(saved)
+    return found
 
 
 def restore_records(
@@ -207,17 +234,13 @@ def _unpack(
         return None, None
     check_keys(call, shared, ("format", "iteration"))
     clock = {key: value for key, value in shared.items() if key != "optimizer"}
-    check_count(call, "iteration", clock["iteration"], 0)
-    if clock["format"] not in READABLE_FORMATS:
-        raise ValueError(
-            f"{call}: format={clock['format']!r}, but one of {READABLE_FORMATS} is needed"
-        )
+    check_count(call, "iteration", clock["iteration"], 0, NEVER)
+    check_format(call, clock["format"])
     if clock["format"] == 2:
-        own = _from_format_2(clock, optimizer, share)
+        own = _from_format_2(call, clock, optimizer, share)
     else:
         own = shared.get("optimizer")
         check_keys(f"{call}: optimizer", own, ("steps", "windows", "records", "kept"))
-    keys = set(optimizer.course.number_entries("parameter"))
     windows = {}
     check_keys(f"{call}: windows", own["windows"], ())
     for name, window in own["windows"].items():
@@ -225,44 +248,59 @@ def _unpack(
         if not pair or not all(isinstance(each, int) for each in window):
             raise ValueError(f"{call}: windows[{name!r}]={window!r}, but two iterations are needed")
         windows[name] = tuple(window)
-    records = []
-    if not isinstance(own["records"], list):
-        raise ValueError(f"{call}: records={own['records']!r}, but a list is needed")
-    for group in own["records"]:
-        if not isinstance(group, list):
-            raise ValueError(f"{call}: records has {group!r}, but a list is needed")
-        records.append([])
-        for entry in group:
-            records[-1].append(_record(call, entry, keys))
+    records = _records(call, own["records"], optimizer)
     if own["steps"] is not None:
         check_count(call, "steps", own["steps"], 0)
     check_keys(f"{call}: kept", own["kept"], ())
+    for number, names in own["kept"].items():
+        if not isinstance(names, (list, tuple)) or not all(isinstance(n, str) for n in names):
+            raise ValueError(f"{call}: kept[{number!r}]={names!r}, but a list of keys is needed")
     return {**own, "windows": windows, "records": records}, clock
 
 
-def _record(call: str, entry: Any, keys: set[str]) -> SavedRecord:
-    """One parameter's record, checked; of the numbers those under `keys`."""
+def _records(call: str, saved: Any, optimizer: StepAdam) -> list[list[SavedRecord]]:
+    """The records of all parameters, by group, checked; there may be more of them."""
+    if not isinstance(saved, list):
+        raise ValueError(f"{call}: records={saved!r}, but a list is needed")
+    entries, records = optimizer.course.number_entries("parameter"), list[list[SavedRecord]]()
+    for group in saved:
+        if not isinstance(group, list):
+            raise ValueError(f"{call}: records has {group!r}, but a list is needed")
+        records.append([_record(call, entry, entries) for entry in group])
+    for i, group in enumerate(optimizer.param_groups):
+        found, needed = len(records[i]) if i < len(records) else 0, len(group["params"])
+        if found < needed:
+            raise ValueError(
+                f"{call}: records has {found} for {group_name(i, group)}, but {needed} are needed"
+            )
+    return records
+
+
+def _record(call: str, entry: Any, entries: Mapping[str, Kept]) -> SavedRecord:
+    """One parameter's record, checked; of the numbers those that are among the `entries`."""
     check_keys(f"{call}: records", entry, ("last_step", "numbers"))
     check_keys(f"{call}: records", entry["numbers"], ())
     last_step, units = entry["last_step"], entry.get("units", [])
     if last_step is not None:
-        check_count(call, "last_step", last_step, -1)
+        check_count(call, "last_step", last_step, -1, NEVER)
     if not isinstance(units, (list, tuple)) or not all(isinstance(name, str) for name in units):
         raise ValueError(f"{call}: units={units!r}, but names of parts are needed")
     numbers = {
-        key: check_number(call, key, value)
+        key: check_kept_number(call, key, entries[key], value)
         for key, value in entry["numbers"].items()
-        if key in keys
+        if key in entries
     }
     return SavedRecord(last_step, numbers, tuple(units))
 
 
 def _without_units(records: list[list[SavedRecord]]) -> list[list[SavedRecord]]:
     """The same, of moments in the parameters' own units."""
-    return [[each._replace(units=()) for each in group] for group in records]
+    return [[SavedRecord(each.last_step, each.numbers) for each in group] for group in records]
 
 
-def _from_format_2(clock: dict[str, Any], optimizer: StepAdam, share: list[Any]) -> dict[str, Any]:
+def _from_format_2(
+    call: str, clock: dict[str, Any], optimizer: StepAdam, share: list[Any]
+) -> dict[str, Any]:
     """What format 2 did not say: the present windows hold where its iteration lies in them."""
     course, last_step = optimizer.course, clock["iteration"] - 1
     windows = {}
@@ -272,7 +310,10 @@ def _from_format_2(clock: dict[str, Any], optimizer: StepAdam, share: list[Any])
             windows[name] = list(window)
     records = []
     for group, seen in zip(optimizer.param_groups, share, strict=True):
-        numbers = {} if seen is None else {"OutOfView.seen_share": float(seen)}
+        numbers = {}
+        if seen is not None:
+            number = seen.item() if isinstance(seen, Tensor) and seen.numel() == 1 else seen
+            numbers["OutOfView.seen_share"] = check_number(call, SHARE_OF_FORMAT_2, number)
         if "FreshMoments" in windows:  # those moments were zeroed already
             numbers["FreshMoments.fresh"] = 1.0
         records.append(
@@ -290,6 +331,40 @@ def _split(saved: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     return kept, rest
 
 
+def _cast_back(
+    course: Course,
+    kept: Mapping[str, Any],
+    param: Tensor,
+    rounded: set[torch.dtype],
+    *,
+    cast: bool,
+) -> dict[str, Any]:
+    """What parts keep per row in the dtypes that they declare.
+
+    torch's own load casts all that an optimizer without parts has beside a parameter to the
+    parameter's dtype, and a checkpoint that such an optimizer saves has it so.
+
+    Args:
+        course: whose parts they are.
+        kept: what the checkpoint has, under today's keys.
+        param: the parameter.
+        rounded: gets the dtypes that have lost digits.
+        cast: whether a stock optimizer has loaded it here, of whatever dtype the parameter is now.
+    """
+    found = dict(kept)
+    for name, entries in course.declared.items():
+        for entry in entries.values():
+            key, dtype = key_of(name, entry), entry.dtype_for(param)
+            value = found.get(key)
+            if not isinstance(value, Tensor) or value.dtype == dtype:
+                continue
+            if value.is_floating_point() and (cast or value.dtype == param.dtype):
+                found[key] = value.to(dtype)
+                if value.dtype.itemsize < torch.float32.itemsize:
+                    rounded.add(value.dtype)
+    return found
+
+
 def _rows(
     call: str,
     course: Course,
@@ -298,8 +373,6 @@ def _rows(
     moments: Mapping[str, Any],
     kept: Mapping[str, Any],
     needed: Iterable[str],
-    *,
-    cast: bool,
 ) -> dict[str, Tensor]:
     """What parts keep per row of a parameter, checked; without what is not valid any more.
 
@@ -311,11 +384,8 @@ def _rows(
         moments: Adam's, which say how many rows there were.
         kept: what the checkpoint has, under today's keys.
         needed: keys that it must have.
-        cast: whether a stock optimizer has loaded it, and cast it to the parameter's dtype.
     """
-    found = {}
-    first = moments["exp_avg"]
-    rows = first.shape[0] if first.dim() else 1
+    found, rows = dict[str, Tensor](), rows_of(moments["exp_avg"])
     for name, part in course.named().items():
         window = part.window(course)
         entries = {key_of(name, e): e for e in course.declared[name].values() if e.per == "row"}
@@ -325,22 +395,35 @@ def _rows(
             missing = absent  # what a part keeps is of use together only
         if missing:
             raise ValueError(f"{call}: {missing} are missing, which the checkpoint says are there")
-        for key, entry in entries.items():
-            value = kept.get(key)
-            if not _is_there(value):
-                continue
-            if cast and isinstance(value, Tensor) and value.is_floating_point():
-                value = value.to(entry.dtype_for(param))
-            check_kept(call, key, entry, value, param, rows)
-            if own["windows"].get(name) != window or _too_many(key, value, own, window):
-                LOGGER.info("%s: %s is of other iterations: it begins anew", call, key)
-            elif rows != rows_of(param):
+        there = {key: kept[key] for key in entries if key not in absent}
+        for key, value in there.items():
+            check_kept(call, key, entries[key], value, param)
+        valid = own["windows"].get(name) == window
+        mine = {k: v for k, v in there.items() if valid and not _too_many(k, v, own, window)}
+        for key in there.keys() - mine.keys():
+            LOGGER.info("%s: %s is of other iterations: it begins anew", call, key)
+        edited = [key for key, value in mine.items() if rows_of(value) != rows]
+        if edited:
+            # INRIA's edits of rows are of the moments alone, and a stock trainer has no ledger.
+            warn_user(
+                f"{call}: {edited[0]} of {rows_of(mine[edited[0]])} rows beside moments of {rows}, "
+                "since a trainer without parts has edited the points: what "
+                f"{name} keeps is dropped, and collected anew"
+            )
+        elif mine and rows != rows_of(param):
+            for key in mine:
                 warn_user(
                     f"{call}: {key} of {rows} rows for a parameter of {rows_of(param)}: dropped, "
                     "and collected anew"
                 )
-            else:
-                found[key] = value
+        else:
+            restarted = restart_rows(mine, param)
+            if restarted:
+                warn_user(
+                    f"{call}: what {name} keeps of {restarted} of {rows} rows is not finite: they "
+                    "begin anew"
+                )
+            found |= mine
     return found
 
 

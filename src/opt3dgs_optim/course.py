@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import LOGGER, as_damage, check_count, check_keys, check_number, warn_user
+from opt3dgs_optim.checks import LOGGER, as_damage, check_count, check_keys, warn_user
 from opt3dgs_optim.names import gaussian_of, set_of
 from opt3dgs_optim.part import Kept, Part, Phase, Window, overrides
-from opt3dgs_optim.state import ADAM_KEYS, key_of
+from opt3dgs_optim.state import ADAM_KEYS, check_kept_number, key_of
 
 if TYPE_CHECKING:
     from opt3dgs_optim.stepadam import StepAdam
@@ -437,7 +437,7 @@ class Course:
         check_keys(f"{call}: windows", saved_windows, ())
         entries = self.number_entries("training")
         numbers = {
-            key: restored_number(check_number(call, key, kept[key]), entry)
+            key: restored_number(check_kept_number(call, key, entry, kept[key]), entry)
             for key, entry in entries.items()
             if key in kept
         }

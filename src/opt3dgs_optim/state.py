@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import cmath
+import math
 import weakref
 from collections.abc import Iterable, Iterator, Mapping, MutableMapping, Sequence
+from numbers import Complex, Integral, Real
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
-from opt3dgs_optim.checks import check_keys
+from opt3dgs_optim.checks import as_float, check_keys
 from opt3dgs_optim.part import Kept
 
 MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # torch's names of Adam's, the last amsgrad's
@@ -349,36 +351,147 @@ def check_rows(call: str, rows: Rows, param: Tensor) -> Tensor:
     raise ValueError(f"{call}: rows={rows!r}, but {needed}")
 
 
-def check_moments(call: str, param: Tensor, saved: Any) -> None:
-    """ValueError unless these are Adam's moments of a parameter like `param`.
+def check_moments(call: str, param: Tensor, saved: Any, *, amsgrad: bool = False) -> None:
+    """ValueError unless these are the step count and Adam's moments of a parameter like `param`.
 
-    The number of rows may differ: some trainers load the optimizer first, the points afterwards.
+    The number of rows may differ from the parameter's, but is one: some trainers load the optimizer
+    first, the points afterwards. One pass over each moment, and a wait for its device.
+
+    Args:
+        call: what messages name.
+        param: the parameter.
+        saved: what a checkpoint has for it.
+        amsgrad: whether the largest second moment must be there.
     """
-    check_keys(call, saved, ("step", "exp_avg", "exp_avg_sq"))
-    for key in ("exp_avg", "exp_avg_sq"):
+    check_keys(call, saved, ADAM_KEYS if amsgrad else ADAM_KEYS[:-1])
+    step = saved["step"]
+    if isinstance(step, Tensor):
+        real = step.numel() == 1 and step.dtype != torch.bool and not step.is_complex()
+        step = step.item() if real else None
+    if not 0 <= as_float(step) < math.inf:
+        raise ValueError(f"{call}: step={saved['step']!r}, but a number of steps is needed")
+    for key in [key for key in MOMENTS if key in saved]:
         value = saved[key]
-        if not isinstance(value, Tensor) or value.shape[1:] != param.shape[1:]:
+        fits = isinstance(value, Tensor) and value.dim() == param.dim()
+        if not fits or value.shape[1:] != param.shape[1:]:
             shape = tuple(value.shape) if isinstance(value, Tensor) else value
             raise ValueError(
                 f"{call}: {key} has shape {shape}, but the parameter has {tuple(param.shape)}"
             )
+        if value.shape != saved["exp_avg"].shape:
+            raise ValueError(
+                f"{call}: {key} has {rows_of(value)} rows, but exp_avg has "
+                f"{rows_of(saved['exp_avg'])}, and one number of rows is needed"
+            )
+        fits = value.is_complex() if param.is_complex() else value.is_floating_point()
+        if not fits or value.layout is not torch.strided:
+            raise ValueError(
+                f"{call}: {key} is of {value.dtype}, {value.layout}, but a dense moment of a "
+                f"parameter of {param.dtype} is needed"
+            )
+        _check_finite(call, key, value.detach(), param.detach())
 
 
-def check_kept(call: str, key: str, kept: Kept, value: Any, param: Tensor, rows: int) -> None:
-    """ValueError unless `value` is what a part keeps per row of a parameter, of `rows` points."""
+def _check_finite(call: str, key: str, moment: Tensor, param: Tensor) -> None:
+    """ValueError where a moment would make a number of the parameter one that is not finite.
+
+    Two things are let through, since they are no damage. In float16 the square of a gradient above
+    256 is infinite, and Adam's step is then zero, in the stock trainer, too: a healthy run has
+    such second moments, and could not be resumed otherwise. And where the parameter itself is not
+    finite, as a point that a trainer has lost and not removed yet, there is nothing left to break.
+    """
+    if moment.numel() == 0:
+        return
+    second = key != "exp_avg"  # a mean of squares
+    may_overflow = second and moment.dtype == torch.float16
+    numbers = torch.view_as_real(moment.resolve_conj()) if moment.is_complex() else moment
+    lowest = 0.0 if second else -torch.finfo(numbers.dtype).max
+    low, high = (each.item() for each in torch.aminmax(numbers))  # NaN where there is one
+    if low >= lowest and (high < math.inf or may_overflow):
+        return
+    sound = numbers >= lowest
+    if not may_overflow:
+        sound &= numbers < math.inf
+    if moment.is_complex():
+        sound = sound.all(-1)
+    if moment.shape == param.shape:
+        sound |= ~param.isfinite().to(sound.device)
+    wrong = int((~sound).reshape(rows_of(moment), -1).any(1).sum())
+    if wrong:
+        raise ValueError(
+            f"{call}: {key} is not finite{', or below 0,' if second else ''} in {wrong} of "
+            f"{rows_of(moment)} rows; zeros for all moments of a row let it begin anew"
+        )
+
+
+def check_kept_number(call: str, key: str, kept: Kept, value: Any) -> Any:
+    """What a part keeps as a number, as Python's; ValueError where its dtype does not hold it.
+
+    It need not be finite: the smallest of what has not begun yet is infinite.
+    """
+    kind: Any = int
+    numbers: type = Integral
+    if kept.dtype == torch.bool:
+        kind = numbers = bool
+    elif kept.dtype.is_complex:
+        kind, numbers = complex, Complex
+    elif kept.dtype.is_floating_point:
+        kind, numbers = float, Real
+    try:
+        if isinstance(value, numbers) and isinstance(value, bool) == (kind is bool):
+            number = kind(value)
+            torch.tensor(number, dtype=kept.dtype)  # raises where it does not fit
+            return number
+    except (OverflowError, RuntimeError, ValueError):
+        pass
+    raise ValueError(f"{call}: {key}={value!r}, but a number of {kept.dtype} is needed")
+
+
+def check_kept(call: str, key: str, kept: Kept, value: Any, param: Tensor) -> None:
+    """ValueError unless `value` is what a part keeps per row of a parameter, of however many rows.
+
+    Which of its rows are finite is looked at by `restart_rows`.
+    """
     if not isinstance(value, Tensor):
         raise ValueError(f"{call}: {key}={value!r}, but a tensor is needed")
     needed = kept.shape_for(param)
-    if param.dim():
-        needed = (rows, *needed[1:])
-    if tuple(value.shape) != needed:
+    if param.dim() and value.dim():
+        needed = (len(value), *needed[1:])
+    dense = "" if value.layout is torch.strided else "dense "
+    if tuple(value.shape) != needed or dense:
         raise ValueError(
-            f"{call}: {key} has shape {tuple(value.shape)}, but {needed} is needed beside a "
-            f"parameter of shape {tuple(param.shape)} and moments of {rows} rows"
+            f"{call}: {key} has shape {tuple(value.shape)}, but {dense}{needed} is needed beside a "
+            f"parameter of shape {tuple(param.shape)}"
         )
     if value.dtype != kept.dtype_for(param):
         raise ValueError(
             f"{call}: {key} is of {value.dtype}, but {kept.dtype_for(param)} is needed"
         )
-    if value.is_floating_point() and not bool(value.isfinite().all()):
-        raise ValueError(f"{call}: {key} has numbers that are not finite")
+
+
+def restart_rows(kept: dict[str, Tensor], param: Tensor) -> int:
+    """Zero the rows of what a part keeps that are not finite; return how many.
+
+    A row of zeros means "nothing yet". Rows whose parameter is not finite either stay as they are:
+    those of a point that a healthy run has lost, which goes on bit for bit.
+
+    Args:
+        kept: [N, ..] each, of one part. What has rows to be zeroed is replaced, not written to.
+        param: the parameter, [N, ..].
+    """
+    wrong = torch.zeros(param.shape[:1], dtype=torch.bool, device=param.device)
+    for value in kept.values():
+        if (value.is_floating_point() or value.is_complex()) and not is_finite_sum(value):
+            wrong |= ~_finite_rows(value, wrong.shape).to(wrong.device)
+    if not bool(wrong.any()):
+        return 0
+    wrong &= _finite_rows(param.detach(), wrong.shape)
+    for key, value in kept.items():
+        rows = broadcast_rows(wrong.to(value.device), value)
+        kept[key] = value.masked_fill(rows, 0)
+    return int(wrong.sum())
+
+
+def _finite_rows(tensor: Tensor, shape: torch.Size) -> Tensor:
+    """Which rows of a tensor [N, ..] are finite, bool, of the shape [N]; 0-d of a number alone."""
+    return tensor.isfinite().reshape(*shape, -1).all(-1)
