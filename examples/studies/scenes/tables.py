@@ -9,7 +9,14 @@ from statistics import fmean
 
 from studies.pages import table
 from studies.scenes.analysis import METRICS, Difference, Study, difference
-from studies.scenes.arms import ADAPTIVE, ADAPTIVE_DEFAULTS, BASELINE, DEFAULTS, arm_of
+from studies.scenes.arms import (
+    ADAPTIVE,
+    ADAPTIVE_DEFAULTS,
+    BASELINE,
+    DEFAULTS,
+    OWN_FRAME_ARM,
+    arm_of,
+)
 from studies.scenes.decisions import MANY_VIEWS_SCENES, PIECES, decide, settings_of
 from studies.scenes.records import Plain, Record, Setting
 
@@ -20,6 +27,7 @@ LABELS = {
     DEFAULTS: "the defaults",
     "paper": "the paper's preset",
     "faded": "3DGS-MCMC with `Fading`",
+    OWN_FRAME_ARM: "with `OwnFrame`",
     "faded+out-of-view+averaged": "the defaults",
     ADAPTIVE: "gsplat's `DefaultStrategy`",
     "adc+annealed+faded": "with `Annealing` and `Fading`",
