@@ -7,6 +7,7 @@ import io
 import itertools
 import pickle
 import random
+import types
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +22,7 @@ from torch.nn import Parameter, ParameterDict
 from trainers import gsplat_optimizers, make_splats
 
 from opt3dgs_optim import DEFAULTS, DEFAULTS_ADC, PhaseScheduler
-from opt3dgs_optim.removed_rows import RemovedRows, were_removed
+from opt3dgs_optim.removed_rows import EDITS, RemovedRows, were_removed
 from opt3dgs_optim.runs import RunLog
 
 TOTAL, POINTS = 60, 200
@@ -272,6 +273,15 @@ def test_what_a_scene_is_told_decides(
     assert len(scene.edits) <= 1
     optimizer.param_groups[0]["params"][0] = Parameter(optimizer.param_groups[0]["params"][0][2:])
     assert watch.found([optimizer])  # the next exchange is looked at again
+
+
+@pytest.mark.parametrize("edit", EDITS)
+def test_which_edits_remove_rows(edit: str) -> None:
+    """Split takes the parents out; all others but removal keep every row that there was."""
+    watch, scene = RemovedRows(), types.SimpleNamespace(**dict.fromkeys(EDITS, len))
+    watch.listen(scene)
+    getattr(scene, edit)(NOTHING)
+    assert watch.found([]) == (edit in ("on_split", "on_remove"))
 
 
 def test_what_was_told_before_a_rewind_holds_no_more() -> None:
