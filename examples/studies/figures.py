@@ -181,13 +181,11 @@ def step_costs() -> str:
     text = []
     for path in sorted(BENCHMARK.parent.glob("step_*.json")):
         bench = json.loads(path.read_text(encoding="utf-8"))
-        sizes = list(bench["results"])
-        rows = [
-            (step, *(f"{r['ns_per_point']:.0f} (x{r['per_adam']:.2f})" for r in of))
-            for step in ROWS
-            for of in [[bench["results"][n][step] for n in sizes]]
-        ]
-        heads = ("ns per point", *(f"{int(n):,} points" for n in sizes))
+        rows = []
+        for step in ROWS:
+            found = [result[step] for result in bench["results"].values()]
+            rows.append((step, *(f"{r['ns_per_point']:.0f} (x{r['per_adam']:.2f})" for r in found)))
+        heads = ("ns per point", *(f"{int(n):,} points" for n in bench["results"]))
         text += [f"{bench['device']}, torch {bench['torch']}, {bench['date']}:", ""]
         text += [table(heads, "lr", rows), "", goal_table(bench), ""]
         text += [f"Made by `{bench['command']}`.", ""]
@@ -256,7 +254,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in args.names or MADE:
         MADE[name](args.out / name)
         print(args.out / name)
-    for page in PAGES:
+    # Not where the figures go elsewhere: whoever looks at them there changes no page.
+    for page in PAGES if args.out == FIGURES else ():
         page.write_text(tabled(page.read_text(encoding="utf-8")), encoding="utf-8")
         print(page)
     return 0
