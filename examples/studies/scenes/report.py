@@ -26,6 +26,7 @@ from studies.scenes.arms import (
     ADAPTIVE_DEFAULTS,
     BASELINE,
     DEFAULTS,
+    OWN_FRAME,
     OWN_FRAME_ARM,
     arm_of,
 )
@@ -53,6 +54,7 @@ from studies.scenes.records import (
 )
 from studies.scenes.tables import (
     arms_table,
+    costs_table,
     crowd,
     decisions_table,
     differences_table,
@@ -159,6 +161,8 @@ def appendix(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
     made["tiled"] = metrics_table(
         study, tiled, mcmc, head=lambda s: f"{s.scene}, {s.tiled} pieces, {s.iterations:,}"
     )
+    iterated = ("faded", f"{OWN_FRAME}+faded", "paper")  # averaging is a branch of the first two
+    made["costs"] = costs_table(read_costs(FOLDER / COSTS), iterated)
     made["collapse"] = falls_table(json.loads(FALLS.read_text("utf-8")))
     fixed = [s for s in study.settings() if not s.rotated]
     few = [s for s in fixed if s.scene == "brighton_beach" and s.iterations == BRIEF]

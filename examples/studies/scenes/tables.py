@@ -18,7 +18,7 @@ from studies.scenes.arms import (
     arm_of,
 )
 from studies.scenes.decisions import MANY_VIEWS_SCENES, PIECES, decide, settings_of
-from studies.scenes.records import Plain, Record, Setting
+from studies.scenes.records import Costs, Plain, Record, Setting
 
 SIZES = {"images_4": "quarter", "images_2": "half", "images": "full"}
 # How pages that are read without the list of variants name them.
@@ -102,6 +102,23 @@ def differences_table(study: Study, settings: Sequence[Setting], arms: Iterable[
     names, metrics = ("variant", "compared with"), ("PSNR", "SSIM", "LPIPS")
     heads = (*names, "scenes, trainings", *metrics, "time of an iteration, ratio", "by the rule")
     return table(heads, "lllrrrrl", rows)
+
+
+def costs_table(costs: Costs, arms: Sequence[str]) -> str:
+    """One line per kind of training: the time of an iteration of each arm, as the baseline's share.
+
+    `arms` are shown as far as they were measured anywhere.
+    """
+    shown = [arm for arm in arms if any(key[-1] == arm for key in costs)]
+    rows = []
+    for scene, size, iterations, pieces, degree in sorted({key[:-1] for key in costs}):
+        found = [costs.get((scene, size, iterations, pieces, degree, arm)) for arm in shown]
+        about = f"{SIZES[size]}{f', degree {degree}' * (degree > 0)}"
+        about += f", {pieces} pieces" * (pieces > 0)
+        cells = ["-" if share is None else f"{share:.2f}" for share in found]
+        if any(share is not None for share in found):
+            rows.append((scene, about, f"{iterations:,}", *cells))
+    return table(("scene", "images", "iterations", *map(label, shown)), "llr", rows)
 
 
 def cells_of(found: Difference) -> list[str]:
