@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from oracles import adam_steps
+from simulated_device import SimulatedDevice
 from torch import Tensor
 from trainers import gaussians
 
@@ -303,3 +304,75 @@ def test_options_of_a_stock_adam_are_loaded_as_torch_loads_them() -> None:
     optimizer.load_state_dict(saved)
     group = optimizer.param_groups[0]
     assert (group["lr"], group["betas"], group["eps"]) == (0.01, (0.8, 0.99), 1e-6)
+
+
+@pytest.mark.parametrize(
+    "path", [{}, {"foreach": True}, {"fused": False, "foreach": False}], ids=str
+)
+def test_every_step_on_a_device_has_the_nu_of_its_energy(path: dict) -> None:
+    """Paths that need a number on the host read it anew after each energy."""
+
+    def steps(device: str) -> list[float]:
+        draw, histogram = torch.Generator().manual_seed(0), EnergyHistogram(warmup=10)
+        x = torch.nn.Parameter(torch.zeros(1, device=device))
+        optimizer = AWSGLD([x], lr=1.0, betas=(0.0, 0.999), histogram=histogram, **path)
+        made = []
+        for _ in range(40):
+            x.grad = torch.ones(1, device=device)
+            histogram.observe((0.1 + 0.1 * torch.rand((), generator=draw)).to(device))
+            before = float(x.detach()[0])
+            optimizer.step()
+            made.append(before - float(x.detach()[0]))
+        return made
+
+    expected = steps("cpu")
+    assert max(expected) - min(expected) > 0.5
+    with SimulatedDevice():
+        assert steps("cuda:0") == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("made", ["noise", "a plain drift", "a histogram"])
+def test_an_energy_that_is_not_finite_skips_the_step(made: str) -> None:
+    """Whoever looks at it, noise and all; the next step, of which nothing is known, is made."""
+    options: Any = {
+        "noise": {"noise": IsotropicNoise(std=1.0)},
+        "a plain drift": {"preconditioner": "none", "noise": IsotropicNoise(std=1.0)},
+        "a histogram": {"histogram": EnergyHistogram()},
+    }[made]
+    x = torch.nn.Parameter(torch.ones(3))
+    x.grad = torch.ones(3)
+    optimizer = AWSGLD([x], lr=0.1, **options)
+    optimizer.step(lambda: torch.tensor(float("nan")))
+    assert torch.equal(x, torch.ones(3))
+    if made == "a histogram":
+        options["histogram"].observe(0.5)
+    optimizer.step()
+    assert not torch.equal(x, torch.ones(3))
+
+
+@pytest.mark.parametrize("schedule", ["CyclicLR", "OneCycleLR"])
+def test_schedules_that_write_betas_give_the_plain_drift_no_momentum(schedule: str) -> None:
+    x = torch.nn.Parameter(torch.zeros(1))
+    optimizer = AWSGLD([x], lr=0.1, preconditioner="none")
+    made = {"CyclicLR": {"base_lr": 0.1, "max_lr": 0.2}, "OneCycleLR": {"max_lr": 0.1}}[schedule]
+    more: Any = {"OneCycleLR": {"total_steps": 10}}.get(schedule, {})
+    rates = getattr(torch.optim.lr_scheduler, schedule)(optimizer, **made, **more)
+    for gradient in (1.0, -1.0, 1.0, -1.0):
+        group, before = optimizer.param_groups[0], x.item()
+        x.grad, written, rate = torch.tensor([gradient]), group["betas"], group["lr"]
+        optimizer.step()
+        assert (before - x.item()) / rate == pytest.approx(gradient, rel=1e-5)
+        assert group["betas"] == written != (0.0, 0.999)  # the schedule's own, for its next step
+        rates.step()
+
+
+def test_a_plain_drift_of_float16_is_refused_where_it_would_stand_still() -> None:
+    half = torch.nn.Parameter(torch.zeros(2, dtype=torch.float16))
+    with pytest.raises(ValueError, match=r"AWSGLD: a parameter of torch.float16 .* fused=True"):
+        AWSGLD([half], preconditioner="none")
+    optimizer = AWSGLD([torch.nn.Parameter(torch.zeros(2))], preconditioner="none")
+    with pytest.raises(ValueError, match="float16"):
+        optimizer.add_param_group({"params": [half]})
+    assert len(optimizer.param_groups) == 1
+    AWSGLD([half], preconditioner="none", fused=True)
+    AWSGLD([half])

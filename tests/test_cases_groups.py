@@ -217,3 +217,76 @@ def test_a_tensor_may_leave_its_group() -> None:
         adam.step()
     assert [adam.state[pose]["step"].item() for pose in poses] == [3, 6, 6]
     assert adam.state[means]["step"].item() == 6
+
+
+def sets_of_gaussians(*names: str) -> dict[str, Parameter]:
+    """Two sets of Gaussians of different sizes, by `SET#NAME`."""
+    return {
+        f"{one}#{name}": Parameter(torch.full((5, width), size if name == "scales" else 1.0))
+        for one, size in zip(names, (-1.0, -5.0), strict=True)
+        for name, width in (("means", 3), ("scales", 3), ("quats", 4))
+    }
+
+
+@pytest.mark.parametrize("named", [False, True], ids=["unnamed groups", "named groups"])
+def test_the_key_says_which_set_an_optimizer_holds(named: bool) -> None:
+    """Whatever its group is called: also after a load, which puts other groups in place."""
+    params = sets_of_gaussians("near", "far")
+    adams = {
+        key: torch.optim.Adam(
+            [{"params": [param], **({"name": key.rpartition("#")[2]} if named else {})}]
+        )
+        for key, param in params.items()
+    }
+    phases = PhaseScheduler(100, parts=[OwnFrame(rate=0.1)])
+    phases.upgrade(adams)
+    for _ in range(2):
+        for one, size in (("near", -1.0), ("far", -5.0)):
+            found = phases.gaussians_of(params[f"{one}#means"])
+            assert found["scales"] is params[f"{one}#scales"]
+            assert found["scales"][0, 0] == size
+        for adam in adams.values():
+            adam.load_state_dict(adam.state_dict())
+
+
+def test_a_key_goes_before_the_name_of_a_group() -> None:
+    p, q = Parameter(torch.ones(4, 3)), Parameter(torch.ones(4, 3))
+    adams = {
+        "means": torch.optim.Adam([{"params": [p], "name": "scales"}]),
+        "scales": torch.optim.Adam([{"params": [q], "name": "means"}]),
+    }
+    phases = PhaseScheduler(100)
+    phases.upgrade(adams)
+    assert phases.gaussians_of(p)["means"] is p
+
+
+@pytest.mark.parametrize("another", [False, True], ids=["one leaves", "and another comes"])
+def test_a_tensor_that_moves_up_in_its_group_keeps_its_own_gaussians(another: bool) -> None:
+    params = sets_of_gaussians("near", "far")
+    names = ("means", "scales", "quats")
+    adam: Any = torch.optim.Adam(
+        [{"params": [params[f"{s}#{n}"] for s in ("near", "far")], "name": n} for n in names]
+    )
+    phases = PhaseScheduler(100, parts=[OwnFrame(rate=0.1, final=1.0)])
+    phases.upgrade(adam)
+
+    def step() -> None:
+        for group in adam.param_groups:
+            for param in group["params"]:
+                param.grad = torch.ones_like(param)
+        phases.observe(0.1)
+        adam.step()
+
+    step()
+    more = sets_of_gaussians("new", "other")
+    for group in adam.param_groups:
+        name = group["name"]
+        del adam.state[group["params"][0]]
+        group["params"] = [params[f"far#{name}"]] + ([more[f"new#{name}"]] if another else [])
+    means = params["far#means"]
+    assert phases.gaussians_of(means)["scales"] is params["far#scales"]
+    before = means.detach().clone()
+    step()
+    assert float((before - means.detach()).abs().max()) == pytest.approx(
+        0.1 * 2.718281828**-5, rel=0.1
+    )

@@ -136,3 +136,18 @@ def test_before_the_first_step_there_is_nothing_to_reset() -> None:
     p, adam, _ = trained("Averaging", 0)
     adam.reset_rows(p, torch.tensor([0]))
     assert not {key for key in adam.state[p] if key not in ADAMS}
+
+
+@pytest.mark.parametrize("rows", [[1, 7], [True] * 8], ids=["indices", "a mask"])
+def test_after_an_edit_of_rows_that_left_what_parts_keep_behind(rows: Any) -> None:
+    """INRIA's edits know the two moments only; what is of the old rows is dropped, not written."""
+    p, adam, _ = trained("averaging throughout", 8)
+    state = adam.state.pop(p)
+    grown = Parameter(torch.cat([p.detach(), torch.ones(2, 3)]))
+    for key in ("exp_avg", "exp_avg_sq"):
+        state[key] = torch.cat([state[key], torch.ones(2, 3)])
+    adam.param_groups[0]["params"][0] = grown
+    adam.state[grown] = state
+    adam.reset_rows(grown, rows)
+    assert not state["exp_avg"][rows].any()
+    assert [key for key in state if "." in key] == []

@@ -11,7 +11,7 @@ import torch
 from torch.nn import Parameter
 from trainers import gsplat_optimizers, make_splats, state_of, step_all, train
 
-from opt3dgs_optim import Annealing, Averaging, Fading, PhaseScheduler
+from opt3dgs_optim import Annealing, Averaging, EnergyHistogram, Fading, PhaseScheduler
 from opt3dgs_optim.names import GAUSSIAN
 
 TOTAL = 1000
@@ -317,3 +317,100 @@ def test_one_part_twice_is_refused() -> None:
     part = Fading()
     with pytest.raises(ValueError, match="twice"):
         PhaseScheduler(TOTAL, parts=[part, part])
+
+
+def test_two_models_that_are_upgraded_by_two_calls() -> None:
+    """Parts would take the Gaussians of the one for those of the other."""
+    one, two = make_splats(seed=0), make_splats(seed=1)
+    phases = PhaseScheduler(TOTAL, parts=[Fading()])
+    adams = [phases.upgrade(gsplat_optimizers(splats)) for splats in (one, two)]
+
+    def together() -> None:
+        for _ in range(5):
+            iterate_once(phases, [one, two], adams)
+
+    (message,) = said(together)
+    assert "two optimizers that were upgraded by different calls hold" in message
+    assert "as a dict whose keys say which set they belong to" in message
+
+
+def test_an_optimizer_that_is_made_anew_while_the_old_one_lives_on() -> None:
+    splats = make_splats()
+    phases = PhaseScheduler(TOTAL, parts=[Fading()])
+    old = phases.upgrade(gsplat_optimizers(splats))
+
+    def anew() -> None:
+        iterate_once(phases, [splats], [old])
+        made = phases.upgrade(gsplat_optimizers(splats))
+        for _ in range(5):
+            iterate_once(phases, [splats], [made])
+
+    assert said(anew) == []
+
+
+def iterate_once(phases: Any, models: list[Any], optimizers: list[Any]) -> None:
+    for splats in models:
+        for param in splats.values():
+            param.grad = torch.ones_like(param)
+    phases.observe(0.1)
+    for each in optimizers:
+        step_all(each)
+
+
+def test_a_closure_that_every_optimizer_is_given_is_one_iteration() -> None:
+    splats, phases, optimizers = begun()
+
+    def closure() -> torch.Tensor:
+        loss = torch.stack([param.square().sum() for param in splats.values()]).sum()
+        for param in splats.values():
+            param.grad = None
+        loss.backward()
+        return loss
+
+    for _ in range(7):
+        for adam in optimizers.values():
+            adam.step(closure)
+    assert phases.iteration == 7
+    for param in splats.values():  # and the loss that is observed by hand is not counted twice
+        param.grad = torch.ones_like(param)
+    phases.observe(0.1)
+    for adam in list(optimizers.values())[1:]:
+        adam.step(closure)
+    assert phases.iteration == 8
+
+
+@pytest.mark.parametrize(
+    "loss", [torch.ones(4), None, torch.tensor(1j), "0.1", torch.ones(0)], ids=str
+)
+def test_a_loss_that_is_no_number_changes_nothing(loss: Any) -> None:
+    _, phases, _ = begun()
+    phases.observe(0.1)
+    with pytest.raises(ValueError, match=r"PhaseScheduler.observe: loss=.*one real number"):
+        phases.observe(loss)
+    assert phases.iteration == 1
+
+
+def test_a_loss_is_a_number_of_32_bits_whatever_torchs_default_is() -> None:
+    def multiplier() -> float:
+        histogram = EnergyHistogram(warmup=5)
+        phases = PhaseScheduler(TOTAL, parts=[histogram])
+        for i in range(18):  # before it is said that nothing was upgraded
+            phases.observe(0.5 + 1e-3 * (i % 7))
+        return float(histogram.multiplier)
+
+    expected = multiplier()
+    torch.set_default_dtype(torch.bfloat16)
+    try:
+        assert multiplier() == expected != 1.0
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+def test_parts_that_an_adaptive_run_did_not_need_are_on_in_one_that_is_not() -> None:
+    _, phases, _ = begun()
+    phases.switched_off = {"Fading": "no use"}
+    state = phases.state_dict()
+    for adaptive, off in ((True, ["Fading"]), (False, [])):
+        other = PhaseScheduler(TOTAL, parts=[Fading(), Averaging()], adaptive=adaptive)
+        other.load_state_dict(state)
+        assert [*other.switched_off] == off

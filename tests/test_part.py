@@ -23,7 +23,16 @@ from trainers import (
 )
 
 import opt3dgs_optim
-from opt3dgs_optim import Annealing, Kept, Part, Phase, PhaseScheduler, RunLog
+from opt3dgs_optim import (
+    Annealing,
+    Curvature,
+    Kept,
+    OwnFrame,
+    Part,
+    Phase,
+    PhaseScheduler,
+    RunLog,
+)
 from opt3dgs_optim.names import GAUSSIAN
 from opt3dgs_optim.runs.log import RESERVED
 
@@ -306,3 +315,101 @@ def test_the_core_knows_no_part() -> None:
     ):
         text = (SOURCE / f"{name}.py").read_text()
         assert "opt3dgs_optim.parts" not in text, name
+
+
+def test_a_dropped_step_of_several_parameters_leaves_shared_numbers_alone() -> None:
+    """One number for all of an optimizer's parameters, each of which has counted in it."""
+
+    class Count(Part):
+        keeps = (Kept("all", per="training"), Kept("own", per="parameter"))
+
+        def before(
+            self, group: Any, param: Tensor, grad: Tensor, state: Any, course: Any
+        ) -> Tensor:
+            state["all"] += 1
+            state["own"] += 1
+            return grad
+
+        def after(self, group: Any, param: Tensor, state: Any, course: Any) -> None:
+            state["all"] += 10
+
+    splats = make_splats()
+    phases = PhaseScheduler(TOTAL, parts=[Count()])
+    optimizer = phases.upgrade(inria_optimizer(splats))
+    counted = []
+    for loss in (0.1, float("nan"), 0.1):
+        for param in splats.values():
+            param.grad = torch.ones_like(param)
+        phases.observe(loss)
+        optimizer.step()
+        counted.append(float(phases.kept_numbers["Count.all"]) / len(splats))
+    assert counted == [11, 11, 22]
+
+
+@pytest.mark.parametrize(
+    ("attributes", "said"),
+    [
+        ({"during": "exploration"}, "during='exploration', but a Phase or None"),
+        ({"names": ("xyz",)}, r"names=\('xyz',\), but None or a tuple of gsplat's names"),
+        ({"names": "means"}, "names='means', but"),
+        ({"keeps": Kept("n")}, "keeps=.*, but a tuple of Kept is needed"),
+    ],
+    ids=str,
+)
+def test_what_a_part_says_of_itself_is_checked(attributes: dict[str, Any], said: str) -> None:
+    part = type("Own", (Part,), attributes)()
+    with pytest.raises(ValueError, match=f"PhaseScheduler: Own.*{said}"):
+        PhaseScheduler(TOTAL, parts=[part])
+
+
+def test_how_often_something_is_kept_is_checked() -> None:
+    with pytest.raises(ValueError, match="Kept: per='point', but 'row' or"):
+        Kept("n", per="point")  # pyright: ignore[reportArgumentType]
+
+
+def test_one_part_alone_is_no_list_of_parts() -> None:
+    with pytest.raises(TypeError, match=r"parts=Annealing.*, but a list of parts is needed"):
+        PhaseScheduler(TOTAL, parts=Annealing())  # pyright: ignore[reportArgumentType]
+
+
+def test_a_window_holds_for_energies_and_the_photometric_term() -> None:
+    class Late(Part):
+        def __init__(self) -> None:
+            self.observed: list[int] = []
+
+        def window(self, course: Any) -> tuple[int, int]:
+            return 5, 8
+
+        def observe(self, energy: Tensor, valid: Any, course: Any) -> None:
+            self.observed.append(course.current)
+
+        def pixel_loss(self, error: Tensor) -> Tensor:
+            return error.sum() * 7
+
+    part = Late()
+    phases = PhaseScheduler(12, parts=[part])
+    losses = []
+    for _ in range(12):
+        losses.append(phases.pixel_loss(torch.ones(1), torch.zeros(1)).item())
+        phases.observe(0.1)
+    assert part.observed == [5, 6, 7]
+    assert losses == [7.0 if i in part.observed else 1.0 for i in range(12)]
+
+
+def test_a_part_that_needs_the_parameters_units_comes_first() -> None:
+    """A pair of the positions' difference in the world and gradients in the own frame is none."""
+    with pytest.raises(ValueError, match=r"Curvature after OwnFrame.*Curvature must come first"):
+        PhaseScheduler(TOTAL, parts=[OwnFrame(), Curvature()])
+    PhaseScheduler(TOTAL, parts=[Curvature(), OwnFrame()])
+    PhaseScheduler(TOTAL, parts=[OwnFrame(), Curvature(names=("scales",))])
+
+
+def test_a_part_whose_words_fail_upgrades_nothing() -> None:
+    class Mute(Annealing):
+        def __repr__(self) -> str:
+            raise RuntimeError("no words")
+
+    adam = torch.optim.Adam([{"params": [Parameter(torch.ones(2, 3))], "name": "means"}])
+    with pytest.raises(RuntimeError, match="no words"):
+        PhaseScheduler(TOTAL, parts=[Mute()]).upgrade(adam)
+    assert type(adam) is torch.optim.Adam

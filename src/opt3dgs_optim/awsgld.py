@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Literal
 
+import torch
 from torch import Tensor
 
 from opt3dgs_optim.checks import check_choice, warn_user
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import gaussian_of
-from opt3dgs_optim.overrides import AdamOptions
+from opt3dgs_optim.overrides import AdamOptions, TemporaryOverrides
 from opt3dgs_optim.part import Group, Part
 from opt3dgs_optim.parts.histogram import EnergyHistogram
 from opt3dgs_optim.parts.noise import IsotropicNoise, PositionNoise
@@ -120,6 +121,14 @@ class AWSGLD(StepAdam):
         if self.defaults["eps"] == PLAIN_EPS:
             group = self.param_groups[-1]
             group.update(betas=(0.0, group["betas"][1]), eps=PLAIN_EPS)
+            for param in group["params"]:
+                if param.dtype == torch.float16 and not group["fused"]:
+                    self.param_groups.pop()
+                    raise ValueError(
+                        "AWSGLD: a parameter of torch.float16 with preconditioner='none', which "
+                        "needs numbers up to 1e15; torch.float32, torch.bfloat16 or fused=True is "
+                        "needed"
+                    )
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """As torch's; but `preconditioner` stays, whichever the checkpoint was made with.
@@ -145,6 +154,14 @@ class AWSGLD(StepAdam):
                 f"by Adam; here it stays {name!r}, with the betas and eps that belong to it"
             )
 
+    def _step(self, mask: Tensor | None, acting: bool) -> None:
+        with TemporaryOverrides() as temporary:
+            if self.defaults["eps"] == PLAIN_EPS:
+                # torch's CyclicLR and OneCycleLR write betas, and the drift would get momentum.
+                for group in self.param_groups:
+                    temporary.item(group, "betas", (0.0, group["betas"][1]))
+            super()._step(mask, acting)
+
     def acts_on(self, part: Part, group: Group) -> bool:
         """All parts on all groups, but the positions' noise on positions."""
         if isinstance(part, PositionNoise):
@@ -159,13 +176,14 @@ class AWSGLD(StepAdam):
 class _ObservedCourse(Course):
     """A course without a clock whose energies a histogram is told."""
 
-    def stepping(self, closure_value: Any) -> bool:
-        self.steps += 1
+    def stepping(self, closure_value: Any, optimizer: StepAdam) -> bool:
         histogram = self.part(EnergyHistogram)
         if histogram is None:
-            return True
+            return super().stepping(closure_value, optimizer)
+        self.steps += 1
         if closure_value is not None:
             histogram.observe(closure_value)
+        self.num_observed = histogram.num_observed
         if self.steps == 1 and histogram.num_observed == 0:
             warn_user(
                 "AWSGLD: no energy has been observed yet, so the multiplier is not adapted; call "

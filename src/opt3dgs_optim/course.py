@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import weakref
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Integral
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.checks import LOGGER, as_damage, check_count, check_keys, warn_user
-from opt3dgs_optim.names import gaussian_of, set_of
+from opt3dgs_optim.names import GAUSSIAN, NamedGroup, gaussian_of, set_of
 from opt3dgs_optim.part import Kept, Part, Phase, Window, overrides
 from opt3dgs_optim.state import ADAM_KEYS, check_kept_number, key_of
 
@@ -69,12 +69,17 @@ class Course:
         switch_step: int | None = None,
         adaptive: bool = False,
     ) -> None:
-        call, self._parts = type(self).__name__, tuple(parts)
+        call = type(self).__name__
+        if not isinstance(parts, Iterable):
+            raise TypeError(f"{call}: parts={parts!r}, but a list of parts is needed")
+        self._parts = tuple(parts)
         for part in self._parts:
             if not isinstance(part, Part):
                 raise TypeError(f"{call}: parts has {part!r}, but a Part is needed")
             if sum(part is other for other in self._parts) > 1:
                 raise ValueError(f"{call}: parts has {part!r} twice, but each acts once per step")
+            _check_attributes(call, part)
+        _check_units(call, self._parts)
         self.total_steps, self.switch_step = total_steps, switch_step or 0
         self._has_phases = switch_step is not None
         self.keeps_state = self._has_phases or bool(self._parts)  # for a checkpoint
@@ -92,9 +97,11 @@ class Course:
         self._numbers_read: dict[int, tuple[int, weakref.ref[Tensor], float]] = {}
         self._reported: set[str] = set()  # kinds of mistakes that were said
         self._published: dict[tuple[str, Place], tuple[int, Any]] = {}
-        self._places: dict[int, tuple[weakref.ref[Tensor], Place]] = {}  # id of a tensor -> where
+        # id of a tensor -> the group that holds it, and where it stands
+        self._places: dict[int, tuple[weakref.ref[NamedGroup], Place]] = {}
         # With what they held: a lost one is not missed where another one holds that.
         self._followers: list[tuple[weakref.ref[StepAdam], frozenset[Any]]] = []
+        self.holds_twice = False  # whether two that exist have held the same Gaussian parameter
         self._named = _by_name(self._parts)
         self.declared = {name: _declared(call, part) for name, part in self._named.items()}
         self.row_keys = tuple(
@@ -139,7 +146,8 @@ class Course:
         # Noted here, because every optimizer asks, and so that a compiled loss does not depend on
         # the iteration but at the switch.
         self.hooks = self._hooks[self.phase_of(iteration)]  # of the step that comes next
-        self.pixel_parts = self._hooks[self.phase_of(iteration + 1)]["pixel_loss"]
+        having = self._hooks[self.phase_of(iteration + 1)]["pixel_loss"]
+        self.pixel_parts = [part for part in having if self._in_window(part, iteration + 1)]
 
     @property
     def iteration(self) -> int:
@@ -195,6 +203,13 @@ class Course:
         self._windows, self._rewinds_followed = (self._current, found), self.rewinds
         return found
 
+    def _in_window(self, part: Part, iteration: int) -> bool:
+        """Whether an iteration is in the window of a part, if that has one."""
+        if not overrides(part, "window"):  # the plan knows the phases
+            return True
+        window = part.window(self)
+        return window is None or window[0] <= iteration < window[1]
+
     # -- the parts -------------------------------------------------------------------------------
 
     def part(self, kind: type[P]) -> P | None:
@@ -214,11 +229,24 @@ class Course:
     def register(self, optimizer: StepAdam) -> None:
         """Know an optimizer whose steps have these parts, for as long as somebody else holds it."""
         if optimizer not in self.followers():
-            self._followers.append((weakref.ref(optimizer), _held(optimizer)))
+            held = _held(optimizer)
+            self.holds_twice |= any(own & held for ref, own in self._followers if ref() is not None)
+            self._followers.append((weakref.ref(optimizer), held))
 
     def followers(self) -> list[StepAdam]:
         """The optimizers whose steps have these parts, the latest last."""
         return [each for ref, _ in self._followers if (each := ref()) is not None]
+
+    def stepped_together(self, iteration: int) -> str | None:
+        """A Gaussian parameter of which two optimizers have stepped one each in an iteration."""
+        seen = set[Any]()
+        for ref, held in self._followers:
+            optimizer = ref()
+            if optimizer is not None and optimizer.stepped_at == iteration:
+                if seen & held:
+                    return "#".join(filter(None, min(seen & held)))
+                seen |= held
+        return None
 
     @property
     def num_lost_followers(self) -> int:
@@ -232,14 +260,23 @@ class Course:
     def place_of(self, param: Tensor) -> Place | None:
         """Where a Gaussian parameter stands; None for any other tensor."""
         known = self._places.get(id(param))
-        if known is not None and known[0]() is param:
-            return known[1]
-        place = next((place for place, _, each in self._gaussians() if each is param), None)
-        if place is not None:
-            if len(self._places) >= MAX_CACHED_PLACES:  # of tensors that density control replaced
-                self._places.clear()
-            self._places[id(param)] = weakref.ref(param), place
-        return place
+        if known is not None and (group := known[0]()) is not None:
+            place, params = known[1], group["params"]
+            if place.number < len(params) and params[place.number] is param:
+                return place
+        for group in self._groups():
+            for number, each in enumerate(group["params"]):
+                if each is param:
+                    if len(self._places) >= MAX_CACHED_PLACES:  # of tensors that were replaced
+                        self._places.clear()
+                    place = Place(group.set_name, number)
+                    self._places[id(param)] = weakref.ref(group), place
+                    return place
+        return None
+
+    def forget_places(self) -> None:
+        """Look anew for where parameters stand: groups were exchanged."""
+        self._places.clear()
 
     def gaussians_of(self, param: Tensor) -> dict[str, Tensor]:
         """The present tensors of the set of Gaussians that a parameter belongs to.
@@ -268,13 +305,16 @@ class Course:
         found = (each.record_of(param) for each in self.followers())
         return next((record.numbers.get(key) for record in found if record is not None), None)
 
-    def _gaussians(self) -> Iterator[tuple[Place, str, Tensor]]:
+    def _groups(self) -> Iterator[NamedGroup]:
         for optimizer in self.followers():
             for group in optimizer.param_groups:
-                name = gaussian_of(group)
-                if name is not None:
-                    for index, param in enumerate(group["params"]):
-                        yield Place(set_of(group), index), name, param
+                if isinstance(group, NamedGroup) and group.gaussian is not None:
+                    yield group
+
+    def _gaussians(self) -> Iterator[tuple[Place, str, Tensor]]:
+        for group in self._groups():
+            for number, param in enumerate(group["params"]):
+                yield Place(group.set_name, number), group["gaussian"], param
 
     def publish(self, name: str, param: Tensor, value: Any) -> None:
         """Tell other parts something about the set of Gaussians that a parameter belongs to.
@@ -322,15 +362,18 @@ class Course:
         is_finite = math.isfinite if energy.device.type == "cpu" else torch.isfinite
         self.valid = is_finite(energy)
         for part in self.hooks["observe"]:
-            part.observe(energy, self.valid, self)
+            if self._in_window(part, self.current):
+                part.observe(energy, self.valid, self)
 
-    def stepping(self, closure_value: Any) -> bool:
+    def stepping(self, closure_value: Any, optimizer: StepAdam) -> bool:
         """Called at the begin of every step of every optimizer: whether the parts act.
 
         `closure_value` is the loss that a closure has returned, or None.
         """
         self.steps += 1
-        if closure_value is not None:
+        if closure_value is None:
+            self.valid = True  # of this step nothing is known
+        else:
             self.current += 1
             self.take(torch.as_tensor(closure_value).detach().reshape(()))
         return True
@@ -531,6 +574,33 @@ def check_format(call: str, value: Any) -> None:
     whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not whole or value not in READABLE_FORMATS:
         raise ValueError(f"{call}: format={value!r}, but one of {READABLE_FORMATS} is needed")
+
+
+def _check_attributes(call: str, part: Part) -> None:
+    """ValueError unless a part's class says in a known way when and on what it acts."""
+    kind, names, during = type(part).__name__, part.names, part.during
+    if not (isinstance(part.keeps, (tuple, list)) and all(isinstance(k, Kept) for k in part.keeps)):
+        raise ValueError(f"{call}: {kind}.keeps={part.keeps!r}, but a tuple of Kept is needed")
+    if during is not None and not isinstance(during, Phase):
+        raise ValueError(f"{call}: {kind}.during={during!r}, but a Phase or None is needed")
+    if names is not None and not (isinstance(names, (tuple, list)) and {*names} <= {*GAUSSIAN}):
+        raise ValueError(
+            f"{call}: {kind}.names={names!r}, but None or a tuple of gsplat's names is needed: "
+            f"{', '.join(GAUSSIAN)}"
+        )
+
+
+def _check_units(call: str, parts: Sequence[Part]) -> None:
+    """ValueError where a part that needs the parameter's own units comes after one with others."""
+    for i, part in enumerate(parts):
+        for before in parts[:i]:
+            shared = part.names is None or before.names is None or {*part.names} & {*before.names}
+            if part.needs_units and before.own_units and shared:
+                late, early = type(part).__name__, type(before).__name__
+                raise ValueError(
+                    f"{call}: parts has {late} after {early}, which feeds gradients in units of "
+                    f"its own, but {late} needs those of the parameter; {late} must come first"
+                )
 
 
 def _declared(call: str, part: Part) -> dict[str, Kept]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import torch
 from torch import Tensor
 
+from opt3dgs_optim.checks import check_choice
 from opt3dgs_optim.names import GAUSSIAN
 
 if TYPE_CHECKING:
@@ -38,7 +39,8 @@ class Kept:
         shape: per row, the dimensions after the first, or a function of the parameter [N, ..] that
             gives them; None: those of the parameter itself.
         dtype: of what is kept. A floating one is never narrower than the parameter's: what belongs
-            to float64 positions is kept in float64.
+            to float64 positions is kept in float64. What has a number for each of the parameter's
+            is complex where that is.
         initial: the value of a number before it is written. Rows begin as zeros, because trainers
             that add points append zero rows: an all-zero row must mean "nothing yet".
     """
@@ -48,6 +50,10 @@ class Kept:
     shape: tuple[int, ...] | Callable[[Tensor], tuple[int, ...]] | None = None
     dtype: torch.dtype = torch.float32
     initial: float = 0.0
+
+    def __post_init__(self) -> None:
+        """ValueError where `per` is none of the three."""
+        check_choice("Kept", "per", self.per, ("row", "parameter", "training"))
 
     def shape_for(self, param: Tensor) -> tuple[int, ...]:
         """The whole shape of what is kept of a parameter [N, ..]."""
@@ -60,9 +66,14 @@ class Kept:
 
     def dtype_for(self, param: Tensor) -> torch.dtype:
         """The dtype of what is kept of a parameter."""
-        if self.dtype.is_floating_point and param.dtype == torch.float64:
-            return torch.float64
-        return self.dtype
+        wide = param.dtype in (torch.float64, torch.complex128)
+        if self.dtype.is_floating_point and param.is_complex() and self.is_like(param):
+            return torch.complex128 if wide else torch.complex64
+        return torch.float64 if self.dtype.is_floating_point and wide else self.dtype
+
+    def is_like(self, param: Tensor) -> bool:
+        """Whether it has a number for each number of a parameter."""
+        return self.per == "row" and self.shape is None
 
     def make(self, param: Tensor) -> Tensor:
         """The initial value for a parameter, on its device."""
@@ -102,10 +113,13 @@ class Part:
         own_units: whether `before` feeds Adam a gradient in other units than the parameter's. Then
             Adam's moments are in these units, too, and begin anew where the part begins to act on
             a parameter or ends, in a checkpoint of the stock trainer, say.
+        needs_units: whether `before` needs a gradient in the parameter's own units. Then the part
+            cannot come after one that has other units.
     """
 
     during: ClassVar[Phase | None] = None
     own_units: ClassVar[bool] = False
+    needs_units: ClassVar[bool] = False
     keeps: tuple[Kept, ...] = ()
     names: Any = GAUSSIAN  # tuple[str, ...] | None
 

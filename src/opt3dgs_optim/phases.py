@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from numbers import Integral
+from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import torch
@@ -28,6 +28,7 @@ from opt3dgs_optim.upgrading import say, upgrade
 
 if TYPE_CHECKING:
     from opt3dgs_optim.runs import RunLog
+    from opt3dgs_optim.stepadam import StepAdam
 
 CALL = "PhaseScheduler"
 # How long a trainer may do something by design before it is taken for a mistake.
@@ -197,6 +198,7 @@ class PhaseScheduler(Course):
             iteration: the trainer's own count from 0, where it may differ from the number of
                 calls: in a training that goes on from a checkpoint of the stock trainer, say.
         """
+        value = _as_energy(loss)
         if iteration is not None:
             iteration = check_count(f"{CALL}.observe", "iteration", iteration, 0)
             if iteration < self.current:  # what is kept for a time begins anew
@@ -207,8 +209,6 @@ class PhaseScheduler(Course):
         self.current = self.iteration if iteration is None else iteration
         self._watch_clock(before)
         self._watch_rows()
-        value = loss if isinstance(loss, Tensor) else torch.tensor(float(loss))
-        value = value.detach().reshape(()) if value.dim() else value.detach()
         self.take(value if self._over_ranks is None else self._over_ranks(value))
         self._watch_losses()
         if self.log is not None:
@@ -238,9 +238,13 @@ class PhaseScheduler(Course):
         """The part whose photometric term holds for the iteration whose loss comes next."""
         return self.pixel_parts[-1] if self.pixel_parts else None
 
-    def stepping(self, closure_value: Any) -> bool:
-        """As `Course.stepping`; before the first energy the steps are plain Adam's."""
-        if closure_value is not None:
+    def stepping(self, closure_value: Any, optimizer: StepAdam) -> bool:
+        """As `Course.stepping`; before the first energy the steps are plain Adam's.
+
+        Of several optimizers that are given a closure, the one that has stepped in the present
+        iteration begins the next one.
+        """
+        if closure_value is not None and optimizer.stepped_at == self.current:
             self.observe(closure_value)
         self.steps += 1
         if not self._has_moved_gaussians:  # in a warm-up of rates that begin at 0, say
@@ -269,6 +273,14 @@ class PhaseScheduler(Course):
             before: the iteration of the energy before this one, whose steps have been made.
         """
         adam_steps, self._adam_steps = self._adam_steps, None
+        if self.holds_twice and (name := self.stepped_together(before)) is not None:
+            self._report(
+                "twice",
+                f"two optimizers that were upgraded by different calls hold {name!r} and step in "
+                "the same iteration: parts take the Gaussians of one of them for those of both; "
+                "upgrade them in one call, as a dict whose keys say which set they belong to, "
+                f"such as 'first#{name}' and 'second#{name}'",
+            )
         if self._gaussians_have_moved_since(before):
             self._has_moved_gaussians, self._iterations_without_step = True, 0
         patience = LONG_PATIENCE if self.steps else PATIENCE
@@ -390,11 +402,19 @@ class PhaseScheduler(Course):
         return super().state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """As `Course.load_state_dict`; parts that the user has chosen are not off for removal."""
+        """As `Course.load_state_dict`; what nobody would switch on again is not off.
+
+        Those are parts that the user has chosen, for removal, and parts that an adaptive run did
+        not need, in one that is not adaptive.
+        """
         super().load_state_dict(state)
         self._removed_rows.forget()
-        if self._chosen and REMOVAL in self.switched_off.values():
-            left = {name: why for name, why in self.switched_off.items() if why != REMOVAL}
+        left = {
+            name: why
+            for name, why in self.switched_off.items()
+            if (not self._chosen if why == REMOVAL else self.adaptive)
+        }
+        if left != self.switched_off:
             self.switched_off = left
             self._plan()
 
@@ -429,6 +449,19 @@ class PhaseScheduler(Course):
             off = self.switched_off.get(name)
             lines.append(str(part) + ("" if off is None else f": switched off, {off}"))
         return block(CALL, lines)
+
+
+def _as_energy(loss: Any) -> Tensor:
+    """A loss as a detached tensor, 0-d; ValueError where it is no single real number."""
+    if isinstance(loss, Tensor):
+        if loss.numel() == 1 and not loss.is_complex():
+            return loss.detach().reshape(()) if loss.dim() else loss.detach()
+        got = f"a tensor of shape {tuple(loss.shape)} and {loss.dtype}"
+    elif isinstance(loss, Real):  # numpy's scalars, too
+        return torch.tensor(float(loss), dtype=torch.float32)
+    else:
+        got = repr(loss)
+    raise ValueError(f"{CALL}.observe: loss={got}, but one real number is needed")
 
 
 class RankMean:

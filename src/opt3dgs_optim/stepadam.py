@@ -113,10 +113,10 @@ class StepAdam(Adam):
             self._name_groups()
 
     def _name_groups(self) -> None:
-        """Know what each group holds; of those that came or were exchanged their names say it.
+        """Know what each group holds: what was said of it, or else what its name says.
 
         A group that takes the place of another goes on with what was kept for that one. It is the
-        one of its name, or else the one that stood where it stands.
+        one that stood where it stands, if that had the same name, or else the one of its name.
         """
         groups = self.param_groups
         if len(groups) == len(self._known):
@@ -130,17 +130,18 @@ class StepAdam(Adam):
             if type(group) is NamedGroup:
                 continue
             slot = split_name(group.get("name"))
-            heir = next((o for o in gone if slot[1] and (o.set_name, o.gaussian) == slot), None)
-            if slot[1] is None:
-                place = self._known[i] if i < len(self._known) else None
-                heir = next((old for old in gone if old is place), None)
-                if heir is not None:
-                    slot = heir.set_name, heir.gaussian
-                elif i < len(self._slots):
-                    slot = self._slots[i]
+            place = self._known[i] if i < len(self._known) else None
+            heir = next((old for old in gone if old is place), None)
+            if heir and (slot[1] is None or slot == split_name(heir.get("name"))):
+                slot = heir.set_name, heir.gaussian
+            elif i < len(self._slots):
+                slot, heir = self._slots[i], None
+            else:
+                heir = next((o for o in gone if slot[1] and (o.set_name, o.gaussian) == slot), None)
             groups[i] = NamedGroup(group, *slot, () if heir is None else heir.records)
             gone = [old for old in gone if old is not heir]
             self._acting = (None, None, {})
+            self.course.forget_places()
             if self._known and heir is None:
                 taken = slot[1] or "left alone"
                 LOGGER.info("a group was added: %s, %s", group_name(i, group), taken)
@@ -187,7 +188,6 @@ class StepAdam(Adam):
             ValueError: several masks, or one that fits no parameter with a gradient.
             RuntimeError: a CUDA graph is being captured, and there are parts.
         """
-        self.stepped_at = self.course.current
         self._opt_called = True  # what learning-rate schedulers would note by wrapping this method
         refuse_capture(self)
         masks: list[Any] = [each for each in (visible, visibility) if each is not None]
@@ -202,7 +202,8 @@ class StepAdam(Adam):
             # torch's distributed checkpoints make a step of length zero, to have Adam's moments.
             begun = not self.course.needs_energies or self.course.num_observed > 0
             idle = not begun and loss is None and self._is_held()
-            acting = not idle and self.course.stepping(loss)
+            acting = not idle and self.course.stepping(loss, self)
+            self.stepped_at = self.course.current
             if mask is None and not self.course.parts:
                 self._step_base(None)
             else:
@@ -268,6 +269,11 @@ class StepAdam(Adam):
                 self._step_base(mask)
         for moving in step.moving:
             self._finish(moving, course)
+        # What a part keeps for several parameters: the first of them has saved what it was.
+        for moving in reversed(step.moving):
+            if moving.guarded and moving.parts.any:
+                moving.state.settle(moving.rows, moving.counts)
+            self._ownership.claim(moving.param, moving.state.adam, course.row_keys)
 
     def _parts_of(self, group: Group) -> ActingParts:
         """The parts that act on a group in this step; sought when they change."""
@@ -426,9 +432,6 @@ class StepAdam(Adam):
             if before is not None:
                 # .data: no write that a part should notice by the version counter.
                 param.data.copy_(moving.where_it_moves(param.data, before))
-        if moving.guarded and parts.any:
-            view.settle(moving.rows, moving.counts)
-        self._ownership.claim(param, view.adam, course.row_keys)
 
     def _zero_nonfinite(self, param: Tensor) -> None:
         """Take what is not finite in a gradient as zero, and say so once."""
@@ -497,6 +500,7 @@ class StepAdam(Adam):
         if not any(param is each for group in self.param_groups for each in group["params"]):
             raise ValueError(f"{call}: a parameter of shape {tuple(param.shape)} is none of these")
         index, state = check_rows(call, rows, param), self.state.get(param, {})
+        self._ownership.drop_foreign(param, state, self.course.row_keys)
         for key in (*MOMENTS, *self.course.row_keys):
             if key in state:
                 state[key][index] = 0

@@ -78,9 +78,9 @@ def upgrade(optimizers: Any, course: Course) -> int:
             f"{CALL}: none of the names {left} is a Gaussian parameter's; allowed are "
             f"{', '.join(names)}"
         )
+    parts = ", ".join(str(part) for part in course.parts) or "none"  # a part's own words may fail
     _warn_of_unknown(unknown, known_rows)
     _carry_out(plans, course)
-    parts = ", ".join(str(part) for part in course.parts) or "none"
     others = f"; left alone: {', '.join(left)}" if left else ""
     again = f" from iteration {course.iteration}" if course.iteration else ""
     say(

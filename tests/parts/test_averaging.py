@@ -26,7 +26,7 @@ from trainers import (
     values_of,
 )
 
-from opt3dgs_optim import Averaging
+from opt3dgs_optim import Averaging, PhaseScheduler
 
 TOTAL = 60
 FIRST = 45  # the first iteration of the last quarter, whose iterates are averaged
@@ -232,3 +232,23 @@ def test_it_takes_its_memory_only_in_the_end() -> None:
     state = [set(each.state[p]) for each in every_one(optimizers) for p in each.state]
     assert all(keys == {"step", "exp_avg", "exp_avg_sq"} for keys in state)
     assert len(state) == len(make_splats())
+
+
+@pytest.mark.parametrize("finite", [True, False], ids=["finite", "with a NaN"])
+def test_complex_parameters_are_averaged_with_both_their_parts(finite: bool) -> None:
+    real, ours = Parameter(torch.zeros(4, 2)), Parameter(torch.zeros(4, dtype=torch.complex64))
+    with torch.no_grad():
+        if not finite:
+            real[1], ours[1] = float("nan"), complex("nan")
+    adams = {"means": torch.optim.Adam([ours]), "scales": torch.optim.Adam([real])}
+    phases = PhaseScheduler(60, parts=[Averaging()])
+    phases.upgrade(adams)
+    draw = torch.Generator().manual_seed(0)
+    for _ in range(60):
+        real.grad = torch.randn(4, 2, generator=draw)
+        ours.grad = torch.view_as_complex(real.grad)
+        phases.observe(0.1)
+        for adam in adams.values():
+            adam.step()
+    rows = [0, 2, 3]  # torch's own complex step makes a NaN of both parts
+    assert torch.equal(torch.view_as_real(ours.detach())[rows], real.detach()[rows])

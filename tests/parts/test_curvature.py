@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import devices
@@ -96,7 +97,8 @@ def test_what_it_has_counted_is_in_checkpoints() -> None:
     one, other = Curvature(), Curvature()
     one.load_state_dict({"seen": [3.0, 4.0, 0.5, 2.0], "probes": 6})
     other.load_state_dict(one.state_dict())
-    assert other.state_dict() == {"seen": [3.0, 4.0, 0.5, 2.0], "probes": 6}
+    counted = {"history_size": 5, "seen": [3.0, 4.0, 0.5, 2.0], "probes": 6}
+    assert other.state_dict() == counted
 
 
 @pytest.mark.parametrize(
@@ -143,3 +145,26 @@ def test_a_step_that_the_device_drops_leaves_no_pair(monkeypatch: Any) -> None:
         phases.observe(loss)
         means.step()
     assert torch.equal(means.state[x]["Curvature.history"], before)
+
+
+@pytest.mark.parametrize(("saved", "ours"), [(3, 4), (4, 3), (3, 5), (5, 3)])
+def test_pairs_of_another_history_are_refused(saved: int, ours: int) -> None:
+    """Of three coordinates, three pairs take as much room as four: the shape does not tell."""
+
+    def trained(history_size: int, steps: int) -> tuple[Parameter, LQNAdam]:
+        x = Parameter(torch.arange(12.0).reshape(4, 3))
+        optimizer = LQNAdam([x], lr=0.1, history_size=history_size)
+        for _ in range(steps):
+            x.grad = x.detach() * torch.tensor([1.0, 2.0, 3.0])
+            optimizer.step()
+        return x, optimizer
+
+    state = trained(saved, 6)[1].state_dict()
+    x, optimizer = trained(ours, 2)
+    before = copy.deepcopy(optimizer.state_dict())
+    with pytest.raises(ValueError, match=r"history_size=|shape"):
+        optimizer.load_state_dict(state)
+    now = optimizer.state_dict()
+    assert now["param_groups"] == before["param_groups"]
+    for key, value in before["state"][0].items():
+        assert torch.equal(optimizer.state[x][key], value), key

@@ -254,3 +254,8 @@ def test_a_trainers_noise_is_fine_where_ours_is_off() -> None:
         train(splats, optimizers, phases, iteration, iteration + 1)
         with torch.no_grad():
             splats["means"].add_(0.01)
+
+
+def test_the_phase_is_checked() -> None:
+    with pytest.raises(ValueError, match="PositionNoise: during='exploration', but None or"):
+        PositionNoise(during="exploration")  # pyright: ignore[reportArgumentType]

@@ -47,7 +47,7 @@ def set_share(optimizers: Any, share: float) -> None:
 def hook(phases: Any, optimizer: Any, param: torch.Tensor, grad: torch.Tensor) -> torch.Tensor:
     """The part's `before` for a parameter in the place of the optimizer's; its second moments."""
     group, record = optimizer.param_groups[0], optimizer._records[0][0]
-    group["params"] = [param]
+    group["params"], param.grad = [param], grad
     moments = {"exp_avg_sq": torch.zeros_like(param)}
     view = record.view(param, moments, phases.declared, phases.kept_numbers)
     phases.part(OutOfView).before(group, param, grad, view.of("OutOfView"), phases)
@@ -299,3 +299,28 @@ def test_it_acts_below_a_third(share: float, acts: bool) -> None:
     least = state_of(optimizers, splats["opacities"])["exp_avg_sq"][-1].item()
     plain = (1 - 0.999) * PULL**2
     assert (least > 2 * plain) is acts
+
+
+@pytest.mark.parametrize("fused", [False, True])
+def test_an_overflow_in_the_positions_puts_no_point_out_of_view(fused: bool) -> None:
+    """A GradScaler drops their step; that of the scales counts, with an optimizer of its own."""
+
+    def second_moments(*, overflow: bool) -> torch.Tensor:
+        splats = {name: torch.nn.Parameter(torch.zeros(POINTS, 3)) for name in ("means", "scales")}
+        phases = only(10_000, OutOfView())
+        adams = {name: torch.optim.Adam([p], fused=fused) for name, p in splats.items()}
+        phases.upgrade(adams)
+        set_share(adams, SEEN / POINTS)
+        scaler: Any = torch.amp.GradScaler("cpu", init_scale=4.0)  # pyright: ignore
+        seen = (torch.arange(POINTS) < SEEN)[:, None].float()
+        loss = sum(((param + 1) * seen).sum() for param in splats.values())
+        scaler.scale(loss).backward()
+        if overflow:
+            assert splats["means"].grad is not None
+            splats["means"].grad[0, 0] = float("inf")
+        phases.observe(0.1)
+        for adam in adams.values():
+            scaler.step(adam)
+        return state_of(adams, splats["scales"])["exp_avg_sq"]
+
+    assert torch.equal(second_moments(overflow=True), second_moments(overflow=False))

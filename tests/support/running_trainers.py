@@ -108,8 +108,8 @@ class Runner:
         runner = self
 
         class Watched(PhaseScheduler):
-            def stepping(self, closure_value: Any) -> bool:
-                acting = super().stepping(closure_value)
+            def stepping(self, closure_value: Any, optimizer: Any) -> bool:
+                acting = super().stepping(closure_value, optimizer)
                 if acting:
                     runner._scheduled = self.current, self.total_steps
                 return acting

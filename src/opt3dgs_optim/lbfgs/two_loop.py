@@ -41,7 +41,9 @@ def two_loop(
             loss per unit of the parameters.
         history: [N, slots, 2 (D + 1)], float32 or float64, as `history_from_pairs` makes it. It is
             not changed. The arithmetic is in its dtype.
-        history_size: K, the number of pairs that the history has room for, at least 1.
+        history_size: K, the number of pairs that the history has room for, at least 1. Of D
+            coordinates, the history of D pairs has the shape of one of D + 1: the shape does not
+            tell them apart.
         backend: `"auto"` takes the CUDA kernel where it can run; `"cuda"` and `"torch"` insist.
 
     Returns:

@@ -44,8 +44,9 @@ class Averaging(Part):
         start, end = self.window(course)
         count, mean = state["count"].add_(1.0), state["mean"]
         whole = param.is_cpu and is_finite_sum(param)  # a GPU would have to be waited for
-        iterate = param if whole else param.nan_to_num(0.0, 0.0, 0.0)
-        mean.lerp_(iterate.to(mean.dtype), 1.0 / broadcast_rows(count, param))
+        iterate = param if whole else torch.where(param.isfinite(), param, 0.0)
+        weight = 1.0 / broadcast_rows(count, param)
+        mean.lerp_(iterate.to(mean.dtype), weight.to(mean.dtype))
         # Trainers save before the last step, or do not make it.
         if end - course.current <= max(2, (end - start) / 10):
             param.copy_(mean if whole else torch.where(param.isfinite(), mean, param))

@@ -71,6 +71,7 @@ class Curvature(Part):
     """
 
     during = Phase.EXPLOITATION
+    needs_units = True  # a pair is a difference of positions and one of gradients
 
     def __init__(
         self,
@@ -150,7 +151,8 @@ class Curvature(Part):
 
     def state_dict(self) -> dict[str, Any]:
         """What `adaptive` judges by; the pairs are in the optimizers' state."""
-        return {"seen": self._seen.tolist(), "probes": self._probes}
+        seen = self._seen.tolist()
+        return {"history_size": self.history_size, "seen": seen, "probes": self._probes}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore `state_dict()`.
@@ -167,6 +169,13 @@ class Curvature(Part):
             low = -MAX_SEEN if i == FORESIGHT else 0.0
             check_number(call, f"seen[{i}]", number, low, MAX_SEEN)
         probes = check_count(call, "probes", state["probes"], 0)
+        # Of D coordinates, D pairs take as much room as D + 1. Earlier versions did not say.
+        size = check_count(call, "history_size", state.get("history_size", self.history_size), 1)
+        if size != self.history_size:
+            raise ValueError(
+                f"{call}: history_size={size}, but pairs of history_size={self.history_size} are "
+                "needed"
+            )
         self._seen, self._probes = torch.tensor(seen, dtype=torch.float32), probes
 
     def evidence(self, course: Course) -> Tensor:

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import check_number, set_options, warn_user
+from opt3dgs_optim.checks import check_choice, check_number, set_options, warn_user
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.frames import rotate, unit_quaternion
 from opt3dgs_optim.lbfgs.pairs import columns, put, row_chunks
@@ -54,6 +54,7 @@ class PositionNoise(Part):
     ) -> None:
         self.gaussians = gaussians
         self.scale = check_number("PositionNoise", "scale", scale, 0.0)
+        during = check_choice("PositionNoise", "during", during, (None, *Phase))
         self.during = during  # pyright: ignore[reportAttributeAccessIssue]
         self.generator = generator
         self._num_changed_by_others = 0

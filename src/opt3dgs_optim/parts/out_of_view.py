@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -48,6 +48,9 @@ class OutOfView(Part):
         if grad.dim() == 0 or grad.shape[0] == 0:
             return grad
         if gaussian_of(group) == "means":
+            # Not of what Adam is fed: that is zero where a step turns out not to count, which the
+            # other parameters' steps may do.
+            grad = cast(Tensor, param.grad)
             kept = state[SEEN_SHARE]
             kept.lerp_(_seen_share(grad).to(kept), 1 / NUM_VIEWS_AVERAGED)
             # A GPU's number is not read.
