@@ -12,6 +12,8 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
+# Every twin is a set of Gaussians of its own, of one point, and no part looks for the others.
+pytestmark = pytest.mark.filterwarnings("ignore:PhaseScheduler. two optimizers that were upgraded")
 # Float64, but the pairs' header: pairs of condition 30 amplify its rounding over some 40 steps. A
 # foreign pair shows as 1e-4 and more.
 TOLERANCE = 1e-5
