@@ -50,14 +50,14 @@ class OutOfView(Part):
         if gaussian_of(group) == "means":
             # Not of what Adam is fed: that is zero where a step turns out not to count, which the
             # other parameters' steps may do.
-            grad = cast(Tensor, param.grad)
+            own = cast(Tensor, param.grad)
             kept = state[SEEN_SHARE]
-            kept.lerp_(_seen_share(grad).to(kept), 1 / NUM_VIEWS_AVERAGED)
+            kept.lerp_(_seen_share(own).to(kept), 1 / NUM_VIEWS_AVERAGED)
             # A GPU's number is not read.
-            share: Any = kept.item() if grad.is_cpu else kept
+            share: Any = kept.item() if own.is_cpu else kept
             course.publish(SEEN_SHARE, param, share)
             if not isinstance(share, float) or share < MAX_SEEN_SHARE:
-                course.publish(OUT_OF_VIEW, param, ~_has_gradient(grad))
+                course.publish(OUT_OF_VIEW, param, ~_has_gradient(own))
             return grad
         share = course.published(SEEN_SHARE, param)
         positions: Tensor | None = None  # their gradient, where they come later
