@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
+from textwrap import indent
+
+import pytest
+
+from opt3dgs_optim.hosts import diff
 
 GSPLAT = """\
 import torch
@@ -135,3 +141,48 @@ SYNTHETIC = {
 def added(lines: str) -> list[str]:
     """The lines that a diff adds, stripped."""
     return [line[1:].strip() for line in lines.splitlines() if re.match(r"\+(?!\+\+)", line)]
+
+
+STEP = "gaussians.optimizer.step()\ngaussians.optimizer.zero_grad()"
+
+
+def short(
+    *,
+    top: str = "",
+    above: str = "",
+    over: str = "range(opt.iterations)",
+    loss: str = "loss = loss_of()",
+    backward: str = "loss.backward()",
+    step: str = STEP,
+) -> str:
+    """A trainer that `running_trainers.run` can run: a function with one loop, then its call.
+
+    Args:
+        top: lines above the function.
+        above: lines above the loop.
+        over: what the loop goes over.
+        loss: lines that begin a turn.
+        backward: lines after these.
+        step: lines that end a turn.
+    """
+    inside = f"saw(iteration, opt.iterations)\n{loss}\n{backward}\n{step}"
+    made = f"gaussians = GaussianModel()\ngaussians.training_setup(opt)\n{above}"
+    body = f"{made}\nfor iteration in {over}:\n{indent(inside, ' ' * 4)}"
+    head = f"import itertools\nimport torch\nfrom trainer import *\n\n{top}\n\n"
+    return f"{head}def training(opt):\n{indent(body, ' ' * 4)}\n\n\ntraining(opt)\n"
+
+
+def refusal_of(folder: Path, text: str) -> str:
+    """What a script is refused with; it names a line."""
+    path = folder / "train.py"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"^line \d+: .{20,}") as refused:
+        diff(path)
+    return str(refused.value)
+
+
+def lines_of(folder: Path, text: str) -> list[str]:
+    """The lines that a script gets, but for the import."""
+    path = folder / "train.py"
+    path.write_text(text)
+    return added(diff(path).diff)[1:]

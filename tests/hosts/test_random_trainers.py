@@ -28,7 +28,7 @@ from opt3dgs_optim.hosts import diff
 # With these a refusal is the only right answer: no edit would give the trainer's own clock.
 IMPOSSIBLE = {
     "body": {"micro", "retries", "sometimes", "one arm", "two losses", "closure"},
-    "step": {"every second", "named", "continues", "twice", "inner"},
+    "step": {"every second", "named", "continues", "twice", "inner", "counted", "leaves"},
     "around": {"epochs", "while"},
     "where": {"repeated method", "called twice", "called in a loop"},
 }

@@ -77,6 +77,14 @@ STEPS = {
     "twice": "gaussians.optimizer.step()\ngaussians.optimizer.step()\n",
     "finally": "try:\n    fails(0)\nfinally:\n    gaussians.optimizer.step()\n",
     "inner": "for _ in range(2):\n    gaussians.optimizer.step()\n",
+    "counted": (
+        "opt.waiting = getattr(opt, 'waiting', 0) + 1\nif opt.waiting >= 2:\n"
+        "    gaussians.optimizer.step()\n    opt.waiting = 0\n"
+    ),
+    "leaves": (
+        "gaussians.optimizer.step()\ndone = False\nif {i} + 3 >= {end}:\n    done = True\n"
+        "if done:\n    break\n"
+    ),
 }
 AROUND = {  # around the whole loop
     "nothing": "{loop}",

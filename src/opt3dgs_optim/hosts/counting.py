@@ -3,7 +3,7 @@
 import ast
 from typing import NamedTuple
 
-from opt3dgs_optim.hosts.syntax import Spot, counts_of, loops_around, refusal, values, with_values
+from opt3dgs_optim.hosts.syntax import Spot, refusal, values
 
 RANGES = ("range", "trange")
 WRAPPERS = ("tqdm", "track", "iter", "list")  # what goes over its first argument, in its order
@@ -34,7 +34,6 @@ def read_count(loop: ast.For, own: list[Spot], observed: ast.stmt, *, each_turn:
     for value in _possible_values(step, own):
         if isinstance(value, ast.UnaryOp) or (_number(value) or 1) < 0 or _number(value) == 0:
             raise refusal(loop, f"range(...) with a step of {ast.unparse(value)} counts down")
-    _check_end(loop, own)
     if _is_zero(start, own):
         for value in _possible_values(end, own):
             if _is_difference(value):
@@ -63,35 +62,6 @@ def read_count(loop: ast.For, own: list[Spot], observed: ast.stmt, *, each_turn:
     for line, _ in values(inside, count):
         raise refusal(line, f"{count}, the count of the loop, gets another value in it")
     return Count(total, count + shift)
-
-
-def _check_end(loop: ast.For, own: list[Spot]) -> None:
-    """ValueError where the loop is left at a certain count, before its range is over."""
-    inside = [spot for spot in own if loop in loops_around(spot)]
-    counts, nodes = counts_of(loop, inside), {spot.node for spot in inside}
-    for spot in inside:
-        match spot.node:
-            case ast.Break():
-                leaves = loops_around(spot)[-1] is loop
-            case ast.Return():  # an exception is no end that a training has
-                leaves = True
-            case ast.Call(called):
-                leaves = ast.unparse(called) in ("exit", "quit", "sys.exit", "os._exit")
-            case _:
-                leaves = False
-        if not leaves:
-            continue
-        for around, below in zip(spot.above, spot.chain, strict=True):
-            if not isinstance(around, ast.If) or around not in nodes or below is around.test:
-                continue
-            asked = [n for value in with_values(around.test, inside) for n in ast.walk(value)]
-            if any(isinstance(n, ast.expr) and ast.unparse(n) in counts for n in asked):
-                raise refusal(
-                    spot.line,
-                    f"the loop over {ast.unparse(loop.iter)} is left where "
-                    f"{ast.unparse(around.test)}: the number of iterations cannot be read from its "
-                    "range",
-                )
 
 
 def _possible_values(number: ast.expr, own: list[Spot]) -> list[ast.expr]:

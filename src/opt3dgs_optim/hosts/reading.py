@@ -8,32 +8,31 @@ would be worse than none.
 """
 
 import ast
-import re
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
+from opt3dgs_optim.hosts.calls import check_calls
 from opt3dgs_optim.hosts.counting import read_count
-from opt3dgs_optim.hosts.optimizers import Step, find_optimizers, read_step
+from opt3dgs_optim.hosts.endings import check_end
+from opt3dgs_optim.hosts.optimizers import find_optimizers, read_step
 from opt3dgs_optim.hosts.photometric import PixelLoss, find_pixel_loss
+from opt3dgs_optim.hosts.rhythm import check_rhythm
 from opt3dgs_optim.hosts.syntax import (
     FUNCTIONS,
     Scope,
     Spot,
     are_exclusive,
-    counts_of,
+    comes_to,
     is_reference,
     loops_around,
     refusal,
     scopes,
     spots,
     values,
-    with_values,
 )
 
 BACKWARDS = ("backward", "manual_backward")
-SOMETIMES = re.compile(r"accum|sync|micro", re.I)  # in the condition of a step of several batches
 
 
 @dataclass
@@ -86,17 +85,17 @@ def read_trainer(tree: ast.Module, folder: Path) -> Trainer:
     found_optimizers = find_optimizers(tree, own, loop, steps, folder)
     trainer.optimizers, trainer.setups, trainer.notes = found_optimizers
     main = [step for step in steps if step.optimizer == trainer.optimizers[0]]
-    _check_loops(backwards, main)
-    _check_rhythm(trainer, inside, backwards, main)
+    check_rhythm(tree, loop, inside, backwards, main)
     if not isinstance(loop, ast.For):
         raise refusal(
             loop,
             "the training loop is a `while`: the number of iterations cannot be read from it, only "
             "from a range(...)",
         )
-    _check_calls(tree, scope, trainer)
+    check_calls(tree, scope, loop, trainer.optimizers[0])
     each_turn = _is_in_each_turn(backwards, inside, loop)
     trainer.total, trainer.iteration = read_count(loop, own, found[-1], each_turn=each_turn)
+    check_end(tree, loop, inside, loss)
     trainer.scene = _scene(inside)
     trainer.pixel = find_pixel_loss(inside, loop, max(s.lineno for s in found))
     if not trainer.pixel:
@@ -214,220 +213,13 @@ def _innermost(backwards: list[Spot]) -> ast.stmt:
     return loop
 
 
-def _check_loops(backwards: list[Spot], steps: list[Step]) -> None:
-    """ValueError unless each turn of one loop has a backward and a step, and it runs once."""
-    around = loops_around(backwards[0])
-    backward = backwards[0].line
-    for step in steps:
-        if step.loops == around:
-            continue
-        line = step.spot.line
-        if step.loops == around[: len(step.loops)]:
-            raise refusal(
-                backward,
-                f"loss.backward() runs several times for one step of {step.optimizer} (line "
-                f"{line}), in the loop of line {_line(around[len(step.loops)])}: observe the mean "
-                "of its losses once, above the step",
-            )
-        raise refusal(
-            line, f"{step.optimizer} steps in another loop than loss.backward() (line {backward})"
-        )
-    if len(around) > 1:
-        raise refusal(
-            around[-1],
-            f"the training loop runs inside another loop (line {_line(around[-2])}): the "
-            "iterations of all its runs together are the schedule's, and cannot be read from one "
-            "of them",
-        )
-
-
-def _check_rhythm(
-    trainer: Trainer, inside: list[Spot], backwards: list[Spot], steps: list[Step]
-) -> None:
-    """ValueError unless each `loss.backward()` of the loop is followed by one step."""
-    last = max(spot.line for spot in backwards)
-    first = min(step.spot.line for step in steps)
-    if first < last:
-        raise refusal(
-            first, f"{steps[0].optimizer} steps above loss.backward() (line {last}), not below it"
-        )
-    for one, other in combinations([step.spot for step in steps], 2):
-        if not are_exclusive(one, other):
-            raise refusal(
-                other.line, f"{steps[0].optimizer} steps twice an iteration (line {one.line})"
-            )
-    for spot in inside:
-        skips = isinstance(spot.node, ast.Continue) and loops_around(spot)[-1] is trainer.loop
-        failed = any(isinstance(node, ast.ExceptHandler) for node in spot.above)
-        if skips and not failed and last < spot.line < first:
-            raise refusal(
-                spot.line,
-                f"`continue` between loss.backward() (line {last}) and the step (line {first}): "
-                "one step may have several of them",
-            )
-    for step in steps:
-        if not _follows(step.spot, trainer.loop, _statements(backwards)):
-            raise refusal(
-                step.spot.line,
-                f"{step.optimizer} steps also where no loss.backward() (line {last}) came before",
-            )
-        for node, below in zip(step.spot.above, step.spot.chain, strict=True):
-            if isinstance(node, ast.If) and below is not node.test and trainer.loop in step.loops:
-                _check_condition(node.test, inside, step)
-
-
-def _follows(step: Spot, loop: ast.AST, backwards: list[ast.AST]) -> bool:
-    """Whether one of the statements has run whenever a turn of the loop comes to a step."""
-    for around, below in zip(step.above, step.chain, strict=True):
-        if around is loop or loop in step.above[: step.above.index(around)]:
-            for name in ("body", "orelse", "finalbody"):
-                block: list[Any] = getattr(around, name, [])
-                before = block[: block.index(below)] if below in block else []
-                if _comes_to(before, backwards):
-                    return True
-    return False
-
-
-def _check_condition(test: ast.expr, inside: list[Spot], step: Step) -> None:
-    """ValueError where a step is made only in every so many iterations."""
-    asked = with_values(test, inside)
-    counts = counts_of(step.loops[-1], inside)
-    sometimes = SOMETIMES.search(" ".join(map(ast.unparse, asked))) is not None
-    for node in [each for value in asked for each in ast.walk(value)]:
-        match node:
-            case ast.BinOp(_, ast.Mod() | ast.FloorDiv() | ast.BitAnd()):
-                sometimes = True
-            case ast.Compare(left, [ast.Eq() | ast.In()], [right]):
-                sometimes |= bool({ast.unparse(left), ast.unparse(right)} & counts)
-            case ast.Call(_, arguments):
-                sometimes |= bool({ast.unparse(each) for each in arguments} & counts)
-    if sometimes:
-        raise refusal(
-            step.spot.line,
-            f"{step.optimizer} steps only where {ast.unparse(test)}: one step may have several "
-            "losses; observe their mean once, above the step",
-        )
-
-
-def _check_calls(
-    tree: ast.Module, scope: Scope, trainer: Trainer, seen: frozenset[Scope] = frozenset()
-) -> None:
-    """ValueError where a function that trains with optimizers of others runs more than once."""
-    if isinstance(scope, ast.Module) or _makes_optimizers(scope, trainer.optimizers[0]):
-        return
-    if scope in seen:
-        raise refusal(
-            scope,
-            f"{scope.name} trains and calls itself: the iterations of all its calls together are "
-            "the schedule's",
-        )
-    called = _calls(tree, scope)
-    what = f"{scope.name} (line {scope.lineno}) trains"
-    for spot, loops in called:
-        if loops:
-            raise refusal(
-                spot.line,
-                f"{what} and is called in a loop (line {_line(loops[-1])}): the iterations of all "
-                "its calls together are the schedule's",
-            )
-    for (one, _), (other, _) in combinations(called, 2):
-        if one.above[0] is not other.above[0] or not are_exclusive(one, other):
-            raise refusal(
-                other.line,
-                f"{what} and is called twice (line {one.line}): the iterations of both calls "
-                "together are the schedule's",
-            )
-    for spot, _ in called:
-        caller = spot.above[0]
-        if isinstance(caller, FUNCTIONS) and caller is not scope:
-            _check_calls(tree, caller, trainer, seen | {scope})
-
-
-def _calls(tree: ast.Module, function: ast.AST) -> list[tuple[Spot, list[ast.AST]]]:
-    """Where a function is called, and the loops in which that is on the same optimizers.
-
-    A method is called on `self`, or on an object that the same scope has made of its class: one
-    that is made in the loop has optimizers of its own. An object that comes from elsewhere may be
-    of the class; only `train()`, which every network has too, is not taken for the method there.
-    """
-    name = getattr(function, "name", "")
-    every = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
-    owners = {node.name for node in every if function in node.body}
-    found = []
-    for own in [[*spots(scope)] for scope in scopes(tree)]:
-        for spot in own:
-            match spot.node:
-                case ast.Call(ast.Name(known)) if known == name and not owners:
-                    found.append((spot, loops_around(spot)))
-                case ast.Call(ast.Attribute(ast.Name("self" | "cls"), known)) if known == name:
-                    found += [(spot, loops_around(spot))] if owners else []
-                case ast.Call(ast.Attribute(ast.Name(holder), known)) if known == name:
-                    given = [value for _, value in values(own, holder)]
-                    if owners and name != "train" and given in ([], [None]):
-                        found.append((spot, loops_around(spot)))
-                    for made in own:
-                        match made.node:
-                            case ast.Assign([ast.Name(given)], ast.Call(kind)) if (
-                                given == holder and ast.unparse(kind) in owners
-                            ):
-                                around = loops_around(made)
-                                loops = [n for n in loops_around(spot) if n not in around]
-                                found.append((spot, loops))
-    return found
-
-
-def _makes_optimizers(scope: ast.AST, optimizer: str) -> bool:
-    """Whether a function makes the optimizers itself, so that each call trains anew."""
-    nodes = [spot.node for spot in spots(scope)]
-    return any(
-        isinstance(node, ast.stmt) and _gives(node, optimizer, optimizer.removesuffix(".optimizer"))
-        for node in nodes
-    )
-
-
-def _gives(statement: ast.stmt, optimizer: str, owner: str) -> bool:
-    """Whether a statement makes the optimizer."""
-    match statement:
-        case ast.Assign(targets):
-            return optimizer in {ast.unparse(n) for t in targets for n in ast.walk(t)}
-        case ast.Expr(value):
-            return ast.unparse(value).startswith(f"{owner}.training_setup(")
-    return False
-
-
 def _is_in_each_turn(backwards: list[Spot], inside: list[Spot], loop: ast.For) -> bool:
     """Whether every turn of a loop comes to a `loss.backward()`."""
     first = min(spot.line for spot in backwards)
     skips = any(isinstance(spot.node, ast.Continue) and spot.line < first for spot in inside)
     fails = any(isinstance(spot.node, ast.Try) and spot.node.handlers for spot in inside)
-    return not skips and not fails and _comes_to(loop.body, _statements(backwards))
+    return not skips and not fails and comes_to(loop.body, _statements(backwards))
 
 
 def _statements(found: list[Spot]) -> list[ast.AST]:
     return [spot.above[-1] for spot in found]
-
-
-def _comes_to(block: list[ast.stmt], targets: list[ast.AST]) -> bool:
-    """Whether statements that run to their end run one of the targets, whatever branches they take.
-
-    A `try` whose handlers leave the block does, if its own statements do.
-    """
-    leaving = (ast.Continue, ast.Break, ast.Return, ast.Raise)
-    for statement in block:
-        match statement:
-            case ast.If(_, body, orelse):
-                found = _comes_to(body, targets) and _comes_to(orelse, targets)
-            case ast.With(_, body):
-                found = _comes_to(body, targets)
-            case ast.Try(body, handlers, _, final):
-                leave = all(isinstance(handler.body[-1], leaving) for handler in handlers)
-                found = _comes_to(final, targets) or (leave and _comes_to(body, targets))
-            case _:
-                found = statement in targets
-        if found:
-            return True
-    return False
-
-
-def _line(node: ast.AST) -> int:
-    return getattr(node, "lineno", 1)
