@@ -215,9 +215,12 @@ def _insert(lines: list[bytes], node: ast.stmt, new: list[str], *, above: bool =
     """Put lines below a statement, or above it, with its indentation and its line's end."""
     first, last = node.lineno - 1, (node.end_lineno or node.lineno) - 1
     at = first if above else last
-    indent, rest = lines[first][: node.col_offset], lines[last][node.end_col_offset :].strip()
+    indent = lines[first][: node.col_offset]
+    # What is above a statement does not depend on its last line, which may have been edited.
+    rest = b"" if above else lines[last][node.end_col_offset :].strip()
     if indent.strip() or (rest and not rest.startswith(b"#")):
-        raise ValueError(f"line {at + 1} has several statements: {lines[at].decode().strip()}")
+        shown = lines[at].decode().strip()
+        raise refusal(at + 1, f"there are several statements in this line: {shown}")
     end = lines[at][len(lines[at].rstrip(b"\r\n")) :]
     own, text = lines[at].removesuffix(end), [indent + line.encode() for line in new]
     # The file's last line may have no end.

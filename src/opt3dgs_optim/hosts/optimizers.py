@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
+from opt3dgs_optim.hosts.remade import SECOND, find_remade, set_ups
 from opt3dgs_optim.hosts.syntax import (
     COMPREHENSIONS,
     FUNCTIONS,
@@ -17,7 +18,10 @@ from opt3dgs_optim.hosts.syntax import (
     values,
 )
 
-SECOND = ("shoptimizer",)  # of Gaussians; any other, as of exposures or networks, is left alone
+GAUSSIANS = re.compile(r"gauss|splat|primitive|convex", re.I)  # in the name of their model
+NO_ADAM = re.compile(
+    r"(^|\.)(SGD|ASGD|RMSprop|Rprop|Adagrad|Adadelta|Adafactor|LBFGS|SparseAdam|Muon)$"
+)
 ADAM = re.compile(r"(^|\.)\w*Adam\w*$")
 
 
@@ -65,9 +69,10 @@ def find_optimizers(
     dicts = [text for text in stepped if text.split(".")[-1] == "optimizers"]
     owners = [text[: -len(".optimizer")] for text in stepped if text.endswith(".optimizer")]
     named = [text for text in stepped if _is_adam(own, text)]
+    others = [text for text in stepped if text not in dicts and text.endswith("optimizers")]
     if len(owners) > 1:
-        owners = [owner for owner in owners if set_ups(own, owner)]
-    if len(dicts) == 1 and not owners:
+        owners = _of_gaussians(owners, own)
+    if len(dicts) == 1 and not owners and not any(map(GAUSSIANS.search, others)):
         found = dicts
     elif len(owners) == 1 and not dicts:
         (owner,) = owners
@@ -89,8 +94,8 @@ def find_optimizers(
             "X.optimizers.values()` or one `X.optimizer.step()` is needed "
             f"(stepped in the loop: {lines or 'nothing'})",
         )
-    inside = [spot for spot in own if loop in loops_around(spot)]
-    setups = _remade(inside, found[0], _makers([tree, *models]))
+    _check_adam([tree, *models], found[0])
+    setups = find_remade([tree, *models], own, loop, found[0])
     if others := [text for text in stepped if text not in found]:
         notes.append(f"left alone: {', '.join(others)}")
     if any(_steps_at_times(model) for model in models):
@@ -99,6 +104,34 @@ def find_optimizers(
             "observed, but the mean of the last thirtieth has as few iterates as there are steps"
         )
     return Optimizers(found, setups, notes)
+
+
+def _of_gaussians(owners: list[str], own: list[Spot]) -> list[str]:
+    """Which of several models are the Gaussians': by its name, or as the one that is set up here.
+
+    One that comes from elsewhere may be set up there.
+    """
+    named = [owner for owner in owners if GAUSSIANS.search(owner)]
+    if len(named) == 1:
+        return named
+    here = [owner for owner in owners if any(value for _, value in values(own, owner))]
+    set_up = [owner for owner in owners if set_ups(own, owner)]
+    return set_up if len(here) == len(owners) else []
+
+
+def _check_adam(trees: list[ast.Module], optimizer: str) -> None:
+    """NothingToAddError where all that the files make under a name is no Adam."""
+    name = optimizer.rsplit(".", maxsplit=1)[-1]
+    made: list[ast.Call] = []
+    for node in [node for tree in trees for node in ast.walk(tree)]:
+        match node:
+            case ast.Assign([ast.Name(known) | ast.Attribute(_, known)], ast.Call() as call):
+                made += [call] if known == name else []
+    if made and all(NO_ADAM.search(ast.unparse(call.func)) for call in made):
+        raise NothingToAddError(
+            f"line {made[0].lineno}: {optimizer} is {ast.unparse(made[0].func)}(...), but "
+            "torch.optim.Adam is needed; other optimizers get no parts"
+        )
 
 
 def _is_adam(own: list[Spot], name: str) -> bool:
@@ -116,12 +149,6 @@ def _makes_adam(value: ast.expr | None) -> bool:
         case ast.Dict(_, many):
             return bool(many) and all(map(_makes_adam, many))
     return False
-
-
-def set_ups(among: list[Spot], owner: str) -> list[ast.stmt]:
-    """The statements that make a model's optimizers."""
-    statements = [spot.node for spot in among if isinstance(spot.node, ast.Expr)]
-    return [s for s in statements if ast.unparse(s).startswith(f"{owner}.training_setup(")]
 
 
 def read_step(spot: Spot, own: list[Spot]) -> Step | None:
@@ -187,73 +214,6 @@ def _is_closure(node: ast.expr, own: list[Spot]) -> bool:
     """Whether an argument of `step` is a function, which would compute the loss itself."""
     functions = [spot.node.name for spot in own if isinstance(spot.node, FUNCTIONS)]
     return isinstance(node, ast.Lambda) or (isinstance(node, ast.Name) and node.id in functions)
-
-
-def _remade(inside: list[Spot], optimizer: str, makers: set[str]) -> list[ast.stmt]:
-    """The statements in a loop after which the optimizers may be others, in the file's order.
-
-    Upgrading again what is the same changes nothing, so that one too many does no harm.
-
-    Raises:
-        ValueError: the object that holds them is exchanged, or it happens in a condition.
-    """
-    owner = optimizer.rpartition(".")[0]
-    found: list[ast.stmt] = []
-    for spot in inside:
-        stored = ast.unparse(spot.node) if isinstance(spot.node, ast.expr) else ""
-        if isinstance(getattr(spot.node, "ctx", None), ast.Store) and stored == owner:
-            raise refusal(spot.line, f"{owner}, which has the optimizers, gets another value here")
-        match spot.node:
-            case ast.Name(_, ast.Store()) | ast.Attribute(_, _, ast.Store()):
-                makes = stored == optimizer
-            case ast.Subscript(holder, _, ast.Store()):
-                makes = ast.unparse(holder) == optimizer
-            case ast.Call(ast.Name(name) | ast.Attribute(_, name)):
-                makes = name in makers
-            case _:
-                makes = False
-        if not makes:
-            continue
-        statement = next(node for node in reversed(spot.above) if isinstance(node, ast.stmt))
-        if not isinstance(statement, (ast.Expr, ast.Assign, ast.AnnAssign)):
-            raise refusal(
-                spot.line,
-                f"{optimizer} may be made anew by {ast.unparse(spot.node)}, and no line can stand "
-                "directly below it; give it a statement of its own",
-            )
-        if statement not in found:
-            found.append(statement)
-    return found
-
-
-def _makers(trees: list[ast.Module]) -> set[str]:
-    """The functions and methods of these files that make optimizers, by their names.
-
-    Those that set an attribute `optimizer` or `optimizers`, and those that call such a one.
-    """
-    names = {"optimizer", "optimizers", *SECOND}
-    calls: dict[str, set[str]] = {}
-    found = {"training_setup", "restore"}  # INRIA's, where the model's file is not beside it
-    for tree in trees:
-        for function in ast.walk(tree):
-            if not isinstance(function, FUNCTIONS) or function.name.startswith("__"):
-                continue
-            for spot in spots(function):
-                match spot.node:
-                    case ast.Attribute(_, name, ast.Store()) if name in names:
-                        around = spot.above[-1]
-                        empty = isinstance(around, ast.Assign) and _is_none(around.value)
-                        if not empty:
-                            found.add(function.name)
-                    case ast.Call(ast.Name(name) | ast.Attribute(_, name)):
-                        calls.setdefault(function.name, set()).add(name)
-    while more := {name for name, called in calls.items() if called & found} - found:
-        found |= more
-    return found
-
-
-def _is_none(node: ast.expr) -> bool:
-    return isinstance(node, ast.Constant) and node.value is None
 
 
 def _model_files(folder: Path) -> list[ast.Module]:
