@@ -16,6 +16,12 @@ NO_PHOTO = re.compile(
     re.I,
 )
 
+# What makes another number of an elementwise term than of its mean.
+REDUCTIONS = {
+    *("amax", "amin", "max", "mean", "median", "min", "nanmean", "norm", "prod", "quantile"),
+    *("std", "sum", "topk"),
+}
+
 
 class PixelLoss(NamedTuple):
     """A photometric L1 term."""
@@ -24,10 +30,20 @@ class PixelLoss(NamedTuple):
     images: list[ast.expr]  # its two arguments
 
 
-def find_pixel_loss(inside: list[Spot], loop: ast.stmt, last: int) -> list[PixelLoss]:
+def find_pixel_loss(
+    tree: ast.Module, inside: list[Spot], loop: ast.stmt, last: int
+) -> list[PixelLoss]:
     """The photometric term above a line: `L1 = l1_loss(a, b)`, alone or with `.mean()`.
 
-    Several only where branches write the same name; none where it is not certain which it is.
+    Args:
+        tree: the file's syntax tree.
+        inside: every node of the training loop.
+        loop: the training loop.
+        last: the line.
+
+    Returns:
+        Several only where branches write the same name; none where it is not certain which it is,
+        or that it is the mean of the absolute error.
     """
     found: dict[str, list[tuple[Spot, PixelLoss]]] = {}
     for spot in inside:
@@ -42,13 +58,99 @@ def find_pixel_loss(inside: list[Spot], loop: ast.stmt, last: int) -> list[Pixel
                 other = NO_PHOTO.search(" ".join([name, *images]))
                 shown = all(PHOTO.search(each) for each in images)
                 usual = name.lower() in USUAL_L1
-                if usual and shown and not other and loops_around(spot)[-1] is loop:
-                    found.setdefault(name, []).append((spot, PixelLoss(spot.node.value, pair)))
+                mean = ast.unparse(spot.node.value).endswith(").mean()")
+                certain = _is_mean(tree, mean) and (mean or not _is_reduced(name, spot, inside))
+                if not (usual and shown and not other and loops_around(spot)[-1] is loop):
+                    continue
+                if not certain or _is_without_gradient(spot) or not _have_one_shape(pair, inside):
+                    return []
+                found.setdefault(name, []).append((spot, PixelLoss(spot.node.value, pair)))
     terms = next(iter(found.values())) if len(found) == 1 else []
     places = [spot for spot, _ in terms]
     if not all(are_exclusive(one, other) for one, other in combinations(places, 2)):
         return []
     return [term for _, term in terms]
+
+
+def _is_mean(tree: ast.Module, of_elements: bool) -> bool:
+    """Whether `l1_loss` may be taken for the mean absolute error, by what a file says of it.
+
+    Args:
+        tree: the file's syntax tree.
+        of_elements: whether the mean is taken of what it returns.
+    """
+    for node in ast.walk(tree):
+        match node:
+            case ast.FunctionDef("l1_loss"):
+                returned = [n.value for n in ast.walk(node) if isinstance(n, ast.Return)]
+                for text in [ast.unparse(value) if value else "" for value in returned] or [""]:
+                    mean = of_elements or re.fullmatch(r".*\.mean\(\)|torch\.mean\(.*\)", text)
+                    if not mean or "abs(" not in text or "sum(" in text:
+                        return False
+            case ast.Name("l1_loss", ast.Store()) | ast.Attribute(_, "l1_loss", ast.Store()):
+                return False
+            case ast.alias(name, "l1_loss") if name != "l1_loss":
+                return False
+    return True
+
+
+def _is_without_gradient(spot: Spot) -> bool:
+    """Whether a term is computed for the log alone."""
+    items = [item for node in spot.above if isinstance(node, ast.With) for item in node.items]
+    return any(re.search("no_grad|inference_mode", ast.unparse(item)) for item in items)
+
+
+def _have_one_shape(pair: list[ast.expr], inside: list[Spot]) -> bool:
+    """Whether no axis is added to one of two images alone: the other is broadcast then."""
+    added = []
+    for image in pair:
+        names = {node.id for node in ast.walk(image) if isinstance(node, ast.Name)}
+        given = [value for name in names for _, value in values(inside, name) if value]
+        added.append(any(map(_has_another_axis, (image, *given))))
+    return added[0] == added[1]
+
+
+def _has_another_axis(image: ast.expr) -> bool:
+    """Whether an axis is added to an image, which may go on: `image[None].cuda()`."""
+    match image:
+        case ast.Subscript(value, index):
+            return "None" in ast.unparse(index) or _has_another_axis(value)
+        case ast.Call(ast.Attribute(_, "unsqueeze")):
+            return True
+        case ast.Call(value) | ast.Attribute(value):
+            return _has_another_axis(value)
+    return False
+
+
+def _is_reduced(name: str, term: Spot, inside: list[Spot]) -> bool:
+    """Whether a term is treated as one of many elements, or is in no loss.
+
+    It is where a mean, a sum or an item of it is taken, or of what is computed with it.
+    """
+    computed, used = {name}, False
+    after = getattr(term.node, "end_lineno", term.line)
+    for spot in inside:
+        match spot.node:
+            case ast.Name(read, ast.Load()) if read in computed and spot.line > after:
+                around = spot.above[-1]
+            case _:
+                continue
+        if isinstance(around, ast.Attribute) and around.attr in ("item", "detach"):
+            continue
+        used |= read == name
+        for around, below in zip(reversed(spot.above), reversed(spot.chain), strict=True):
+            match around:
+                case ast.Subscript(value) if value is below:
+                    return True
+                case ast.Call(ast.Attribute(_, method)) if method in REDUCTIONS:
+                    return True
+                case ast.Assign(targets) if below is around.value:
+                    computed |= {ast.unparse(target) for target in targets}
+                case ast.AugAssign(target) if below is around.value:
+                    computed.add(ast.unparse(target))
+            if isinstance(around, ast.stmt):
+                break
+    return not used
 
 
 def _written(image: ast.expr, inside: list[Spot]) -> str:

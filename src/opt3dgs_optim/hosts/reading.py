@@ -97,7 +97,7 @@ def read_trainer(tree: ast.Module, folder: Path) -> Trainer:
     trainer.total, trainer.iteration = read_count(loop, own, found[-1], each_turn=each_turn)
     check_end(tree, loop, inside, loss)
     trainer.scene = _scene(inside)
-    trainer.pixel = find_pixel_loss(inside, loop, max(s.lineno for s in found))
+    trainer.pixel = find_pixel_loss(tree, inside, loop, max(s.lineno for s in found))
     if not trainer.pixel:
         trainer.notes.append(
             "no L1 = l1_loss(render, photo) was found with certainty: the paper's squared loss "
