@@ -17,6 +17,8 @@ from opt3dgs_optim.hosts.syntax import (
     values,
 )
 
+REPEATING = ("imap", "map", "partial", "repeat", "starmap")  # may call what they are given again
+
 
 def check_calls(
     tree: ast.Module,
@@ -81,10 +83,11 @@ def _calls(tree: ast.Module, function: ast.AST) -> list[tuple[Spot, list[ast.AST
     for own in [[*spots(scope)] for scope in scopes(tree)]:
         for spot in own:
             match spot.node:
-                case ast.Call(ast.Name(known)) if known == name and not owners:
-                    found.append((spot, loops_around(spot)))
-                case ast.Call(ast.Attribute(ast.Name("self" | "cls"), known)) if known == name:
-                    found += [(spot, loops_around(spot))] if owners else []
+                case ast.Name(known, ast.Load()) if known == name and not owners:
+                    if not any(values(own, name)):  # no other value of this name
+                        found.append((spot, _loops_of_use(spot, name)))
+                case ast.Attribute(ast.Name("self" | "cls"), known) if known == name and owners:
+                    found.append((spot, _loops_of_use(spot, name)))
                 case ast.Call(ast.Attribute(ast.Name(holder), known)) if known == name:
                     given = [value for _, value in values(own, holder)]
                     if owners and name != "train" and given in ([], [None]):
@@ -97,7 +100,43 @@ def _calls(tree: ast.Module, function: ast.AST) -> list[tuple[Spot, list[ast.AST
                                 around = loops_around(made)
                                 loops = [n for n in loops_around(spot) if n not in around]
                                 found.append((spot, loops))
+                case ast.Call(ast.Attribute(ast.Attribute(_, held), known)) if (
+                    known == name and owners
+                ):
+                    if name != "train" or _holds(tree, held, owners):
+                        found.append((spot, loops_around(spot)))
     return found
+
+
+def _holds(tree: ast.Module, attribute: str, owners: set[str]) -> bool:
+    """Whether an attribute is given an object of one of these classes."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.Assign([ast.Attribute(_, name)], ast.Call(kind)) if name == attribute:
+                if ast.unparse(kind) in owners:
+                    return True
+    return False
+
+
+def _loops_of_use(spot: Spot, name: str) -> list[ast.AST]:
+    """The loops in which a function is called, where its name stands.
+
+    Raises:
+        ValueError: it gets another name, or is given to what may call it several times.
+    """
+    around = spot.above[-1]
+    if isinstance(around, ast.keyword):
+        around = spot.above[-2]
+    match around:
+        case ast.Call(called) if called is spot.node:
+            return loops_around(spot)
+        case ast.Call(ast.Name(called) | ast.Attribute(_, called)) if called not in REPEATING:
+            return loops_around(spot)
+    raise refusal(
+        spot.line,
+        f"{name} trains, and may be called several times by way of {ast.unparse(around)}: the "
+        "iterations of all its calls together are the schedule's",
+    )
 
 
 def _makes_optimizers(scope: Scope, loop: ast.stmt, optimizer: str) -> bool:

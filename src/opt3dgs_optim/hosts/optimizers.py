@@ -151,7 +151,7 @@ def _makes_adam(value: ast.expr | None) -> bool:
     return False
 
 
-def read_step(spot: Spot, own: list[Spot]) -> Step | None:
+def read_step(tree: ast.Module, spot: Spot, own: list[Spot]) -> Step | None:
     """The step that a call makes: of an optimizer, or of each of many.
 
     Raises:
@@ -174,7 +174,9 @@ def read_step(spot: Spot, own: list[Spot]) -> Step | None:
         loops = [each for each in loops if each is not loop]
     elif not name.endswith("optimizer") and not _is_adam(own, name):
         return None
-    if not scaled and (options or len(given) > 2 or any(_is_closure(each, own) for each in given)):
+    if not scaled and (
+        options or len(given) > 2 or any(_is_closure(tree, each, own) for each in given)
+    ):
         raise NothingToAddError(
             f"line {call.lineno}: {ast.unparse(call)} is no step of an Adam; only step() and "
             "step(mask, ...) are known, and other optimizers get no parts"
@@ -210,10 +212,19 @@ def _goes_over_optimizers(loop: ast.AST, name: str) -> str:
     return ""
 
 
-def _is_closure(node: ast.expr, own: list[Spot]) -> bool:
+def _is_closure(tree: ast.Module, node: ast.expr, own: list[Spot]) -> bool:
     """Whether an argument of `step` is a function, which would compute the loss itself."""
-    functions = [spot.node.name for spot in own if isinstance(spot.node, FUNCTIONS)]
-    return isinstance(node, ast.Lambda) or (isinstance(node, ast.Name) and node.id in functions)
+    match node:
+        case ast.Lambda():
+            return True
+        case ast.Call(ast.Name(name) | ast.Attribute(_, name)):
+            return "partial" in name or "closure" in name
+        case ast.Name(name) | ast.Attribute(_, name):
+            functions = [n.name for n in ast.walk(tree) if isinstance(n, FUNCTIONS)]
+            given = [value for _, value in values(own, ast.unparse(node)) if value]
+            computed = any(_is_closure(tree, v, own) for v in given if not is_reference(v))
+            return name in functions or "closure" in name or computed
+    return False
 
 
 def _model_files(folder: Path) -> list[ast.Module]:

@@ -8,6 +8,7 @@ would be worse than none.
 """
 
 import ast
+import re
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
@@ -23,12 +24,16 @@ from opt3dgs_optim.hosts.syntax import (
     Scope,
     Spot,
     are_exclusive,
+    called_functions,
     comes_to,
     is_reference,
+    line_of,
     loops_around,
+    properties,
     refusal,
     scopes,
     spots,
+    stored_attributes,
     values,
 )
 
@@ -75,7 +80,7 @@ def read_trainer(tree: ast.Module, folder: Path) -> Trainer:
         )
     outermost = loops_around(backwards[0])[0]
     around = [spot for spot in own if outermost in spot.above]
-    steps = [step for spot in around if (step := read_step(spot, own)) is not None]
+    steps = [step for spot in around if (step := read_step(tree, spot, own)) is not None]
     steps = [step for step in steps if loop in step.loops] or steps
     statements = [spot.above[-1] for spot in backwards]
     found = [statement for statement in statements if isinstance(statement, ast.stmt)]
@@ -86,6 +91,7 @@ def read_trainer(tree: ast.Module, folder: Path) -> Trainer:
     trainer.optimizers, trainer.setups, trainer.notes = found_optimizers
     main = [step for step in steps if step.optimizer == trainer.optimizers[0]]
     check_rhythm(tree, loop, inside, backwards, main)
+    _check_loss(tree, backwards[0], loss, inside)
     if not isinstance(loop, ast.For):
         raise refusal(
             loop,
@@ -94,7 +100,7 @@ def read_trainer(tree: ast.Module, folder: Path) -> Trainer:
         )
     check_calls(tree, scope, loop, trainer.optimizers[0])
     each_turn = _is_in_each_turn(backwards, inside, loop)
-    trainer.total, trainer.iteration = read_count(loop, own, found[-1], each_turn=each_turn)
+    trainer.total, trainer.iteration = read_count(tree, loop, own, found[-1], each_turn=each_turn)
     check_end(tree, loop, inside, loss)
     trainer.scene = _scene(inside)
     trainer.pixel = find_pixel_loss(tree, inside, loop, max(s.lineno for s in found))
@@ -114,7 +120,8 @@ def _scene(inside: list[Spot]) -> str:
             case ast.Call(ast.Attribute(_, "step_post_backward"), _, keywords):
                 given = [k.value for k in keywords if k.arg == "scene"]
                 found |= {ast.unparse(value) if is_reference(value) else "" for value in given}
-    return found.pop() if len(found) == 1 else ""
+    scene = found.pop() if len(found) == 1 else ""
+    return scene if re.search(r"(^|[._])scene$", scene) else ""  # no number, as `scene_scale`
 
 
 # -- the loop --------------------------------------------------------------------------------------
@@ -123,7 +130,7 @@ def _scene(inside: list[Spot]) -> str:
 def _backwards(tree: ast.Module) -> tuple[Scope, list[Spot], list[Spot]]:
     """The scope that trains, its nodes, and the calls of `loss.backward()` in a loop of it."""
     every = [(scope, [*spots(scope)]) for scope in scopes(tree)]
-    calls = [(scope, own, spot) for scope, own in every for spot in own if _calls_backward(spot)]
+    calls = [(scope, own, spot) for scope, own in every for spot in own if _is_backward(spot.node)]
     looped = [(scope, own, spot) for scope, own, spot in calls if loops_around(spot)]
     if not calls:
         raise ValueError(
@@ -149,18 +156,39 @@ def _backwards(tree: ast.Module) -> tuple[Scope, list[Spot], list[Spot]]:
     for spot in backwards:
         _loss(spot)  # refuses what is no loss
     inner = {spot.node for spot in backwards}
-    for _, _, spot in calls:
-        around = loops_around(backwards[0])[0]
-        if spot.node not in inner and spot.node in ast.walk(around):
-            raise refusal(spot.line, "this loss.backward() is in a function inside the loop")
+    around = loops_around(backwards[0])[0]
+    for node in ast.walk(around):
+        if node not in inner and _is_backward(node):
+            raise refusal(node, "this loss.backward() is in a function inside the loop")
+    direct = called_functions(tree, around, deep=False)
+    for function in called_functions(tree, around):
+        others = [
+            node
+            for node in ast.walk(function)
+            if _is_backward(node) and (function in direct or _is_of_a_name(node))
+        ]
+        if others and function is not scope:
+            raise refusal(
+                others[0],
+                f"{function.name}, which the loop of line {line_of(around)} calls, computes "
+                "gradients too; one loss.backward() an iteration is needed",
+            )
     return scope, own, backwards
 
 
-def _calls_backward(spot: Spot) -> bool:
+def _is_backward(node: ast.AST) -> bool:
     """Whether a node is a call that computes gradients."""
-    match spot.node:
+    match node:
         case ast.Call(ast.Attribute(receiver, name)) if name in BACKWARDS:
             return ast.unparse(receiver) != "super()"
+    return False
+
+
+def _is_of_a_name(backward: ast.AST) -> bool:
+    """Whether it is `loss.backward()`: gradients of sums of an image are scores for pruning."""
+    match backward:
+        case ast.Call(ast.Attribute(receiver)):
+            return is_reference(receiver)
     return False
 
 
@@ -183,6 +211,28 @@ def _loss(spot: Spot) -> ast.expr:
             "needed, so that what is observed is what is minimised",
         )
     return loss
+
+
+def _check_loss(tree: ast.Module, backward: Spot, loss: str, inside: list[Spot]) -> None:
+    """ValueError where a loss may be something else that has a method `backward`, or a property."""
+    reference: ast.AST = ast.parse(loss, mode="eval").body
+    attribute = reference.attr if isinstance(reference, ast.Attribute) else ""
+    if attribute in properties(tree):
+        raise refusal(
+            backward.line,
+            f"{loss} is a property, which would be computed once more where it is observed; give "
+            "it a name above loss.backward()",
+        )
+    known = attribute in stored_attributes([tree])
+    while isinstance(reference, ast.expr):
+        known |= any(values(inside, ast.unparse(reference)))
+        reference = getattr(reference, "value", tree)
+    if loss in ("self", "cls") or not known:
+        raise refusal(
+            backward.line,
+            f"{ast.unparse(backward.node)}: {loss} gets no value in the loop, so that it is not "
+            "clear that it is a loss",
+        )
 
 
 def _check_scale(loss: str, inside: list[Spot]) -> None:
@@ -218,6 +268,8 @@ def _is_in_each_turn(backwards: list[Spot], inside: list[Spot], loop: ast.For) -
     first = min(spot.line for spot in backwards)
     skips = any(isinstance(spot.node, ast.Continue) and spot.line < first for spot in inside)
     fails = any(isinstance(spot.node, ast.Try) and spot.node.handlers for spot in inside)
+    for spot in inside:
+        fails |= isinstance(spot.node, ast.withitem) and "suppress(" in ast.unparse(spot.node)
     return not skips and not fails and comes_to(loop.body, _statements(backwards))
 
 

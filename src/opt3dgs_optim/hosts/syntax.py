@@ -150,10 +150,17 @@ def changed_in(inside: list[Spot]) -> set[str]:
     return found
 
 
-def called_functions(tree: ast.Module, node: ast.AST) -> list[ast.FunctionDef]:
+def called_functions(
+    tree: ast.Module, node: ast.AST, *, deep: bool = True
+) -> list[ast.FunctionDef]:
     """The functions and methods of a file that are called below a node, or by such a one.
 
     They are known by their names alone, so that there may be one too many.
+
+    Args:
+        tree: the file's syntax tree.
+        node: where they are called.
+        deep: False leaves out those that only other functions call.
     """
     every = [each for each in ast.walk(tree) if isinstance(each, FUNCTIONS)]
     found: list[Any] = []
@@ -169,7 +176,7 @@ def called_functions(tree: ast.Module, node: ast.AST) -> list[ast.FunctionDef]:
                     names |= {name} if own or name not in OF_TORCH else set()
         more = [each for each in every if each.name in names and each not in found]
         found += more
-        waiting += more
+        waiting += more if deep else []
     return found
 
 
@@ -183,6 +190,12 @@ def stored_attributes(functions: Iterable[ast.AST]) -> set[str]:
     """The names of the attributes that get a value in these functions."""
     nodes = [node for function in functions for node in ast.walk(function)]
     return {n.attr for n in nodes if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store)}
+
+
+def properties(tree: ast.Module) -> set[str]:
+    """The names of the properties that the classes of a file have."""
+    functions = [node for node in ast.walk(tree) if isinstance(node, FUNCTIONS)]
+    return {f.name for f in functions if "property" in " ".join(map(ast.unparse, f.decorator_list))}
 
 
 def references(node: ast.AST) -> set[str]:
@@ -264,6 +277,17 @@ def comes_to(block: list[ast.stmt], targets: list[ast.AST]) -> bool:
                 found = statement in targets
         if found:
             return True
+    return False
+
+
+def runs_before(spot: Spot, targets: list[ast.AST]) -> bool:
+    """Whether one of the statements has always run when a node is reached."""
+    for around, below in zip(spot.above, spot.chain, strict=True):
+        for name in ("body", "orelse", "finalbody"):
+            block = getattr(around, name, [])
+            inside = isinstance(block, list) and below in block
+            if inside and comes_to(block[: block.index(below)], targets):
+                return True
     return False
 
 
