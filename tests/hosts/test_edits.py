@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -9,7 +10,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from trainer_files import GSPLAT, INRIA, MCMC, MINI_SPLATTING, SYNTHETIC, TAMING, added
+from running_trainers import run
+from trainer_files import (
+    GSPLAT,
+    INRIA,
+    MCMC,
+    MINI_SPLATTING,
+    SYNTHETIC,
+    TAMING,
+    added,
+    lines_of,
+    refusal_of,
+    short,
+)
 
 from opt3dgs_optim.hosts import diff, write
 from opt3dgs_optim.hosts.edits import main
@@ -342,3 +355,209 @@ def test_as_a_module_it_prints_the_lines(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert added(done.stdout) == [IMPORT, *OURS]
     assert path.read_text() == INRIA
+
+
+GLOBAL = """\
+import torch
+from trainer import *
+
+optimizers = make_optimizers()
+
+
+def training(opt):
+{more}    for iteration in range(opt.iterations):
+        saw(iteration, opt.iterations)
+        loss = loss_of()
+        loss.backward()
+        for o in optimizers.values():
+            o.step(), o.zero_grad()
+
+
+training(opt)
+"""
+HELD = """\
+import torch
+from dataclasses import dataclass
+from typing import NamedTuple
+from trainer import *
+
+
+{model}
+
+
+def training(model):
+    for iteration in range(8):
+        saw(iteration, 8)
+        loss = loss_of()
+        loss.backward()
+        model.optimizer.step()
+        model.optimizer.zero_grad()
+
+
+training(Model(adam()))
+"""
+MODELS = {
+    "property": (
+        "class Model:\n    def __init__(self, adam):\n        self.adam = adam\n\n"
+        "    @property\n    def optimizer(self):\n        return self.adam\n"
+    ),
+    "frozen": "@dataclass(frozen=True)\nclass Model:\n    optimizer: object",
+    "tuple": "class Model(NamedTuple):\n    optimizer: object",
+}
+
+
+def clocks_agree(path: Path) -> bool:
+    """Whether every step of the edited script has the parts, at the trainer's own time."""
+    edited = run(diff(path).new)
+    left = [said and said[1] - said[0] for said in edited.scheduled]
+    return left == [total - count for count, total in edited.clock] and left != []
+
+
+@pytest.mark.parametrize(
+    ("more", "upgrade"),
+    [
+        ("", "phases.upgrade(optimizers)"),
+        ("    global optimizers\n", "optimizers = phases.upgrade(optimizers)"),
+    ],
+)
+def test_a_name_of_another_scope_is_not_made_local(tmp_path: Path, more: str, upgrade: str) -> None:
+    path = saved(tmp_path, GLOBAL.format(more=more))
+    assert added(diff(path).diff)[2] == upgrade
+    assert clocks_agree(path)
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_an_attribute_that_cannot_be_set(tmp_path: Path, kind: str) -> None:
+    path = saved(tmp_path, HELD.format(model=MODELS[kind]))
+    assert added(diff(path).diff)[2] == "phases.upgrade(model.optimizer)"
+    assert clocks_agree(path)
+
+
+@pytest.mark.parametrize(
+    ("top", "above"),
+    [
+        ("", "if opt.accum == 3:\n    world_size = 2"),
+        ("", "for world_size in ():\n    pass"),
+        ("if __name__ == 'main':\n    world_size = 2", ""),
+    ],
+)
+def test_a_number_of_processes_that_need_not_be_there(tmp_path: Path, top: str, above: str) -> None:
+    said = refusal_of(tmp_path, short(top=top, above=above))
+    assert "world_size has a value in some cases alone" in said
+
+
+@pytest.mark.parametrize(
+    ("top", "above", "given"),
+    [
+        ("", "sizes = [world_size for world_size in (1, 2)]", False),
+        ("", "world_size = (10.0, 4.0)", False),
+        ("world_size = [10.0, 4.0]", "", False),
+        ("", "if opt:\n    world_size = 1\nelse:\n    world_size = 2", True),
+        ("", "with torch.no_grad():\n    world_size = 1", True),
+        ("world_size = 1", "", True),
+        ("from trainer import opt as world_size", "", True),
+    ],
+)
+def test_a_number_of_processes(tmp_path: Path, top: str, above: str, given: bool) -> None:
+    lines = lines_of(tmp_path, short(top=top, above=above))
+    assert ("process_group" in lines[0]) is given
+
+
+@pytest.mark.parametrize(
+    "own",
+    [
+        "try:\n    raise KeyError\nexcept KeyError as phases:\n    pass",
+        "match opt:\n    case phases:\n        pass",
+        "match [1]:\n    case [*phases]:\n        pass",
+        "match {}:\n    case {**phases}:\n        pass",
+        "global phases",
+    ],
+)
+def test_a_name_that_the_file_has_in_some_way(tmp_path: Path, own: str) -> None:
+    path = saved(tmp_path, short(above=own))
+    assert "opt3dgs_phases = PhaseScheduler(opt.iterations)" in added(diff(path).diff)
+    assert clocks_agree(path)
+
+
+def test_a_number_is_no_scene(tmp_path: Path) -> None:
+    edit = "self.cfg.strategy.step_post_backward("
+    lines = lines_for(tmp_path, GSPLAT.replace(edit, f"{edit}scene=self.scene_scale, "))
+    assert "self.optimizers = phases.upgrade(self.optimizers)" in lines
+
+
+def test_a_loss_in_the_last_line_of_the_loop(tmp_path: Path) -> None:
+    text = MINI_SPLATTING.replace("                gaussians.training_setup(opt)\n", "")
+    text = text.replace("            if iteration == simp_iteration1:\n", "")
+    again = "gaussians.optimizer.step()\n        if iteration == 3:\n            "
+    text = text.replace("gaussians.optimizer.step()\n", f"{again}gaussians.training_setup(opt)\n")
+    assert lines_for(tmp_path, text).count(OURS[1]) == 2
+
+
+@pytest.mark.parametrize("end", ["\r", "\n"])
+@pytest.mark.parametrize("line", ["import torch, opt3dgs_optim", "import opt3dgs_optim.runs as r"])
+def test_any_import_of_ours_is_seen(tmp_path: Path, line: str, end: str) -> None:
+    text = INRIA.replace("import torch\n", f"{line}\n").replace("\n", end)
+    with pytest.raises(ValueError, match="imports opt3dgs_optim already"):
+        diff(saved(tmp_path, text))
+
+
+def test_a_comment_is_no_import(tmp_path: Path) -> None:
+    text = INRIA.replace("import torch\n", 'import torch\nTEXT = """\nimport opt3dgs_optim\n"""\n')
+    assert lines_for(tmp_path, text) == [IMPORT, *OURS]
+
+
+@pytest.mark.parametrize("deep", [" + ".join(["a"] * 990), " + ".join(["'a'"] * 9000)])
+def test_what_is_nested_too_deeply(
+    tmp_path: Path, deep: str, capsys: pytest.CaptureFixture
+) -> None:
+    path = saved(tmp_path, f"{INRIA}\nX = {deep}\n")
+    assert main(["diff", str(path)]) == 1
+    assert "nested too deeply" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("first", "encoding", "line", "reason"),
+    [
+        ("# coding: cp1252", "cp1252", 1, "cp1252; only UTF-8 is read"),
+        ("# coding: latin-1", "utf-8", 1, "iso-8859-1; only UTF-8 is read"),
+        ("#\n# é", "cp1252", 2, "not written in UTF-8"),
+    ],
+)
+def test_other_encodings(tmp_path: Path, first: str, encoding: str, line: int, reason: str) -> None:
+    path = tmp_path / "train.py"
+    path.write_bytes(f"{first}\n{INRIA}# é\n".encode(encoding))
+    with pytest.raises(ValueError, match=rf"(?s)^line {line}: .*{reason}"):
+        diff(path)
+
+
+def test_no_imports(tmp_path: Path) -> None:
+    text = INRIA.replace("import torch\nfrom scene import Scene, GaussianModel\n", "")
+    assert "there are no imports at the top" in refusal_of(tmp_path, text)
+
+
+def test_lines_that_do_not_fit(tmp_path: Path) -> None:
+    body = (
+        "        if opt: \\\n        loss.backward()\n        else:\n            loss.backward()\n"
+    )
+    said = refusal_of(tmp_path, INRIA.replace("        loss.backward()\n", body))
+    assert "the lines do not fit around this loop" in said
+    assert "<edited>" not in said
+
+
+def test_a_pipe_is_no_script(tmp_path: Path) -> None:
+    path = tmp_path / "train.py"
+    os.mkfifo(path)
+    with pytest.raises(ValueError, match="no regular file"):
+        write(path)
+
+
+def test_a_link_is_followed(tmp_path: Path) -> None:
+    """The file that it names is changed, and has the backup beside it."""
+    (tmp_path / "trainers").mkdir()
+    path, link = saved(tmp_path / "trainers", INRIA), tmp_path / "link.py"
+    link.symlink_to(path)
+    backup = write(link)
+    assert backup == path.with_name("train.py.orig").resolve()
+    assert link.is_symlink()
+    assert OURS[0] in path.read_text()
+    assert backup.read_text() == INRIA

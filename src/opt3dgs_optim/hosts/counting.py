@@ -3,10 +3,25 @@
 import ast
 from typing import NamedTuple
 
-from opt3dgs_optim.hosts.syntax import Spot, refusal, values
+from opt3dgs_optim.hosts.syntax import (
+    Spot,
+    are_exclusive,
+    refusal,
+    scopes,
+    shared_names,
+    spots,
+    values,
+)
 
 RANGES = ("range", "trange")
 WRAPPERS = ("tqdm", "track", "iter", "list")  # what goes over its first argument, in its order
+OF_PROGRESS_BARS = (
+    "refresh",
+    "set_description",
+    "set_postfix",
+    "update",
+    "write",
+)  # change no order
 FUNCTIONS_OF_NUMBERS = ("int", "len", "max", "min", "round", "abs")
 
 
@@ -17,31 +32,28 @@ class Count(NamedTuple):
     iteration: str  # an expression, from 0; empty where the number of observed losses is the same
 
 
-def read_count(loop: ast.For, own: list[Spot], observed: ast.stmt, *, each_turn: bool) -> Count:
+def read_count(
+    tree: ast.Module, loop: ast.For, own: list[Spot], observed: ast.stmt, *, each_turn: bool
+) -> Count:
     """The count of a loop over a range.
 
     Args:
+        tree: the file's syntax tree.
         loop: the training loop.
         own: every node of its scope.
         observed: the last statement after which the loss is observed.
         each_turn: whether every turn of the loop observes a loss.
 
     Raises:
-        ValueError: it goes over something else, backwards, or over the rest of a training, changes
-            its own count, or ends before it.
+        ValueError: it goes over something else, backwards, or over the rest of a training, or
+            changes its own count.
     """
     start, end, step = _arguments(loop, own)
-    for value in _possible_values(step, own):
+    known = _Known(tree, own)
+    for value in known.values_of(step):
         if isinstance(value, ast.UnaryOp) or (_number(value) or 1) < 0 or _number(value) == 0:
             raise refusal(loop, f"range(...) with a step of {ast.unparse(value)} counts down")
-    if _is_zero(start, own):
-        for value in _possible_values(end, own):
-            if _is_difference(value):
-                raise refusal(
-                    loop,
-                    f"range({ast.unparse(value)}) may be the rest of a training; a range from its "
-                    "first to its last iteration is needed",
-                )
+    _check_rest(loop, start, end, known)
     if not _is_plain(end):
         raise refusal(
             loop,
@@ -50,9 +62,9 @@ def read_count(loop: ast.For, own: list[Spot], observed: ast.stmt, *, each_turn:
         )
     total, shift = end, ""
     match end:
-        case ast.BinOp(left, ast.Add(), ast.Constant(1)) if _is_one_or_more(start, loop, own):
+        case ast.BinOp(left, ast.Add(), ast.Constant(1)) if _is_one_or_more(start, loop, known):
             total, shift = left, " - 1"
-    if _is_zero(start, own) and _number(step) == 1 and each_turn:
+    if known.is_zero(start) and _number(step) == 1 and each_turn:
         return Count(total, "")
     count = ast.unparse(loop.target)
     if not isinstance(loop.target, ast.Name):
@@ -64,11 +76,63 @@ def read_count(loop: ast.For, own: list[Spot], observed: ast.stmt, *, each_turn:
     return Count(total, count + shift)
 
 
-def _possible_values(number: ast.expr, own: list[Spot]) -> list[ast.expr]:
-    """An expression, and what it is given where it is a name."""
-    if not isinstance(number, ast.Name):
-        return [number]
-    return [number, *(value for _, value in values(own, number.id) if value is not None)]
+class _Known:
+    """What a file says of the value of a name or an attribute."""
+
+    def __init__(self, tree: ast.Module, own: list[Spot]) -> None:
+        self.own, self.shared = own, shared_names(tree)
+        self.every = [*spots(tree), *(s for each in scopes(tree)[1:] for s in spots(each))]
+
+    def values_of(self, number: ast.expr) -> list[ast.expr]:
+        """An expression, and what it is given where it is a name or an attribute, also by `-=`."""
+        if not isinstance(number, ast.Name | ast.Attribute):
+            return [number]
+        text = ast.unparse(number)
+        everywhere = isinstance(number, ast.Attribute) or text in self.shared
+        found: list[ast.expr] = [number]
+        for spot in self.every if everywhere else self.own:
+            match spot.node:
+                case ast.AugAssign(target, operator, value) if ast.unparse(target) == text:
+                    found.append(ast.BinOp(number, operator, value))
+        given = values(self.every if everywhere else self.own, text)
+        return [*found, *(value for _, value in given if value is not None)]
+
+    def is_zero(self, start: ast.expr) -> bool:
+        """Whether a count certainly starts at 0: written so, or a name with this one value."""
+        if isinstance(start, ast.Name):
+            given = [*values(self.own, start.id)]
+            alone = len(given) == 1 and start.id not in self.shared
+            return alone and _number(given[0][1]) == 0
+        return _number(start) == 0
+
+    def may_be_negative(self, number: ast.expr) -> bool:
+        """Whether a number, or what a name is given, is written as a negative one."""
+        return any((_number(value) or 0) < 0 for value in self.values_of(number))
+
+
+def _check_rest(loop: ast.For, start: ast.expr, end: ast.expr, known: _Known) -> None:
+    """ValueError where a range from the first iteration on may count only those that are left."""
+    if not known.is_zero(start) and _number(start) != 1:
+        return
+    ends = [end.left] if isinstance(end, ast.BinOp) and _number(end.right) == 1 else [end]
+    for value in [value for each in (end, *ends) for value in known.values_of(each)]:
+        if _is_difference(value):
+            raise refusal(
+                loop,
+                f"range({ast.unparse(value)}) may be the rest of a training; a range from its "
+                "first to its last iteration is needed",
+            )
+    sources = [loop.iter, *known.values_of(loop.iter)]
+    for call in [node for source in sources for node in ast.walk(source)]:
+        if isinstance(call, ast.Call):
+            for keyword in call.keywords:
+                if keyword.arg == "initial" and _number(keyword.value) != 0:
+                    raise refusal(
+                        call,
+                        f"{ast.unparse(call)} begins at {ast.unparse(keyword.value)}, so that its "
+                        "range may be the rest of a training; a range from its first to its last "
+                        "iteration is needed",
+                    )
 
 
 def _is_difference(number: ast.expr) -> bool:
@@ -108,6 +172,8 @@ def _ranges(source: ast.expr, own: list[Spot], line: int) -> list[ast.Call]:
         case ast.Name(name):
             given = [(at, value) for at, value in values(own, name) if at < line]
             found = [_ranges(value, own, at) if value else [] for at, value in given]
+            if all(found) and given:
+                _check_unchanged(name, min(at for at, _ in given), line, own)
             return [call for calls in found for call in calls] if all(found) else []
         case ast.IfExp(_, yes, no):
             arms = [_ranges(arm, own, line) for arm in (yes, no)]
@@ -138,28 +204,49 @@ def _is_plain(node: ast.AST) -> bool:
 
 
 def _number(node: ast.AST | None) -> int | None:
-    """The integer that is written there."""
+    """The integer that is written there, also as the negative or the sum of others."""
     match node:
         case ast.Constant(int(value)) if not isinstance(value, bool):
             return value
+        case ast.UnaryOp(ast.USub(), value) if (number := _number(value)) is not None:
+            return -number
+        case ast.BinOp(left, ast.Add() | ast.Sub() as operator, right):
+            one, other = _number(left), _number(right)
+            if one is not None and other is not None:
+                return one + other if isinstance(operator, ast.Add) else one - other
     return None
 
 
-def _is_zero(start: ast.expr, own: list[Spot]) -> bool:
-    """Whether a count certainly starts at 0: written so, or a name with this one value."""
-    if isinstance(start, ast.Name):
-        given = [*values(own, start.id)]
-        return len(given) == 1 and _number(given[0][1]) == 0
-    return _number(start) == 0
+def _check_unchanged(name: str, first: int, last: int, own: list[Spot]) -> None:
+    """ValueError where a list or a range with a name may be another one before the loop over it."""
+    for spot in own:
+        match spot.node:
+            case ast.Name(known, ast.Load()) if known == name and first < spot.line < last:
+                around, outer = spot.above[-1], spot.above[-2]
+            case _:
+                continue
+        match around, outer:
+            case ast.Call(ast.Name(called) | ast.Attribute(_, called)), _ if (
+                called in (*WRAPPERS, "len", "print") and spot.node is not around.func
+            ):
+                continue
+            case ast.Attribute(_, method, ast.Load()), ast.Call(called) if (
+                called is around and method in OF_PROGRESS_BARS
+            ):
+                continue
+        raise refusal(spot.line, f"{name}, which the loop goes over, may be changed here")
 
 
-def _is_one_or_more(start: ast.expr, loop: ast.For, own: list[Spot]) -> bool:
+def _is_one_or_more(start: ast.expr, loop: ast.For, known: _Known) -> bool:
     """Whether a count certainly starts at 1 or later: by its value, or by `start += 1` above."""
+    own = known.own
     match start:
-        case ast.BinOp(_, ast.Add(), more):
-            return _is_positive(more)
+        case ast.BinOp(left, ast.Add(), more) if _number(start) is None:
+            return _is_positive(more) and not known.may_be_negative(left)
         case ast.Name(name):
-            above = next(spot.above for spot in own if spot.node is loop)
+            if name in known.shared or known.may_be_negative(start):
+                return False
+            at = next(spot for spot in own if spot.node is loop)
             before = [spot for spot in own if spot.line < loop.lineno]
             given = [*values(before, name)]
             if given and all(_is_positive(value) for _, value in given):
@@ -171,7 +258,8 @@ def _is_one_or_more(start: ast.expr, loop: ast.For, own: list[Spot]) -> bool:
                 and ast.unparse(spot.node.target) == name
                 and isinstance(spot.node.op, ast.Add)
                 and _is_positive(spot.node.value)
-                and spot.above[-1] in above  # in no branch that may be left out
+                and spot.above[-1] in at.above  # in no branch that may be left out
+                and not are_exclusive(spot, at)
                 for spot in before
             )
     return _is_positive(start)

@@ -9,15 +9,31 @@ import argparse
 import ast
 import builtins
 import difflib
+import io
 import re
 import sys
-from collections.abc import Iterable, Sequence
+import tokenize
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import takewhile
 from pathlib import Path
 from typing import NamedTuple
 
+from opt3dgs_optim.hosts.counting import FUNCTIONS_OF_NUMBERS
 from opt3dgs_optim.hosts.reading import Trainer, read_trainer
-from opt3dgs_optim.hosts.syntax import FUNCTIONS, NothingToAddError, refusal, scopes, spots
+from opt3dgs_optim.hosts.syntax import (
+    FUNCTIONS,
+    LOOPS,
+    MUTATING,
+    NothingToAddError,
+    Spot,
+    comes_to,
+    properties,
+    refusal,
+    runs_before,
+    scopes,
+    spots,
+    values,
+)
 
 COMMAND = """Print the lines to change in a training script as a diff; --write applies them.
 
@@ -26,6 +42,7 @@ file whose names cannot be read with certainty is refused, with the lines to add
 that has them.
 """
 SCHEDULER = "PhaseScheduler"
+TOO_DEEP = "an expression or a branch in it is nested too deeply to be read"
 LINES_BY_HAND = (
     "from opt3dgs_optim import PhaseScheduler  # at the top",
     "phases = PhaseScheduler(TOTAL_STEPS)  # above the loop",
@@ -73,36 +90,76 @@ def diff(path: Path) -> Edited:
     if path.is_dir():
         names = ", ".join(str(p.relative_to(path)) for p in sorted(path.rglob("*train*.py"))[:10])
         raise ValueError(f"it is a folder; name the training script ({names or 'no *train*.py'})")
+    source = _read(path)
     try:
-        source = path.read_bytes()
-        text, tree = source.decode(), ast.parse(source)
-    except OSError as error:
-        raise ValueError(f"it cannot be read: {error}") from None
+        tree = ast.parse(source)
     except (SyntaxError, ValueError) as error:
         raise ValueError(f"it cannot be read as Python: {error}") from None
+    except RecursionError:
+        raise ValueError(TOO_DEEP) from None
     for name, reason in IMPORTS.items():
-        if _imports(text, name):
+        if _imports(tree, name):
             raise (ValueError if name in PAGES else NothingToAddError)(reason)
-    trainer = read_trainer(tree, path.parent)
-    new = b"".join(_edited_lines(source.splitlines(keepends=True), tree, trainer))
+    try:
+        trainer = read_trainer(tree, path.parent)
+        new = b"".join(_edited_lines(source.splitlines(keepends=True), tree, trainer))
+    except RecursionError:
+        raise ValueError(TOO_DEEP) from None
     try:
         compile(new, "<edited>", "exec", dont_inherit=True)
     except (SyntaxError, ValueError) as error:
-        raise ValueError(f"the lines do not fit into it: {error}") from None
+        reason = getattr(error, "msg", error)  # without the line, which is one of the edited file
+        raise refusal(trainer.loop, f"the lines do not fit around this loop: {reason}") from None
     before, after = ([x.decode() for x in y.splitlines(keepends=True)] for y in (source, new))
     shown = difflib.unified_diff(before, after, str(path), str(path), n=1)
     return Edited(new, "".join(shown), trainer.notes)
 
 
-def _imports(text: str, module: str) -> bool:
+def _read(path: Path) -> bytes:
+    """The bytes of a script.
+
+    Raises:
+        ValueError: it is no regular file, or is not written in UTF-8.
+    """
+    if path.exists() and not path.is_file():
+        raise ValueError("it is no regular file")
+    try:
+        source = path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"it cannot be read: {error}") from None
+    try:
+        encoding, _ = tokenize.detect_encoding(io.BytesIO(source).readline)
+    except SyntaxError:  # which the parser names
+        encoding = "utf-8"
+    if encoding not in ("utf-8", "utf-8-sig"):
+        raise refusal(1, f"it says that it is written in {encoding}; only UTF-8 is read")
+    try:
+        source.decode()
+    except UnicodeDecodeError as error:
+        line = source[: error.start].count(b"\n") + 1
+        raise refusal(line, f"it is not written in UTF-8, and only that is read: {error}") from None
+    return source
+
+
+def _imports(tree: ast.Module, module: str) -> bool:
     """Whether a file imports a module, or from it."""
-    return bool(re.search(rf"^\s*(from|import) {module}\b", text, re.MULTILINE))
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        match node:
+            case ast.Import(names):
+                found |= {each.name.split(".")[0] for each in names}
+            case ast.ImportFrom(str(name), _, 0):
+                found.add(name.split(".")[0])
+    return module in found
 
 
 def _help_by_hand(path: Path) -> list[str]:
     """What to do with a script that is refused."""
-    text = path.read_text(encoding="utf-8", errors="ignore")
-    pages = [page for module, page in PAGES.items() if _imports(text, module)]
+    try:
+        tree = ast.parse(path.read_bytes())
+    except (SyntaxError, ValueError, RecursionError):
+        tree = ast.Module([], [])
+    pages = [page for module, page in PAGES.items() if _imports(tree, module)]
     if any((folder / LIGHTNING).is_file() for folder in path.resolve().parents):
         pages.append("lightning")
     if pages:
@@ -117,6 +174,7 @@ def write(path: Path) -> Path:
         ValueError: as `diff`, there is a backup already, or the file cannot be written; it and
             its folder are then as they were.
     """
+    path = path.resolve()  # of a link, the file itself is changed
     backup = path.with_name(path.name + ".orig")
     if backup.exists():
         raise ValueError(f"its backup {backup} exists already; remove it or move it away")
@@ -144,12 +202,13 @@ def _edited_lines(lines: list[bytes], tree: ast.Module, trainer: Trainer) -> lis
     known = _known(tree, trainer, point)
     is_known = trainer.scene.split(".")[0].split("[")[0] in known
     scene = f", scene={trainer.scene}" if is_known else ""
-    upgrade = [f"{first} = {name}.upgrade({first}{scene})"]
+    upgrade = [f"{_target(tree, trainer, first)}{name}.upgrade({first}{scene})"]
     for other in second:  # None where the trainer's options leave it out
-        upgrade += [f"if {other} is not None:", f"    {other} = {name}.upgrade({other})"]
+        target = _target(tree, trainer, other)
+        upgrade += [f"if {other} is not None:", f"    {target}{name}.upgrade({other})"]
     _check_total(trainer, point)
     call = ast.unparse(trainer.total)
-    if "world_size" in known:
+    if "world_size" in known and _counts_processes(tree, trainer, point):
         call += ", process_group=torch.distributed.group.WORLD if world_size > 1 else None"
     start = [f"{name} = {scheduler}({call})", *upgrade]
     defined = {*known, name, scheduler}
@@ -178,6 +237,12 @@ def _used(tree: ast.Module) -> set[str]:
                 found.add(name)
             case ast.FunctionDef(name) | ast.AsyncFunctionDef(name) | ast.ClassDef(name):
                 found.add(name)
+            case ast.ExceptHandler(_, str(name)) | ast.MatchAs(_, str(name)):
+                found.add(name)
+            case ast.MatchStar(str(name)) | ast.MatchMapping(_, _, str(name)):
+                found.add(name)
+            case ast.Global(names) | ast.Nonlocal(names):
+                found |= {*names}
             case ast.alias(name, other):
                 found |= {name.split(".")[-1], other or name.split(".")[0]}
     return found
@@ -192,16 +257,27 @@ def _unused(name: str, used: set[str]) -> str:
 
 def _check_total(trainer: Trainer, point: ast.stmt) -> None:
     """ValueError where the number of iterations changes between our lines and the loop."""
-    parts = {ast.unparse(n) for n in ast.walk(trainer.total) if isinstance(n, ast.expr)}
+    nodes = [*ast.walk(trainer.total)]
+    parts = {ast.unparse(node) for node in nodes if isinstance(node, ast.expr)}
+    sized = {
+        ast.unparse(node.args[0]) for node in nodes if isinstance(node, ast.Call) and node.args
+    }
     for spot in trainer.spots:
+        changed, line = "", spot.line
         match spot.node:
             case ast.Name(ctx=ast.Store()) | ast.Attribute(ctx=ast.Store()) as node:
-                text = ast.unparse(node)
-                later = node.lineno > trainer.total.lineno or node.lineno >= point.lineno
-                if text in parts and later and node.lineno < trainer.loop.lineno:
-                    raise refusal(
-                        node, f"{text} changes here, between the range and the loop over it"
-                    )
+                changed = ast.unparse(node)
+            case ast.Subscript(holder, _, ast.Store() | ast.Del()):
+                changed = ast.unparse(holder)
+            case ast.Call(ast.Attribute(holder, method)) if method in MUTATING:
+                changed = ast.unparse(holder)
+            case ast.Call(ast.Name("setattr" | "vars"), [holder, *_]):
+                changed = ast.unparse(holder)
+            case ast.Call(called, arguments) if ast.unparse(called) not in FUNCTIONS_OF_NUMBERS:
+                changed = next((t for t in map(ast.unparse, arguments) if t in sized), "")
+        later = line > trainer.total.lineno or line >= point.lineno
+        if changed in parts and later and line < trainer.loop.lineno:
+            raise refusal(line, f"{changed} changes here, between the range and the loop over it")
 
 
 def _replace(lines: list[bytes], node: ast.expr, text: str) -> None:
@@ -233,28 +309,102 @@ def _last_import(tree: ast.Module, point: ast.stmt) -> ast.stmt:
     top = takewhile(lambda s: not isinstance(s, code) and s.lineno < point.lineno, tree.body)
     imports = [s for s in top if isinstance(s, (ast.Import, ast.ImportFrom))]
     if not imports:
-        raise ValueError("it has no imports")
+        raise refusal(1, "there are no imports at the top, below which ours could stand")
     return imports[-1]
+
+
+def _target(tree: ast.Module, trainer: Trainer, optimizer: str) -> str:
+    """What is left of `upgrade(...)`: it works in place, so that an assignment may be left off.
+
+    It is where the name is another scope's, and an assignment would make it one of this function,
+    or where the attribute cannot be set.
+    """
+    owner, _, name = optimizer.rpartition(".")
+    if owner:
+        off = name in {*properties(tree), *_frozen_fields(tree)}
+    else:
+        off = isinstance(trainer.scope, FUNCTIONS) and name not in _bound(trainer.spots)
+    return "" if off else f"{optimizer} = "
+
+
+def _frozen_fields(tree: ast.Module) -> set[str]:
+    """The fields of the classes in a file that cannot be set: frozen dataclasses, named tuples."""
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef):
+            said = " ".join(map(ast.unparse, (*node.decorator_list, *node.bases)))
+            if re.search(r"frozen=True|NamedTuple", said):
+                fields = [each.target for each in node.body if isinstance(each, ast.AnnAssign)]
+                found |= {ast.unparse(field) for field in fields}
+    return found
+
+
+def _counts_processes(tree: ast.Module, trainer: Trainer, point: ast.stmt) -> bool:
+    """Whether the name `world_size` is a number wherever the training loop is reached.
+
+    Raises:
+        ValueError: it has a value in some cases alone.
+    """
+    name = "world_size"
+    own = [spot for spot in trainer.spots if spot.line < point.lineno]
+    here = name in _bound(trainer.spots)
+    places = [*_places(own, name)] if here else []
+    if here and not any(isinstance(node, ast.arg) for node in places):
+        at = next(spot for spot in trainer.spots if spot.node is point)
+        always = runs_before(at, [node for node in places if not isinstance(node, LOOPS)])
+    else:
+        around = [scope for scope in scopes(tree) if trainer.scope in ast.walk(scope)]
+        bodies = [] if here else [(each, [*spots(each)]) for each in around]
+        always = here
+        for scope, inside in bodies:
+            found = [*_places(inside, name)]
+            places += found
+            always |= any(isinstance(node, ast.arg) for node in found)
+            always |= comes_to(scope.body, found)
+    given = [value for _, value in values(own if here else [*spots(tree)], name)]
+    if any(isinstance(value, ast.Tuple | ast.List | ast.Dict | ast.Set) for value in given):
+        return False
+    if not always:
+        raise refusal(
+            places[0] if places else point,
+            f"{name} has a value in some cases alone, so that it is not certain whether several "
+            "processes train",
+        )
+    return True
+
+
+def _places(among: list[Spot], name: str) -> Iterator[ast.AST]:
+    """The statements and the arguments that give a value to a name."""
+    for spot in among:
+        if name in _bound([spot]):
+            is_statement = isinstance(spot.node, ast.stmt | ast.arg)
+            above = (node for node in reversed(spot.above) if isinstance(node, ast.stmt))
+            yield spot.node if is_statement else next(above)
 
 
 def _known(tree: ast.Module, trainer: Trainer, point: ast.stmt) -> set[str]:
     """The names that have a value where a statement of the training function begins."""
-    own = [spot.node for spot in trainer.spots]
-    before = [node for node in own if getattr(node, "lineno", point.lineno) < point.lineno]
+    own = trainer.spots
+    before = [spot for spot in own if getattr(spot.node, "lineno", point.lineno) < point.lineno]
     around = [scope for scope in scopes(tree) if trainer.scope in ast.walk(scope)]
-    outside = _bound(spot.node for scope in around for spot in spots(scope)) | set(dir(builtins))
+    outside = _bound(spot for scope in around for spot in spots(scope)) | set(dir(builtins))
     return _bound(before) | (outside - _bound(own))
 
 
-def _bound(nodes: Iterable[ast.AST]) -> set[str]:
-    """The names to which these nodes give a value."""
+def _bound(among: Iterable[Spot]) -> set[str]:
+    """The names to which these nodes give a value; the variables of comprehensions are others."""
     found: set[str] = set()
-    for node in nodes:
-        match node:
-            case ast.Name(name, ast.Store()) | ast.arg(name) | ast.FunctionDef(name):
+    for spot in among:
+        match spot.node:
+            case ast.Name(name, ast.Store()):
+                if not any(isinstance(each, ast.comprehension) for each in spot.above):
+                    found.add(name)
+            case ast.arg(name) | ast.FunctionDef(name):
                 found.add(name)
             case ast.alias(_, str(name)) | ast.alias(name):
                 found.add(name.split(".")[0])
+            case ast.Global(names) | ast.Nonlocal(names):
+                found |= {*names}
     return found
 
 
