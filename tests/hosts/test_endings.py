@@ -39,6 +39,12 @@ LEFT = {  # lines above the loop, the end of a turn, the condition that is named
         "if time.time() - start > 60 or iteration == 7:\n    break",
         "time.time() - start > 60",
     ),
+    "item": (
+        "state = {}",
+        "state['done'] = False\nif iteration >= 7:\n    state['done'] = True\n"
+        "if state['done']:\n    break",
+        "state['done']",
+    ),
     "helper": (
         "def over():\n    return iteration == 7",
         "if over():\n    break",
@@ -89,3 +95,16 @@ def test_a_handler_in_the_loop_ends_nothing(tmp_path: Path) -> None:
     step = f"try:\n{indent(STEP, ' ' * 4)}\nexcept ValueError:\n    pass"
     more = "\nif iteration == 99:\n    raise ValueError"
     assert "phases = PhaseScheduler(opt.iterations)" in lines_of(tmp_path, short(step=step + more))
+
+
+def test_an_end_in_every_turn(tmp_path: Path) -> None:
+    said = refusal_of(
+        tmp_path, short(step=f"{STEP}\nfor view in loader:\n    pass\nelse:\n    break")
+    )
+    assert "is left where nothing is asked" in said
+
+
+def test_an_exception_of_a_helper(tmp_path: Path) -> None:
+    top = "class Done(Exception):\n    pass\n\n\ndef check(i):\n    if i == 7:\n        raise Done"
+    said = refusal_of(tmp_path, short(top=top, step=f"{STEP}\ncheck(iteration)"))
+    assert "is left where check raises this" in said

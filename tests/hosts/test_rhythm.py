@@ -43,6 +43,20 @@ ACCUMULATED = {  # lines above the loop, the end of a turn, the condition that i
         "if iteration % 2:\n    on = True\nelse:\n    on = False\n" + when("on"),
         "on",
     ),
+    "gap": ("", when("iteration < 2 or iteration >= 5"), "iteration < 2 or iteration >= 5"),
+    "gap, negated": (
+        "",
+        when("not (iteration >= 2 and iteration < 5)"),
+        "not (iteration >= 2 and iteration < 5)",
+    ),
+    "gap in the other arm": (
+        "",
+        f"if 2 <= iteration < 5:\n    pass\nelse:\n{indent(STEP, ' ' * 4)}",
+        "2 <= iteration < 5",
+    ),
+    "gap in an or": ("", "2 <= iteration < 5 or gaussians.optimizer.step()", "2 <= iteration < 5"),
+    "gap in a chain": ("", when("not 2 <= iteration < 5"), "not 2 <= iteration < 5"),
+    "all but one": ("", when("iteration != 3"), "iteration != 3"),
     "by a helper": (
         "on = False\ndef turn():\n    nonlocal on\n    on = not on",
         "turn()\n" + when("on"),
@@ -73,6 +87,8 @@ def test_accumulated_gradients(tmp_path: Path, kind: str) -> None:
         "0 <= iteration < opt.iterations",
         "opt.iterations % 2 == 0",
         "isinstance(opt, object)",
+        "iteration < opt.iterations or opt.iterations == 0",
+        "not (iteration < 0 or iteration >= opt.iterations)",
     ],
 )
 def test_a_condition_that_changes_once(tmp_path: Path, condition: str) -> None:
@@ -102,3 +118,17 @@ def test_a_manager_that_accumulates(tmp_path: Path, manager: str) -> None:
     body = f"with {manager}:\n    loss.backward()\n{indent(STEP, ' ' * 4)}"
     said = refusal_of(tmp_path, short(backward=body, step=""))
     assert f"steps only where {manager}" in said
+
+
+def test_a_property_decides(tmp_path: Path) -> None:
+    top = "class Due:\n    @property\n    def due(self):\n        return next(turns)\n\n\n"
+    top += "turns = itertools.cycle([0, 1])"
+    text = short(top=top, above="my = Due()", step=when("my.due"))
+    assert len(run(text.encode()).clock) == 4
+    assert "steps only where my.due" in refusal_of(tmp_path, text)
+
+
+def test_an_error_after_the_loss(tmp_path: Path) -> None:
+    body = "try:\n    loss.backward()\n    if iteration % 2 == 0:\n        raise KeyError\n"
+    text = short(backward=f"{body}except KeyError:\n    continue")
+    assert "`continue` between loss.backward()" in refusal_of(tmp_path, text)

@@ -11,6 +11,7 @@ from opt3dgs_optim.hosts.syntax import (
     counts_of,
     loops_around,
     refusal,
+    spots,
     stored_attributes,
     values,
 )
@@ -40,9 +41,16 @@ def check_end(tree: ast.Module, loop: ast.stmt, inside: list[Spot], loss: str) -
         handlers = [node.type for node in spot.above if isinstance(node, ast.ExceptHandler)]
         if any(kind is not None and "StopIteration" in ast.unparse(kind) for kind in handlers):
             raise _refused(spot, loop, "the data are over")
-        for test in conditions(spot, loop):
+        tests = [*conditions(spot, loop)]
+        for test in tests:
             if asked.depends_on_count(test, frozenset()):
                 raise _refused(spot, loop, ast.unparse(test))
+        if not tests and not handlers:
+            raise _refused(spot, loop, "nothing is asked")
+    for function in called_functions(tree, loop):
+        for spot in spots(function):
+            if isinstance(spot.node, ast.Raise) and _leaves(spot, loop, caught):
+                raise _refused(spot, loop, f"{function.name} raises this")
 
 
 def _refused(spot: Spot, loop: ast.stmt, where: str) -> ValueError:
@@ -131,6 +139,8 @@ def _outside_calls(test: ast.AST) -> set[str]:
     match test:
         case ast.Name() | ast.Attribute():
             return {ast.unparse(test)}
+        case ast.Subscript(holder, index):
+            return {ast.unparse(test), *_outside_calls(holder), *_outside_calls(index)}
         case ast.Call():
             return set()
     return {name for child in ast.iter_child_nodes(test) for name in _outside_calls(child)}

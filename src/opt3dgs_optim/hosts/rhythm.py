@@ -21,6 +21,7 @@ from opt3dgs_optim.hosts.syntax import (
     conditions,
     line_of,
     loops_around,
+    properties,
     refusal,
     shared_names,
     stored_attributes,
@@ -33,7 +34,7 @@ FUNCTIONS_OF_VALUES = (  # give the same for the same
     *("max", "min", "round", "str"),
 )
 METHODS_OF_VALUES = ("endswith", "get", "is_initialized", "lower", "startswith", "upper")
-ORDERS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE, ast.NotEq)
+ORDERS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)
 
 
 class Loop(NamedTuple):
@@ -43,7 +44,7 @@ class Loop(NamedTuple):
     inside: list[Spot]
     counts: set[str]  # its own names
     changed: set[str]  # expressions
-    changed_attributes: set[str]  # by the functions that it calls: the names alone
+    changed_attributes: set[str]  # properties, and by the functions that it calls: the names
 
 
 def check_rhythm(
@@ -75,8 +76,7 @@ def check_rhythm(
             )
     for spot in inside:
         skips = isinstance(spot.node, ast.Continue) and loops_around(spot)[-1] is loop
-        failed = any(isinstance(node, ast.ExceptHandler) for node in spot.above)
-        if skips and not failed and last < spot.line < first:
+        if skips and not _skips_a_loss(spot, last) and last < spot.line < first:
             raise refusal(
                 spot.line,
                 f"`continue` between loss.backward() (line {last}) and the step (line {first}): "
@@ -89,6 +89,15 @@ def check_rhythm(
                 f"{step.optimizer} steps also where no loss.backward() (line {last}) came before",
             )
     _check_conditions(tree, loop, inside, backwards, steps)
+
+
+def _skips_a_loss(skip: Spot, last: int) -> bool:
+    """Whether a `continue` stands where the loss has failed, so that there is none to step for."""
+    for node in skip.above:
+        if isinstance(node, ast.Try) and any(each in skip.above for each in node.handlers):
+            raised = [n for n in ast.walk(node) if isinstance(n, ast.Raise) and n.lineno > last]
+            return not raised
+    return False
 
 
 def _check_loops(backwards: list[Spot], steps: list[Step]) -> None:
@@ -142,19 +151,19 @@ def _check_conditions(
             if isinstance(node, ast.With) and loop in spot.above[: spot.above.index(node)]:
                 for item in node.items:
                     _check_batches(spot.line, steps[0], item.context_expr)
-    called = called_functions(tree, loop)
     target = loop.target if isinstance(loop, ast.For) else ast.Tuple([])
     own = {node.id for node in ast.walk(target) if isinstance(node, ast.Name)}
-    facts = Loop(
-        loop, inside, own, changed_in(inside) | shared_names(tree) | own, stored_attributes(called)
-    )
+    changed = changed_in(inside) | shared_names(tree)
+    attributes = stored_attributes(called_functions(tree, loop)) | properties(tree)
+    facts = Loop(loop, inside, own - changed, changed | own, attributes)
     always = comes_to(getattr(loop, "body", []), [step.spot.above[-1] for step in steps])
     for step in steps:
         together = not any(are_exclusive(spot, step.spot) for spot in backwards)
         for test in conditions(step.spot, loop):
             _check_batches(step.spot.line, step, test)
             around_all = together and all(test in conditions(spot, loop) for spot in backwards)
-            if not always and not around_all and not _is_steady(test, facts, set()):
+            negated = _is_where_false(step.spot, test)
+            if not (always or around_all or _is_steady(test, facts, negated=negated)):
                 raise refusal(
                     step.spot.line,
                     f"{step.optimizer} steps only where {ast.unparse(test)}: one step may have "
@@ -171,29 +180,53 @@ def _check_batches(line: int, step: Step, test: ast.expr) -> None:
         )
 
 
-def _is_steady(test: ast.expr, loop: Loop, seen: set[str]) -> bool:
-    """Whether a condition changes its answer once at most, but for a loss that is not finite."""
-    if asks_for_nan(test) or _is_fixed(test, loop):
-        return True
+def _is_where_false(spot: Spot, test: ast.expr) -> bool:
+    """Whether a node is what runs where a condition around it does not hold."""
+    for node, below in zip(spot.above, spot.chain, strict=True):
+        match node:
+            case ast.If(asked, _, orelse) if asked is test:
+                return below in orelse
+            case ast.IfExp(asked, _, orelse) if asked is test:
+                return below is orelse
+            case ast.BoolOp(ast.Or(), parts) if test in parts:
+                return True
+    return False
+
+
+def _is_steady(
+    test: ast.expr, loop: Loop, seen: frozenset[str] = frozenset(), *, negated: bool = False
+) -> bool:
+    """Whether a condition never fails between two turns in which it holds.
+
+    But for a loss that is not finite: its gradients are no part of a sum.
+    """
     match test:
+        case _ if asks_for_nan(test) or _is_fixed(test, loop):
+            return True
         case ast.UnaryOp(ast.Not(), value):
-            return _is_steady(value, loop, seen)
-        case ast.BoolOp(_, parts):
-            return all(_is_steady(part, loop, seen) for part in parts)
+            return _is_steady(value, loop, seen, negated=not negated)
+        case ast.BoolOp(operator, parts):
+            # Of two that hold from some turn on and up to some turn, only both are without a gap.
+            both = isinstance(operator, ast.Or if negated else ast.And)
+            alone = sum(not _is_fixed(part, loop) for part in parts) == 1
+            steady = all(_is_steady(part, loop, seen, negated=negated) for part in parts)
+            return steady and (both or alone)
         case ast.Compare(left, operators, others):
             counted = all(_is_count(n, loop) or _is_fixed(n, loop) for n in (left, *others))
-            return counted and all(isinstance(each, ORDERS) for each in operators)
+            gap = negated and len(operators) > 1
+            return counted and not gap and all(isinstance(each, ORDERS) for each in operators)
         case ast.Name(name) if name not in seen:
-            stores = [s for s in loop.inside if _stores(s, name)]
-            given = [value for _, value in values(loop.inside, name)]
-            unconditional = all(list(conditions(s, loop.node)) == [] for s in stores)
-            return (
-                len(stores) == len(given) == 1
-                and unconditional
-                and given[0] is not None
-                and _is_steady(given[0], loop, seen | {name})
-            )
+            value = _only_value(name, loop)
+            return value is not None and _is_steady(value, loop, seen | {name}, negated=negated)
     return False
+
+
+def _only_value(name: str, loop: Loop) -> ast.expr | None:
+    """What a name is given in every turn of a loop, in one place; else None."""
+    stores = [spot for spot in loop.inside if _stores(spot, name)]
+    given = [value for _, value in values(loop.inside, name)]
+    once = len(stores) == len(given) == 1
+    return given[0] if once and not any(conditions(stores[0], loop.node)) else None
 
 
 def _stores(spot: Spot, name: str) -> bool:
