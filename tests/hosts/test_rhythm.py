@@ -132,3 +132,8 @@ def test_an_error_after_the_loss(tmp_path: Path) -> None:
     body = "try:\n    loss.backward()\n    if iteration % 2 == 0:\n        raise KeyError\n"
     text = short(backward=f"{body}except KeyError:\n    continue")
     assert "`continue` between loss.backward()" in refusal_of(tmp_path, text)
+
+
+def test_a_count_that_is_another_at_the_step(tmp_path: Path) -> None:
+    step = f"for iteration in range(3, 10, 3):\n    pass\n{when('iteration < opt.iterations')}"
+    assert "steps only where iteration < opt.iterations" in refusal_of(tmp_path, short(step=step))

@@ -155,7 +155,9 @@ def _check_conditions(
     own = {node.id for node in ast.walk(target) if isinstance(node, ast.Name)}
     changed = changed_in(inside) | shared_names(tree)
     attributes = stored_attributes(called_functions(tree, loop)) | properties(tree)
-    facts = Loop(loop, inside, own - changed, changed | own, attributes)
+    last = max(step.spot.line for step in steps)  # what comes above the loss is read elsewhere
+    between = [spot for spot in inside if backwards[0].line < spot.line <= last]
+    facts = Loop(loop, inside, own - changed_in(between), changed | own, attributes)
     always = comes_to(getattr(loop, "body", []), [step.spot.above[-1] for step in steps])
     for step in steps:
         together = not any(are_exclusive(spot, step.spot) for spot in backwards)
