@@ -413,9 +413,9 @@ def commit_of(folder: Path) -> str:
     if (folder / ".commit").is_file():
         words = (folder / ".commit").read_text().split()
         return f"{words[0][:7]} ({words[-1]})"
-    command = ["git", "-C", str(folder), "log", "-1", "--format=%h (%cs)"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    return done.stdout.strip() or "unknown"
+    command = ["git", "-C", str(folder), "log", "-1", "--format=%H %cs"]
+    words = subprocess.run(command, capture_output=True, text=True, check=False).stdout.split()
+    return f"{words[0][:7]} ({words[1]})" if words else "unknown"
 
 
 def parts_of(output: str) -> str:

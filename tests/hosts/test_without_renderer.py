@@ -37,8 +37,12 @@ def test_trained_edited_saved_and_resumed(name: str, folder: str) -> None:
     sources = installed_fvdb() if folder == "installed" else TRAINERS / folder
     if not sources.is_dir():
         pytest.skip(f"no {sources}: put its sources there, set OPT3DGS_TRAINERS")
-    if name == "3dgrut" and importlib.util.find_spec("hydra") is None:
-        pytest.skip("3dgrut needs hydra-core: pip install it")
+    needed = {"hydra": "hydra-core", "tensorboard": "tensorboard"} if name == "3dgrut" else {}
+    missing = [
+        package for module, package in needed.items() if not importlib.util.find_spec(module)
+    ]
+    if missing:
+        pytest.skip(f"3dgrut needs {', '.join(missing)}: pip install them")
     command = [sys.executable, without_renderer.__file__, name, str(sources)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
