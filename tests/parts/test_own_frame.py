@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import gc
+import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -216,6 +217,19 @@ def test_positions_with_a_rate_of_zero_are_held(kind: Any) -> None:
     before = splats["means"].detach().clone()
     run(splats, pull(torch.ones(6, 3).double()), lr=kind(0.0))
     assert torch.equal(splats["means"], before)
+
+
+@pytest.mark.parametrize("kind", RATES)
+def test_the_smallest_rate_that_counts_is_the_smallest_normal_number(kind: Any) -> None:
+    """Below it the factor would overflow: such a rate holds the positions, as 0 does."""
+    rate = kind(1.0)
+    least = torch.finfo(rate.dtype).tiny if isinstance(rate, torch.Tensor) else sys.float_info.min
+    for lr, held in ((least, False), (least / 2, True)):
+        splats = scene(6, 3)
+        before = splats["means"].detach().clone()
+        run(splats, pull(torch.ones(6, 3).double()), lr=kind(lr))
+        moved = (splats["means"].detach() - before).abs().max()
+        assert (moved < 1e-30) == held
 
 
 def full() -> tuple[Part, ...]:
