@@ -78,6 +78,7 @@ SHORTER = (BRIEF, 10_000)  # lengths that may do instead of the baseline's
 ADAPTIVE_ARMS = (ADAPTIVE, "adc+annealed+faded", ADAPTIVE_DEFAULTS)
 PLUSH = Setting("plush", 4_000, BRIEF, "sfm", rotated=True)  # where other rates were tried, too
 LARGEST = Setting("bonsai", 50_000, LONG, "sfm", rotated=True, size="images_2")  # the README's
+FULL_ARMS = (BASELINE, "faded", DEFAULTS, OWN_FRAME_ARM)
 UNSEEN_ARMS = (BASELINE, "faded", "faded+out-of-view+averaged")
 
 
@@ -104,6 +105,7 @@ def conclusions(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
     quarter = [setting for setting in every if setting.size == QUARTER]
     degrees = [*every, *every_scene(study, LONG, sh_degree=3)]
     half = settings_of(study, LONG, size=HALF)
+    full = [s for s in study.settings() if s.rotated and s.size == "images" and not s.views]
     nine = settings_of(study, LONG, PIECES["OutOfView"])
     trained = [r for r in study.records() if r.setting.rotated]
     tuned = [small_trainings(study), settings_of(study, BRIEF), long]
@@ -111,6 +113,9 @@ def conclusions(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
         "rotated-machines": machines_line(trained),
         "decisions": decisions_table(study, BRIEF),
         "every-scene": scenes_gain_table(study, degrees, DEFAULTS, BASELINE),
+        "full": metrics_table(
+            study, full, FULL_ARMS, plain=True, head=lambda s: f"{s.scene}, {s.iterations:,}"
+        ),
         "own-frame": scenes_gain_table(study, half, OWN_FRAME_ARM, BASELINE),
         "own-frame-or-not": scenes_gain_table(study, half, OWN_FRAME_ARM, DEFAULTS),
         "headline": headline_table(study, long, BRIEF),
