@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import gc
 import warnings
 from typing import Any
@@ -377,6 +378,33 @@ def test_a_closure_that_every_optimizer_is_given_is_one_iteration() -> None:
     for adam in list(optimizers.values())[1:]:
         adam.step(closure)
     assert phases.iteration == 8
+
+
+@pytest.mark.parametrize("how", ["state_dict", "a copy", "made anew"])
+def test_after_a_resume_a_closure_is_an_iteration_at_once(how: str) -> None:
+    def closure() -> torch.Tensor:
+        for param in splats.values():
+            param.grad = torch.ones_like(param)
+        return torch.tensor(0.1)
+
+    splats, phases, optimizers = begun()
+    for _ in range(5):
+        for adam in optimizers.values():
+            adam.step(closure)
+    if how == "a copy":
+        splats, phases, optimizers = copy.deepcopy((splats, phases, optimizers))
+    elif how == "state_dict":
+        states = {name: adam.state_dict() for name, adam in optimizers.items()}
+        splats, phases, optimizers = begun()
+        for name, adam in optimizers.items():
+            adam.load_state_dict(states[name])
+    else:
+        optimizers = phases.upgrade(gsplat_optimizers(splats))
+    assert phases.iteration == 5
+    for _ in range(2):
+        for adam in optimizers.values():
+            adam.step(closure)
+    assert phases.iteration == 7
 
 
 @pytest.mark.parametrize(

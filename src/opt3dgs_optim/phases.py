@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from numbers import Integral, Real
+from numbers import Integral
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import torch
@@ -242,9 +242,9 @@ class PhaseScheduler(Course):
         """As `Course.stepping`; before the first energy the steps are plain Adam's.
 
         Of several optimizers that are given a closure, the one that has stepped in the present
-        iteration begins the next one.
+        iteration already begins the next one.
         """
-        if closure_value is not None and optimizer.stepped_at == self.current:
+        if closure_value is not None and optimizer.clock_at == self.current:
             self.observe(closure_value)
         self.steps += 1
         if not self._has_moved_gaussians:  # in a warm-up of rates that begin at 0, say
@@ -457,10 +457,13 @@ def _as_energy(loss: Any) -> Tensor:
         if loss.numel() == 1 and not loss.is_complex():
             return loss.detach().reshape(()) if loss.dim() else loss.detach()
         got = f"a tensor of shape {tuple(loss.shape)} and {loss.dtype}"
-    elif isinstance(loss, Real):  # numpy's scalars, too
-        return torch.tensor(float(loss), dtype=torch.float32)
     else:
         got = repr(loss)
+        try:
+            if not isinstance(loss, (str, bytes)):  # numpy's scalars, too
+                return torch.tensor(float(loss), dtype=torch.float32)
+        except (TypeError, ValueError):
+            pass
     raise ValueError(f"{CALL}.observe: loss={got}, but one real number is needed")
 
 

@@ -80,6 +80,7 @@ class StepAdam(Adam):
     _known: list[NamedGroup]  # the groups at the last look
     _open_windows: dict[str, Window | None]
     stepped_at = -1  # the iteration of its last step, of whatever parameters
+    clock_at = -1  # the course's iteration when this optimizer last stepped, or began
     _rewinds = 0
     _nonfinite_reported = False
     _nonfinite: Tensor | None = None  # seen on a device, and not looked at yet
@@ -100,6 +101,7 @@ class StepAdam(Adam):
         if base is Adam and course.parts and can_be_fused(self):
             use_fused(self)
         self._claim_rows()
+        self.clock_at = course.current
         course.register(self)
 
     def hold(self, slots: list[tuple[str, str | None]]) -> None:
@@ -203,7 +205,7 @@ class StepAdam(Adam):
             begun = not self.course.needs_energies or self.course.num_observed > 0
             idle = not begun and loss is None and self._is_held()
             acting = not idle and self.course.stepping(loss, self)
-            self.stepped_at = self.course.current
+            self.stepped_at = self.clock_at = self.course.current
             if mask is None and not self.course.parts:
                 self._step_base(None)
             else:
@@ -559,6 +561,7 @@ class StepAdam(Adam):
             self._ownership, self._known = RowOwnership(), []
             self._name_groups()
             self._claim_rows()
+            self.clock_at = self.course.current
             self.course.register(self)
 
     def state_dict(self) -> dict[str, Any]:
@@ -641,6 +644,7 @@ class StepAdam(Adam):
                     self._take_units(group, param, record, ())
         self._open_windows = dict(saved.windows)
         self._rewinds = self.course.rewinds
+        self.clock_at = self.course.current
         self._claim_rows()
 
     def take_loaded(self) -> None:
