@@ -70,8 +70,8 @@ def test_several_sets_in_one_optimizer() -> None:
     sets = {"Background": 8, "RigidNodes": 5}
 
     def train(optimizers: list[Adam]) -> None:
-        phases = PhaseScheduler(60)
-        for optimizer in optimizers:
+        schedulers = [PhaseScheduler(60) for _ in optimizers]
+        for phases, optimizer in zip(schedulers, optimizers, strict=True):
             phases.upgrade(optimizer)
         for iteration in range(60):
             for optimizer in optimizers:
@@ -80,8 +80,8 @@ def test_several_sets_in_one_optimizer() -> None:
                     torch.manual_seed(iteration + 1000 * (index % 6) + len(param))
                     param.grad = torch.randn(param.shape)
                     param.grad[iteration % len(param)] = 0.0
-            phases.observe(0.1)
-            for optimizer in optimizers:
+            for phases, optimizer in zip(schedulers, optimizers, strict=True):
+                phases.observe(0.1)
                 optimizer.step()
 
     alone = [adam_with(names, rows) for rows in sets.values()]
