@@ -12,7 +12,14 @@ import torch
 from torch.nn import Parameter
 from trainers import gsplat_optimizers, make_splats, state_of, step_all, train
 
-from opt3dgs_optim import Annealing, Averaging, EnergyHistogram, Fading, PhaseScheduler
+from opt3dgs_optim import (
+    Annealing,
+    Averaging,
+    EnergyHistogram,
+    Fading,
+    LQNAdam,
+    PhaseScheduler,
+)
 from opt3dgs_optim.names import GAUSSIAN
 
 TOTAL = 1000
@@ -442,3 +449,20 @@ def test_parts_that_an_adaptive_run_did_not_need_are_on_in_one_that_is_not() -> 
         other = PhaseScheduler(TOTAL, parts=[Fading(), Averaging()], adaptive=adaptive)
         other.load_state_dict(state)
         assert [*other.switched_off] == off
+
+
+@pytest.mark.parametrize(
+    "loss", [torch.ones(4), torch.tensor(1j), 1j, "0.1", torch.ones(0)], ids=str
+)
+def test_every_taker_of_a_loss_refuses_what_is_no_number(loss: Any) -> None:
+    histogram = EnergyHistogram()
+    with pytest.raises(ValueError, match=r"EnergyHistogram.observe: energy=.*one real number"):
+        histogram.observe(loss)
+    assert histogram.num_observed == 0
+    x = Parameter(torch.ones(1, 2))
+    x.grad = torch.ones(1, 2)
+    optimizer = LQNAdam([x])
+    with pytest.raises(ValueError, match=r"LQNAdam.step: the closure's value=.*one real number"):
+        optimizer.step(lambda: loss)
+    assert torch.equal(x, torch.ones(1, 2))
+    assert optimizer.course.steps == 0

@@ -155,11 +155,13 @@ class AWSGLD(StepAdam):
             )
 
     def _step(self, mask: Tensor | None, acting: bool) -> None:
+        if self.defaults["eps"] != PLAIN_EPS:
+            super()._step(mask, acting)
+            return
         with TemporaryOverrides() as temporary:
-            if self.defaults["eps"] == PLAIN_EPS:
-                # torch's CyclicLR and OneCycleLR write betas, and the drift would get momentum.
-                for group in self.param_groups:
-                    temporary.item(group, "betas", (0.0, group["betas"][1]))
+            # torch's CyclicLR and OneCycleLR write betas, and the drift would get momentum.
+            for group in self.param_groups:
+                temporary.item(group, "betas", (0.0, group["betas"][1]))
             super()._step(mask, acting)
 
     def acts_on(self, part: Part, group: Group) -> bool:

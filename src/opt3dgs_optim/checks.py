@@ -73,6 +73,28 @@ def as_damage(call: str) -> Iterator[None]:
         raise ValueError(f"{call}: {said}") from error
 
 
+def check_energy(
+    call: str, name: str, value: Any, dtype: torch.dtype = torch.float32
+) -> torch.Tensor:
+    """Return a loss as a detached tensor, 0-d, or raise ValueError unless it is one real number.
+
+    A tensor keeps its dtype; `dtype` is that of any other number, whatever torch's default is.
+    """
+    if isinstance(value, torch.Tensor):
+        if value.numel() == 1 and not value.is_complex():
+            value = value.reshape(()) if value.dim() else value
+            return value.detach() if value.requires_grad else value
+        got = f"a tensor of shape {tuple(value.shape)} and {value.dtype}"
+    else:
+        got = repr(value)
+        try:
+            if not isinstance(value, (str, bytes)):  # numpy's scalars, too
+                return torch.tensor(float(value), dtype=dtype)
+        except (TypeError, ValueError):
+            pass
+    raise ValueError(f"{call}: {name}={got}, but one real number is needed")
+
+
 def check_choice(call: str, name: str, value: Any, allowed: Sequence[Any] = (True, False)) -> Any:
     """Return `value`, or raise ValueError unless it is one of `allowed`, and of its type."""
     if not any(isinstance(value, type(each)) and value == each for each in allowed):

@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import LOGGER, as_damage, check_count, check_keys, warn_user
+from opt3dgs_optim.checks import (
+    LOGGER,
+    as_damage,
+    check_count,
+    check_energy,
+    check_keys,
+    warn_user,
+)
 from opt3dgs_optim.names import GAUSSIAN, NamedGroup, gaussian_of, set_of
 from opt3dgs_optim.part import Kept, Part, Phase, Window, overrides
 from opt3dgs_optim.state import ADAM_KEYS, check_kept_number, key_of
@@ -370,12 +377,17 @@ class Course:
 
         `closure_value` is the loss that a closure has returned, or None.
         """
+        energy = None
+        if closure_value is not None:
+            energy = check_energy(
+                f"{optimizer.call_name}.step", "the closure's value", closure_value
+            )
         self.steps += 1
-        if closure_value is None:
+        if energy is None:
             self.valid = True  # of this step nothing is known
         else:
             self.current += 1
-            self.take(torch.as_tensor(closure_value).detach().reshape(()))
+            self.take(energy)
         return True
 
     def valid_on_host(self) -> bool:

@@ -67,13 +67,10 @@ class Kept:
     def dtype_for(self, param: Tensor) -> torch.dtype:
         """The dtype of what is kept of a parameter."""
         wide = param.dtype in (torch.float64, torch.complex128)
-        if self.dtype.is_floating_point and param.is_complex() and self.is_like(param):
+        alike = self.per == "row" and self.shape is None  # one number for each of the parameter's
+        if self.dtype.is_floating_point and param.is_complex() and alike:
             return torch.complex128 if wide else torch.complex64
         return torch.float64 if self.dtype.is_floating_point and wide else self.dtype
-
-    def is_like(self, param: Tensor) -> bool:
-        """Whether it has a number for each number of a parameter."""
-        return self.per == "row" and self.shape is None
 
     def make(self, param: Tensor) -> Tensor:
         """The initial value for a parameter, on its device."""

@@ -11,7 +11,13 @@ from torch import Tensor
 from torch._compile import _disable_dynamo
 from torch.optim import Optimizer
 
-from opt3dgs_optim.checks import check_choice, check_count, check_number, warn_user
+from opt3dgs_optim.checks import (
+    check_choice,
+    check_count,
+    check_energy,
+    check_number,
+    warn_user,
+)
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import block, gaussian_of
 from opt3dgs_optim.overrides import is_moving_rate
@@ -198,7 +204,7 @@ class PhaseScheduler(Course):
             iteration: the trainer's own count from 0, where it may differ from the number of
                 calls: in a training that goes on from a checkpoint of the stock trainer, say.
         """
-        value = _as_energy(loss)
+        value = check_energy(f"{CALL}.observe", "loss", loss)
         if iteration is not None:
             iteration = check_count(f"{CALL}.observe", "iteration", iteration, 0)
             if iteration < self.current:  # what is kept for a time begins anew
@@ -449,22 +455,6 @@ class PhaseScheduler(Course):
             off = self.switched_off.get(name)
             lines.append(str(part) + ("" if off is None else f": switched off, {off}"))
         return block(CALL, lines)
-
-
-def _as_energy(loss: Any) -> Tensor:
-    """A loss as a detached tensor, 0-d; ValueError where it is no single real number."""
-    if isinstance(loss, Tensor):
-        if loss.numel() == 1 and not loss.is_complex():
-            return loss.detach().reshape(()) if loss.dim() else loss.detach()
-        got = f"a tensor of shape {tuple(loss.shape)} and {loss.dtype}"
-    else:
-        got = repr(loss)
-        try:
-            if not isinstance(loss, (str, bytes)):  # numpy's scalars, too
-                return torch.tensor(float(loss), dtype=torch.float32)
-        except (TypeError, ValueError):
-            pass
-    raise ValueError(f"{CALL}.observe: loss={got}, but one real number is needed")
 
 
 class RankMean:

@@ -12,6 +12,7 @@ from torch import Tensor
 from opt3dgs_optim.checks import (
     as_float,
     check_count,
+    check_energy,
     check_interval,
     check_keys,
     check_number,
@@ -161,16 +162,10 @@ class EnergyHistogram(Part):
             self._sums = [a + b for a, b in zip(self._sums, (1.0, nu, nu * nu), strict=True)]
 
     def _on_device(self, energy: Tensor | float) -> Tensor:
-        if not isinstance(energy, Tensor):
-            energy = torch.tensor(float(energy), dtype=torch.float64)
-        elif energy.numel() != 1:
-            shape = tuple(energy.shape)
-            raise ValueError(f"{CALL}.observe: energy has shape {shape}, but one number is needed")
-        if energy.device != self._device:  # e.g. resumed from a checkpoint
-            self._restore(energy.device, self.state_dict())
-        if energy.dim():
-            energy = energy.reshape(())
-        return energy.detach() if energy.requires_grad else energy
+        value = check_energy(f"{CALL}.observe", "energy", energy, torch.float64)
+        if value.device != self._device:  # e.g. resumed from a checkpoint
+            self._restore(value.device, self.state_dict())
+        return value
 
     def factor(self, group: Group, course: Course | None = None) -> float | Tensor | None:
         """Nu, a number where the energies live on a CPU."""
