@@ -59,10 +59,10 @@ def default_step(
     # Those of dropped iterations come with the next one.
     events = range(state.get("events", 0), events_before(iteration + 1, total))
     state["events"] = events.stop
-    # A point is out of view if its position has no gradient. At most 16,384 points are asked, and
+    # A point is out of view if its position has no gradient. At most 2,048 points are asked, and
     # the share of those in view is a mean over the last 100 views or so.
     in_view = grads["means"].any(1)
-    now = in_view[:: 1 + num_points // 16_384].float().mean().clamp(min=0.01)
+    now = in_view[:: 1 + num_points // 2_048].float().mean().clamp(min=0.01)
     state["share"] = torch.lerp(state.get("share", torch.tensor(1.0)), now, 1 / 100)
     share = state["share"].item()
 

@@ -106,6 +106,7 @@ class Course:
         self._published: dict[tuple[str, Place], tuple[int, Any]] = {}
         # id of a tensor -> the group that holds it, and where it stands
         self._places: dict[int, tuple[weakref.ref[NamedGroup], Place]] = {}
+        self._holders: list[weakref.ref[StepAdam]] | None = None  # of opacities; None: not sought
         # With what they held: a lost one is not missed where another one holds that.
         self._followers: list[tuple[weakref.ref[StepAdam], frozenset[Any]]] = []
         self.holds_twice = False  # whether two that exist have held the same Gaussian parameter
@@ -239,10 +240,21 @@ class Course:
             held = _held(optimizer)
             self.holds_twice |= any(own & held for ref, own in self._followers if ref() is not None)
             self._followers.append((weakref.ref(optimizer), held))
+            self.forget_places()
 
     def followers(self) -> list[StepAdam]:
         """The optimizers whose steps have these parts, the latest last."""
         return [each for ref, _ in self._followers if (each := ref()) is not None]
+
+    def holders_of_opacities(self) -> list[StepAdam]:
+        """The followers that hold opacities."""
+        if self._holders is None:  # asked in every iteration
+            self._holders = [
+                weakref.ref(each)
+                for each in self.followers()
+                if any(gaussian_of(group) == "opacities" for group in each.param_groups)
+            ]
+        return [each for ref in self._holders if (each := ref()) is not None]
 
     def stepped_together(self, iteration: int) -> str | None:
         """A Gaussian parameter of which two optimizers have stepped one each in an iteration."""
@@ -284,6 +296,7 @@ class Course:
     def forget_places(self) -> None:
         """Look anew for where parameters stand: groups were exchanged."""
         self._places.clear()
+        self._holders = None
 
     def gaussians_of(self, param: Tensor) -> dict[str, Tensor]:
         """The present tensors of the set of Gaussians that a parameter belongs to.
@@ -524,7 +537,7 @@ class Course:
             self.kept_numbers.clear()
             self.kept_numbers.update(numbers)
             self._followers[:] = followers
-            self._places.clear()
+            self.forget_places()
             for part, attributes, state in parts:
                 _put_back(part, attributes, state)
             raise
@@ -544,6 +557,7 @@ class Course:
             **vars(self),
             "_followers": [],
             "_places": {},
+            "_holders": None,
             "_published": {},
             "_numbers_read": {},
         }

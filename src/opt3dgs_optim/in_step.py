@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -89,3 +89,28 @@ class StepInProgress:
     counts: Tensor | bool
     overrides: TemporaryOverrides
     moving: list[MovingParameter] = field(default_factory=list)
+
+
+def check_mask_fits(
+    call: str, groups: Iterable[Group], mask: Tensor, is_about: Callable[[Group, int], bool]
+) -> None:
+    """ValueError unless a mask [N] fits the parameters that it is about, and there are any.
+
+    Only those with a gradient: the others are not stepped, and it may be older than they are.
+
+    Args:
+        call: whose step it is.
+        is_about: whether a mask of so many rows is about a group.
+    """
+    rows, present = mask.numel(), list[tuple[Group, Tensor]]()
+    for group in groups:
+        if group["differentiable"]:
+            raise ValueError(f"{call}.step: a mask with differentiable=True is not possible")
+        present += [(group, param) for param in group["params"] if param.grad is not None]
+    shapes = [tuple(param.shape) for group, param in present if is_about(group, rows)]
+    if present and (not shapes or any(shape[:1] != (rows,) for shape in shapes)):
+        shapes = shapes or [tuple(param.shape) for _, param in present]
+        raise ValueError(
+            f"{call}.step: the mask has {rows} rows, but the parameters have shapes {shapes}; a "
+            "mask of their first dimension is needed"
+        )

@@ -5,14 +5,18 @@ import inspect
 import operator
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from typing import Any, TypedDict
+from typing import Any, ParamSpec, TypedDict, TypeVar
 
 import torch
 from torch import Tensor
+from torch._compile import _disable_dynamo
 from torch.optim import Adam
 
 from opt3dgs_optim.part import Group
 from opt3dgs_optim.state import broadcast_rows, is_finite_sum
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class AdamOptions(TypedDict, total=False):
@@ -54,6 +58,22 @@ class TemporaryOverrides(AbstractContextManager["TemporaryOverrides"]):
         """Have `owner[key]`, which is not there otherwise."""
         self._previous.append((_delete, owner, key, None))
         owner[key] = value
+
+
+def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
+    """A function that runs as it is in a compiled one, at no cost outside of one.
+
+    torch's own decorator for it changes the interpreter's state in every call, compiled or not.
+    """
+    disabled = _disable_dynamo(function)
+
+    @functools.wraps(function)
+    def called(*args: P.args, **kwargs: P.kwargs) -> R:
+        if torch.compiler.is_dynamo_compiling():
+            return disabled(*args, **kwargs)
+        return function(*args, **kwargs)
+
+    return called
 
 
 def _delete(owner: Any, key: Any, _: Any) -> None:

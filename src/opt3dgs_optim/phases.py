@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import torch
 from torch import Tensor
-from torch._compile import _disable_dynamo
 from torch.optim import Optimizer
 
 from opt3dgs_optim.checks import (
@@ -20,7 +19,7 @@ from opt3dgs_optim.checks import (
 )
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import block, gaussian_of
-from opt3dgs_optim.overrides import is_moving_rate
+from opt3dgs_optim.overrides import is_moving_rate, uncompiled
 from opt3dgs_optim.part import Part, Phase
 from opt3dgs_optim.presets import (
     DEFAULTS,
@@ -40,6 +39,7 @@ CALL = "PhaseScheduler"
 # How long a trainer may do something by design before it is taken for a mistake.
 PATIENCE = 20  # iterations without a step, steps without an energy, or losses that are not finite
 LONG_PATIENCE = 200  # iterations without a step in a training that has stepped
+LOOK_INTERVAL = 10  # iterations between two looks at all optimizers
 MAX_REWINDS = 5  # how often a trainer may go back to an earlier iteration
 REMOVAL = "the trainer removes Gaussians, as clone, split and prune does"  # why a part is off
 Optimizers = TypeVar("Optimizers", bound="Optimizer | Mapping[str, Optimizer] | list[Optimizer]")
@@ -116,9 +116,10 @@ class PhaseScheduler(Course):
         self._over_ranks = None if process_group is None else RankMean(CALL, process_group)
         self._iterations_without_step = 1  # that has moved Gaussians
         self._has_moved_gaussians = False
+        self._looked_at = -1  # the iteration of the last look at all optimizers
         self._steps_without_energy = 0
         self._losses_not_finite = 0  # in a row
-        self._iterations_incomplete = 0  # since an upgraded optimizer does not exist any more
+        self._complete_at = 0  # energies, at the last look that found all upgraded optimizers
         self._num_optimizers = 0
         self._observed_again = 0  # the same iteration, in a row
         self._adam_steps: int | None = None  # of moments that came without a state of ours
@@ -192,7 +193,7 @@ class PhaseScheduler(Course):
         return optimizers
 
     # In a compiled function it runs as it is: what it looks at changes from iteration to iteration.
-    @_disable_dynamo
+    @uncompiled
     def observe(self, loss: Tensor | float, *, iteration: int | None = None) -> None:
         """Take the loss of this iteration: once, after backward, before the optimizers step.
 
@@ -287,40 +288,16 @@ class PhaseScheduler(Course):
                 "upgrade them in one call, as a dict whose keys say which set they belong to, "
                 f"such as 'first#{name}' and 'second#{name}'",
             )
-        if self._gaussians_have_moved_since(before):
-            self._has_moved_gaussians, self._iterations_without_step = True, 0
-        patience = LONG_PATIENCE if self.steps else PATIENCE
-        if self._iterations_without_step > patience:
-            self._report(
-                "no step",
-                f"{patience} losses were observed and no upgraded optimizer has moved Gaussians: "
-                f"{self._names()} do nothing; call upgrade(...) again where the trainer makes its "
-                "optimizers anew; where it freezes the Gaussians before the end, give total_steps "
-                "as the iteration after their last step, since the last thirtieth is averaged",
-            )
         if self.num_observed == 0 and self._stepped_before_first_energy():
             self._report(
                 "late",
                 "the optimizers had stepped before the first observe(loss), so each step has the "
                 "loss of the iteration before; call observe after backward, before the steps",
             )
-        lost, alive = self.num_lost_followers, len(self.followers())
-        # A trainer that follows the advice to end the schedule where it freezes the Gaussians goes
-        # on observing: from there on, no step is missed.
-        ended = self.current >= self.total_steps and self.steps > 0
-        if self.num_observed % LONG_PATIENCE == 0 and not ended:
-            self._watch_optimizers()
-        incomplete = lost and alive and not ended
-        self._iterations_incomplete = self._iterations_incomplete + 1 if incomplete else 0
-        if self._iterations_incomplete > LONG_PATIENCE:
-            self._report(
-                "lost",
-                f"{lost} of {lost + alive} upgraded optimizers do not exist any more: the "
-                "trainer has made some of them anew, whose steps have no parts; call upgrade(...) "
-                "again there",
-            )
-        self._iterations_without_step += not ended
+        self._iterations_without_step += not self._has_ended()
         self._steps_without_energy = 0
+        if self.num_observed < LOOK_INTERVAL or self.num_observed % LOOK_INTERVAL == 0:
+            self._look_at_optimizers()
         # Trainers that count from 1 end at total_steps. Frozen Gaussians may be rendered longer.
         beyond = self.total_steps + 1
         if self.current > beyond and self._gaussians_have_moved_since(beyond):
@@ -336,6 +313,45 @@ class PhaseScheduler(Course):
                 f"{CALL}: Adam's moments have made {adam_steps} steps, but this is iteration "
                 f"{self.current} of {self.total_steps}; a training that goes on from a checkpoint "
                 "of the stock trainer needs observe(loss, iteration=...)"
+            )
+
+    def _has_ended(self) -> bool:
+        """Whether the schedule is over: no step is missed from there on.
+
+        A trainer that follows the advice to end it where it freezes the Gaussians observes longer.
+        """
+        return self.current >= self.total_steps and self.steps > 0
+
+    def _look_at_optimizers(self) -> None:
+        """Look for optimizers that stand still, have gone, or go on for too long.
+
+        Not in every iteration, of whose time it would take a part that shows.
+        """
+        looked_at, self._looked_at = self._looked_at, self.current
+        if self._gaussians_have_moved_since(looked_at):
+            self._has_moved_gaussians, self._iterations_without_step = True, 0
+        elif self.current < looked_at:  # the clock was set back
+            self._iterations_without_step = 0
+        patience = LONG_PATIENCE if self.steps else PATIENCE
+        if self._iterations_without_step > patience:
+            self._report(
+                "no step",
+                f"{patience} losses were observed and no upgraded optimizer has moved Gaussians: "
+                f"{self._names()} do nothing; call upgrade(...) again where the trainer makes its "
+                "optimizers anew; where it freezes the Gaussians before the end, give total_steps "
+                "as the iteration after their last step, since the last thirtieth is averaged",
+            )
+        lost, alive = self.num_lost_followers, len(self.followers())
+        if self.num_observed % LONG_PATIENCE == 0 and not self._has_ended():
+            self._watch_optimizers()
+        if not (lost and alive) or self._has_ended():
+            self._complete_at = self.num_observed
+        if self.num_observed - self._complete_at > LONG_PATIENCE:
+            self._report(
+                "lost",
+                f"{lost} of {lost + alive} upgraded optimizers do not exist any more: the "
+                "trainer has made some of them anew, whose steps have no parts; call upgrade(...) "
+                "again there",
             )
 
     def _watch_count(self, iteration: int) -> None:
@@ -384,7 +400,7 @@ class PhaseScheduler(Course):
         """Switch off what loses with clone, split and prune once the trainer removes Gaussians."""
         if self._chosen or REMOVAL in self.switched_off.values():
             return
-        if not self._removed_rows.found(self.followers()):
+        if not self._removed_rows.found(self.holders_of_opacities()):
             return
         self._removed_rows.forget()  # gives the opacities back that it holds
         off = [

@@ -9,7 +9,6 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor
-from torch._compile import _disable_dynamo
 from torch.optim import Adam
 
 from opt3dgs_optim.checkpoint import (
@@ -28,6 +27,7 @@ from opt3dgs_optim.in_step import (
     MovingParameter,
     NamedPart,
     StepInProgress,
+    check_mask_fits,
 )
 from opt3dgs_optim.names import NamedGroup, block, gaussian_of, group_name, split_name
 from opt3dgs_optim.overrides import (
@@ -38,6 +38,7 @@ from opt3dgs_optim.overrides import (
     own_step,
     refuse_capture,
     scale_learning_rate,
+    uncompiled,
     use_fused,
     zero_nonfinite,
 )
@@ -165,7 +166,7 @@ class StepAdam(Adam):
     # -- a step ----------------------------------------------------------------------------------
 
     # Under torch.compile a step runs as it is, like those of torch's own optimizers.
-    @_disable_dynamo
+    @uncompiled
     def step(  # pyright: ignore[reportIncompatibleMethodOverride]
         self,
         closure: Callable[[], Any] | Tensor | None = None,
@@ -192,10 +193,12 @@ class StepAdam(Adam):
         """
         self._opt_called = True  # what learning-rate schedulers would note by wrapping this method
         refuse_capture(self)
-        masks: list[Any] = [each for each in (visible, visibility) if each is not None]
-        if isinstance(closure, Tensor):
-            masks, closure = [closure, *masks], None
-        mask = check_mask(self.call_name, masks, num_points) if masks else None
+        mask = None
+        if closure is not None or visible is not None or visibility is not None:
+            masks: list[Any] = [each for each in (visible, visibility) if each is not None]
+            if isinstance(closure, Tensor):
+                masks, closure = [closure, *masks], None
+            mask = check_mask(self.call_name, masks, num_points) if masks else None
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -252,7 +255,7 @@ class StepAdam(Adam):
         if acting:
             self._follow_windows()
         if mask is not None:
-            self._check_mask(mask)
+            check_mask_fits(self.call_name, self.param_groups, mask, self._takes_mask)
         with TemporaryOverrides() as temporary:
             step = StepInProgress(mask, acting, counts, temporary)
             for group in self.param_groups:
@@ -328,6 +331,8 @@ class StepAdam(Adam):
         guarded = rows is not None or counts is not True
         needed = rows is not None or parts.any  # whether more than the gradient's check is
         now = max(self.course.current, 0)  # a course may have no clock
+        plain = not (guarded or parts.displacement or parts.after or group["maximize"])
+        plain = plain and getattr(self, "grad_scale", None) is None
         for i, (param, record) in enumerate(zip(params, group.records, strict=True)):
             grad = param.grad
             if grad is None or grad.is_sparse:
@@ -336,7 +341,9 @@ class StepAdam(Adam):
                 self._zero_nonfinite(param)
             if record.units != parts.units:
                 self._take_units(group, param, record, parts.units)
-            if needed:
+            if needed and plain:
+                self._feed(step, group, param, record, parts)
+            elif needed:
                 own, known = rows, counts
                 if own is not None:
                     own = own.to(param.device)
@@ -350,6 +357,27 @@ class StepAdam(Adam):
                 record.last_step = now
         if parts.displacement or rows is not None:
             step.overrides.item(group, "params", params)
+
+    def _feed(
+        self,
+        step: StepInProgress,
+        group: Group,
+        param: Tensor,
+        record: ParameterRecord,
+        parts: ActingParts,
+    ) -> None:
+        """Do what `_prepare` and `_finish` do where nothing is masked, scaled, undone or moved.
+
+        Most steps are of this kind, and take less time so.
+        """
+        course, view = self.course, self._view_of(group, param, record)
+        grad = fed = cast(Tensor, param.grad)
+        for name, part in parts.before:
+            fed = part.before(group, param, fed, view.of(name), course)
+        if fed is not grad:
+            step.overrides.attribute(param, "grad", fed)
+        if course.row_keys:
+            self._ownership.claim(param, view.adam, course.row_keys)
 
     def _take_units(
         self, group: Group, param: Tensor, record: ParameterRecord, units: tuple[str, ...]
@@ -378,7 +406,8 @@ class StepAdam(Adam):
         state, course = self.state[param], self.course
         if not state:  # torch makes its moments only where there is nothing else yet
             self._init_group({**group, "params": [param]}, [], [], [], [], [], [])
-        self._ownership.drop_foreign(param, state, course.row_keys)
+        if course.row_keys:
+            self._ownership.drop_foreign(param, state, course.row_keys)
         return record.view(param, state, course.declared, course.kept_numbers)
 
     def _prepare(self, step: StepInProgress, moving: MovingParameter) -> Tensor:
@@ -512,24 +541,6 @@ class StepAdam(Adam):
         if gaussian_of(group) is not None:
             return True
         return self.any_group and any(p.shape[:1] == (rows,) for p in group["params"])
-
-    def _check_mask(self, mask: Tensor) -> None:
-        """ValueError unless it fits the parameters that it is about, and there are any.
-
-        Only those with a gradient: the others are not stepped, and it may be older than they are.
-        """
-        call, rows = f"{self.call_name}.step", mask.numel()
-        if self.defaults["differentiable"]:
-            raise ValueError(f"{call}: a mask with differentiable=True is not possible")
-        every = [(group, p) for group in self.param_groups for p in group["params"]]
-        present = [(group, p) for group, p in every if p.grad is not None]
-        shapes = [tuple(p.shape) for group, p in present if self._takes_mask(group, rows)]
-        if present and (not shapes or any(shape[:1] != (rows,) for shape in shapes)):
-            shapes = shapes or [tuple(p.shape) for _, p in present]
-            raise ValueError(
-                f"{call}: the mask has {rows} rows, but the parameters have shapes {shapes}; a "
-                "mask of their first dimension is needed"
-            )
 
     def _drop_foreign(self) -> None:
         """Forget what parts have kept of other rows than the parameters' present ones."""

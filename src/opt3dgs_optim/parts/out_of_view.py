@@ -14,7 +14,7 @@ from opt3dgs_optim.state import broadcast_rows
 
 OUT_OF_VIEW, SEEN_SHARE = "out_of_view", "seen_share"  # what it publishes, and keeps
 NUM_VIEWS_AVERAGED = 100
-MAX_POINTS_LOOKED_AT = 16_384  # of each view, for the mean share
+MAX_POINTS_LOOKED_AT = 2_048  # of each view, for the mean share over many
 MAX_SEEN_SHARE = 1 / 3  # above it nothing is changed
 MIN_SEEN_SHARE = 0.01  # a view counts as seeing at least so much
 
