@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from studies.scenes.analysis import Difference, Study, difference
+from studies.scenes.analysis import METRICS, Difference, Study, difference
 from studies.scenes.arms import BASELINE, DEFAULTS, OWN_FRAME_ARM
 from studies.scenes.records import Setting
 
-QUARTER, HALF = "images_4", "images_2"
+QUARTER, HALF, FULL = "images_4", "images_2", "images"
 # What decides: the first of these that enough scenes and seeds were trained at.
 LADDER = ((HALF, 30_000), (QUARTER, 30_000), (QUARTER, 7_500))
 POINTS, HALF_POINTS = 4_000, 50_000
@@ -34,6 +34,11 @@ COMPARISONS = {
 PIECES = {"OutOfView": 9}
 
 
+# On before anything could be trained at full size, which must confirm every other part.
+ON_BEFORE = ("Fading", "Averaging", "OutOfView")
+CONFIRMING = 30_000  # iterations
+
+
 @dataclass(frozen=True)
 class Decision:
     """Whether a part is in the defaults."""
@@ -43,6 +48,7 @@ class Decision:
     iterations: int | None  # None: not measured on enough scenes
     found: Difference | None
     size: str = QUARTER  # of the photos
+    confirmed: bool = True  # by trainings at full size, or on before there were any
 
     @property
     def verdict(self) -> str:
@@ -50,7 +56,11 @@ class Decision:
         if self.found is None:
             return "too few"
         verdict, seeds = self.found.verdict, min(map(len, self.found.pairs.values()))
-        return f"{verdict}, one seed" if verdict == "pays" and seeds < MIN_SEEDS else verdict
+        if verdict != "pays":
+            return verdict
+        if seeds < MIN_SEEDS:
+            return "pays, one seed"
+        return verdict if self.confirmed else "pays, not confirmed at full size"
 
     @property
     def on(self) -> bool:
@@ -89,16 +99,26 @@ def decide(study: Study) -> dict[str, Decision]:
 
     Each part is judged against the same training without it: the multiplier against a constant of
     its mean, curvature against the same phase without it, annealing and pooling on top of the
-    defaults. At half size one seed decides nothing while there are several at a quarter.
+    defaults. At half size one seed decides nothing while there are several at a quarter. A part
+    that pays must be confirmed at full size, but for those that were on before.
     """
     made = {}
     for part, (arm, control) in COMPARISONS.items():
         made[part] = Decision(arm, control, None, None)
+        confirmed = part in ON_BEFORE or is_confirmed(study, arm, control)
         for size, iterations in LADDER:
             settings = settings_of(study, iterations, PIECES.get(part, 0), size)
             found = difference(study, settings, arm, control)
             seeds = min(map(len, found.pairs.values()), default=0)
             if len(found.pairs) >= MIN_SCENES and (size != HALF or seeds >= MIN_SEEDS):
-                made[part] = Decision(arm, control, iterations, found, size)
+                made[part] = Decision(arm, control, iterations, found, size, confirmed)
                 break
     return made
+
+
+def is_confirmed(study: Study, arm: str, control: str) -> bool:
+    """Whether an arm was trained at full size and length, and is behind in no metric there."""
+    every = every_scene(study, CONFIRMING) + every_scene(study, CONFIRMING, sh_degree=3)
+    found = difference(study, [s for s in every if s.size == FULL], arm, control)
+    ahead = (sign * found.of(metric)[0] >= 0 for metric, (sign, _) in METRICS.items())
+    return found.count > 0 and all(ahead)

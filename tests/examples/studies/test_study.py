@@ -236,6 +236,35 @@ def test_half_size_decides_where_it_was_trained_with_two_seeds(seeds: int) -> No
     assert (decision.size, decision.verdict) == expected
 
 
+@pytest.mark.parametrize(
+    ("full", "verdict"),
+    [
+        ({}, "pays"),
+        ({"ssim": 0.6999}, "pays, not confirmed at full size"),
+        ({"lpips": 0.2001}, "pays, not confirmed at full size"),
+        (None, "pays, not confirmed at full size"),
+    ],
+)
+def test_a_new_part_must_be_confirmed_at_full_size(
+    full: dict[str, float] | None, verdict: str
+) -> None:
+    arm, control = COMPARISONS["OwnFrame"]
+    records = [
+        rotated_record(name, scene, seed, psnr=20.0 + (name == arm))
+        for scene in MANY_VIEWS_SCENES
+        for seed in (0, 1)
+        for name in (arm, control)
+    ]
+    others = {"size": "images", "points": 200_000, "sh_degree": 3, "iterations": 30_000}
+    for name, better in ((arm, full), (control, {})):
+        if better is not None:
+            made = rotated_record(name, "bonsai", 0, **better)
+            records.append(replace(made, setting=replace(made.setting, **others)))
+    decision = decide(Study(records))["OwnFrame"]
+    assert decision.verdict == verdict
+    assert decision.on == (verdict == "pays")
+
+
 def test_every_scene_and_size_has_its_line() -> None:
     arms = ((BASELINE, 20.0), ("annealed", 20.5))
     quarter = [rotated_record(arm, "banana", 0, psnr=psnr) for arm, psnr in arms]
