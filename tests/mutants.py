@@ -154,6 +154,7 @@ def _in_child(
     known = set(sys.modules)
     # -n 0: in this process, whatever the project's own options are.
     options = ["-x", "-q", "-n", "0", "-p", "no:cacheprovider", "-k", LEFT_OUT]
+    options += ["-m", "not slow and not hosts and not compiles and not processes"]
     # Hypothesis is imported before pytest could rewrite its assertions; it has none to rewrite.
     options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
     status = pytest.main([*options, *map(str, tests)], [plugin])

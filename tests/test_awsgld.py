@@ -376,3 +376,19 @@ def test_a_plain_drift_of_float16_is_refused_where_it_would_stand_still() -> Non
     assert len(optimizer.param_groups) == 1
     AWSGLD([half], preconditioner="none", fused=True)
     AWSGLD([half])
+
+
+def test_an_energy_that_is_not_finite_drops_one_step() -> None:
+    """And not those after it for which nothing was observed."""
+    x = torch.nn.Parameter(torch.ones(3))
+    histogram = EnergyHistogram()
+    optimizer = AWSGLD([x], lr=0.01, histogram=histogram)
+    moved = []
+    for energy in (0.1, float("nan"), None, None, 0.1):
+        before = x.detach().clone()
+        if energy is not None:
+            histogram.observe(energy)
+        x.grad = torch.ones_like(x)
+        optimizer.step()
+        moved.append(not torch.equal(x, before))
+    assert moved == [True, False, True, True, True]

@@ -14,7 +14,7 @@ from placed_training import ARMS
 from torch import Tensor
 from torch.nn import Parameter
 
-from opt3dgs_optim import PhaseScheduler
+from opt3dgs_optim import Kept, Part, PhaseScheduler
 
 TOTAL, SWITCH, ROWS = 90, 60, 20
 SHAPES = {"means": (3,), "opacities": (1,)}
@@ -81,3 +81,42 @@ def test_each_set_goes_where_it_goes_alone(arm: str, numbers: list[int]) -> None
         ):
             unlike = [key for key in found if not torch.equal(found[key], expected[key])]
             assert unlike == [], f"set {at} of {numbers}"
+
+
+class Counted(Part):
+    """How many steps each parameter has made."""
+
+    keeps = (Kept("steps", per="parameter"),)
+
+    def after(self, group: Any, param: Tensor, state: Any, course: Any) -> None:
+        state["steps"] += 1
+
+
+@pytest.mark.parametrize(
+    ("then", "expected"),
+    [
+        ("ab", [8, 8]),
+        ("ba", [8, 8]),
+        ("bc", [8, 3]),  # a has left, and c is new
+        ("ca", [3, 8]),
+        ("cb", [8, 8]),  # c stands where a stood
+        ("cd", [8, 8]),  # density control has replaced both
+        ("abc", [8, 8, 3]),
+        ("b", [8]),
+        ("c", [3]),  # nobody knows whose place it is
+    ],
+)
+def test_what_is_kept_goes_with_a_parameter_that_stays(then: str, expected: list[int]) -> None:
+    every = {name: Parameter(torch.zeros(4, 3)) for name in "abcd"}
+    adam: Any = torch.optim.Adam([{"params": [every[n] for n in "ab"], "name": "means"}], lr=0.01)
+    phases = PhaseScheduler(TOTAL, parts=[Counted()])
+    phases.upgrade(adam)
+    for names, many in (("ab", 5), (then, 3)):
+        adam.param_groups[0]["params"] = [every[name] for name in names]
+        for _ in range(many):
+            for param in every.values():
+                param.grad = torch.ones_like(param)
+            phases.observe(0.1)
+            adam.step()
+    records = adam.param_groups[0].records
+    assert [int(record.numbers["Counted.steps"]) for record in records] == expected

@@ -942,3 +942,74 @@ def test_everything_in_it_is_plain() -> None:
     _, optimizer, saved = scheduler_state()
     assert flat(reread(saved)) == flat(saved)
     assert optimizer.course.part(Curvature) is not None
+
+
+BAD = (float("nan"), float("inf"), -1.0, "1", None)
+OPTIONS = [(name, value) for name in ("lr", "eps", "weight_decay") for value in BAD]
+OPTIONS += [("betas", value) for value in (0.9, (0.9,), (0.9, 2.0), (float("nan"), 0.9), None)]
+OPTIONS += [(name, -1) for name in ("amsgrad", "maximize", "capturable", "foreach", "fused")]
+OPTIONS += [("params", 0), ("params", "01")]
+
+
+@pytest.mark.parametrize(("name", "value"), OPTIONS, ids=str)
+@pytest.mark.parametrize("how", ["damaged", "missing"])
+def test_damaged_options_of_adam_are_refused_and_nothing_is_loaded(
+    name: str, value: Any, how: str
+) -> None:
+    if how == "missing" and (value != BAD[0] or name not in ("lr", "eps", "betas")):
+        return
+    _, adam = phased(points(), [Averaging()], 5)
+    before, saved = copy.deepcopy(adam.state_dict()), copy.deepcopy(adam.state_dict())
+    saved["state"][0]["exp_avg"].zero_()
+    if how == "missing":
+        del saved["param_groups"][0][name]
+    else:
+        saved["param_groups"][0][name] = value
+    with pytest.raises(ValueError, match=name):
+        adam.load_state_dict(saved)
+    assert flat(adam.state_dict()) == flat(before)
+
+
+def test_a_parameter_whose_state_is_none_has_made_no_step() -> None:
+    _, adam = phased(points(), [Averaging()], 5)
+    saved = copy.deepcopy(adam.state_dict())
+    saved["state"][0] = None
+    _, fresh = phased(fresh_x := points(), [Averaging()])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that the moments are of another number of steps
+        fresh.load_state_dict(saved)
+    assert not fresh.state.get(fresh_x)
+
+
+@pytest.mark.parametrize("key", ["ema.mean", "ema", "my.own.mean"])
+def test_what_a_trainer_keeps_under_names_of_its_own_survives(key: str) -> None:
+    _, adam = phased(x := points(), [Averaging()], 5)
+    adam.state[x][key] = torch.full_like(x, 3.0)
+    saved = copy.deepcopy(adam.state_dict())
+    _, again = phased(y := points(), [Averaging()])
+    again.load_state_dict(saved)
+    assert torch.equal(again.state[y][key], torch.full_like(y, 3.0))
+
+
+class Wide(Part):
+    """Keeps whole numbers that float32 has not."""
+
+    keeps = (Kept("count", shape=(), dtype=torch.int64),)
+
+    def after(self, group: Any, param: Tensor, state: Any, course: Any) -> None:
+        state["count"] += self.step
+
+    def __init__(self, step: int) -> None:
+        self.step = step
+
+
+@pytest.mark.parametrize(("step", "said"), [(16_777_217, True), (3, False)])
+def test_whole_numbers_that_a_stock_trainer_rounds_are_said(step: int, said: bool) -> None:
+    _, adam = phased(x := points(), [Wide(step)], 3)
+    stock = stock_of(x, adam.state_dict())
+    _, again = phased(y := points(), [Wide(step)])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        again.load_state_dict(stock.state_dict())
+    assert any("rounded to torch.float32" in str(each.message) for each in caught) is said
+    assert int(again.state[y]["Wide.count"][0]) == pytest.approx(3 * step, abs=4)

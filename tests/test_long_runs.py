@@ -86,6 +86,7 @@ def assert_flat(folder: Path, steps: int) -> None:
         assert inside[-1][1] - inside[0][1] < 8 * 2**20
 
 
+@pytest.mark.thorough
 def test_it_trains(tmp_path: Path) -> None:
     training = Training(tmp_path, 300)
     losses = [training.step() for _ in range(200)]  # up to the switch, where the loss is another

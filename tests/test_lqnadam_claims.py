@@ -99,6 +99,7 @@ def test_where_it_is_faster_than_adam_and_where_slower(
     assert factor * best_error(name, winner) < best_error(name, loser)
 
 
+@pytest.mark.thorough
 def test_the_default_histogram_is_not_for_sampling() -> None:
     """A fifth of the steps of the docstring."""
     assert crossings(None, 4_000) <= 1

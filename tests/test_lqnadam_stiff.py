@@ -97,6 +97,7 @@ def test_lqnadam_converges(lqnadam: Make, condition: float, left: float) -> None
     assert float(decayed(lqnadam, hessians(300, condition)).median()) < left
 
 
+@pytest.mark.thorough
 def test_where_lqnadam_does_not_get() -> None:
     """A plain statement. From condition 1e3 on, in rotated axes, it does not arrive; Adam does.
 

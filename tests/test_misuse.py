@@ -193,6 +193,76 @@ def test_all_optimizers_made_anew() -> None:
     assert "no upgraded optimizer has moved Gaussians" in message
 
 
+@pytest.mark.parametrize("period", [2, 5, 7, 10])
+@pytest.mark.parametrize("how", ["requires_grad", "rate"])
+def test_gaussians_that_are_frozen_now_and_then_are_no_mistake(how: str, period: int) -> None:
+    """Whichever iterations are looked at: trackers and mappers take turns, for example."""
+    for first in range(period):
+        splats, phases, optimizers = begun()
+        rates = {name: each.param_groups[0]["lr"] for name, each in optimizers.items()}
+
+        def train(first: int = first, given: Any = (splats, phases, optimizers, rates)) -> None:
+            splats, phases, optimizers, rates = given
+            for iteration in range(first, 450):
+                frozen = iteration % period != 0 if period < 10 else iteration % period == 0
+                for name, param in splats.items():
+                    param.requires_grad_(not frozen or how != "requires_grad")
+                    rate = 0.0 if frozen and how == "rate" else rates[name]
+                    optimizers[name].param_groups[0]["lr"] = rate
+                iterate(splats, phases, optimizers, 1)
+
+        assert said(train) == []
+
+
+def test_an_optimizer_made_anew_after_a_checkpoint_was_loaded() -> None:
+    """Whatever the checkpoint does to the count of losses."""
+    splats, phases, optimizers = begun(10_000)
+    iterate(splats, phases, optimizers, 100)
+    early = copy.deepcopy({name: each.state_dict() for name, each in optimizers.items()})
+    iterate(splats, phases, optimizers, 900)
+    for name, each in optimizers.items():
+        each.load_state_dict(early[name])
+    optimizers["scales"] = gsplat_optimizers(splats)["scales"]
+    gc.collect()
+    assert said(lambda: iterate(splats, phases, optimizers, 190)) == []
+    (message,) = said(lambda: iterate(splats, phases, optimizers, 60))
+    assert "1 of 6 upgraded optimizers do not exist any more" in message
+
+
+def test_an_optimizer_made_anew_soon_after_a_resume_may_be_upgraded_again() -> None:
+    splats, phases, optimizers = begun(10_000)
+    iterate(splats, phases, optimizers, 500)
+    saved = {name: each.state_dict() for name, each in optimizers.items()}
+    splats, phases, optimizers = begun(10_000)
+    for name, each in optimizers.items():
+        each.load_state_dict(saved[name])
+
+    def go_on() -> None:
+        optimizers["scales"] = gsplat_optimizers(splats)["scales"]
+        gc.collect()
+        iterate(splats, phases, optimizers, 50)
+        phases.upgrade(optimizers)
+        iterate(splats, phases, optimizers, 300)
+
+    assert not any("do not exist any more" in message for message in said(go_on))
+
+
+def test_a_second_run_of_the_same_objects_with_an_optimizer_that_steps_rarely() -> None:
+    splats, phases, optimizers = begun(2_000)
+
+    def run() -> None:
+        for iteration in range(990):
+            for param in splats.values():
+                param.grad = torch.ones_like(param)
+            phases.observe(0.1, iteration=iteration)
+            for name, each in optimizers.items():
+                if name != "shN" or iteration % 16 == 0:
+                    each.step()
+
+    run()
+    assert said(run) == []
+
+
 # How trainers freeze Gaussians: gsplat main's `ppisp` does the first, and goes on stepping.
 FREEZING = ("requires_grad", "requires_grad, gradients kept", "no gradient", "rate", "no step")
 
@@ -466,3 +536,11 @@ def test_every_taker_of_a_loss_refuses_what_is_no_number(loss: Any) -> None:
         optimizer.step(lambda: loss)
     assert torch.equal(x, torch.ones(1, 2))
     assert optimizer.course.steps == 0
+
+
+def test_one_optimizer_under_two_keys_is_refused() -> None:
+    means = gsplat_optimizers(splats := make_splats())["means"]
+    with pytest.raises(ValueError, match=r"optimizers\['scales'\] is optimizers\['means'\]"):
+        PhaseScheduler(TOTAL).upgrade({"means": means, "scales": means})
+    assert type(means) is torch.optim.Adam
+    assert splats["means"].requires_grad

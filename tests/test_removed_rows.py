@@ -19,7 +19,7 @@ from gsplat_host import Trainer, scene_of_main, strategies
 from inria_host import OPTIONS, made_model
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
-from trainers import gsplat_optimizers, make_splats
+from trainers import gsplat_optimizers, inria_optimizer, make_splats
 
 from opt3dgs_optim import DEFAULTS, DEFAULTS_ADC, PhaseScheduler
 from opt3dgs_optim.removed_rows import EDITS, RemovedRows, were_removed
@@ -584,3 +584,36 @@ def test_a_copy_looks_for_itself() -> None:
     run_inria(other, other.optimizer.course, densify_and_prune, FIRST_EDIT, TOTAL)
     assert set(other.optimizer.course.switched_off) == {"Fading"}
     assert phases.switched_off == {}
+
+
+@pytest.mark.parametrize("how", ["in place", "another dict", "another list"])
+def test_rows_that_are_removed_by_another_group(how: str) -> None:
+    """Trainers that make their groups anew where they prune."""
+    splats = make_splats(40)
+    adam = inria_optimizer(splats)
+    phases = PhaseScheduler(TOTAL)
+    phases.upgrade(adam)
+    for pruned in (False, True):
+        if pruned:
+            groups = []
+            for group in adam.param_groups:
+                old = group["params"][0]
+                new = Parameter(old.detach()[10:].clone())
+                state = adam.state.pop(old)
+                adam.state[new] = {
+                    key: value[10:].clone() if value.dim() else value
+                    for key, value in state.items()
+                }
+                if how == "in place":
+                    group["params"][0] = new
+                groups.append(group if how == "in place" else {**group, "params": [new]})
+            if how == "another list":
+                adam.param_groups = groups
+            else:
+                adam.param_groups[:] = groups
+        for group in adam.param_groups:
+            for param in group["params"]:
+                param.grad = torch.ones_like(param)
+        phases.observe(0.1)
+        adam.step()
+    assert "Fading" in phases.switched_off

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from placed_training import ARMS, GPU, Training, distance
+from placed_training import ARMS, GPU, Training, distance, is_brief, some_of
 from simulated_device import DeviceTensor, SimulatedDevice, on_device, on_host
 from torch import Tensor
 from torch.nn import Parameter
@@ -298,7 +298,7 @@ def test_all_on_one_gpu(arm: str) -> None:
     assert_never_waits(training)
 
 
-@pytest.mark.parametrize("arm", list(ARMS))
+@pytest.mark.parametrize("arm", some_of(ARMS, is_brief))
 def test_some_parameters_on_the_host(arm: str) -> None:
     """The host must wait once to know whether the loss is finite, and once for nu."""
     with SimulatedDevice():
@@ -312,7 +312,7 @@ def test_some_parameters_on_the_host(arm: str) -> None:
     assert max(counts[1:], default=0) <= 2 + copied, training.waits
 
 
-@pytest.mark.parametrize("arm", list(ARMS))
+@pytest.mark.parametrize("arm", some_of(ARMS, is_brief))
 def test_parameters_on_two_gpus_and_the_loss_on_a_third(arm: str) -> None:
     path = {} if arm == "no parts" else {"adam": FUSED}
     training = compared(arm, {"places": TWO, "loss_on": "cuda:2"}, path)
@@ -534,7 +534,7 @@ def goes_on(arm: str, first: Training, states: Any, **places: Any) -> Training:
     return second.run()
 
 
-@pytest.mark.parametrize("arm", RESUMED)
+@pytest.mark.parametrize("arm", some_of(RESUMED, is_brief))
 def test_a_checkpoint_of_another_gpu_is_gone_on_with(arm: str) -> None:
     with SimulatedDevice():
         first, states = resumed(arm, places="cuda:1", loss_on="cuda:1")
@@ -545,7 +545,7 @@ def test_a_checkpoint_of_another_gpu_is_gone_on_with(arm: str) -> None:
         assert distance(second.values(), whole.values()) == 0.0
 
 
-@pytest.mark.parametrize("arm", RESUMED)
+@pytest.mark.parametrize("arm", some_of(RESUMED, is_brief))
 def test_a_checkpoint_of_the_host_is_gone_on_with_on_a_gpu(arm: str) -> None:
     """`torch.load(..., map_location="cpu")`: everything in it is the host's."""
     with SimulatedDevice():
@@ -556,7 +556,7 @@ def test_a_checkpoint_of_the_host_is_gone_on_with_on_a_gpu(arm: str) -> None:
         assert distance(second.values(), whole.values()) == 0.0
 
 
-@pytest.mark.parametrize("arm", ARMS)
+@pytest.mark.parametrize("arm", some_of(ARMS, is_brief))
 def test_parameter_groups_hold_plain_numbers(arm: str) -> None:
     with SimulatedDevice():
         training = Training(arm, **ON_GPU).run(40)

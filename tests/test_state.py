@@ -202,7 +202,7 @@ def test_a_pickled_record_has_no_view() -> None:
     place.view()["count"] = 2
     place.record.last_step = 4
     other = copy.deepcopy(place.record)
-    known = {"last_step": 4, "units": None, "numbers": {"Mine.count": 2}}
+    known = {"last_step": 4, "last_moved": None, "units": None, "numbers": {"Mine.count": 2}}
     assert vars(other) == {**known, "param": None, "_view": None}
 
 

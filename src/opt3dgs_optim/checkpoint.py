@@ -15,10 +15,12 @@ distributed checkpoints take them. Checkpoints of format 2 are still read.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Collection, Iterable, Mapping
 from itertools import chain
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -109,6 +111,8 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
     call = f"{optimizer.call_name}.load_state_dict"
     params = _parameters(optimizer)
     groups = [dict(group) for group in loaded["param_groups"]]
+    for i, group in enumerate(groups):
+        _check_options(call, f"param_groups[{i}]", group)
     shared = groups[0].pop(STATE_KEY, None) if groups else None
     share = [group.get(SHARE_OF_FORMAT_2) for group in groups]
     for group in groups:
@@ -133,12 +137,14 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
         )
     by_name = any(isinstance(number, str) for number in state)  # torch's distributed checkpoints
     rows, orphaned, rounded = [], False, set[torch.dtype]()
+    known = {*optimizer.course.named(), *(own["windows"] if own is not None else ())}
     for i, (number, param) in enumerate(zip(numbers, params, strict=True)):
         saved = state.get(number)
         if not saved:
+            state.pop(number, None)  # torch takes no None
             rows.append({})
             continue
-        kept, rest = _split(saved)
+        kept, rest = _split(saved, known)
         state[number] = rest
         if own is None or stale:
             orphaned |= bool(kept) and own is None
@@ -305,7 +311,7 @@ def _from_format_2(
     course, last_step = optimizer.course, clock["iteration"] - 1
     windows = {}
     for name, part in course.named().items():
-        window = part.window(course)
+        window = course.window_of_part(part)
         if window is not None and window[0] <= last_step < window[1]:
             windows[name] = list(window)
     records = []
@@ -322,13 +328,49 @@ def _from_format_2(
     return {"steps": None, "windows": windows, "records": records, "kept": {}}
 
 
-def _split(saved: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What parts keep, under today's keys, and what is torch's or the base class's."""
+def is_kept_by_part(key: Any, known: Collection[str]) -> bool:
+    """Whether a key of a parameter's state is that of a part, and not torch's or the trainer's.
+
+    Those of parts begin with the name of a class. `known` are the names of parts that there are;
+    of others it is taken for one if it begins with a capital letter.
+    """
+    part = str(key).rpartition(".")[0]
+    return part in known or part[:1].isupper()
+
+
+def _split(
+    saved: Mapping[str, Any], known: Collection[str]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What parts keep, under today's keys, and what is torch's, the base class's or the trainer's.
+
+    `known` are names of parts.
+    """
     kept, rest = {}, {}
     for key, value in saved.items():
         new = ROW_KEYS_OF_FORMAT_2.get(key, key)
-        (kept if "." in str(new) else rest)[new] = value
+        (kept if is_kept_by_part(new, known) else rest)[new] = value
     return kept, rest
+
+
+def _check_options(call: str, name: str, group: Any) -> None:
+    """ValueError unless a group of a checkpoint has Adam's options, each one that Adam takes."""
+    check_keys(f"{call}: {name}", group, ("params", "lr", "betas", "eps", "weight_decay"))
+    if not isinstance(group["params"], (list, tuple)):
+        raise ValueError(f"{call}: {name}: params={group['params']!r}, but a list is needed")
+    betas = group["betas"]
+    if not isinstance(betas, (list, tuple)) or len(betas) != 2:
+        raise ValueError(f"{call}: {name}: betas={betas!r}, but two numbers are needed")
+    bounds = {"lr": math.inf, "eps": math.inf, "weight_decay": math.inf, "betas": 1.0}
+    for option, most in bounds.items():
+        for value in betas if option == "betas" else [group[option]]:
+            if not isinstance(value, Tensor):
+                check_number(call, f"{name}: {option}", value, 0.0, most)
+            elif value.numel() == 1 and value.is_cpu:  # of others torch says so, or a GPU must wait
+                check_number(call, f"{name}: {option}", value.item(), 0.0, most)
+    for option in ("amsgrad", "maximize", "capturable", "differentiable", "foreach", "fused"):
+        value = group.get(option)
+        if value is not None and not (isinstance(value, (bool, np.bool_)) or value in (0, 1)):
+            raise ValueError(f"{call}: {name}: {option}={value!r}, but True or False is needed")
 
 
 def _cast_back(
@@ -360,9 +402,17 @@ def _cast_back(
                 continue
             if value.is_floating_point() and (cast or value.dtype == param.dtype):
                 found[key] = value.to(dtype)
-                if value.dtype.itemsize < torch.float32.itemsize:
+                if _has_lost_digits(value, dtype):
                     rounded.add(value.dtype)
     return found
+
+
+def _has_lost_digits(value: Tensor, declared: torch.dtype) -> bool:
+    """Whether a tensor may have been rounded when it was cast to the dtype that it has."""
+    if declared.is_floating_point or declared.is_complex:
+        return value.dtype.itemsize < declared.itemsize
+    # Integers are exact up to 2 / eps.
+    return bool((value.abs() >= 2 / torch.finfo(value.dtype).eps).any())
 
 
 def _rows(
@@ -387,7 +437,7 @@ def _rows(
     """
     found, rows = dict[str, Tensor](), rows_of(moments["exp_avg"])
     for name, part in course.named().items():
-        window = part.window(course)
+        window = course.window_of_part(part)
         entries = {key_of(name, e): e for e in course.declared[name].values() if e.per == "row"}
         absent = [key for key in entries if not _is_there(kept.get(key))]
         missing = [key for key in absent if key in needed]
@@ -433,7 +483,7 @@ def _warn_of_rows_left_out(
     """Torch's distributed files give only what a fresh optimizer had, too: no rows of parts."""
     found = set().union(*rows) if rows else set()
     for name, part in course.named().items():
-        window = part.window(course)
+        window = course.window_of_part(part)
         keys = [key_of(name, entry) for entry in course.declared[name].values()]
         begun = window is None or window[0] <= last_step < window[1]
         if any(key in course.row_keys for key in keys) and begun and not found & set(keys):

@@ -119,8 +119,8 @@ def check_interval(call: str, name: str, value: Any) -> tuple[float, float]:
     if not pair:
         raise ValueError(f"{call}: {name}={value!r}, but a pair (low, high) is needed")
     low, high = (check_number(call, f"{name}[{i}]", value[i]) for i in (0, 1))
-    if low >= high:
-        raise ValueError(f"{call}: {name}={value!r}, but low < high is needed")
+    if low >= high or not math.isfinite(high - low):
+        raise ValueError(f"{call}: {name}={value!r}, but low < high, a finite way apart, is needed")
     return low, high
 
 

@@ -6,7 +6,7 @@ import math
 import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from numbers import Integral
+from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import torch
@@ -35,7 +35,9 @@ STATE_KEY = "opt3dgs"  # in param_groups[0] of an optimizer's state_dict: the co
 NEVER = 2**62  # an iteration that no training reaches
 MAX_CACHED_PLACES = 64
 # What a line of the run log has of each iteration, and what `RunLog.step` is called with.
-COLUMNS_OF_THE_LOG = frozenset(("self", "kind", "iteration", "seconds", "phase", "event", "energy"))
+COLUMNS_OF_THE_LOG = frozenset(
+    ("self", "kind", "iteration", "seconds", "phase", "event", "energy", "metadata")
+)
 P = TypeVar("P", bound=Part)
 
 
@@ -124,6 +126,8 @@ class Course:
             for name, part in self._named.items()
             if self.declared[name] or overrides(part, "window")
         ]
+        for part in self._parts:
+            self.window_of_part(part)
         self._plan()
 
     def _plan(self) -> None:
@@ -192,13 +196,31 @@ class Course:
         exploring = phase is Phase.EXPLORATION
         return (0, self.switch_step) if exploring else (self.switch_step, NEVER)
 
+    def window_of_part(self, part: Part) -> Window | None:
+        """`part.window`, as two integers of Python's, which a checkpoint can hold.
+
+        Raises:
+            ValueError: it is neither None nor two iterations, the first not after the second.
+        """
+        window: Any = part.window(self)
+        if window is None:
+            return None
+        pair = window if isinstance(window, (tuple, list)) and len(window) == 2 else ()
+        whole = [int(each) for each in pair if isinstance(each, Real) and each == each // 1]
+        if len(whole) != 2 or whole[0] > whole[1]:
+            raise ValueError(
+                f"{type(part).__name__}.window: {window!r}, but None or two iterations, the first "
+                "and the one after the last, are needed"
+            )
+        return whole[0], whole[1]
+
     def open_windows(self) -> dict[str, Window | None]:
         """The window of each part that has one, None while it is closed."""
         if self._windows[0] == self._current:  # each optimizer asks
             return self._windows[1]
         found: dict[str, Window | None] = {}
         for name in self._windowed:
-            window = self._named[name].window(self)
+            window = self.window_of_part(self._named[name])
             if window is not None:
                 found[name] = window if window[0] <= self.current < window[1] else None
         known, rewound = self._windows[1], self._rewinds_followed != self.rewinds
@@ -215,7 +237,7 @@ class Course:
         """Whether an iteration is in the window of a part, if that has one."""
         if not overrides(part, "window"):  # the plan knows the phases
             return True
-        window = part.window(self)
+        window = self.window_of_part(part)
         return window is None or window[0] <= iteration < window[1]
 
     # -- the parts -------------------------------------------------------------------------------
@@ -248,13 +270,14 @@ class Course:
 
     def holders_of_opacities(self) -> list[StepAdam]:
         """The followers that hold opacities."""
-        if self._holders is None:  # asked in every iteration
-            self._holders = [
-                weakref.ref(each)
-                for each in self.followers()
-                if any(gaussian_of(group) == "opacities" for group in each.param_groups)
-            ]
-        return [each for ref in self._holders if (each := ref()) is not None]
+        known = self._holders  # asked for in every iteration
+        found = self.followers() if known is None else [o for ref in known if (o := ref())]
+        for optimizer in found:
+            optimizer.name_groups()  # a trainer may have put other groups there
+        if self._holders is None:
+            found = [o for o in self.followers() if _holds_opacities(o)]
+            self._holders = [weakref.ref(each) for each in found]
+        return found
 
     def stepped_together(self, iteration: int) -> str | None:
         """A Gaussian parameter of which two optimizers have stepped one each in an iteration."""
@@ -429,17 +452,26 @@ class Course:
         """What the parts that act say of themselves: columns of the run log.
 
         Raises:
-            ValueError: those of a part are no dict, or have a name of the log's own.
+            ValueError: those of a part are no dict of numbers, or have a name of the log's own.
         """
         columns: dict[str, float | Tensor] = {}
         for part in self.hooks["numbers"]:
-            own = part.numbers(self)
+            own, name = part.numbers(self), self.name_of(part)
             if not isinstance(own, Mapping) or not COLUMNS_OF_THE_LOG.isdisjoint(own):
                 raise ValueError(
-                    f"{self.name_of(part)}.numbers: {own!r}, but a dict is needed, without the "
-                    f"log's own columns {sorted(COLUMNS_OF_THE_LOG)}"
+                    f"{name}.numbers: {own!r}, but a dict is needed, without the log's own "
+                    f"columns {sorted(COLUMNS_OF_THE_LOG)}"
                 )
-            columns.update(own)
+            for key, value in own.items():
+                size = math.prod(getattr(value, "shape", ()))
+                if size != 1 or not (isinstance(value, Real) or hasattr(value, "item")):
+                    raise ValueError(
+                        f"{name}.numbers: {key}={value!r}, but a number, or a tensor of one "
+                        "element, is needed"
+                    )
+            # Of two parts of one class the second's columns are "faded#2", as in checkpoints.
+            mark = name.rpartition("#")[2] if "#" in name else ""
+            columns |= {f"{key}#{mark}" if mark else key: value for key, value in own.items()}
         return columns
 
     def judge(self, over_ranks: Any = None) -> list[Change]:
@@ -561,6 +593,10 @@ class Course:
             "_published": {},
             "_numbers_read": {},
         }
+
+
+def _holds_opacities(optimizer: StepAdam) -> bool:
+    return any(gaussian_of(group) == "opacities" for group in optimizer.param_groups)
 
 
 def _held(optimizer: StepAdam) -> frozenset[Any]:

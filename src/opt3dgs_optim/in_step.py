@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, fields
-from typing import Any
+from numbers import Real
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -12,6 +14,9 @@ from torch import Tensor
 from opt3dgs_optim.overrides import TemporaryOverrides
 from opt3dgs_optim.part import Group, Part
 from opt3dgs_optim.state import HeldRows, ParameterState, PickedRows, broadcast_rows
+
+if TYPE_CHECKING:
+    from opt3dgs_optim.course import Course
 
 NamedPart = tuple[str, Part]
 
@@ -43,6 +48,40 @@ class ActingParts:
     def sought(cls, find: Callable[[str], list[NamedPart]]) -> ActingParts:
         """What `find` finds for the name of each hook."""
         return cls(*map(find, STEP_HOOKS))
+
+    def feed(
+        self, group: Group, param: Tensor, grad: Tensor, state: ParameterState, course: Course
+    ) -> Tensor:
+        """What Adam is fed in the place of a gradient."""
+        for name, part in self.before:
+            found = part.before(group, param, grad, state.of(name), course)
+            if found is not grad:
+                _check_returned(name, "before", found, grad)
+                grad = found
+        return grad
+
+    def factors(self, group: Group, course: Course) -> list[float | Tensor]:
+        """The factors on the group's step that are not None."""
+        found = list[Any]()
+        for name, part in self.factor:
+            factor: Any = part.factor(group, course)
+            if factor is None:
+                continue
+            number = isinstance(factor, Real) and math.isfinite(factor)
+            if not number and not (isinstance(factor, Tensor) and factor.numel() == 1):
+                raise ValueError(f"{name}.factor: {factor!r}, but a finite number is needed")
+            found.append(factor)
+        return found
+
+    def displace(
+        self, group: Group, param: Tensor, step: Tensor, state: ParameterState, course: Course
+    ) -> Tensor:
+        """What the parameter moves by in the place of Adam's step."""
+        for name, part in self.displacement:
+            found = part.displacement(group, param, step, state.of(name), course)
+            _check_returned(name, "displacement", found, step)
+            step = found
+        return step
 
 
 STEP_HOOKS = tuple(each.name for each in fields(ActingParts) if each.init)
@@ -89,6 +128,15 @@ class StepInProgress:
     counts: Tensor | bool
     overrides: TemporaryOverrides
     moving: list[MovingParameter] = field(default_factory=list)
+
+
+def _check_returned(name: str, hook: str, found: Any, like: Tensor) -> None:
+    """ValueError unless what a part's hook has returned is a tensor of the shape of `like`."""
+    if not isinstance(found, Tensor) or found.shape != like.shape:
+        got = f"of shape {tuple(found.shape)}" if isinstance(found, Tensor) else repr(found)
+        raise ValueError(
+            f"{name}.{hook}: returned {got}, but a tensor of shape {tuple(like.shape)} is needed"
+        )
 
 
 def check_mask_fits(

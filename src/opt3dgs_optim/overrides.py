@@ -61,7 +61,7 @@ class TemporaryOverrides(AbstractContextManager["TemporaryOverrides"]):
 
 
 def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
-    """A function that runs as it is in a compiled one, at no cost outside of one.
+    """A step that runs as it is in a compiled function, at no cost outside of one.
 
     torch's own decorator for it changes the interpreter's state in every call, compiled or not.
     """

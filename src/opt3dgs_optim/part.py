@@ -52,8 +52,16 @@ class Kept:
     initial: float = 0.0
 
     def __post_init__(self) -> None:
-        """ValueError where `per` is none of the three."""
+        """ValueError where an option is outside what is allowed."""
         check_choice("Kept", "per", self.per, ("row", "parameter", "training"))
+        shape: Any = self.shape
+        if not (shape is None or callable(shape) or isinstance(shape, (tuple, list))):
+            raise ValueError(
+                f"Kept: shape={shape!r}, but a tuple of the dimensions after the first, a function "
+                "of the parameter, or None is needed"
+            )
+        if self.per == "row" and self.initial != 0:
+            raise ValueError(f"Kept: initial={self.initial!r}, but rows begin as zeros")
 
     def shape_for(self, param: Tensor) -> tuple[int, ...]:
         """The whole shape of what is kept of a parameter [N, ..]."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import torch
 from torch import Tensor
+from torch._compile import _disable_dynamo
 from torch.optim import Optimizer
 
 from opt3dgs_optim.checks import (
@@ -19,7 +20,6 @@ from opt3dgs_optim.checks import (
 )
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import block, gaussian_of
-from opt3dgs_optim.overrides import is_moving_rate, uncompiled
 from opt3dgs_optim.part import Part, Phase
 from opt3dgs_optim.presets import (
     DEFAULTS,
@@ -119,7 +119,8 @@ class PhaseScheduler(Course):
         self._looked_at = -1  # the iteration of the last look at all optimizers
         self._steps_without_energy = 0
         self._losses_not_finite = 0  # in a row
-        self._complete_at = 0  # energies, at the last look that found all upgraded optimizers
+        self._iterations_incomplete = 0  # since an upgraded optimizer does not exist any more
+        self._iterations_since_look = 0
         self._num_optimizers = 0
         self._observed_again = 0  # the same iteration, in a row
         self._adam_steps: int | None = None  # of moments that came without a state of ours
@@ -193,7 +194,7 @@ class PhaseScheduler(Course):
         return optimizers
 
     # In a compiled function it runs as it is: what it looks at changes from iteration to iteration.
-    @uncompiled
+    @_disable_dynamo
     def observe(self, loss: Tensor | float, *, iteration: int | None = None) -> None:
         """Take the loss of this iteration: once, after backward, before the optimizers step.
 
@@ -294,10 +295,12 @@ class PhaseScheduler(Course):
                 "the optimizers had stepped before the first observe(loss), so each step has the "
                 "loss of the iteration before; call observe after backward, before the steps",
             )
+        self._iterations_since_look += 1
+        begins = self.num_observed < LOOK_INTERVAL or not self.steps
+        if begins or self._iterations_since_look >= LOOK_INTERVAL:
+            self._look_at_optimizers()
         self._iterations_without_step += not self._has_ended()
         self._steps_without_energy = 0
-        if self.num_observed < LOOK_INTERVAL or self.num_observed % LOOK_INTERVAL == 0:
-            self._look_at_optimizers()
         # Trainers that count from 1 end at total_steps. Frozen Gaussians may be rendered longer.
         beyond = self.total_steps + 1
         if self.current > beyond and self._gaussians_have_moved_since(beyond):
@@ -328,6 +331,7 @@ class PhaseScheduler(Course):
         Not in every iteration, of whose time it would take a part that shows.
         """
         looked_at, self._looked_at = self._looked_at, self.current
+        passed, self._iterations_since_look = self._iterations_since_look, 0
         if self._gaussians_have_moved_since(looked_at):
             self._has_moved_gaussians, self._iterations_without_step = True, 0
         elif self.current < looked_at:  # the clock was set back
@@ -342,11 +346,11 @@ class PhaseScheduler(Course):
                 "as the iteration after their last step, since the last thirtieth is averaged",
             )
         lost, alive = self.num_lost_followers, len(self.followers())
-        if self.num_observed % LONG_PATIENCE == 0 and not self._has_ended():
+        if not self._has_ended():
             self._watch_optimizers()
-        if not (lost and alive) or self._has_ended():
-            self._complete_at = self.num_observed
-        if self.num_observed - self._complete_at > LONG_PATIENCE:
+        incomplete = lost and alive and not self._has_ended()
+        self._iterations_incomplete = self._iterations_incomplete + passed if incomplete else 0
+        if self._iterations_incomplete > LONG_PATIENCE:
             self._report(
                 "lost",
                 f"{lost} of {lost + alive} upgraded optimizers do not exist any more: the "
@@ -368,8 +372,9 @@ class PhaseScheduler(Course):
 
     def _watch_optimizers(self) -> None:
         """Say once that one of several optimizers has stopped, as one that was made anew has."""
+        # One that has stepped later than now has not stepped since the clock was set back.
         every = {id(each): each.stepped_at for each in self.followers()}
-        last = max(every.values(), default=-1)
+        last = max((at for at in every.values() if at <= self.current), default=-1)
         stopped = [at for at in every.values() if 0 <= at < last - LONG_PATIENCE]
         if stopped:
             self._report(
@@ -386,14 +391,11 @@ class PhaseScheduler(Course):
         a gradient make no step.
         """
         return any(
-            param.requires_grad
-            and (record := optimizer.record_of(param)) is not None
-            and record.last_step is not None
-            and record.last_step >= iteration
+            record.last_moved is not None and record.last_moved >= iteration
             for optimizer in self.followers()
             for group in optimizer.param_groups
-            if gaussian_of(group) is not None and is_moving_rate(group["lr"])
-            for param in group["params"]
+            if gaussian_of(group) is not None
+            for record in getattr(group, "records", ())
         )
 
     def _watch_rows(self) -> None:

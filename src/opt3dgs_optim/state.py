@@ -136,6 +136,7 @@ class ParameterRecord:
     Attributes:
         last_step: the iteration of the parameter's last step, whether that counted or not; None
             before the first.
+        last_moved: that of its last step with a learning rate above 0 and a gradient required.
         units: the parts in whose units Adam's moments are; None where there are no moments yet.
         param: the parameter that was there last, weakly; None before any.
         numbers: what parts keep per parameter, key -> 0-d tensor.
@@ -143,6 +144,7 @@ class ParameterRecord:
 
     def __init__(self) -> None:
         self.last_step: int | None = None
+        self.last_moved: int | None = None
         self.units: tuple[str, ...] | None = None
         self.param: weakref.ref[Tensor] | None = None
         self.numbers: dict[str, Tensor] = {}
@@ -162,7 +164,12 @@ class ParameterRecord:
         if view is None or view.param is not param or view.adam is not adam:
             view = ParameterState(param, adam, self, declared, training)
             self._view, self.param = view, weakref.ref(param)
+        view.release()
         return view
+
+    def is_of(self, param: Tensor) -> bool:
+        """Whether that parameter was there last."""
+        return self.param is not None and self.param() is param
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_view": None, "param": None}
@@ -171,17 +178,25 @@ class ParameterRecord:
 def records_of(params: list[Tensor], records: list[ParameterRecord]) -> list[ParameterRecord]:
     """One record for each of a group's parameters, of the records that it has had.
 
-    They belong to places, where density control puts other parameters. Where places have gone, the
-    parameters that are still the same tell which are left.
+    A parameter that was there keeps its own, wherever it stands now. Another one has the record of
+    its place, where density control has put it, if nobody else has that. Where places have gone,
+    nobody knows which, and it begins anew.
     """
-    if len(records) > len(params):
-        by_param = {id(record.param()): record for record in records if record.param is not None}
-        records = [by_param.get(id(param)) or ParameterRecord() for param in params]
-    else:
-        records = [*records, *(ParameterRecord() for _ in range(len(params) - len(records)))]
-    for param, record in zip(params, records, strict=True):
-        record.param = weakref.ref(param)
-    return records
+    before = [None if record.param is None else record.param() for record in records]
+    known = {id(param): i for i, param in enumerate(before) if param is not None}
+    kept = {known[id(param)] for param in params if id(param) in known}
+    free = range(len(records)) if len(records) <= len(params) else ()
+    found = list[ParameterRecord]()
+    for place, param in enumerate(params):
+        i = known.get(id(param), place if place in free and place not in kept else None)
+        found.append(ParameterRecord() if i is None else records[i])
+        found[-1].param = weakref.ref(param)
+    return found
+
+
+def are_of(records: list[ParameterRecord], params: list[Tensor]) -> bool:
+    """Whether each record is that of the parameter at its place."""
+    return len(records) == len(params) and all(map(ParameterRecord.is_of, records, params))
 
 
 class ParameterState(MutableMapping[str, Any]):
@@ -215,10 +230,14 @@ class ParameterState(MutableMapping[str, Any]):
         self._part, self._kept = part, self._declared[part]
         return self
 
+    def release(self) -> None:
+        """Forget what a step has saved that an exception has ended."""
+        if self._guarded:
+            self._saved, self._guarded, self._moments_guarded = [], False, False
+
     def guard(self, moments: bool) -> None:
         """Save what hooks read from now on, until `settle`; Adam's moments too if `moments`."""
         self._guarded, self._moments_guarded = True, moments
-        self._saved = []  # of a step that an exception has ended
 
     @torch.no_grad()
     def settle(self, rows: Tensor | None, counts: Tensor | bool) -> None:
@@ -266,6 +285,9 @@ class ParameterState(MutableMapping[str, Any]):
         kept = self._kept.get(name)
         if kept is not None:
             return self._find(kept)
+        if name not in self.adam:
+            part, allowed = self._part, ", ".join(self)
+            raise KeyError(f"{part} does not declare {name!r} in keeps; there are {allowed}")
         value = self.adam[name]
         if self._moments_guarded and name in ADAM_KEYS:
             self._save(self.adam, name, value)
@@ -281,6 +303,9 @@ class ParameterState(MutableMapping[str, Any]):
 
     @torch.no_grad()
     def __setitem__(self, name: str, value: Any) -> None:
+        if name not in self:
+            part, allowed = self._part, ", ".join(self)
+            raise KeyError(f"{part} does not declare {name!r} in keeps; there are {allowed}")
         tensor = self[name]
         if value is not tensor:
             tensor.copy_(value) if isinstance(value, Tensor) else tensor.fill_(value)

@@ -15,6 +15,7 @@ from opt3dgs_optim.checkpoint import (
     Saved,
     as_loaded,
     inspect_checkpoint,
+    is_kept_by_part,
     number_of_steps,
     pack_optimizer,
     restore_records,
@@ -52,6 +53,7 @@ from opt3dgs_optim.state import (
     PickedRows,
     RowOwnership,
     Rows,
+    are_of,
     broadcast_rows,
     check_mask,
     check_rows,
@@ -97,7 +99,7 @@ class StepAdam(Adam):
         if "_slots" not in vars(self):
             self._slots = []
         self._known, self._open_windows = [], {}
-        self._name_groups()
+        self.name_groups()
         self._patch_step_function()  # torch's, for a class that was given to a made optimizer
         if base is Adam and course.parts and can_be_fused(self):
             use_fused(self)
@@ -113,9 +115,9 @@ class StepAdam(Adam):
         """As torch's; notes which Gaussian parameter the group's name says that it holds."""
         super().add_param_group(param_group)
         if "course" in vars(self):
-            self._name_groups()
+            self.name_groups()
 
-    def _name_groups(self) -> None:
+    def name_groups(self) -> None:
         """Know what each group holds: what was said of it, or else what its name says.
 
         A group that takes the place of another goes on with what was kept for that one. It is the
@@ -124,7 +126,7 @@ class StepAdam(Adam):
         groups = self.param_groups
         if len(groups) == len(self._known):
             for group in groups:
-                if type(group) is not NamedGroup or len(group["params"]) != len(group.records):
+                if type(group) is not NamedGroup or not are_of(group.records, group["params"]):
                     break
             else:
                 return
@@ -144,13 +146,13 @@ class StepAdam(Adam):
             groups[i] = NamedGroup(group, *slot, () if heir is None else heir.records)
             gone = [old for old in gone if old is not heir]
             self._acting = (None, None, {})
-            self.course.forget_places()
             if self._known and heir is None:
                 taken = slot[1] or "left alone"
                 LOGGER.info("a group was added: %s, %s", group_name(i, group), taken)
+        self.course.forget_places()
         self._known, self._slots = cast(list[NamedGroup], list(groups)), []
         for group in self._known:
-            if len(group["params"]) != len(group.records):
+            if not are_of(group.records, group["params"]):
                 group.records = records_of(group["params"], group.records)
 
     @property
@@ -251,7 +253,7 @@ class StepAdam(Adam):
     def _step(self, mask: Tensor | None, acting: bool) -> None:
         """Override what the base's step reads by what the parts say, and restore it."""
         course, counts = self.course, self._counts(mask)
-        self._name_groups()
+        self.name_groups()
         if acting:
             self._follow_windows()
         if mask is not None:
@@ -264,8 +266,7 @@ class StepAdam(Adam):
                     parts = self._ready(parts, group)
                 self._prepare_group(step, cast(NamedGroup, group), parts)
                 if parts.factor:
-                    found = [part.factor(group, course) for _, part in parts.factor]
-                    factors = [factor for factor in found if factor is not None]
+                    factors = parts.factors(group, course)
                     scale_learning_rate(temporary, group, factors, counts, course.on_host)
             if counts is not False:
                 if isinstance(counts, Tensor) and self._base is Adam:
@@ -331,6 +332,7 @@ class StepAdam(Adam):
         guarded = rows is not None or counts is not True
         needed = rows is not None or parts.any  # whether more than the gradient's check is
         now = max(self.course.current, 0)  # a course may have no clock
+        moves = is_moving_rate(group["lr"])
         plain = not (guarded or parts.displacement or parts.after or group["maximize"])
         plain = plain and getattr(self, "grad_scale", None) is None
         for i, (param, record) in enumerate(zip(params, group.records, strict=True)):
@@ -355,6 +357,8 @@ class StepAdam(Adam):
                 step.moving.append(moving)
             if step.acting:
                 record.last_step = now
+                if moves and param.requires_grad:
+                    record.last_moved = now
         if parts.displacement or rows is not None:
             step.overrides.item(group, "params", params)
 
@@ -371,9 +375,8 @@ class StepAdam(Adam):
         Most steps are of this kind, and take less time so.
         """
         course, view = self.course, self._view_of(group, param, record)
-        grad = fed = cast(Tensor, param.grad)
-        for name, part in parts.before:
-            fed = part.before(group, param, fed, view.of(name), course)
+        grad = cast(Tensor, param.grad)
+        fed = parts.feed(group, param, grad, view, course)
         if fed is not grad:
             step.overrides.attribute(param, "grad", fed)
         if course.row_keys:
@@ -427,8 +430,7 @@ class StepAdam(Adam):
             fed = fed / unit
         if parts.displacement and group["weight_decay"]:
             fed = fed.add(param.detach(), alpha=group["weight_decay"])
-        for name, part in parts.before:
-            fed = part.before(group, param, fed, view.of(name), course)
+        fed = parts.feed(group, param, fed, view, course)
         if unit is not None:
             fed = fed * unit
         if moving.rows is not None and self._base is Adam:
@@ -452,9 +454,7 @@ class StepAdam(Adam):
         if moving.masked is not None:
             moving.masked.put_back()
         if moving.buffer is not None:
-            step = moving.buffer
-            for name, part in parts.displacement:
-                step = part.displacement(group, param, step, view.of(name), course)
+            step = parts.displace(group, param, moving.buffer, view, course)
             param.add_(moving.where_it_moves(step, 0.0) if moving.guarded else step)
         if parts.after:
             before = param.detach().clone() if moving.guarded else None
@@ -570,7 +570,7 @@ class StepAdam(Adam):
         super().__setstate__(state)
         if "course" in state:  # a copy: the parameters are other objects, the rows the same
             self._ownership, self._known = RowOwnership(), []
-            self._name_groups()
+            self.name_groups()
             self._claim_rows()
             self.clock_at = self.course.current
             self.course.register(self)
@@ -583,7 +583,7 @@ class StepAdam(Adam):
         self._nonfinite = None
         if not self.course.keeps_state:
             return super().state_dict()
-        self._name_groups()
+        self.name_groups()
         own = pack_optimizer(self, self._records, self._open_windows)
         with TemporaryOverrides() as temporary:
             shared = {**self.course.state_dict(), "optimizer": own}
@@ -633,13 +633,14 @@ class StepAdam(Adam):
             saved = inspect_checkpoint(self, as_loaded(self))[0]
             self.param_groups[0].pop(STATE_KEY, None)
         self._acting = (None, None, {})
-        self._name_groups()
+        self.name_groups()
         for group in self._known:
             group.records = records_of(group["params"], [])
+        known = self.course.named().keys()
         params = chain.from_iterable(group["params"] for group in self.param_groups)
         for param, rows in zip(params, saved.rows, strict=True):
             own = self.state.get(param)
-            for key in [key for key in own or () if "." in str(key)]:
+            for key in [key for key in own or () if is_kept_by_part(key, known)]:
                 del self.state[param][key]
             for key, value in rows.items():
                 self.state[param][key] = value.detach().to(param.device, copy=True)
@@ -648,7 +649,6 @@ class StepAdam(Adam):
         else:
             self.course.expect(number_of_steps(self.state.values()))
         restore_records(self, self._records, saved)
-        known = self.course.named().keys()
         for group, records in zip(self.param_groups, self._records, strict=True):
             for param, record in zip(group["params"], records, strict=True):
                 if not known >= set(record.units or ()):  # without parts no step would notice

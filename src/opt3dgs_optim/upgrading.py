@@ -52,7 +52,11 @@ def upgrade(optimizers: Any, course: Course) -> int:
     taken, left, plans, held = list[str](), list[str](), list[Plan](), list[tuple[str, str]]()
     unknown: list[tuple[str, Any]] = []
     known_rows = set[int]()
+    looked_at = dict[int, str]()
     for key, optimizer, shown in candidates:  # all are looked at before the first is changed
+        if id(optimizer) in looked_at:
+            raise ValueError(f"{CALL}: {shown} is {looked_at[id(optimizer)]}, which is there twice")
+        looked_at[id(optimizer)] = shown
         if key is not None and canonical_name(key) is None:
             left.append(str(key))
             unknown += [(str(key), group) for group in getattr(optimizer, "param_groups", ())]

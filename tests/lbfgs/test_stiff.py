@@ -191,6 +191,7 @@ def test_line_search_on_quadratics(lqn: Step, condition: float, left: float) -> 
     assert float(quadratic(hessian)(end).max()) < 1e-11 * condition
 
 
+@pytest.mark.thorough
 def test_line_search_in_the_helical_valley(lqn: Step) -> None:
     """The problem of three coordinates, every row in units of 1e-8 to 1e8 and axes of its own."""
     (problem,) = (p for p in SMOOTH if p.dim == 3)

@@ -383,3 +383,15 @@ def test_no_points_have_a_history() -> None:
     none = torch.ones(5, 0, 3)
     assert history_from_pairs(none, none).shape == (0, 5, 8)
     assert two_loop(none[0], history_from_pairs(none, none), 5).shape == (0, 3)
+
+
+@pytest.mark.parametrize("size", [1e39, 1e300, 1e-60, 1e-300])
+def test_a_gradient_of_float64_beside_pairs_of_float32(size: float) -> None:
+    """Of whatever size: the history's dtype holds neither of them."""
+    s, y = (each.float() for each in convex_pairs(3, 3, 5, 0)[:2])
+    history = history_from_pairs(s, y)
+    grad = gradients(5, 3, 1).double()
+    found = two_loop(grad * size, history, 3)
+    expected = two_loop(grad.float(), history, 3).double() * size
+    assert torch.allclose(found / size, expected / size, rtol=1e-5)
+    assert (found != 0).all()

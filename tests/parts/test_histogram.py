@@ -158,6 +158,7 @@ def test_the_decaying_step_size(count: int) -> None:
     assert histogram.weights.tolist() == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.thorough
 def test_the_papers_weights_estimate_the_density_to_the_power_of_two() -> None:
     """theta -> p^(1 / (1 - zeta)), not the cumulative density as the paper's text says."""
     histogram = EnergyHistogram(4, (0.0, 4.0), zeta=0.5, temperature=1.0, warmup=0)

@@ -23,7 +23,14 @@ from trainers import (
     values_of,
 )
 
-from opt3dgs_optim import Annealing, Course, IsotropicNoise, Phase, PositionNoise
+from opt3dgs_optim import (
+    Annealing,
+    Course,
+    IsotropicNoise,
+    Phase,
+    PhaseScheduler,
+    PositionNoise,
+)
 from opt3dgs_optim.names import GAUSSIAN
 from opt3dgs_optim.parts.noise import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
 
@@ -259,3 +266,15 @@ def test_a_trainers_noise_is_fine_where_ours_is_off() -> None:
 def test_the_phase_is_checked() -> None:
     with pytest.raises(ValueError, match="PositionNoise: during='exploration', but None or"):
         PositionNoise(during="exploration")  # pyright: ignore[reportArgumentType]
+
+
+def test_what_is_missing_is_said_before_anything_has_moved() -> None:
+    means = torch.nn.Parameter(torch.ones(4, 3))
+    adam = torch.optim.Adam([{"params": [means], "lr": 0.01, "name": "means"}])
+    phases = PhaseScheduler(10, parts=[PositionNoise()])
+    phases.upgrade(adam)
+    means.grad = torch.ones_like(means)
+    phases.observe(0.1)
+    with pytest.raises(ValueError, match=r"PositionNoise: .*scales.* are not among"):
+        adam.step()
+    assert torch.equal(means, torch.ones(4, 3))

@@ -177,6 +177,7 @@ def test_of_twice_as_many_points_as_are_looked_at_every_second_is_asked() -> Non
     _, phases, optimizers = large(2_000, OutOfView())
     grad = torch.zeros(MAX_POINTS_LOOKED_AT + 1, 3)
     grad[1::2] = 1.0  # the others
+    grad[0] = 1.0
     phases.take(torch.tensor(0.1))
     hook(phases, optimizers["means"], torch.zeros_like(grad), grad)
     assert share_of(optimizers) == pytest.approx(0.02 + 0.01 * (0.01 - 0.02))
@@ -285,10 +286,18 @@ def test_no_points_are_no_error(shape: tuple[int, ...]) -> None:
     assert share_of(optimizers) == share
 
 
-def test_views_that_see_nothing_count_as_a_hundredth() -> None:
+def test_views_that_see_next_to_nothing_count_as_a_hundredth() -> None:
     splats, phases, optimizers = large(2_000, OutOfView())
-    iterate(splats, optimizers, phases, 0, 400, seen=0)
+    iterate(splats, optimizers, phases, 0, 400, seen=1)
     assert share_of(optimizers) == pytest.approx(0.01 + 0.01 * 0.99**400, rel=1e-6)
+
+
+def test_a_gradient_that_is_zero_everywhere_is_of_no_view() -> None:
+    """Frozen positions whose gradient is kept: their share says nothing of the views."""
+    splats, phases, optimizers = large(2_000, OutOfView())
+    set_share(optimizers, 0.5)
+    iterate(splats, optimizers, phases, 0, 400, seen=0)
+    assert share_of(optimizers) == 0.5
 
 
 @pytest.mark.parametrize(("share", "acts"), [(0.32, True), (0.35, False)])

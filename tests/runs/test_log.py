@@ -643,3 +643,27 @@ def test_the_clock_may_be_another(tmp_path: Path) -> None:
     assert seconds[1] == 3.5
     assert seconds == sorted(seconds)
     assert seconds[-1] < 10  # the time between the two sessions does not count
+
+
+@pytest.mark.parametrize("call", ["step", "evaluation", "event"])
+def test_no_line_may_have_metadata_of_its_own(call: str, tmp_path: Path) -> None:
+    """A reader would take it for the run's."""
+    with RunLog(tmp_path / "a.jsonl") as log:
+        log.step(0, loss=1.0)
+        line = ("pruned", 1) if call == "event" else (1,)
+        with pytest.raises(ValueError, match="reserved"):
+            getattr(log, call)(*line, metadata=1.0)
+        log.step(1, loss=0.5)
+    assert read_run(tmp_path / "a.jsonl").steps["loss"].tolist() == [1.0, 0.5]
+
+
+def test_a_second_run_in_the_file_of_the_first_is_said_once(tmp_path: Path) -> None:
+    for session in range(2):
+        with RunLog(tmp_path / "a.jsonl") as log:
+            if session:
+                with pytest.warns(UserWarning, match=r"iteration 0 in a log that has 2 already"):
+                    log.step(0)
+            for iteration in range(session, 3):
+                log.step(iteration)
+    with RunLog.resume(tmp_path / "a.jsonl", iteration=1) as log:
+        log.step(1)

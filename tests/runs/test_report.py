@@ -539,3 +539,11 @@ def test_a_place_that_cannot_be_written_is_found_before_any_log_is_read(
     monkeypatch.setattr("tempfile.TemporaryFile", refuse)  # root may write anywhere
     assert report.main([str(tmp_path / "logs"), "-o", str(tmp_path / "out")]) == 2
     assert "Permission denied" in capsys.readouterr().err
+
+
+def test_an_arm_that_is_none_goes_by_the_files_name(tmp_path):
+    for name in ("first", "second"):
+        with RunLog(tmp_path / f"{name}.jsonl", metadata={"arm": None, "scene": None}) as log:
+            log.evaluation(1, psnr=20.0)
+    (found,) = compare([read_run(tmp_path / f"{name}.jsonl") for name in ("first", "second")])
+    assert {arm.name for arm in found.arms} == {"first", "second"}

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+import pytest
 import simulated_device
 import torch
 from simulated_device import on_host
@@ -90,6 +91,23 @@ EVERYTHING = (
     *("FreshMoments", "SquaredLoss", "Curvature", "PositionNoise"),
 )
 ARMS["everything"] = _everything
+
+
+def some_of(cases: Iterable[Any], kept: Callable[[Any], bool]) -> list[Any]:
+    """The cases as parameters of a test; those that are not kept are `thorough`."""
+    return [
+        each
+        if kept(each)
+        else pytest.param(
+            *(each if isinstance(each, tuple) else (each,)), marks=pytest.mark.thorough
+        )
+        for each in cases
+    ]
+
+
+def is_brief(arm: str) -> bool:
+    """Whether an arm is tested everywhere: what trainers have, and all parts at once."""
+    return arm in ("DEFAULTS", "paper", "everything")
 
 
 class Training:

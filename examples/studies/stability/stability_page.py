@@ -19,7 +19,8 @@ from mutants import (  # tests/, where `stability` has put them within reach
 LEAST_COVERAGE = 95.0  # per cent, of branches and of statements; modules below are listed
 SLOW = "python -m pytest -m slow --junitxml=build/slow.xml"
 COVERAGE = (
-    "python -m pytest --cov --cov-config=tests/coverage.ini --cov-report=json:build/coverage.json"
+    "python -m pytest -m 'not slow and not hosts and not compiles and not processes' "
+    "--cov --cov-config=tests/coverage.ini --cov-report=json:build/coverage.json"
 )
 MARK = "<!-- {}: made by examples/studies/stability/stability.py -->"
 

@@ -78,10 +78,12 @@ def two_loop(
             return cuda.two_loop(grad, history, history_size)
     result = torch.empty_like(grad)
     for rows in row_chunks(grad):
-        g = columns(grad[rows], history.dtype)
+        # In the wider of the two dtypes, since a gradient may be too large or small for the other.
+        g = columns(grad[rows], torch.promote_types(grad.dtype, history.dtype))
         scale = torch.threshold(largest(g), 0.0, 1.0)  # keeps s.q finite
-        found = recursion(g / scale, *stored_pairs(history[rows], history_size))
-        put(result[rows], found.mul_(scale))
+        unit = (g / scale).to(history.dtype)
+        found = recursion(unit, *stored_pairs(history[rows], history_size))
+        put(result[rows], found.to(g.dtype).mul_(scale))
     return result
 
 

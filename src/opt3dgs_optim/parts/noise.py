@@ -66,7 +66,13 @@ class PositionNoise(Part):
     def before(
         self, group: Group, param: Tensor, grad: Tensor, state: State, course: Course
     ) -> Tensor:
-        """Say once that somebody else moves the positions too, as a trainer's own noise does."""
+        """Say once that somebody else moves the positions too, as a trainer's own noise does.
+
+        Raises:
+            ValueError: what the noise is made of is missing, before anything has moved.
+        """
+        if not callable(self.gaussians):
+            _check_source(self.gaussians or course.gaussians_of(param))
         # Density control puts another tensor in place; noise writes into this one, every time.
         left = course.published(LEFT_AT, param, earlier=True) or (None, 0, None)
         where, version, copy = left
@@ -108,11 +114,7 @@ class PositionNoise(Part):
 
     @torch.no_grad()
     def _add(self, means: Tensor, lr: float | Tensor, source: GaussianTensors) -> None:
-        missing = [name for name in ("scales", "quats", "opacities") if name not in source]
-        if missing:
-            raise ValueError(
-                f"PositionNoise: {missing} are not among the Gaussians' tensors {sorted(source)}"
-            )
+        _check_source(source)
         scales, quats, opacities = source["scales"], source["quats"], source["opacities"]
         if len(scales) != len(means):
             raise ValueError(
@@ -122,6 +124,15 @@ class PositionNoise(Part):
         scales, quats, opacities = (each.to(means.device) for each in (scales, quats, opacities))
         noise = covariance_noise(scales, quats, opacities, _normal_like(means, self.generator))
         means += noise * (lr * self.scale)
+
+
+def _check_source(source: GaussianTensors) -> None:
+    """ValueError unless it has all that the noise is made of."""
+    missing = [name for name in ("scales", "quats", "opacities") if name not in source]
+    if missing:
+        raise ValueError(
+            f"PositionNoise: {missing} are not among the Gaussians' tensors {sorted(source)}"
+        )
 
 
 @dataclass(repr=False, eq=False)

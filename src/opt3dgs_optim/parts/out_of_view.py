@@ -33,9 +33,10 @@ class OutOfView(Part):
     (gradient / (3 s))^2, so that its steps are at most about 3 s of a full one. Above a third
     nothing is changed, bit for bit.
 
-    A point is out of view where the gradient of its position is zero. The positions may be stepped
-    before or after the scales and opacities; where the trainer clears their gradient first, they
-    must be stepped first, as in every known trainer. It costs no memory.
+    A point is out of view where the gradient of its position is zero. A gradient that is zero
+    everywhere is of no view, and does not count in the mean. The positions may be stepped before or
+    after the scales and opacities; where the trainer clears their gradient first, they must be
+    stepped first, as in every known trainer. It costs no memory.
     """
 
     names = ("means", "scales", "opacities")
@@ -52,7 +53,7 @@ class OutOfView(Part):
             # other parameters' steps may do.
             own = cast(Tensor, param.grad)
             kept = state[SEEN_SHARE]
-            kept.lerp_(_seen_share(own).to(kept), 1 / NUM_VIEWS_AVERAGED)
+            kept.copy_(_mean_with(kept, own))
             # A GPU's number is not read.
             share: Any = kept.item() if own.is_cpu else kept
             course.publish(SEEN_SHARE, param, share)
@@ -68,7 +69,7 @@ class OutOfView(Part):
             kept = course.number_kept(self, SEEN_SHARE, means)
             kept = torch.ones((), device=means.device) if kept is None else kept
             positions = means.grad
-            share = kept.lerp(_seen_share(positions).to(kept), 1 / NUM_VIEWS_AVERAGED)
+            share = _mean_with(kept, positions)
             share = share.item() if share.is_cpu else share
         if isinstance(share, float) and share >= MAX_SEEN_SHARE:
             return grad
@@ -92,13 +93,19 @@ class OutOfView(Part):
         return {"visible_share": 1.0 if share is None else share}
 
 
-def _seen_share(grad: Tensor) -> Tensor:
-    """The share of the points that this view sees, 0-d."""
+def _mean_with(kept: Tensor, grad: Tensor) -> Tensor:
+    """The mean share of the points that a view sees, 0-d, with this view's.
+
+    A gradient that is zero everywhere, as that of frozen positions, is of no view.
+    """
     stride = 1 + grad.shape[0] // MAX_POINTS_LOOKED_AT
     seen = _has_gradient(grad[::stride] if stride > 1 else grad)
     # Not `mean`, which takes twice as long.
     share = seen.sum(dtype=torch.float32).div_(seen.shape[0])
-    return share.clamp_(min=MIN_SEEN_SHARE)
+    with_it = kept.lerp(share.clamp(min=MIN_SEEN_SHARE).to(kept), 1 / NUM_VIEWS_AVERAGED)
+    if share.is_cpu:
+        return with_it if share.item() > 0 else kept
+    return torch.where(share.to(kept) > 0, with_it, kept)
 
 
 def _has_gradient(grad: Tensor) -> Tensor:

@@ -199,8 +199,10 @@ def _parse(raw: bytes) -> dict[str, Any]:
     """A line with all that its kind needs; whatever Python raises where it has not."""
     line = json.loads(raw)
     kind, iteration, seconds = line["kind"], line["iteration"], line["seconds"]
-    if kind not in KINDS or not isinstance(line.get("metadata", {}), dict):
-        raise ValueError(f"kind must be one of {KINDS}, and metadata an object")
+    if kind not in KINDS:
+        raise ValueError(f"kind must be one of {KINDS}")
+    if kind == "start" and not isinstance(line.get("metadata", {}), dict):
+        raise ValueError("metadata must be an object")
     if type(iteration) is not int or not (0 <= iteration < 2**53 and 0 <= seconds < 1e12):
         raise ValueError("iteration must be an integer >= 0, and seconds a number >= 0")
     if kind == "event":

@@ -25,11 +25,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import LOGGER, check_count
+from opt3dgs_optim.checks import LOGGER, check_count, warn_user
 from opt3dgs_optim.runs.lines import LineFile, encoded, number, read_run, with_plain_keys
 
 Number = float | Tensor | np.number | np.bool_ | np.ndarray  # of one element
-RESERVED = ("kind", "iteration", "seconds", "phase", "event")
+RESERVED = ("kind", "iteration", "seconds", "phase", "event", "metadata")
 
 
 class _Pending(NamedTuple):
@@ -107,6 +107,7 @@ class RunLog(AbstractContextManager["RunLog"]):
         try:
             last = read_run(self.path).records[-1:]
             self._base: float = last[0]["seconds"] if last else 0.0
+            self._continued_at: int | None = last[0]["iteration"] if last else None
             self._since: float | None = self._clock()
             start = self._line("start", last[0]["iteration"] if last else 0)
             self._file.append(start | _origin() | {"metadata": described})
@@ -137,6 +138,7 @@ class RunLog(AbstractContextManager["RunLog"]):
         log = cls(path, metadata=metadata, clock=clock)
         past = [r["seconds"] for r in read_run(path).records[:-1] if r["iteration"] <= iteration]
         log._base, log._since = past[-1] if past else 0.0, log._clock()
+        log._continued_at = None  # the event says it
         log.event("resumed", iteration)
         return log
 
@@ -177,6 +179,13 @@ class RunLog(AbstractContextManager["RunLog"]):
             TypeError: a value that is no number.
         """
         line = self._line("step", iteration)
+        last, self._continued_at = self._continued_at, None
+        if last is not None and line["iteration"] < last:
+            warn_user(
+                f"RunLog.step: iteration {line['iteration']} in a log that has {last} already, so "
+                "that two runs stand in one file; use RunLog.resume to go on from a checkpoint, or "
+                "another path"
+            )
         if phase is not None:
             line["phase"] = str(phase.value if isinstance(phase, Enum) else phase)
         self._pending.append(_pack("RunLog.step", line, columns))

@@ -80,7 +80,8 @@ def compare(
     for run in runs:
         scene = run.metadata.get("scene")
         arms = scenes.setdefault(None if scene is None else str(scene), {})
-        arms.setdefault(str(run.metadata.get("arm", run.name)), []).append(run)
+        arm = run.metadata.get("arm")
+        arms.setdefault(run.name if arm is None else str(arm), []).append(run)
     names = list(dict.fromkeys(name for arms in scenes.values() for name in arms))
     metrics = metric_names(runs)
     if metric is None:

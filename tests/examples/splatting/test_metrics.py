@@ -75,6 +75,7 @@ def test_ssim_pads_with_zeros_up_to_the_border(height, width):
     torch.testing.assert_close(ssim_map(render, target), expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.thorough
 def test_ssim_gradients():
     render, target = (image.requires_grad_() for image in _pair(7, 13, torch.float64))
     assert torch.autograd.gradcheck(ssim, (render, target))

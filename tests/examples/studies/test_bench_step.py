@@ -16,6 +16,7 @@ from studies.figures import ROWS, goal_table
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 
 
+@pytest.mark.thorough
 def test_every_subject_is_timed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--points", "64", "--repeats", "1", "--out", str(tmp_path)]) == 0
     made = json.loads((tmp_path / "step_cpu.json").read_text(encoding="utf-8"))

@@ -32,6 +32,7 @@ def test_the_share_is_of_points_inside_the_picture() -> None:
     assert large_capture.visible_share(torch.stack([ahead, behind]), [view]) == 0.5
 
 
+@pytest.mark.thorough
 def test_it_trains_goes_on_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = [*SMALL, "--runs", str(tmp_path / "runs"), "-o", str(tmp_path / "out")]
     page = large_capture.PAGE.read_text(encoding="utf-8")
