@@ -15,6 +15,7 @@ from torch import Tensor
 from opt3dgs_optim.checks import (
     LOGGER,
     as_damage,
+    as_float,
     check_count,
     check_energy,
     check_keys,
@@ -206,7 +207,7 @@ class Course:
         if window is None:
             return None
         pair = window if isinstance(window, (tuple, list)) and len(window) == 2 else ()
-        whole = [int(each) for each in pair if isinstance(each, Real) and each == each // 1]
+        whole = [int(each) for each in pair if as_float(each).is_integer()]
         if len(whole) != 2 or whole[0] > whole[1]:
             raise ValueError(
                 f"{type(part).__name__}.window: {window!r}, but None or two iterations, the first "
