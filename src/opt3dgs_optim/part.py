@@ -27,6 +27,10 @@ class Phase(enum.Enum):
     EXPLORATION = "exploration"
     EXPLOITATION = "exploitation"
 
+    def __repr__(self) -> str:
+        """As it is written in code, which messages show."""
+        return f"Phase.{self.name}"
+
 
 @dataclass(frozen=True)
 class Kept:

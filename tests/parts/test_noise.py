@@ -278,3 +278,12 @@ def test_what_is_missing_is_said_before_anything_has_moved() -> None:
     with pytest.raises(ValueError, match=r"PositionNoise: .*scales.* are not among"):
         adam.step()
     assert torch.equal(means, torch.ones(4, 3))
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_two_noises_do_not_take_each_other_for_the_trainers(order: int) -> None:
+    parts = [PositionNoise(scale=1.0), IsotropicNoise(std=1e-6)][::order]
+    splats, phases, optimizers = upgraded(60, *parts)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        train(splats, optimizers, phases, 0, 30)
