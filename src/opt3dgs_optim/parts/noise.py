@@ -165,7 +165,7 @@ class IsotropicNoise(Part):
         deviation: Any = self.std
         if self.temperature is not None:
             deviation = (2 * group["lr"] * self.temperature) ** 0.5
-        # .data: no write of the trainer's that `PositionNoise` should notice by the version counter.
+        # .data: no write of the trainer's, which `PositionNoise` would see by the version counter.
         param.data.add_(_normal_like(param, self.generator) * deviation)
 
 
