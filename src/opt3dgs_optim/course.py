@@ -204,8 +204,10 @@ class Course:
             ValueError: it is neither None nor two iterations, the first not after the second.
         """
         window: Any = part.window(self)
-        if window is None:
-            return None
+        if window is None or (
+            type(window) is tuple and [*map(type, window)] == [int, int] and window[0] <= window[1]
+        ):
+            return window
         pair = window if isinstance(window, (tuple, list)) and len(window) == 2 else ()
         whole = [int(each) for each in pair if as_float(each).is_integer()]
         if len(whole) != 2 or whole[0] > whole[1]:

@@ -13,7 +13,7 @@ from opt3dgs_optim.part import Group, Kept, Part, State
 from opt3dgs_optim.state import broadcast_rows
 
 OUT_OF_VIEW, SEEN_SHARE = "out_of_view", "seen_share"  # what it publishes, and keeps
-NUM_VIEWS_AVERAGED = 100
+WEIGHT = 1 / 100  # of a view in the mean share: that is of the last 100 views or so
 MAX_POINTS_LOOKED_AT = 2_048  # of each view, for the mean share over many
 MAX_SEEN_SHARE = 1 / 3  # above it nothing is changed
 MIN_SEEN_SHARE = 0.01  # a view counts as seeing at least so much
@@ -53,7 +53,7 @@ class OutOfView(Part):
             # other parameters' steps may do.
             own = cast(Tensor, param.grad)
             kept = state[SEEN_SHARE]
-            kept.copy_(_mean_with(kept, own))
+            _include(own, kept)
             # A GPU's number is not read.
             share: Any = kept.item() if own.is_cpu else kept
             course.publish(SEEN_SHARE, param, share)
@@ -69,8 +69,9 @@ class OutOfView(Part):
             kept = course.number_kept(self, SEEN_SHARE, means)
             kept = torch.ones((), device=means.device) if kept is None else kept
             positions = means.grad
-            share = _mean_with(kept, positions)
-            share = share.item() if share.is_cpu else share
+            kept = kept.clone()
+            _include(positions, kept)
+            share = kept.item() if kept.is_cpu else kept
         if isinstance(share, float) and share >= MAX_SEEN_SHARE:
             return grad
         if positions is None:
@@ -93,19 +94,21 @@ class OutOfView(Part):
         return {"visible_share": 1.0 if share is None else share}
 
 
-def _mean_with(kept: Tensor, grad: Tensor) -> Tensor:
-    """The mean share of the points that a view sees, 0-d, with this view's.
+def _include(grad: Tensor, kept: Tensor) -> None:
+    """Take the share of the points that a view sees into the mean share, 0-d, in place.
 
-    A gradient that is zero everywhere, as that of frozen positions, is of no view.
+    A gradient [N, ..] that is zero everywhere, as that of frozen positions, is of no view.
     """
     stride = 1 + grad.shape[0] // MAX_POINTS_LOOKED_AT
     seen = _has_gradient(grad[::stride] if stride > 1 else grad)
     # Not `mean`, which takes twice as long.
     share = seen.sum(dtype=torch.float32).div_(seen.shape[0])
-    with_it = kept.lerp(share.clamp(min=MIN_SEEN_SHARE).to(kept), 1 / NUM_VIEWS_AVERAGED)
-    if share.is_cpu:
-        return with_it if share.item() > 0 else kept
-    return torch.where(share.to(kept) > 0, with_it, kept)
+    if not grad.is_cpu:
+        of_a_view = share > 0
+        share = share.clamp_(min=MIN_SEEN_SHARE).to(kept)
+        kept.copy_(torch.where(of_a_view.to(kept.device), kept.lerp(share, WEIGHT), kept))
+    elif share.item() > 0:
+        kept.lerp_(share.clamp_(min=MIN_SEEN_SHARE).to(kept), WEIGHT)
 
 
 def _has_gradient(grad: Tensor) -> Tensor:
