@@ -172,6 +172,7 @@ MADE: dict[str, Callable[[Path], None]] = {
 
 ROWS = (  # of the benchmark, on the page
     *("six Adams", "defaults", "defaults, a tenth in view", "defaults, last thirtieth"),
+    "defaults and OwnFrame",
     *("defaults, steps of a tenth", "the paper's exploration", "the paper's exploitation"),
 )
 

@@ -13,6 +13,8 @@ from opt3dgs_optim import (
     DEFAULTS,
     Curvature,
     EnergyHistogram,
+    Fading,
+    OwnFrame,
     Part,
     PhaseScheduler,
     SquaredLoss,
@@ -20,6 +22,7 @@ from opt3dgs_optim import (
 )
 from opt3dgs_optim.lbfgs import history_from_pairs
 
+BUT_MEANS = ("scales", "quats", "opacities", "sh0", "shN")
 HISTORY_SIZE = 5
 VIEWS = 4  # whose gradients take turns
 NUMBERS = 59  # of a Gaussian with harmonics of degree 3
@@ -152,6 +155,9 @@ SUBJECTS: dict[str, Callable[[Case], Callable[[], Any]]] = {
     "defaults, a tenth in view": lambda case: upgraded(case, [*DEFAULTS], tenth=True),
     "defaults, steps of a tenth": lambda case: upgraded(case, [*DEFAULTS], tenth=True, masked=True),
     "defaults, last thirtieth": lambda case: upgraded(case, [*DEFAULTS], at=0.975),
+    "defaults and OwnFrame": lambda case: upgraded(
+        case, [OwnFrame(), Fading(names=BUT_MEANS), *DEFAULTS[1:]]
+    ),
     "the paper's exploration": lambda case: upgraded(case, [EnergyHistogram.paper(warmup=4)]),
     "the paper's exploitation": lambda case: upgraded(
         case, [SquaredLoss(), Curvature()], exploit=True, at=0.0
