@@ -185,17 +185,14 @@ class _ObservedCourse(Course):
         self.steps += 1
         if closure_value is not None:
             histogram.observe(closure_value)
-        is_new, self.num_observed = (
-            histogram.num_observed != self.num_observed,
-            histogram.num_observed,
-        )
+        before, self.num_observed = self.num_observed, histogram.num_observed
         if self.steps == 1 and histogram.num_observed == 0:
             warn_user(
                 "AWSGLD: no energy has been observed yet, so the multiplier is not adapted; call "
                 "histogram.observe(loss) before step(), or pass it a closure that returns the loss"
             )
         # Of a step without an energy of its own nothing is known.
-        self.valid = histogram.last_finite if is_new else True
+        self.valid = histogram.last_finite if self.num_observed != before else True
         return True
 
 

@@ -369,7 +369,10 @@ def _check_options(call: str, name: str, group: Any) -> None:
                 check_number(call, f"{name}: {option}", value.item(), 0.0, most)
     for option in ("amsgrad", "maximize", "capturable", "differentiable", "foreach", "fused"):
         value = group.get(option)
-        if value is not None and not (isinstance(value, (bool, np.bool_)) or value in (0, 1)):
+        whether = isinstance(value, (bool, np.bool_)) or (
+            isinstance(value, int) and value in (0, 1)
+        )
+        if value is not None and not whether:
             raise ValueError(f"{call}: {name}: {option}={value!r}, but True or False is needed")
 
 
