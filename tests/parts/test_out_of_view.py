@@ -8,6 +8,7 @@ from typing import Any
 import devices
 import pytest
 import torch
+from simulated_device import SimulatedDevice, on_device, on_host
 from torch.nn import Parameter
 from trainers import (
     assert_same,
@@ -24,7 +25,7 @@ from trainers import (
 )
 
 from opt3dgs_optim import Fading, OutOfView, Part
-from opt3dgs_optim.parts.out_of_view import MAX_POINTS_LOOKED_AT, MAX_SEEN_SHARE
+from opt3dgs_optim.parts.out_of_view import MAX_POINTS_LOOKED_AT, MAX_SEEN_SHARE, _include
 
 POINTS, SEEN = 200, 4  # a view sees 2 % of them
 PULL = 1e-3  # of the regulariser; the images' gradients are about 1
@@ -298,6 +299,30 @@ def test_a_gradient_that_is_zero_everywhere_is_of_no_view() -> None:
     set_share(optimizers, 0.5)
     iterate(splats, optimizers, phases, 0, 400, seen=0)
     assert share_of(optimizers) == 0.5
+
+
+@pytest.mark.parametrize("seen", [0, 1, 3, POINTS])
+def test_a_gpu_takes_a_view_into_the_mean_as_the_host_does(seen: int) -> None:
+    """And is not waited for."""
+    grad = torch.zeros(POINTS, 3)
+    grad[:seen] = 1.0
+    kept = torch.tensor(0.5)
+    _include(grad, kept)
+    with SimulatedDevice() as gpu:
+        there, own = on_device(torch.tensor(0.5)), on_device(grad)
+        gpu.forget()
+        _include(own, there)
+        assert gpu.synchronisations == []
+        assert float(on_host(there)) == float(kept)
+
+
+def test_the_share_of_a_single_point_is_known() -> None:
+    phases = only(2_000, OutOfView())
+    splats = make_splats(1)
+    optimizers = phases.upgrade(gsplat_optimizers(splats))
+    set_share(optimizers, 0.5)
+    iterate(splats, optimizers, phases, 0, 1, seen=1)
+    assert share_of(optimizers) == pytest.approx(0.5 + 0.5 / 100)
 
 
 @pytest.mark.parametrize(("share", "acts"), [(0.32, True), (0.35, False)])
