@@ -50,6 +50,7 @@ STATE = [  # the fast ones of those that are about it
     *(f"test_cases_{name}.py" for name in ("several_tensors", "moved_rows", "copies")),
 ]
 # Of these tests: those that compile C++, a law that the loop oracle sees sooner, other classes.
+CHOSEN = "not slow and not hosts and not compiles and not processes"  # by their markers
 LEFT_OUT = "not sanitizers and not mutants and not kernel and not compiles and not power_four"
 OPTIONS_OF = ("EnergyHistogram", "IsotropicNoise", "PositionNoise", "Annealing", "Fading")
 OPTIONS_OF += ("OwnFrame",)
@@ -154,7 +155,7 @@ def _in_child(
     known = set(sys.modules)
     # -n 0: in this process, whatever the project's own options are.
     options = ["-x", "-q", "-n", "0", "-p", "no:cacheprovider", "-k", LEFT_OUT]
-    options += ["-m", "not slow and not hosts and not compiles and not processes"]
+    options += ["-m", CHOSEN]
     # Hypothesis is imported before pytest could rewrite its assertions; it has none to rewrite.
     options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
     status = pytest.main([*options, *map(str, tests)], [plugin])

@@ -360,13 +360,12 @@ def _check_options(call: str, name: str, group: Any) -> None:
     betas = group["betas"]
     if not isinstance(betas, (list, tuple)) or len(betas) != 2:
         raise ValueError(f"{call}: {name}: betas={betas!r}, but two numbers are needed")
-    bounds = {"lr": math.inf, "eps": math.inf, "weight_decay": math.inf, "betas": 1.0}
-    for option, most in bounds.items():
-        for value in betas if option == "betas" else [group[option]]:
-            if not isinstance(value, Tensor):
-                check_number(call, f"{name}: {option}", value, 0.0, most)
-            elif value.numel() == 1 and value.is_cpu:  # of others torch says so, or a GPU must wait
-                check_number(call, f"{name}: {option}", value.item(), 0.0, most)
+    numbers = [(option, group[option], math.inf) for option in ("lr", "eps", "weight_decay")]
+    for option, value, most in [*numbers, *(("betas", beta, 1.0) for beta in betas)]:
+        if not isinstance(value, Tensor):
+            check_number(call, f"{name}: {option}", value, 0.0, most)
+        elif value.numel() == 1 and value.is_cpu:  # of others torch says so, or a GPU must wait
+            check_number(call, f"{name}: {option}", value.item(), 0.0, most)
     for option in ("amsgrad", "maximize", "capturable", "differentiable", "foreach", "fused"):
         value = group.get(option)
         whether = isinstance(value, (bool, np.bool_)) or (

@@ -473,7 +473,7 @@ class Course:
                         "element, is needed"
                     )
             # Of two parts of one class the second's columns are "faded#2", as in checkpoints.
-            mark = name.rpartition("#")[2] if "#" in name else ""
+            mark = name.partition("#")[2]
             columns |= {f"{key}#{mark}" if mark else key: value for key, value in own.items()}
         return columns
 

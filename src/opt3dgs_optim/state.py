@@ -303,9 +303,6 @@ class ParameterState(MutableMapping[str, Any]):
 
     @torch.no_grad()
     def __setitem__(self, name: str, value: Any) -> None:
-        if name not in self:
-            part, allowed = self._part, ", ".join(self)
-            raise KeyError(f"{part} does not declare {name!r} in keeps; there are {allowed}")
         tensor = self[name]
         if value is not tensor:
             tensor.copy_(value) if isinstance(value, Tensor) else tensor.fill_(value)

@@ -195,12 +195,10 @@ class StepAdam(Adam):
         """
         self._opt_called = True  # what learning-rate schedulers would note by wrapping this method
         refuse_capture(self)
-        mask = None
-        if closure is not None or visible is not None or visibility is not None:
-            masks: list[Any] = [each for each in (visible, visibility) if each is not None]
-            if isinstance(closure, Tensor):
-                masks, closure = [closure, *masks], None
-            mask = check_mask(self.call_name, masks, num_points) if masks else None
+        masks: list[Any] = [each for each in (visible, visibility) if each is not None]
+        if isinstance(closure, Tensor):
+            masks, closure = [closure, *masks], None
+        mask = check_mask(self.call_name, masks, num_points) if masks else None
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -379,8 +377,7 @@ class StepAdam(Adam):
         fed = parts.feed(group, param, grad, view, course)
         if fed is not grad:
             step.overrides.attribute(param, "grad", fed)
-        if course.row_keys:
-            self._ownership.claim(param, view.adam, course.row_keys)
+        self._ownership.claim(param, view.adam, course.row_keys)
 
     def _take_units(
         self, group: Group, param: Tensor, record: ParameterRecord, units: tuple[str, ...]
@@ -409,8 +406,7 @@ class StepAdam(Adam):
         state, course = self.state[param], self.course
         if not state:  # torch makes its moments only where there is nothing else yet
             self._init_group({**group, "params": [param]}, [], [], [], [], [], [])
-        if course.row_keys:
-            self._ownership.drop_foreign(param, state, course.row_keys)
+        self._ownership.drop_foreign(param, state, course.row_keys)
         return record.view(param, state, course.declared, course.kept_numbers)
 
     def _prepare(self, step: StepInProgress, moving: MovingParameter) -> Tensor:

@@ -22,7 +22,6 @@ from opt3dgs_optim import (
 )
 from opt3dgs_optim.lbfgs import history_from_pairs
 
-BUT_MEANS = ("scales", "quats", "opacities", "sh0", "shN")
 HISTORY_SIZE = 5
 VIEWS = 4  # whose gradients take turns
 NUMBERS = 59  # of a Gaussian with harmonics of degree 3
@@ -35,6 +34,7 @@ LEARNING_RATES = {
     "sh0": 2.5e-3,
     "shN": 1.25e-4,
 }
+BUT_MEANS = tuple(name for name in LEARNING_RATES if name != "means")
 
 
 class Case:

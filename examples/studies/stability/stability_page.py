@@ -12,6 +12,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from mutants import (  # tests/, where `stability` has put them within reach
+    CHOSEN,
     reasons_of_the_committed_run,
     survivor_key,
 )
@@ -19,7 +20,7 @@ from mutants import (  # tests/, where `stability` has put them within reach
 LEAST_COVERAGE = 95.0  # per cent, of branches and of statements; modules below are listed
 SLOW = "python -m pytest -m slow --junitxml=build/slow.xml"
 COVERAGE = (
-    "python -m pytest -m 'not slow and not hosts and not compiles and not processes' "
+    f"python -m pytest -m '{CHOSEN}' "
     "--cov --cov-config=tests/coverage.ini --cov-report=json:build/coverage.json"
 )
 MARK = "<!-- {}: made by examples/studies/stability/stability.py -->"
