@@ -62,11 +62,12 @@ def default_step(
     # A point is out of view if its position has no gradient. At most 2,048 points are asked, and
     # the share of those in view is a mean over the last 100 views or so.
     in_view = grads["means"].any(1)
-    now = in_view[:: 1 + num_points // 2_048].float().mean()
-    state.setdefault("share", torch.tensor(1.0))
+    seen = in_view[:: 1 + num_points // 2_048]
+    kept = state.setdefault("share", torch.tensor(1.0))
+    share, now = kept.item(), int(seen.sum()) / len(seen)
     if now > 0:
-        state["share"] = torch.lerp(state["share"], now.clamp(min=0.01), 1 / 100)
-    share = state["share"].item()
+        share += 1 / 100 * (max(now, 0.01) - share)
+        kept.fill_(share)
 
     for name, param in params.items():
         grad, own = grads[name], state.setdefault(name, new_moments(param))

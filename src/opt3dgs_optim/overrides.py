@@ -9,8 +9,10 @@ from typing import Any, ParamSpec, TypedDict, TypeVar
 
 import torch
 from torch import Tensor
+from torch._C._autograd import _profiler_enabled
 from torch._compile import _disable_dynamo
-from torch.optim import Adam
+from torch.optim import Adam, Optimizer
+from torch.optim.optimizer import _global_optimizer_post_hooks, _global_optimizer_pre_hooks
 
 from opt3dgs_optim.part import Group
 from opt3dgs_optim.state import broadcast_rows, is_finite_sum
@@ -61,7 +63,7 @@ class TemporaryOverrides(AbstractContextManager["TemporaryOverrides"]):
 
 
 def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
-    """A step that runs as it is in a compiled function, at no cost outside of one.
+    """A function that runs as it is in a compiled one, at no cost outside of one.
 
     torch's own decorator for it changes the interpreter's state in every call, compiled or not.
     """
@@ -74,6 +76,36 @@ def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
         return function(*args, **kwargs)
 
     return called
+
+
+def as_step(function: Callable[P, R]) -> Callable[P, R]:
+    """A method as a step of torch's optimizers: with step hooks, a profiler's range, uncompiled.
+
+    torch's own decorator enters the range in every step, whether anybody profiles or not. With few
+    points that takes as long as the parts do.
+    """
+    watched = Optimizer.profile_hook_step(function)
+    disabled = _disable_dynamo(watched)
+
+    @functools.wraps(function)
+    def called(*args: P.args, **kwargs: P.kwargs) -> R:
+        if torch.compiler.is_dynamo_compiling():
+            return disabled(*args, **kwargs)
+        return (watched if _is_watched(args[0]) else function)(*args, **kwargs)
+
+    vars(called)["hooked"] = True  # torch adds nothing to it
+    return called
+
+
+def _is_watched(optimizer: Any) -> bool:
+    """Whether hooks or a profiler are to see a step."""
+    return bool(
+        optimizer._optimizer_step_pre_hooks
+        or optimizer._optimizer_step_post_hooks
+        or _global_optimizer_pre_hooks
+        or _global_optimizer_post_hooks
+        or _profiler_enabled()
+    )
 
 
 def _delete(owner: Any, key: Any, _: Any) -> None:

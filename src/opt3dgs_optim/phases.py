@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import torch
 from torch import Tensor
-from torch._compile import _disable_dynamo
 from torch.optim import Optimizer
 
 from opt3dgs_optim.checks import (
@@ -20,6 +19,7 @@ from opt3dgs_optim.checks import (
 )
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import block, gaussian_of
+from opt3dgs_optim.overrides import uncompiled
 from opt3dgs_optim.part import Part, Phase
 from opt3dgs_optim.presets import (
     DEFAULTS,
@@ -194,7 +194,7 @@ class PhaseScheduler(Course):
         return optimizers
 
     # In a compiled function it runs as it is: what it looks at changes from iteration to iteration.
-    @_disable_dynamo
+    @uncompiled
     def observe(self, loss: Tensor | float, *, iteration: int | None = None) -> None:
         """Take the loss of this iteration: once, after backward, before the optimizers step.
 

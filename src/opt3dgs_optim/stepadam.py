@@ -33,13 +33,13 @@ from opt3dgs_optim.in_step import (
 from opt3dgs_optim.names import NamedGroup, block, gaussian_of, group_name, split_name
 from opt3dgs_optim.overrides import (
     TemporaryOverrides,
+    as_step,
     can_be_fused,
     decay_weights,
     is_moving_rate,
     own_step,
     refuse_capture,
     scale_learning_rate,
-    uncompiled,
     use_fused,
     zero_nonfinite,
 )
@@ -100,7 +100,7 @@ class StepAdam(Adam):
             self._slots = []
         self._known, self._open_windows = [], {}
         self.name_groups()
-        self._patch_step_function()  # torch's, for a class that was given to a made optimizer
+        self._patch_step_function()  # of a class that was given to a made optimizer
         if base is Adam and course.parts and can_be_fused(self):
             use_fused(self)
         self._claim_rows()
@@ -168,7 +168,7 @@ class StepAdam(Adam):
     # -- a step ----------------------------------------------------------------------------------
 
     # Under torch.compile a step runs as it is, like those of torch's own optimizers.
-    @uncompiled
+    @as_step
     def step(  # pyright: ignore[reportIncompatibleMethodOverride]
         self,
         closure: Callable[[], Any] | Tensor | None = None,

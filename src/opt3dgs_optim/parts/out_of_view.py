@@ -52,10 +52,7 @@ class OutOfView(Part):
             # Not of what Adam is fed: that is zero where a step turns out not to count, which the
             # other parameters' steps may do.
             own = cast(Tensor, param.grad)
-            kept = state[SEEN_SHARE]
-            _include(own, kept)
-            # A GPU's number is not read.
-            share: Any = kept.item() if own.is_cpu else kept
+            share: Any = _include(own, state[SEEN_SHARE])
             course.publish(SEEN_SHARE, param, share)
             if not isinstance(share, float) or share < MAX_SEEN_SHARE:
                 course.publish(OUT_OF_VIEW, param, ~_has_gradient(own))
@@ -69,9 +66,7 @@ class OutOfView(Part):
             kept = course.number_kept(self, SEEN_SHARE, means)
             kept = torch.ones((), device=means.device) if kept is None else kept
             positions = means.grad
-            kept = kept.clone()
-            _include(positions, kept)
-            share = kept.item() if kept.is_cpu else kept
+            share = _include(positions, kept.clone())
         if isinstance(share, float) and share >= MAX_SEEN_SHARE:
             return grad
         if positions is None:
@@ -94,21 +89,28 @@ class OutOfView(Part):
         return {"visible_share": 1.0 if share is None else share}
 
 
-def _include(grad: Tensor, kept: Tensor) -> None:
-    """Take the share of the points that a view sees into the mean share, 0-d, in place.
+def _include(grad: Tensor, kept: Tensor) -> float | Tensor:
+    """Take the share of the points that a view sees into the mean share `kept`, 0-d, in place.
 
     A gradient [N, ..] that is zero everywhere, as that of frozen positions, is of no view.
+
+    Returns:
+        The mean share: a number on a CPU. A GPU's is not read.
     """
     stride = 1 + grad.shape[0] // MAX_POINTS_LOOKED_AT
     seen = _has_gradient(grad[::stride] if stride > 1 else grad)
-    # Not `mean`, which takes twice as long.
-    share = seen.sum(dtype=torch.float32).div_(seen.shape[0])
     if not grad.is_cpu:
+        # Not `mean`, which takes twice as long.
+        share = seen.sum(dtype=torch.float32).div_(seen.shape[0])
         of_a_view = share > 0
         share = share.clamp_(min=MIN_SEEN_SHARE).to(kept)
-        kept.copy_(torch.where(of_a_view.to(kept.device), kept.lerp(share, WEIGHT), kept))
-    elif share.item() > 0:
-        kept.lerp_(share.clamp_(min=MIN_SEEN_SHARE).to(kept), WEIGHT)
+        return kept.copy_(torch.where(of_a_view.to(kept.device), kept.lerp(share, WEIGHT), kept))
+    # Numbers of Python's: each small operator would take as long as the sum does.
+    mean, count = kept.item(), int(seen.sum())
+    if count > 0:
+        mean += WEIGHT * (max(count / seen.shape[0], MIN_SEEN_SHARE) - mean)
+        kept.fill_(mean)
+    return mean
 
 
 def _has_gradient(grad: Tensor) -> Tensor:
