@@ -47,7 +47,7 @@ class Tally:
         self.sums = nu.new_zeros(3)
         self._powers = torch.arange(3).to(nu)
 
-    def add(self, nu: Tensor, valid: Tensor) -> None:
+    def add(self, nu: Tensor, valid: Tensor | Literal[True]) -> None:
         """Take the nu of an energy that has been counted; in the warm-up it becomes 1, in place."""
         in_warmup = self.count <= self.warmup
         nu.masked_fill_(in_warmup, 1.0)
@@ -71,8 +71,6 @@ class Partitions:
             valid: whether it is finite, 0-d, bool. One that is not changes nothing.
             tally: of the energies before it; this one is added. Never synchronises.
         """
-        if valid is True:
-            valid = torch.ones_like(tally.count, dtype=torch.bool)
         tally.count.add_(valid)
         self.take(energy, valid, tally.count)
         tally.add(self.nu, valid)
@@ -309,7 +307,7 @@ class MovingPartitions(Partitions):
         step = torch.mul(t, unit)
         torch.add(mean, step, out=self._to_mean)
         torch.hypot(step, self._tiny, out=self._to_deviation)
-        self._state.lerp_(self._target, rate if valid is True else rate * valid)
+        self._state.lerp_(self._target, rate * valid)
 
     @property
     def weights(self) -> Tensor:

@@ -238,6 +238,8 @@ def test_where_a_launch_takes_the_energy_torch_does_not(monkeypatch: pytest.Monk
     before = histogram.state_dict()
     histogram.observe(0.5)
     assert len(given) == 1
+    # How far away an energy may be is the same, wherever it is taken.
+    assert given[0][7] == partitions.Pace.of(partitions.MEMORY).high
     assert histogram.state_dict() == {**before, "num_observed": 1}
 
 
