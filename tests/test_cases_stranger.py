@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import torch
-from placed_training import GPU, ROWS, VIEWS, Training, distance
+from placed_training import GPU, ROWS, VIEWS, Training, distance, some_of
 from simulated_device import SimulatedDevice
 from torch import Tensor
 from torch.nn import Parameter
@@ -107,7 +107,7 @@ def test_rows_that_a_mask_holds_still_keep_theirs() -> None:
 
 
 @pytest.mark.parametrize("parts", [one, two])
-@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("masked", some_of([False, True], bool))
 @pytest.mark.parametrize(
     "dropped", [{0}, {7, 8, 9}, {SWITCH}, {TOTAL - 1}, set(range(0, TOTAL, 3))]
 )

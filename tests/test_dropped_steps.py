@@ -21,6 +21,7 @@ from placed_training import (
     TOTAL,
     Training,
     distance,
+    is_brief,
     some_of,
 )
 from simulated_device import SimulatedDevice, on_host
@@ -63,11 +64,13 @@ ACTING = [arm for arm in ARMS if arm != "no parts"]  # without parts nothing of 
 # Presets are long, and made of the others.
 SOME = ("around the switch", "every third", "the last")
 CASES = [(arm, when) for arm in ACTING for when in (SOME if arm in PRESETS else WHEN)]
-BRIEF = ("around the switch",)  # of the arms that are not tested with all
+BRIEF = ("around the switch",)
+LONGER = (*BRIEF, "every third", "the last")  # of all parts at once
 
 
 @pytest.mark.parametrize(
-    ("arm", "when"), some_of(CASES, lambda case: case[1] in BRIEF or case[0] == "everything")
+    ("arm", "when"),
+    some_of(CASES, lambda case: case[1] in (LONGER if case[0] == "everything" else BRIEF)),
 )
 def test_the_device_drops_what_the_host_drops(arm: str, when: str) -> None:
     with SimulatedDevice():
@@ -97,7 +100,7 @@ WAYS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("arm", ["everything", "DEFAULTS_ADC"])
+@pytest.mark.parametrize("arm", some_of(["everything", "DEFAULTS_ADC"], is_brief))
 def test_however_it_is_stepped(arm: str, way: str) -> None:
     when = WHEN["every third"]
     with SimulatedDevice():

@@ -45,6 +45,7 @@ def small(out: Path, *words: str) -> list[str]:
     return ["--device", "cpu", "--points", "64", "--repeats", "2", "-o", str(out), *words]
 
 
+@pytest.mark.thorough
 def test_all_of_it_runs_on_a_cpu(checked: dict[str, Any], tmp_path: Path) -> None:
     assert gpu.main(small(tmp_path)) == 0
     made = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))

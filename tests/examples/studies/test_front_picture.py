@@ -41,6 +41,7 @@ def test_it_is_made_of_two_folders(tmp_path: Path) -> None:
     assert str(tmp_path) not in picture.with_suffix(".json").read_text()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("change", "words", "message"),
     [

@@ -14,6 +14,7 @@ from studies.pages import filled
 SMALL = ["--photos", "80", "--points", "300", "--iterations", "20", "--seeds", "2"]
 
 
+@pytest.mark.thorough
 def test_a_photo_sees_little_of_the_scene() -> None:
     scene, whole = large_capture.make_scene(80, 2_000)
     assert 0.02 < large_capture.visible_share(scene.points, scene.train) < 0.06
