@@ -153,41 +153,38 @@ def metrics_table(
     return table([first, *map(head, settings)], "l", rows)
 
 
-def headline_table(study: Study, long: Sequence[Setting], short: int) -> str:
-    """The baseline beside the defaults at both lengths: what a reader sees first.
+def headline_table(study: Study, sizes: Iterable[Sequence[Setting]]) -> str:
+    """The baseline beside the defaults at each size: what a reader sees first.
 
-    Means over the seeds that all of a scene's trainings have, since a seed has held-out views of
-    its own. Where the baseline was trained with other learning rates on all of these, the best of
-    them stands between the two.
+    Means over the seeds that both have, since a seed has held-out views of its own. Other arms
+    stand beside where they have all of these trainings: the best of other learning rates, OwnFrame.
+
+    Args:
+        sizes: the settings of the same scenes at each size.
     """
-    lengths = (long[0].iterations, short) if long else ()
-    shared = {}
-    for setting in long:
-        of = [replace(setting, iterations=count) for count in lengths]
-        both = [study.runs(each, arm) for each in of for arm in (BASELINE, DEFAULTS)]
-        shared[setting] = set.intersection(*map(set, both))
-    rows = []
-    for count in lengths:
-        lines = {LABELS[BASELINE]: BASELINE, f"**{LABELS[DEFAULTS]}**": DEFAULTS}
+    rows, scenes = [], list[str]()
+    for settings in sizes:
+        scenes = [setting.scene for setting in settings]
+        seeds = [study.runs(s, BASELINE).keys() & study.runs(s, DEFAULTS).keys() for s in settings]
         found = {
             arm: [
-                [runs[seed] for seed in seeds if seed in runs]
-                for setting, seeds in shared.items()
-                for runs in [study.runs(replace(setting, iterations=count), arm)]
+                [runs[seed] for seed in sorted(of) if seed in runs]
+                for setting, of in zip(settings, seeds, strict=True)
+                for runs in [study.runs(setting, arm)]
             ]
-            for arm in (*lines.values(), *TUNED)
+            for arm in (BASELINE, *TUNED, DEFAULTS, OWN_FRAME_ARM)
         }
-        best = max(
-            (arm for arm in TUNED if [*map(len, found[arm])] == [*map(len, shared.values())]),
-            key=lambda arm: fmean(fmean(r.final for r in records) for records in found[arm]),
-            default=None,
-        )
-        if best is not None:
-            lines = {LABELS[BASELINE]: BASELINE, TUNED[best]: best, **lines}
-        for what, arm in lines.items():
-            cells = [_cell(records, seeds=False) for records in found[arm]]
-            rows.append((f"{what}, {count:,}", *cells))
-    return table(["training, iterations", *(s.scene for s in long)], "l", rows)
+        whole = [arm for arm in found if [*map(len, found[arm])] == [*map(len, seeds)]]
+        tuned = [arm for arm in whole if arm in TUNED]
+        psnr = {arm: fmean(fmean(r.final for r in of) for of in found[arm]) for arm in tuned}
+        best = max(tuned, key=psnr.__getitem__, default=None)
+        for arm in whole:
+            if arm not in TUNED or arm == best:
+                what = TUNED.get(arm, label(arm))
+                cells = [_cell(of, seeds=False) for of in found[arm]]
+                size = SIZES.get(settings[0].size, settings[0].size)
+                rows.append((size, f"**{what}**" if arm == DEFAULTS else what, *cells))
+    return table(["size", "training", *scenes], "l", rows)
 
 
 def scenes_gain_table(study: Study, settings: Sequence[Setting], arm: str, control: str) -> str:
