@@ -1,10 +1,10 @@
-"""Run the tests that need nothing but torch with the oldest and the newest torch.
+"""Run the tests that need little but torch with the oldest and the newest torch.
 
     python examples/check_torch_versions.py            # 2.4.1 and 2.15.0, on Linux about 12 GB
     python examples/check_torch_versions.py --torch 2.6.0 --keep build/torch-versions
 
-Every version gets a virtual environment of its own with torch, numpy, pytest and hypothesis, and
-the package from this folder. Writes `torch_versions.json` and a table beside it into `build/`.
+Every version gets a virtual environment of its own with torch, numpy, pillow, pytest and
+hypothesis, and the package from this folder. Writes `torch_versions.json` and a table beside it into `build/`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parent.parent
-# Tests that need more than torch, numpy, pytest and hypothesis.
+# Tests that need more than these.
 LEFT_OUT = (
     *("examples", "test_docs.py", "test_mutants.py", "cuda/test_kernel_compile.py"),
     *("hosts/test_survey.py", "hosts/test_trainers.py"),
@@ -34,7 +34,7 @@ LEFT_OUT = (
 OLDEST, NEWEST = "2.4.1", "2.15.0"
 # In place of the project's own options: no workers, which would be one more package.
 PYTEST = ("-m", "pytest", "-q", "-o", "addopts=--import-mode=importlib", "-p", "no:cacheprovider")
-MARKS = "not slow and not hosts and not compiles and not processes"
+MARKS = "not slow and not hosts and not compiles and not processes and not thorough"
 # In a process of its own: what torch 2.4 compiles makes the whole process flush denormal numbers
 # to zero, and hypothesis refuses to draw numbers then.
 ALONE = "tests/runs/test_log.py"
@@ -60,7 +60,7 @@ def environment(version: str, folder: Path) -> Path:
     if not python.exists():
         print(f"torch {version}: installing ...", file=sys.stderr)
         venv.create(folder / version, with_pip=True)
-        wanted = [f"torch=={version}", "numpy", "pytest", "hypothesis"]
+        wanted = [f"torch=={version}", "numpy", "pillow", "pytest", "hypothesis"]
         subprocess.run([*pip, "--no-cache-dir", *wanted], check=True)
     subprocess.run([*pip, "--no-deps", "-e", str(ROOT)], check=True)
     return python
@@ -123,7 +123,7 @@ def table(record: dict[str, Any]) -> str:
     return f"""# Supported torch versions
 
 The oldest that `pyproject.toml` declares and the newest, each with the tests that need torch, \
-numpy, pytest and hypothesis alone.
+numpy, pillow, pytest and hypothesis alone.
 
 | torch | numpy | python | passed | skipped | failed |
 |---|---|---|---:|---:|---:|
