@@ -11,10 +11,6 @@ import torch
 from devices import on_a_device
 from torch import Tensor
 from torch.nn import Parameter
-from torch.optim.optimizer import (
-    register_optimizer_step_post_hook,
-    register_optimizer_step_pre_hook,
-)
 from trainers import (
     AveragedThroughout,
     assert_same,
@@ -129,36 +125,6 @@ def test_hooks_registered_before_the_upgrade_go_on() -> None:
     phases = only(TOTAL, Annealing(names=GAUSSIAN))
     train(splats, phases.upgrade(stock), phases, 0, 1)
     assert calls == ["post"]
-
-
-def test_hooks_of_all_optimizers_see_the_step_as_torchs_own() -> None:
-    calls = []
-    _splats, _phases, optimizers = upgraded(TOTAL, Annealing(names=GAUSSIAN))
-    stock = gsplat_optimizers(make_splats())
-    handles = [
-        register_optimizer_step_pre_hook(lambda o, *_: calls.append(("pre", type(o).__name__))),
-        register_optimizer_step_post_hook(lambda o, *_: calls.append(("post", type(o).__name__))),
-    ]
-    try:
-        for each in (stock, optimizers):
-            calls.append("")
-            each["means"].step()
-    finally:
-        for handle in handles:
-            handle.remove()
-    assert calls == 2 * ["", ("pre", "Adam"), ("post", "Adam")]
-
-
-@pytest.mark.parametrize("parts", [[], [Annealing()]])
-def test_a_profiler_sees_the_range_that_torch_gives_a_step(parts: list[Part]) -> None:
-    _splats, _phases, optimizers = upgraded(TOTAL, *parts)
-    stock = gsplat_optimizers(make_splats())
-    found = []
-    for each in (stock, optimizers):
-        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as seen:
-            each["means"].step()
-        found.append([event.name for event in seen.events() or () if "step" in event.name])
-    assert found[0] == found[1] == ["Optimizer.step#Adam.step"]
 
 
 class Fails(Part):

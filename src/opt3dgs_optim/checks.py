@@ -95,6 +95,14 @@ def check_energy(
     raise ValueError(f"{call}: {name}={got}, but one real number is needed")
 
 
+def energy_of(value: Any) -> torch.Tensor | None:
+    """A loss as of `check_energy`; None where it is no real number, as of a closure's own kind."""
+    try:
+        return check_energy("", "", value)
+    except ValueError:
+        return None
+
+
 def check_choice(call: str, name: str, value: Any, allowed: Sequence[Any] = (True, False)) -> Any:
     """Return `value`, or raise ValueError unless it is one of `allowed`, and of its type."""
     if not any(isinstance(value, type(each)) and value == each for each in allowed):

@@ -4,6 +4,8 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from torch import Tensor
+
 # gsplat's name, then those of INRIA and 3dgs-mcmc and of the trainers in the comments; no name may
 # stand twice. The `features` of 3DGRUT and of gsplat's --app_opt are none of them: they are inputs
 # of a network.
@@ -80,6 +82,9 @@ class NamedGroup(dict[str, Any]):
     ) -> None:
         super().__init__(group)
         self.set_name, self.gaussian, self.records = set_name, gaussian, list(records)
+        # What stood in its place, which somebody may hold and go on to write into.
+        self._former = group if type(group) is dict else None
+        self._was = {key: value for key, value in group.items() if key != "params"}
 
     def __missing__(self, key: str) -> Any:
         if key == SLOT:
@@ -88,6 +93,23 @@ class NamedGroup(dict[str, Any]):
 
     def get(self, key: str, default: Any = None) -> Any:
         return self.gaussian if key == SLOT else super().get(key, default)
+
+    def written_elsewhere(self) -> str | None:
+        """The option that somebody has changed in the group that stood in its place, or None."""
+        former = self._former
+        if former is None or former.get("params") is not self["params"]:
+            self._former = None  # gives the memory of replaced parameters back
+            return None
+        pairs = [(key, was, former.get(key)) for key, was in self._was.items()]
+        return next(
+            (
+                key
+                for key, was, now in pairs
+                # A device's number is not read.
+                if now is not was and (Tensor in (type(now), type(was)) or now != was)
+            ),
+            None,
+        )
 
     def __reduce__(self) -> Any:
         return NamedGroup, (dict(self), self.set_name, self.gaussian, self.records)

@@ -5,12 +5,14 @@ import inspect
 import operator
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from itertools import chain
 from typing import Any, ParamSpec, TypedDict, TypeVar
 
 import torch
 from torch import Tensor
 from torch._C._autograd import _profiler_enabled
 from torch._compile import _disable_dynamo
+from torch.autograd import profiler
 from torch.optim import Adam, Optimizer
 from torch.optim.optimizer import _global_optimizer_post_hooks, _global_optimizer_pre_hooks
 
@@ -35,7 +37,7 @@ class AdamOptions(TypedDict, total=False):
 class TemporaryOverrides(AbstractContextManager["TemporaryOverrides"]):
     """Learning rates, gradients and flags that stand in place of others until the `with` ends.
 
-    They are restored in reverse order, whatever happens in between.
+    They are restored in reverse order, whatever happens in between or meanwhile.
     """
 
     def __init__(self) -> None:
@@ -43,8 +45,14 @@ class TemporaryOverrides(AbstractContextManager["TemporaryOverrides"]):
         self._previous: list[tuple[Callable[..., None], Any, Any, Any]] = []
 
     def __exit__(self, *_: object) -> None:
-        for restore, owner, name, value in reversed(self._previous):
-            restore(owner, name, value)
+        try:
+            while self._previous:
+                restore, owner, name, value = self._previous[-1]
+                restore(owner, name, value)
+                del self._previous[-1]
+        except BaseException:  # Ctrl-C: the rest first
+            self.__exit__()
+            raise
 
     def item(self, owner: Any, key: Any, value: Any) -> None:
         """Put `value` in place of `owner[key]`."""
@@ -91,21 +99,32 @@ def as_step(function: Callable[P, R]) -> Callable[P, R]:
     def called(*args: P.args, **kwargs: P.kwargs) -> R:
         if torch.compiler.is_dynamo_compiling():
             return disabled(*args, **kwargs)
-        return (watched if _is_watched(args[0]) else function)(*args, **kwargs)
+        optimizer: Any = args[0]
+        if (
+            type(optimizer).step is not called
+        ):  # a subclass's step around this one, and torch's around that
+            return function(*args, **kwargs)
+        hooked = optimizer._optimizer_step_pre_hooks or _global_optimizer_pre_hooks
+        if hooked or _profiler_enabled() or profiler._is_profiler_enabled:
+            return watched(*args, **kwargs)
+        found = function(*args, **kwargs)
+        hooks = optimizer._optimizer_step_post_hooks, _global_optimizer_post_hooks
+        for hook in chain(*(each.values() for each in hooks)):  # a closure may have registered one
+            hook(optimizer, args, kwargs)
+        return found
 
     vars(called)["hooked"] = True  # torch adds nothing to it
     return called
 
 
-def _is_watched(optimizer: Any) -> bool:
-    """Whether hooks or a profiler are to see a step."""
-    return bool(
-        optimizer._optimizer_step_pre_hooks
-        or optimizer._optimizer_step_post_hooks
-        or _global_optimizer_pre_hooks
-        or _global_optimizer_post_hooks
-        or _profiler_enabled()
-    )
+def without_torchs_own(step: Callable[..., Any]) -> Callable[..., Any]:
+    """A step without the decorators of torch's optimizers; those of others stay."""
+    torchs = Optimizer.profile_hook_step.__code__.co_filename
+
+    def is_anothers(wrapper: Any) -> bool:
+        return getattr(getattr(wrapper, "__code__", None), "co_filename", None) != torchs
+
+    return inspect.unwrap(step, stop=is_anothers)
 
 
 def _delete(owner: Any, key: Any, _: Any) -> None:
@@ -234,5 +253,5 @@ def refuse_capture(optimizer: Any) -> None:
 def own_step(base: type[Adam]) -> tuple[Callable[..., Any], bool]:
     """The step of an Adam; whether it is INRIA's `step(mask, N)`."""
     # Unwrapped: torch's step hooks and its profiler are around our step already.
-    step = inspect.unwrap(base.step)
+    step = without_torchs_own(base.step)
     return step, len(inspect.signature(step).parameters) > 2

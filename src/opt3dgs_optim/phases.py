@@ -18,7 +18,7 @@ from opt3dgs_optim.checks import (
     warn_user,
 )
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.names import block, gaussian_of
+from opt3dgs_optim.names import NamedGroup, block, gaussian_of, group_name
 from opt3dgs_optim.overrides import uncompiled
 from opt3dgs_optim.part import Part, Phase
 from opt3dgs_optim.presets import (
@@ -345,6 +345,7 @@ class PhaseScheduler(Course):
                 "optimizers anew; where it freezes the Gaussians before the end, give total_steps "
                 "as the iteration after their last step, since the last thirtieth is averaged",
             )
+        self._watch_groups()
         lost, alive = self.num_lost_followers, len(self.followers())
         if not self._has_ended():
             self._watch_optimizers()
@@ -369,6 +370,19 @@ class PhaseScheduler(Course):
                 f"observe(iteration=...) {what}, so that the schedule does not advance; give the "
                 "iteration of the whole training, from 0",
             )
+
+    def _watch_groups(self) -> None:
+        """Say once that somebody goes on to write into a group that another has replaced."""
+        for optimizer in self.followers():
+            for i, group in enumerate(optimizer.param_groups):
+                key = group.written_elsewhere() if type(group) is NamedGroup else None
+                if key is not None:
+                    self._report(
+                        "held group",
+                        f"{key!r} of {group_name(i, group)} was changed in a dict that stood in "
+                        "param_groups before the upgrade, which changes nothing any more; take the "
+                        "group from optimizer.param_groups after the upgrade",
+                    )
 
     def _watch_optimizers(self) -> None:
         """Say once that one of several optimizers has stopped, as one that was made anew has."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from itertools import chain
 from typing import Any, cast
@@ -20,7 +19,7 @@ from opt3dgs_optim.checkpoint import (
     pack_optimizer,
     restore_records,
 )
-from opt3dgs_optim.checks import LOGGER, as_damage
+from opt3dgs_optim.checks import LOGGER, as_damage, energy_of
 from opt3dgs_optim.course import STATE_KEY, Course
 from opt3dgs_optim.in_step import (
     NO_PARTS,
@@ -207,7 +206,9 @@ class StepAdam(Adam):
             # torch's distributed checkpoints make a step of length zero, to have Adam's moments.
             begun = not self.course.needs_energies or self.course.num_observed > 0
             idle = not begun and loss is None and self._is_held()
-            acting = not idle and self.course.stepping(loss, self)
+            # Without parts a closure may return whatever it does in the trainer's own Adam.
+            told = loss if self.course.parts or loss is None else energy_of(loss)
+            acting = not idle and self.course.stepping(told, self)
             self.stepped_at = self.clock_at = self.course.current
             if mask is None and not self.course.parts:
                 self._step_base(None)
@@ -266,11 +267,7 @@ class StepAdam(Adam):
                 if parts.factor:
                     factors = parts.factors(group, course)
                     scale_learning_rate(temporary, group, factors, counts, course.on_host)
-            if counts is not False:
-                if isinstance(counts, Tensor) and self._base is Adam:
-                    # As a GradScaler tells torch's fused step not to be made.
-                    temporary.attribute(self, "found_inf", (~counts).to(torch.float32))
-                self._step_base(mask)
+            self._make(step)
         for moving in step.moving:
             self._finish(moving, course)
         # What a part keeps for several parameters: the first of them has saved what it was.
@@ -303,6 +300,20 @@ class StepAdam(Adam):
         return ActingParts.sought(
             lambda hook: [pair for pair in getattr(parts, hook) if pair[1].ready(group, course)]
         )
+
+    def _make(self, step: StepInProgress) -> None:
+        """Have the base make the step, if that counts, of the rows that the mask lets move."""
+        try:
+            if step.counts is False:
+                return
+            if isinstance(step.counts, Tensor) and self._base is Adam:
+                # As a GradScaler tells torch's fused step not to be made.
+                step.overrides.attribute(self, "found_inf", (~step.counts).to(torch.float32))
+            self._step_base(step.mask)
+        finally:  # also where it fails in one of several groups
+            for moving in step.moving:
+                if moving.masked is not None:
+                    moving.masked.put_back()
 
     def _step_base(self, mask: Tensor | None) -> None:
         step, takes_number = own_step(self._base)
@@ -447,8 +458,6 @@ class StepAdam(Adam):
     def _finish(self, moving: MovingParameter, course: Course) -> None:
         """Move the parameter by what the parts make of Adam's step; have them act after it."""
         group, param, parts, view = moving.group, moving.param, moving.parts, moving.state
-        if moving.masked is not None:
-            moving.masked.put_back()
         if moving.buffer is not None:
             step = parts.displace(group, param, moving.buffer, view, course)
             param.add_(moving.where_it_moves(step, 0.0) if moving.guarded else step)
@@ -550,17 +559,12 @@ class StepAdam(Adam):
 
     # -- copies and checkpoints ------------------------------------------------------------------
 
-    def __reduce_ex__(self, protocol: Any) -> Any:
-        # A made class is found by the class that it was made of, not by its name.
-        made_of = vars(type(self)).get("_made_of")
-        if made_of is None:
-            return super().__reduce_ex__(protocol)
-        return _new_upgraded, (made_of,), self.__getstate__()
-
     def __getstate__(self) -> dict[str, Any]:
         names = ("course", "_base", "_slots", "_open_windows", "_rewinds")
         self._drop_foreign()  # what is of other rows must not be the copy's own
-        return {**super().__getstate__(), **{name: getattr(self, name) for name in names}}
+        state = {**super().__getstate__(), **{name: getattr(self, name) for name in names}}
+        state.pop("_ownership", None)  # a base of the trainer's own may give all attributes
+        return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
@@ -676,20 +680,3 @@ class StepAdam(Adam):
             size = sizes[0] if len(sizes) == 1 else f"{len(sizes)} tensors"
             lines.append(f"{group_name(i, group)} {size}: lr {float(group['lr']):.4g}")
         return block(type(self).__name__, lines)
-
-
-@functools.cache
-def upgraded_class(base: type[Adam]) -> type[StepAdam]:
-    """The class of an upgraded optimizer: a `StepAdam` that is still a `base`.
-
-    Trainers choose by `isinstance`, call what their own class overrides, and look at the module of
-    the class: name, module and everything but the step are `base`'s.
-    """
-    bases = (StepAdam,) if base is Adam else (StepAdam, base)
-    about = {"__module__": base.__module__, "__qualname__": base.__qualname__, "_made_of": base}
-    return type(base.__name__, bases, about)
-
-
-def _new_upgraded(base: type[Adam]) -> StepAdam:
-    made = upgraded_class(base)
-    return made.__new__(made)

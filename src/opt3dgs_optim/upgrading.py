@@ -1,5 +1,6 @@
 """How a trainer's optimizer gets the parts of a course, in place."""
 
+import functools
 import inspect
 import logging
 import sys
@@ -19,8 +20,9 @@ from opt3dgs_optim.names import (
     set_of,
     split_name,
 )
+from opt3dgs_optim.overrides import without_torchs_own
 from opt3dgs_optim.state import rows_of
-from opt3dgs_optim.stepadam import StepAdam, upgraded_class
+from opt3dgs_optim.stepadam import StepAdam
 from opt3dgs_optim.version import __version__
 
 CALL = "PhaseScheduler.upgrade"
@@ -209,16 +211,44 @@ def _made_class(optimizer: Any, shown: str) -> type[StepAdam]:
     return made
 
 
+@functools.cache
+def upgraded_class(base: type[Adam]) -> type[StepAdam]:
+    """The class of an upgraded optimizer: a `StepAdam` that is still a `base`.
+
+    Trainers choose by `isinstance`, call what their own class overrides, and look at the module of
+    the class: name, module and the methods that `StepAdam` has not are `base`'s.
+    """
+    bases = (StepAdam,) if base is Adam else (StepAdam, base)
+
+    def new(cls: type[StepAdam], *args: Any, **options: Any) -> Any:
+        # `type(optimizer)(...)`, of a trainer that makes it anew: one without parts.
+        return base(*args, **options) if args or options else object.__new__(cls)
+
+    def reduce(self: StepAdam, protocol: Any) -> Any:
+        # A made class is found by the class that it was made of, not by its name.
+        return _new_upgraded, (base,), self.__getstate__()
+
+    names = {"__module__": base.__module__, "__qualname__": base.__qualname__, "_made_of": base}
+    return type(base.__name__, bases, {**names, "__new__": new, "__reduce_ex__": reduce})
+
+
+def _new_upgraded(base: type[Adam]) -> StepAdam:
+    made = upgraded_class(base)
+    return made.__new__(made)
+
+
 def _base_of(optimizer: Any, shown: str) -> type[Adam]:
     """The class whose step the parts surround; TypeError where it is no Adam that they know."""
     kind = f"{type(optimizer).__module__}.{type(optimizer).__qualname__}"
     if not isinstance(optimizer, Adam):
         raise TypeError(f"{CALL}: {shown} is a {kind}, but torch.optim.Adam is needed")
+    # A learning-rate scheduler wraps the class's step; another may have wrapped its wrapper.
     own = vars(optimizer).get("step")
-    if own is not None and not getattr(own, "_wrapped_by_lr_sched", False):
+    wrapped = getattr(own, "__func__", None) or getattr(own, "__wrapped__", None)
+    if own is not None and wrapped is not type(optimizer).step:
         raise TypeError(f"{CALL}: somebody has replaced the step of {shown}, a {kind}")
-    step = inspect.unwrap(type(optimizer).step)
-    if step is inspect.unwrap(Adam.step):
+    step = without_torchs_own(type(optimizer).step)
+    if step is without_torchs_own(Adam.step):
         _check_device_path(optimizer, shown)
         return Adam
     if list(inspect.signature(step).parameters)[1:2] == ["visibility"]:

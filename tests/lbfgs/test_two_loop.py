@@ -266,8 +266,8 @@ def test_pairs_that_describe_no_curvature_are_left_out(
     kind = torch.randint(0, 6, (k, n), generator=generator)
     y[kind == 0] *= -1
     y[kind == 1] = 0.0
-    s[kind == 2, 0] = torch.nan
-    y[kind == 3, -1] = torch.inf
+    s[..., 0][kind == 2] = torch.nan
+    y[..., -1][kind == 3] = torch.inf
     g = gradients(n, d, seed)
     history = history_from_pairs(s, y)
     found = two_loop(g, history, k)
