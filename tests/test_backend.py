@@ -43,7 +43,10 @@ def test_a_gpu_with_everything_runs_the_kernels(machine) -> None:
 @pytest.mark.parametrize(
     ("absent", "sentence"),
     [
-        ({"core": False}, r"cuda\.core is not installed \(pip install 'opt3dgs_optim\[cuda(12)?\]'\)"),
+        (
+            {"core": False},
+            r"cuda\.core is not installed \(pip install 'opt3dgs_optim\[cuda(12)?\]'\)",
+        ),
         ({"hip": "6.4"}, "built for ROCm"),
         ({"gpu": False}, "torch sees no CUDA device"),
     ],

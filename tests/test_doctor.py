@@ -98,6 +98,7 @@ def test_the_histogram_is_compared_with_the_hosts(monkeypatch: pytest.MonkeyPatc
         doctor.histogram_kernel(here)
 
 
+@pytest.mark.thorough
 def test_doctor_as_a_command() -> None:
     call = [sys.executable, "-W", "error", "-m", "opt3dgs_optim", "doctor", "--device", "cpu"]
     done = subprocess.run(call, capture_output=True, text=True, check=False)

@@ -629,7 +629,9 @@ class HostRefused:
             raise RuntimeError("No backend type associated with device type cpu")
 
 
-@pytest.mark.parametrize("arm", ["paper", "EnergyHistogram", "Curvature"])
+@pytest.mark.parametrize(
+    "arm", some_of(["paper", "EnergyHistogram", "Curvature"], lambda arm: arm == "paper")
+)
 def test_adaptive_with_ranks_over_nccl(arm: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Evidence of parts that have not acted yet is averaged, too."""
     HostRefused(monkeypatch)

@@ -6,6 +6,7 @@ import copy
 import itertools
 import math
 import re
+import weakref
 from typing import Any
 
 import pytest
@@ -112,18 +113,23 @@ def test_a_tensor_in_the_place_of_a_claimed_one_is_foreign() -> None:
 # -- what the hooks see ---------------------------------------------------------------------------
 
 
-def test_the_view_is_one_object_until_parameter_or_state_is_another() -> None:
+def test_the_view_is_of_the_present_parameter_and_state() -> None:
     place = Place()
     first = place.view()
     assert place.view("Mine#2") is first
     place.adam = adam_state(place.param)
-    second = place.view()
-    assert second is not first
-    assert second.adam is place.adam
+    assert place.view().adam is place.adam
     place.param = torch.zeros(4, 3)
-    third = place.view()
-    assert third is not second
-    assert third.param is place.param
+    assert place.view().param is place.param
+
+
+def test_a_view_that_has_let_go_holds_no_memory() -> None:
+    place = Place()
+    view = place.view()
+    param = weakref.ref(place.param)
+    view.let_go()
+    place.param, place.adam = torch.zeros(2, 3), {}
+    assert param() is None
 
 
 def test_it_is_a_mapping_of_moments_and_of_what_the_part_keeps() -> None:
@@ -353,19 +359,25 @@ def test_complex_moments_are_those_of_a_complex_parameter() -> None:
 def test_rows_that_are_not_finite_begin_anew_unless_the_parameter_is_lost(shape: Any) -> None:
     param, mean = torch.ones(shape), torch.ones(shape)
     count = torch.ones(shape[:1])
-    assert restart_rows({"mean": mean, "count": count}, param) == 0
+    entries = {"mean": Kept("mean"), "count": Kept("count", shape=(), allowed=(0, 9))}
+    assert restart_rows({"mean": mean, "count": count}, entries, param) == 0
     if not param.numel():
         return
     mean.view(-1)[-1] = math.inf
     kept = {"mean": mean, "count": count}
-    assert restart_rows(kept, param) == 1
+    assert restart_rows(kept, entries, param) == 1
     assert bool(mean.isinf().any())  # the checkpoint itself is not written to
     for value in kept.values():
         last = value[-1] if value.dim() else value
         assert not last.any()
         assert bool((value[:-1] == 1).all() if value.dim() else True)
+    beyond = count.clone()
+    beyond.view(-1)[-1] = 10
+    kept = {"mean": torch.ones_like(mean), "count": beyond}
+    assert restart_rows(kept, entries, param) == 1
+    assert not (kept["mean"][-1] if param.dim() else kept["mean"]).any()
     param.view(-1)[-1] = math.nan
-    assert restart_rows({"mean": mean, "count": count}, param) == 0
+    assert restart_rows({"mean": mean, "count": count}, entries, param) == 0
 
 
 def test_what_is_kept_per_row_is_checked() -> None:

@@ -105,6 +105,8 @@ def pack_optimizer(
 def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Saved, dict[str, Any]]:
     """Check a `state_dict()`; return what parts have in it, and the rest, for torch to load.
 
+    The course has its own state then, which the caller undoes if the load fails.
+
     Raises:
         ValueError: it is damaged.
     """
@@ -126,15 +128,10 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
     state, cast = dict(loaded["state"]), bool(loaded.get("cast"))
     steps = number_of_steps(_checked_states(call, groups, params, state))
     stale = own is not None and own["steps"] not in (None, steps)
-    if stale and own is not None and clock is not None:
-        # Torch's distributed checkpoints make a step of a fresh optimizer: of no iteration of ours.
-        counted = int(own["steps"] or 0) if clock["iteration"] else 0
-        clock = {**clock, "iteration": clock["iteration"] + max(steps - counted, 0)}
-        warn_user(
-            f"{call}: Adam's moments have made {steps} steps, but {own['steps']} when our state "
-            "was saved: another optimizer has gone on with them. The clock is moved on to "
-            f"iteration {clock['iteration']}, and what the parts had kept per point begins anew"
-        )
+    if own is not None and clock is not None:
+        clock = _moved_on(call, own, clock, steps) if stale else clock
+        # Here, because a window may follow the clock, or what a part has learnt.
+        optimizer.course.load_state_dict(clock)
     by_name = any(isinstance(number, str) for number in state)  # torch's distributed checkpoints
     rows, orphaned, rounded = [], False, set[torch.dtype]()
     known = {*optimizer.course.named(), *(own["windows"] if own is not None else ())}
@@ -152,7 +149,7 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
             continue
         # Distributed files leave out what a fresh optimizer has not; that is said below.
         needed = () if by_name else own["kept"].get(str(i), ())
-        kept = _cast_back(optimizer.course, kept, param, rounded, cast=cast)
+        kept = _cast_back(optimizer.course, kept, param, rest["exp_avg"], rounded, cast=cast)
         rows.append(_rows(call, optimizer.course, own, param, rest, kept, needed))
     if rounded:
         warn_user(
@@ -178,6 +175,21 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
     records = [] if own is None else _without_units(own["records"]) if stale else own["records"]
     rest = {**loaded, "state": state, "param_groups": groups}
     return Saved(clock, windows, records, rows), rest
+
+
+def _moved_on(
+    call: str, own: Mapping[str, Any], clock: dict[str, Any], steps: int
+) -> dict[str, Any]:
+    """The course's state, moved on by the steps that another optimizer has made since."""
+    # Torch's distributed checkpoints make a step of a fresh optimizer: of no iteration of ours.
+    counted = int(own["steps"] or 0) if clock["iteration"] else 0
+    clock = {**clock, "iteration": clock["iteration"] + max(steps - counted, 0)}
+    warn_user(
+        f"{call}: Adam's moments have made {steps} steps, but {own['steps']} when our state was "
+        "saved: another optimizer has gone on with them. The clock is moved on to iteration "
+        f"{clock['iteration']}, and what the parts had kept per point begins anew"
+    )
+    return clock
 
 
 def as_loaded(optimizer: StepAdam) -> dict[str, Any]:
@@ -379,6 +391,7 @@ def _cast_back(
     course: Course,
     kept: Mapping[str, Any],
     param: Tensor,
+    moment: Tensor,
     rounded: set[torch.dtype],
     *,
     cast: bool,
@@ -386,12 +399,14 @@ def _cast_back(
     """What parts keep per row in the dtypes that they declare.
 
     torch's own load casts all that an optimizer without parts has beside a parameter to the
-    parameter's dtype, and a checkpoint that such an optimizer saves has it so.
+    parameter's dtype, and a checkpoint that such an optimizer saves has it so. One of a model of
+    another dtype has what that declares.
 
     Args:
         course: whose parts they are.
         kept: what the checkpoint has, under today's keys.
         param: the parameter.
+        moment: Adam's first one in the checkpoint, of the dtype of the parameter that was saved.
         rounded: gets the dtypes that have lost digits.
         cast: whether a stock optimizer has loaded it here, of whatever dtype the parameter is now.
     """
@@ -402,7 +417,8 @@ def _cast_back(
             value = found.get(key)
             if not isinstance(value, Tensor) or value.dtype == dtype:
                 continue
-            if value.is_floating_point() and (cast or value.dtype == param.dtype):
+            of_another_model = value.dtype in (moment.dtype, entry.dtype_for(moment))
+            if value.is_floating_point() and (cast or of_another_model):
                 found[key] = value.to(dtype)
                 if _has_lost_digits(value, dtype):
                     rounded.add(value.dtype)
@@ -443,8 +459,8 @@ def _rows(
         entries = {key_of(name, e): e for e in course.declared[name].values() if e.per == "row"}
         absent = [key for key in entries if not _is_there(kept.get(key))]
         missing = [key for key in absent if key in needed]
-        if len(absent) < len(entries):
-            missing = absent  # what a part keeps is of use together only
+        if not needed and len(absent) < len(entries):
+            missing = absent  # nobody has said which there were, and they are of use together
         if missing:
             raise ValueError(f"{call}: {missing} are missing, which the checkpoint says are there")
         there = {key: kept[key] for key in entries if key not in absent}
@@ -469,11 +485,11 @@ def _rows(
                     "and collected anew"
                 )
         else:
-            restarted = restart_rows(mine, param)
+            restarted = restart_rows(mine, entries, param)
             if restarted:
                 warn_user(
-                    f"{call}: what {name} keeps of {restarted} of {rows} rows is not finite: they "
-                    "begin anew"
+                    f"{call}: what {name} keeps of {restarted} of {rows} rows is not finite, or "
+                    "cannot be: they begin anew"
                 )
             found |= mine
     return found

@@ -121,6 +121,7 @@ class Course:
             for kept in entries.values()
             if kept.per == "row"
         )
+        self._unlearnt = {name: part.state_dict() for name, part in self._named.items()}
         self.asks_parts = any(overrides(part, "ready") for part in self._parts)
         self._windowed = [
             name
@@ -545,8 +546,11 @@ class Course:
             if key in kept
         }
         with self.undone_on_error(), as_damage(call):
-            for name in [name for name in self._named if name in state["parts"]]:
-                self._named[name].load_state_dict(state["parts"][name])
+            for name, part in self._named.items():
+                if name in state["parts"]:
+                    part.load_state_dict(state["parts"][name])
+                elif part.state_dict() != self._unlearnt[name]:
+                    _begin_anew(name, part, self._unlearnt[name])
             self.current, self.num_observed = counts[0] - 1, counts[1]
             self._rewinds_followed = self.rewinds
             windows = self.open_windows()
@@ -626,12 +630,23 @@ def _put_back(part: Part, attributes: dict[str, Any], state: dict[str, Any]) -> 
     """Give a part the attributes that it had, and what it had learnt."""
     vars(part).clear()
     vars(part).update(attributes)
-    if not state:  # nothing was learnt, and few parts can load that
+    if part.state_dict() == state:
         return
     try:
-        part.load_state_dict(state)  # it may have changed its lists and tensors in place
+        part.load_state_dict(state)  # it has changed its lists and tensors in place
     except Exception as error:  # the others are put back all the same
         LOGGER.warning("%s cannot load what it has saved: %r", type(part).__name__, error)
+
+
+def _begin_anew(name: str, part: Part, unlearnt: dict[str, Any]) -> None:
+    """Have a part forget what it has learnt, of which a checkpoint says nothing."""
+    try:
+        part.load_state_dict(unlearnt)
+    except Exception as error:
+        warn_user(
+            f"{name} has learnt something that this checkpoint does not know of, and cannot load "
+            f"the {unlearnt!r} that its state_dict() was at first ({error!r}): it keeps that"
+        )
 
 
 def check_format(call: str, value: Any) -> None:

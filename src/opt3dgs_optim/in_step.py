@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.overrides import TemporaryOverrides
+from opt3dgs_optim.overrides import TemporaryOverrides, WeightDecay
 from opt3dgs_optim.part import Group, Part
 from opt3dgs_optim.state import HeldRows, ParameterState, PickedRows, broadcast_rows
 
@@ -57,7 +57,7 @@ class ActingParts:
             found = part.before(group, param, grad, state.of(name), course)
             if found is not grad:
                 _check_returned(name, "before", found, grad)
-                grad = found
+                grad = _laid_out_as(grad, found)
         return grad
 
     def factors(self, group: Group, course: Course) -> list[float | Tensor]:
@@ -67,8 +67,7 @@ class ActingParts:
             factor: Any = part.factor(group, course)
             if factor is None:
                 continue
-            number = isinstance(factor, Real) and math.isfinite(factor)
-            if not number and not (isinstance(factor, Tensor) and factor.numel() == 1):
+            if not _is_number(factor):
                 raise ValueError(f"{name}.factor: {factor!r}, but a finite number is needed")
             found.append(factor)
         return found
@@ -128,15 +127,41 @@ class StepInProgress:
     counts: Tensor | bool
     overrides: TemporaryOverrides
     moving: list[MovingParameter] = field(default_factory=list)
+    decays: list[WeightDecay] = field(default_factory=list)
+
+
+def _is_number(factor: Any) -> bool:
+    """Whether it is a finite real number, or a tensor of one; a device's is not read."""
+    if isinstance(factor, Tensor):
+        one = factor.numel() == 1 and not factor.is_complex()
+        return one and (not factor.is_cpu or math.isfinite(factor))
+    return isinstance(factor, Real) and math.isfinite(factor)
+
+
+def _laid_out_as(like: Tensor, found: Tensor) -> Tensor:
+    """The same numbers in the memory layout and dtype of a gradient.
+
+    torch's fused step reads a gradient as if it lay in memory as the parameter does.
+    """
+    if found.dtype == like.dtype and found.stride() == like.stride():
+        return found
+    return torch.empty_like(like).copy_(found.detach())
 
 
 def _check_returned(name: str, hook: str, found: Any, like: Tensor) -> None:
     """ValueError unless what a part's hook has returned is a tensor of the shape of `like`."""
-    if not isinstance(found, Tensor) or found.shape != like.shape:
-        got = f"of shape {tuple(found.shape)}" if isinstance(found, Tensor) else repr(found)
-        raise ValueError(
-            f"{name}.{hook}: returned {got}, but a tensor of shape {tuple(like.shape)} is needed"
-        )
+    if not isinstance(found, Tensor):
+        got = repr(found)
+    elif found.shape != like.shape:
+        got = f"a tensor of shape {tuple(found.shape)}"
+    elif found.layout is not like.layout or (found.is_complex() and not like.is_complex()):
+        got = f"a tensor of {found.dtype} and {found.layout}"
+    else:
+        return
+    raise ValueError(
+        f"{name}.{hook}: returned {got}, but a tensor of shape {tuple(like.shape)}, {like.dtype} "
+        f"and {like.layout} is needed"
+    )
 
 
 def check_mask_fits(

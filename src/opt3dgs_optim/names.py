@@ -1,7 +1,7 @@
 """Which parameter group is which Gaussian parameter, in the names trainers use."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from torch import Tensor
@@ -124,6 +124,24 @@ def gaussian_of(group: Mapping[str, Any]) -> str | None:
 def set_of(group: Mapping[str, Any]) -> str:
     """The set of Gaussians that a group belongs to, "" where an optimizer holds one."""
     return getattr(group, "set_name", "")
+
+
+def free_slot(
+    slot: tuple[str, str | None],
+    groups: Iterable[Mapping[str, Any]],
+    warn_once: Callable[[str, str], None],
+) -> tuple[str, str | None]:
+    """The set and the Gaussian parameter of a new group; none where one of the groups holds it."""
+    held = [(each.set_name, each.gaussian) for each in groups if type(each) is NamedGroup]
+    if slot[1] is None or slot not in held:
+        return slot
+    warn_once(
+        "held twice",
+        f"add_param_group: the parts act on the first group that holds {slot[1]!r} and leave the "
+        "second alone; for two sets of Gaussians upgrade in one call, as a dict with keys such as "
+        f"'first#{slot[1]}'",
+    )
+    return "", None
 
 
 def group_name(index: int, group: Mapping[str, Any]) -> str:

@@ -136,18 +136,47 @@ def is_moving_rate(rate: float | Tensor) -> bool:
     return bool((isinstance(rate, Tensor) and not rate.is_cpu) or rate)
 
 
+class WeightDecay:
+    """Decoupled weight decay of a group, by the learning rate that the trainer has given it.
+
+    Args:
+        rows: [N] bool, those that a mask lets move; None: all.
+    """
+
+    def __init__(self, group: Group, counts: Tensor | bool, rows: Tensor | None = None) -> None:
+        self._kept: Any = 1 - group["lr"] * group["weight_decay"]
+        self._params, self._counts, self._rows = list(group["params"]), counts, rows
+
+    @torch.no_grad()
+    def make(self) -> None:
+        """Shrink the parameters that have a gradient."""
+        for param in self._params:
+            if param.grad is None:
+                continue
+            rows = self._rows
+            made: Any = True if rows is None else broadcast_rows(rows.to(param.device), param)
+            if isinstance(self._counts, Tensor):
+                made = self._counts.to(param.device) & made
+            # .data: no write of the trainer's that a part should notice by the version counter.
+            if made is True:
+                param.data.mul_(self._kept)
+            else:
+                param.data.copy_(torch.where(made, param * self._kept, param))
+
+
 def scale_learning_rate(
     overrides: TemporaryOverrides,
     group: Group,
     factors: list[Any],
     counts: Tensor | bool,
+    decays: list[WeightDecay],
     read: Callable[[Tensor], float],
 ) -> None:
     """lr times the factors, never left in the group: schedulers would compound it.
 
-    Not on decoupled weight decay, which would grow weights where a factor is negative. `counts` is
-    whether the step will be made, 0-d where only the device knows; `read` gives a device's number
-    to the host.
+    Not on decoupled weight decay, which would grow weights where a factor is negative: that goes to
+    `decays`. `counts` is whether the step will be made, 0-d where only the device knows; `read`
+    gives a device's number to the host.
     """
     if not factors:
         return
@@ -162,36 +191,9 @@ def scale_learning_rate(
         else:
             factor = factor.to(device=device, dtype=torch.float32, non_blocking=True)
     if group.get("decoupled_weight_decay") and group["weight_decay"]:
-        decay_weights(overrides, group, counts)
+        decays.append(WeightDecay(group, counts))
+        overrides.item(group, "weight_decay", 0.0)
     overrides.item(group, "lr", rate * factor)
-
-
-@torch.no_grad()
-def decay_weights(
-    overrides: TemporaryOverrides,
-    group: Group,
-    counts: Tensor | bool,
-    rows: Tensor | None = None,
-) -> None:
-    """Decoupled weight decay of a group, made now with the trainer's own learning rate.
-
-    Of the rows [N] bool that a mask lets move; None: of all.
-    """
-    if counts is False:
-        return
-    kept = 1 - group["lr"] * group["weight_decay"]
-    for param in group["params"]:
-        if param.grad is None:
-            continue
-        made: Any = True if rows is None else broadcast_rows(rows.to(param.device), param)
-        if isinstance(counts, Tensor):
-            made = counts.to(param.device) & made
-        # .data: no write of the trainer's that a part should notice by the version counter.
-        if made is True:
-            param.data.mul_(kept)
-        else:
-            param.data.copy_(torch.where(made, param * kept, param))
-    overrides.item(group, "weight_decay", 0.0)
 
 
 def can_be_fused(optimizer: Any) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
+from numbers import Number
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
@@ -47,6 +48,8 @@ class Kept:
             is complex where that is.
         initial: the value of a number before it is written. Rows begin as zeros, because trainers
             that add points append zero rows: an all-zero row must mean "nothing yet".
+        allowed: the smallest and the largest number that it may be; None: any. One of a checkpoint
+            beyond that is damage. A number that is not finite is, too, unless `initial` is none.
     """
 
     name: str
@@ -54,10 +57,17 @@ class Kept:
     shape: tuple[int, ...] | Callable[[Tensor], tuple[int, ...]] | None = None
     dtype: torch.dtype = torch.float32
     initial: float = 0.0
+    allowed: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         """ValueError where an option is outside what is allowed."""
         check_choice("Kept", "per", self.per, ("row", "parameter", "training"))
+        if not isinstance(self.name, str) or not self.name.isidentifier():
+            raise ValueError(f"Kept: name={self.name!r}, but a word without dots is needed")
+        if not isinstance(self.dtype, torch.dtype):
+            raise ValueError(f"Kept: dtype={self.dtype!r}, but a torch.dtype is needed")
+        if not isinstance(self.initial, Number):
+            raise ValueError(f"Kept: initial={self.initial!r}, but a number is needed")
         shape: Any = self.shape
         if not (shape is None or callable(shape) or isinstance(shape, (tuple, list))):
             raise ValueError(

@@ -153,7 +153,7 @@ class ParameterRecord:
     def view(
         self, param: Tensor, adam: dict[str, Any], declared: Declared, training: dict[str, Tensor]
     ) -> ParameterState:
-        """The state that hooks see, made anew where the parameter or its state is another object.
+        """The state that hooks see, until `let_go`.
 
         Args:
             adam: `optimizer.state[param]`.
@@ -161,9 +161,11 @@ class ParameterRecord:
             training: what parts keep per training, shared by all optimizers.
         """
         view = self._view
-        if view is None or view.param is not param or view.adam is not adam:
-            view = ParameterState(param, adam, self, declared, training)
-            self._view, self.param = view, weakref.ref(param)
+        if view is None:
+            view = self._view = ParameterState(param, adam, self, declared, training)
+        view.param, view.adam = param, adam
+        if not self.is_of(param):
+            self.param = weakref.ref(param)
         view.release()
         return view
 
@@ -214,7 +216,8 @@ class ParameterState(MutableMapping[str, Any]):
         declared: Declared,
         training: dict[str, Tensor],
     ) -> None:
-        self.param, self.adam = param, adam
+        self.param: Tensor = param
+        self.adam: dict[str, Any] = adam
         self._record, self._declared, self._training = record, declared, training
         self._part, self._kept = "", dict[str, Kept]()
         self._guarded = self._moments_guarded = False
@@ -229,6 +232,11 @@ class ParameterState(MutableMapping[str, Any]):
         """This state as the part of that name sees it."""
         self._part, self._kept = part, self._declared[part]
         return self
+
+    def let_go(self) -> None:
+        """Hold no parameter and no moments after a step: density control may replace them."""
+        nothing: Any = None
+        self.param = self.adam = nothing
 
     def release(self) -> None:
         """Forget what a step has saved that an exception has ended."""
@@ -447,9 +455,9 @@ def _check_finite(call: str, key: str, moment: Tensor, param: Tensor) -> None:
 
 
 def check_kept_number(call: str, key: str, kept: Kept, value: Any) -> Any:
-    """What a part keeps as a number, as Python's; ValueError where its dtype does not hold it.
+    """What a part keeps as a number, as Python's; ValueError where it cannot be that.
 
-    It need not be finite: the smallest of what has not begun yet is infinite.
+    The smallest of what has not begun yet is infinite. Other numbers are finite.
     """
     kind: Any = int
     numbers: type = Integral
@@ -463,10 +471,13 @@ def check_kept_number(call: str, key: str, kept: Kept, value: Any) -> Any:
         if isinstance(value, numbers) and isinstance(value, bool) == (kind is bool):
             number = kind(value)
             torch.tensor(number, dtype=kept.dtype)  # raises where it does not fit
-            return number
+            finite = cmath.isfinite(number) or not cmath.isfinite(kept.initial)
+            if finite and (kept.allowed is None or kept.allowed[0] <= number <= kept.allowed[1]):
+                return number
     except (OverflowError, RuntimeError, ValueError):
         pass
-    raise ValueError(f"{call}: {key}={value!r}, but a number of {kept.dtype} is needed")
+    within = "" if kept.allowed is None else " in [{:g}, {:g}]".format(*kept.allowed)
+    raise ValueError(f"{call}: {key}={value!r}, but a number of {kept.dtype}{within} is needed")
 
 
 def check_kept(call: str, key: str, kept: Kept, value: Any, param: Tensor) -> None:
@@ -491,20 +502,27 @@ def check_kept(call: str, key: str, kept: Kept, value: Any, param: Tensor) -> No
         )
 
 
-def restart_rows(kept: dict[str, Tensor], param: Tensor) -> int:
-    """Zero the rows of what a part keeps that are not finite; return how many.
+def restart_rows(kept: dict[str, Tensor], entries: Mapping[str, Kept], param: Tensor) -> int:
+    """Zero the rows of what a part keeps that are not finite, or not allowed; return how many.
 
     A row of zeros means "nothing yet". Rows whose parameter is not finite either stay as they are:
     those of a point that a healthy run has lost, which goes on bit for bit.
 
     Args:
         kept: [N, ..] each, of one part. What has rows to be zeroed is replaced, not written to.
+        entries: how they are declared.
         param: the parameter, [N, ..].
     """
     wrong = torch.zeros(param.shape[:1], dtype=torch.bool, device=param.device)
-    for value in kept.values():
+    for key, value in kept.items():
         if (value.is_floating_point() or value.is_complex()) and not is_finite_sum(value):
             wrong |= ~_finite_rows(value, wrong.shape).to(wrong.device)
+        allowed = entries[key].allowed
+        if allowed is not None:
+            beyond = (value < allowed[0]) | (value > allowed[1])
+            while beyond.dim() > wrong.dim():
+                beyond = beyond.any(-1)
+            wrong |= beyond.to(wrong.device)
     if not bool(wrong.any()):
         return 0
     wrong &= _finite_rows(param.detach(), wrong.shape)

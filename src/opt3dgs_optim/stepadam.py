@@ -23,18 +23,19 @@ from opt3dgs_optim.checks import LOGGER, as_damage, energy_of
 from opt3dgs_optim.course import STATE_KEY, Course
 from opt3dgs_optim.in_step import (
     NO_PARTS,
+    STEP_HOOKS,
     ActingParts,
     MovingParameter,
     NamedPart,
     StepInProgress,
     check_mask_fits,
 )
-from opt3dgs_optim.names import NamedGroup, block, gaussian_of, group_name, split_name
+from opt3dgs_optim.names import NamedGroup, block, free_slot, gaussian_of, group_name, split_name
 from opt3dgs_optim.overrides import (
     TemporaryOverrides,
+    WeightDecay,
     as_step,
     can_be_fused,
-    decay_weights,
     is_moving_rate,
     own_step,
     refuse_capture,
@@ -142,6 +143,7 @@ class StepAdam(Adam):
                 slot, heir = self._slots[i], None
             else:
                 heir = next((o for o in gone if slot[1] and (o.set_name, o.gaussian) == slot), None)
+            slot = slot if heir else free_slot(slot, groups, self.course.warn_once)
             groups[i] = NamedGroup(group, *slot, () if heir is None else heir.records)
             gone = [old for old in gone if old is not heir]
             self._acting = (None, None, {})
@@ -205,7 +207,7 @@ class StepAdam(Adam):
         with torch.set_grad_enabled(self.defaults["differentiable"]):
             # torch's distributed checkpoints make a step of length zero, to have Adam's moments.
             begun = not self.course.needs_energies or self.course.num_observed > 0
-            idle = not begun and loss is None and self._is_held()
+            idle = not begun and loss is None and self._free_slot()
             # Without parts a closure may return whatever it does in the trainer's own Adam.
             told = loss if self.course.parts or loss is None else energy_of(loss)
             acting = not idle and self.course.stepping(told, self)
@@ -216,7 +218,7 @@ class StepAdam(Adam):
                 self._step(mask, acting)
         return loss
 
-    def _is_held(self) -> bool:
+    def _free_slot(self) -> bool:
         """Whether no learning rate moves anything."""
         return not any(is_moving_rate(group["lr"]) for group in self.param_groups)
 
@@ -266,7 +268,9 @@ class StepAdam(Adam):
                 self._prepare_group(step, cast(NamedGroup, group), parts)
                 if parts.factor:
                     factors = parts.factors(group, course)
-                    scale_learning_rate(temporary, group, factors, counts, course.on_host)
+                    scale_learning_rate(
+                        temporary, group, factors, counts, step.decays, course.on_host
+                    )
             self._make(step)
         for moving in step.moving:
             self._finish(moving, course)
@@ -275,6 +279,7 @@ class StepAdam(Adam):
             if moving.guarded and moving.parts.any:
                 moving.state.settle(moving.rows, moving.counts)
             self._ownership.claim(moving.param, moving.state.adam, course.row_keys)
+            moving.state.let_go()
 
     def _parts_of(self, group: Group) -> ActingParts:
         """The parts that act on a group in this step; sought when they change."""
@@ -296,9 +301,10 @@ class StepAdam(Adam):
 
     def _ready(self, parts: ActingParts, group: Group) -> ActingParts:
         """Without the parts that say that they cannot act on the group in this step."""
-        course = self.course
+        every = {name: part for hook in STEP_HOOKS for name, part in getattr(parts, hook)}
+        ready = {name for name, part in every.items() if part.ready(group, self.course)}
         return ActingParts.sought(
-            lambda hook: [pair for pair in getattr(parts, hook) if pair[1].ready(group, course)]
+            lambda hook: [pair for pair in getattr(parts, hook) if pair[0] in ready]
         )
 
     def _make(self, step: StepInProgress) -> None:
@@ -306,6 +312,8 @@ class StepAdam(Adam):
         try:
             if step.counts is False:
                 return
+            for decay in step.decays:  # once no hook can refuse any more
+                decay.make()
             if isinstance(step.counts, Tensor) and self._base is Adam:
                 # As a GradScaler tells torch's fused step not to be made.
                 step.overrides.attribute(self, "found_inf", (~step.counts).to(torch.float32))
@@ -336,7 +344,8 @@ class StepAdam(Adam):
         rows = step.mask if masked and (self._base is Adam or parts.any) else None
         if parts.displacement and group["weight_decay"] and group.get("decoupled_weight_decay"):
             # Of the parameter itself, not of the buffer that Adam will move.
-            decay_weights(step.overrides, group, step.counts, rows)
+            step.decays.append(WeightDecay(group, step.counts, rows))
+            step.overrides.item(group, "weight_decay", 0.0)
         params, counts = list(group["params"]), step.counts
         guarded = rows is not None or counts is not True
         needed = rows is not None or parts.any  # whether more than the gradient's check is
@@ -389,6 +398,7 @@ class StepAdam(Adam):
         if fed is not grad:
             step.overrides.attribute(param, "grad", fed)
         self._ownership.claim(param, view.adam, course.row_keys)
+        view.let_go()
 
     def _take_units(
         self, group: Group, param: Tensor, record: ParameterRecord, units: tuple[str, ...]
@@ -644,9 +654,7 @@ class StepAdam(Adam):
                 del self.state[param][key]
             for key, value in rows.items():
                 self.state[param][key] = value.detach().to(param.device, copy=True)
-        if saved.course is not None:
-            self.course.load_state_dict(saved.course)
-        else:
+        if saved.course is None:
             self.course.expect(number_of_steps(self.state.values()))
         restore_records(self, self._records, saved)
         for group, records in zip(self.param_groups, self._records, strict=True):

@@ -194,6 +194,7 @@ def test_a_value_that_is_read_is_a_wait() -> None:
     assert counted == {"operators": 3, "waits": 1}
 
 
+@pytest.mark.thorough
 def test_a_subject_too_large_for_the_memory_is_skipped(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(_case: object) -> Any:
         raise torch.OutOfMemoryError("out of memory\nand so on")
@@ -222,6 +223,7 @@ def test_the_embedded_scene_in_colmaps_layout(tmp_path: Path) -> None:
     assert read.extent == pytest.approx(scene.extent, rel=1e-5)
 
 
+@pytest.mark.thorough
 def test_a_scene_with_too_few_test_views_is_refused(tmp_path: Path) -> None:
     scene = load_scene("embedded")
     del scene.test[1:]

@@ -110,6 +110,7 @@ def shapes(draw: st.DrawFn) -> Shape:
     )
 
 
+@pytest.mark.thorough
 @settings(
     max_examples=400,
     deadline=None,

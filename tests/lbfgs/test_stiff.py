@@ -231,6 +231,7 @@ def test_two_loop_with_a_line_search_reaches_the_minimum(problem: Problem, rows:
         assert float(error.max()) < 1e-7
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("problem", MULTIMODAL, ids=lambda p: p.name)
 def test_of_several_valleys_it_finds_the_bottom_of_one(problem: Problem) -> None:
     """From around the customary start, in units of 1e-8 to 1e8: which one is the start's affair."""

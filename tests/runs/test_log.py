@@ -667,3 +667,28 @@ def test_a_second_run_in_the_file_of_the_first_is_said_once(tmp_path: Path) -> N
                 log.step(iteration)
     with RunLog.resume(tmp_path / "a.jsonl", iteration=1) as log:
         log.step(1)
+
+
+def test_a_clock_that_is_set_back_leaves_a_log_that_can_be_read(tmp_path: Path) -> None:
+    times = iter([10.0, 10.0, 9.0, 8.5, 12.0, 12.5])
+    with RunLog(tmp_path / "run.jsonl", clock=lambda: next(times)) as log:
+        for i in range(4):
+            log.step(i, loss=1.0)
+    seconds = [
+        r["seconds"] for r in read_run(tmp_path / "run.jsonl").records if r["kind"] == "step"
+    ]
+    assert seconds == sorted(seconds)
+    assert seconds[0] == 0.0
+
+
+@pytest.mark.parametrize("iteration", [-1, 2.0, "2", None])
+def test_a_resume_that_is_refused_has_not_opened_the_log(tmp_path: Path, iteration: int) -> None:
+    path = tmp_path / "run.jsonl"
+    with RunLog(path) as log:
+        log.step(1, loss=1.0)
+    before = path.read_text()
+    with pytest.raises(ValueError, match="iteration=") as held:
+        RunLog.resume(path, iteration=iteration)
+    assert path.read_text() == before
+    RunLog.resume(path, iteration=1).close()  # while the error's traceback is held
+    assert held.value is not None

@@ -32,7 +32,7 @@ class Averaging(Part):
 
     share: ClassVar[float] = 1 / 30  # of the run
 
-    keeps = (Kept("mean"), Kept("count", shape=()))
+    keeps = (Kept("mean"), Kept("count", shape=(), allowed=(0.0, math.inf)))
 
     def window(self, course: Course) -> Window:
         """The last thirtieth of the run, in which iterates are averaged."""

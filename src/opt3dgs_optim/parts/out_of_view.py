@@ -40,7 +40,7 @@ class OutOfView(Part):
     """
 
     names = ("means", "scales", "opacities")
-    keeps = (Kept(SEEN_SHARE, per="parameter", initial=1.0),)
+    keeps = (Kept(SEEN_SHARE, per="parameter", initial=1.0, allowed=(0.0, 1.0)),)
 
     def before(
         self, group: Group, param: Tensor, grad: Tensor, state: State, course: Course

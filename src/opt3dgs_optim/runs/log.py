@@ -135,6 +135,7 @@ class RunLog(AbstractContextManager["RunLog"]):
         """
         if not Path(path).is_file():
             raise FileNotFoundError(f"RunLog.resume: no run log at {os.fspath(path)!r}")
+        check_count("RunLog.resume", "iteration", iteration, 0, 2**53 - 1)
         log = cls(path, metadata=metadata, clock=clock)
         past = [r["seconds"] for r in read_run(path).records[:-1] if r["iteration"] <= iteration]
         log._base, log._since = past[-1] if past else 0.0, log._clock()
@@ -162,7 +163,9 @@ class RunLog(AbstractContextManager["RunLog"]):
     @property
     def seconds(self) -> float:
         """Run seconds so far by the log's clock, without pauses, of all sessions of this run."""
-        return self._base + (0.0 if self._since is None else self._clock() - self._since)
+        # A wall clock may be set back; then the run's stands still.
+        passed = 0.0 if self._since is None else max(self._clock() - self._since, 0.0)
+        return self._base + passed
 
     def step(
         self, iteration: SupportsIndex, *, phase: str | Enum | None = None, **columns: Number

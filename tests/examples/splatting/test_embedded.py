@@ -47,6 +47,7 @@ def test_another_seed_is_another_scene():
     assert not torch.equal(other.train[0].image, _small().train[0].image)
 
 
+@pytest.mark.thorough
 def test_large_is_the_same_scene_with_more_pixels():
     small, large = _small(), embedded_scene("images")
     assert large.extent == small.extent

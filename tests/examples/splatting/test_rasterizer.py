@@ -377,6 +377,7 @@ def test_fast_agrees_at_odd_image_sizes(size: tuple[int, int]):
     assert_twins_agree(scene(40, 1), look_at_origin(*size), 1e-5)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(8))
 def test_fast_agrees_where_thousands_of_edges_pass_pixels(seed: int):
     """Large Gaussians of many layers: alpha >= 1/255 is decided as in float64, pixel by pixel."""

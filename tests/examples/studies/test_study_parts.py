@@ -50,6 +50,7 @@ def test_fewer_views_are_evenly_spaced() -> None:
         scene_of(Spec("embedded", "mcmc", 0, 10, 10, views=1))
 
 
+@pytest.mark.thorough
 def test_adaptive_density_control_grows_and_resumes(tmp_path: Path) -> None:
     pytest.importorskip("gsplat")
     from studies.scenes.adaptive import AdaptiveFit
@@ -113,6 +114,7 @@ def test_a_trainer_with_other_rates_makes_other_steps() -> None:
         FitOptions(rates=0.0)
 
 
+@pytest.mark.thorough
 def test_costs_are_measured_in_turns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in (("ROUNDS", 2), ("STEPS", 1), ("FIRST", 0)):
         monkeypatch.setattr(costs, name, value)
