@@ -5,7 +5,6 @@ import inspect
 import operator
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from itertools import chain
 from typing import Any, ParamSpec, TypedDict, TypeVar
 
 import torch
@@ -100,17 +99,17 @@ def as_step(function: Callable[P, R]) -> Callable[P, R]:
         if torch.compiler.is_dynamo_compiling():
             return disabled(*args, **kwargs)
         optimizer: Any = args[0]
-        if (
-            type(optimizer).step is not called
-        ):  # a subclass's step around this one, and torch's around that
+        # A subclass's step may be around this one, and torch's hooks around that.
+        if type(optimizer).step is not called:
             return function(*args, **kwargs)
         hooked = optimizer._optimizer_step_pre_hooks or _global_optimizer_pre_hooks
         if hooked or _profiler_enabled() or profiler._is_profiler_enabled:
             return watched(*args, **kwargs)
         found = function(*args, **kwargs)
-        hooks = optimizer._optimizer_step_post_hooks, _global_optimizer_post_hooks
-        for hook in chain(*(each.values() for each in hooks)):  # a closure may have registered one
-            hook(optimizer, args, kwargs)
+        own = optimizer._optimizer_step_post_hooks
+        if own or _global_optimizer_post_hooks:  # a closure may have registered one
+            for hook in [*own.values(), *_global_optimizer_post_hooks.values()]:
+                hook(optimizer, args, kwargs)
         return found
 
     vars(called)["hooked"] = True  # torch adds nothing to it

@@ -108,7 +108,7 @@ def conclusions(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
     full = [s for s in study.settings() if s.rotated and s.size == "images" and not s.views]
     nine = settings_of(study, LONG, PIECES["OutOfView"])
     trained = [r for r in study.records() if r.setting.rotated]
-    tuned = [small_trainings(study), settings_of(study, BRIEF), long]
+    tuned = [small_trainings(study), settings_of(study, BRIEF), long, half]
     return {
         "rotated-machines": machines_line(trained),
         "decisions": decisions_table(study, BRIEF),

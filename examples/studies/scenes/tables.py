@@ -293,6 +293,8 @@ def _tuned_column(
             cells[what] = cells_of(kept)[0] + fewer
     scenes = len({scene for scene, _ in tried})
     what = kind if len(settings) == 1 and kind == settings[0].scene else counted(scenes, kind)
+    if settings[0].size == "images_2":
+        what += ", half size"
     head = f"{what}, {settings[0].iterations:,} iterations, {counted(len(tried), 'training')}"
     return (head, cells) if tried else None
 
