@@ -21,6 +21,7 @@ from opt3dgs_optim.checks import (
     check_keys,
     warn_user,
 )
+from opt3dgs_optim.learnt import are_same, begin_anew, learnt_by, put_back
 from opt3dgs_optim.names import GAUSSIAN, NamedGroup, gaussian_of, set_of
 from opt3dgs_optim.part import Kept, Part, Phase, Window, overrides
 from opt3dgs_optim.state import ADAM_KEYS, check_kept_number, key_of
@@ -121,7 +122,7 @@ class Course:
             for kept in entries.values()
             if kept.per == "row"
         )
-        self._unlearnt = {name: part.state_dict() for name, part in self._named.items()}
+        self._unlearnt = {name: learnt_by(part) for name, part in self._named.items()}
         self.asks_parts = any(overrides(part, "ready") for part in self._parts)
         self._windowed = [
             name
@@ -549,8 +550,8 @@ class Course:
             for name, part in self._named.items():
                 if name in state["parts"]:
                     part.load_state_dict(state["parts"][name])
-                elif part.state_dict() != self._unlearnt[name]:
-                    _begin_anew(name, part, self._unlearnt[name])
+                elif not are_same(part.state_dict(), self._unlearnt[name]):
+                    begin_anew(name, part, self._unlearnt[name])
             self.current, self.num_observed = counts[0] - 1, counts[1]
             self._rewinds_followed = self.rewinds
             windows = self.open_windows()
@@ -578,7 +579,7 @@ class Course:
             self._followers[:] = followers
             self.forget_places()
             for part, attributes, state in parts:
-                _put_back(part, attributes, state)
+                put_back(part, attributes, state)
             raise
 
     def number_entries(self, per: str) -> dict[str, Kept]:
@@ -624,29 +625,6 @@ def _by_name(parts: Iterable[Part]) -> dict[str, Part]:
         again = sum(name.split("#")[0] == kind for name in named)
         named[f"{kind}#{again + 1}" if again else kind] = part
     return named
-
-
-def _put_back(part: Part, attributes: dict[str, Any], state: dict[str, Any]) -> None:
-    """Give a part the attributes that it had, and what it had learnt."""
-    vars(part).clear()
-    vars(part).update(attributes)
-    if part.state_dict() == state:
-        return
-    try:
-        part.load_state_dict(state)  # it has changed its lists and tensors in place
-    except Exception as error:  # the others are put back all the same
-        LOGGER.warning("%s cannot load what it has saved: %r", type(part).__name__, error)
-
-
-def _begin_anew(name: str, part: Part, unlearnt: dict[str, Any]) -> None:
-    """Have a part forget what it has learnt, of which a checkpoint says nothing."""
-    try:
-        part.load_state_dict(unlearnt)
-    except Exception as error:
-        warn_user(
-            f"{name} has learnt something that this checkpoint does not know of, and cannot load "
-            f"the {unlearnt!r} that its state_dict() was at first ({error!r}): it keeps that"
-        )
 
 
 def check_format(call: str, value: Any) -> None:

@@ -134,7 +134,7 @@ def _is_number(factor: Any) -> bool:
     """Whether it is a finite real number, or a tensor of one; a device's is not read."""
     if isinstance(factor, Tensor):
         one = factor.numel() == 1 and not factor.is_complex()
-        return one and (not factor.is_cpu or math.isfinite(factor))
+        return one and (not factor.is_cpu or math.isfinite(factor.item()))
     return isinstance(factor, Real) and math.isfinite(factor)
 
 

@@ -164,7 +164,7 @@ class ParameterRecord:
         if view is None:
             view = self._view = ParameterState(param, adam, self, declared, training)
         view.param, view.adam = param, adam
-        if not self.is_of(param):
+        if self.param is None or self.param() is not param:
             self.param = weakref.ref(param)
         view.release()
         return view
