@@ -138,6 +138,18 @@ def test_cuda_is_for_three_coordinates() -> None:
         lqn_direction(*points(7), 5, min_cosine=0.0, graft=True, backend="cuda")
 
 
+@pytest.mark.parametrize(
+    "position",
+    [torch.zeros(5, 3), torch.zeros(4, 2), torch.zeros(4, 3, device="meta")],
+    ids=["other rows", "other columns", "another device"],
+)
+def test_a_position_that_is_not_the_gradients_is_refused(position: Tensor) -> None:
+    grad = torch.ones(4, 3)
+    history = new_history(grad, 5)
+    with pytest.raises(ValueError, match=r"position is \(\d, \d\) on \w+, but \(4, 3\) on cpu is"):
+        lqn_direction(position, grad, history, 5, min_cosine=0.0, graft=True)
+
+
 @pytest.mark.parametrize("spoiled", ["position", "history", "shape"])
 def test_cuda_gets_what_it_can_read(spoiled: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """It reads by the gradient's dtype and shape: another one would be read beyond its end."""
