@@ -89,7 +89,7 @@ def as_step(function: Callable[P, R]) -> Callable[P, R]:
     """A method as a step of torch's optimizers: with step hooks, a profiler's range, uncompiled.
 
     torch's own decorator enters the range in every step, whether anybody profiles or not. With few
-    points that takes as long as the parts do.
+    points that takes a good part of the time of a step.
     """
     watched = Optimizer.profile_hook_step(function)
     disabled = _disable_dynamo(watched)
