@@ -127,6 +127,34 @@ def test_a_part_of_ones_own_is_switched_off_and_on() -> None:
     assert first.asked == second.asked == 4
 
 
+@pytest.mark.parametrize(
+    ("seen", "why", "message"),
+    [
+        (0.5, None, r"Says\.evidence: 0\.5, but a tensor \[k\]"),
+        (torch.tensor(0.5), None, r"Says\.evidence: tensor\(0\.5000\), but a tensor \[k\]"),
+        ([0.5], None, r"Says\.evidence: \[0\.5\], but a tensor \[k\]"),
+        (torch.ones(1, dtype=torch.complex64), None, r"Says\.evidence: .* of real numbers"),
+        (torch.ones(1), True, r"Says\.useless: True, but a reason, or None"),
+    ],
+)
+def test_what_a_part_says_wrongly_is_told_before_any_is_switched_off(
+    seen: Any, why: Any, message: str
+) -> None:
+    class Says(Part):
+        def evidence(self, course: Course) -> Any:
+            return seen
+
+        def useless(self, evidence: list[float], course: Course) -> Any:
+            return why
+
+    other = Judged()
+    other.bad = True
+    phases = PhaseScheduler(1_000, parts=[other, Says()], adaptive=True)
+    with pytest.raises(ValueError, match=message):
+        phases.judge()
+    assert phases.switched_off == {}
+
+
 def test_it_looks_at_the_device_at_rare_checks_only() -> None:
     looks: list[int] = []
     training = Training(Scene())

@@ -21,6 +21,7 @@ from trainers import (
 )
 
 from opt3dgs_optim import DEFAULTS, Fading, Kept, Part, PhaseScheduler, RunLog
+from opt3dgs_optim.course import Course
 from opt3dgs_optim.runs import read_run
 
 TOTAL = 100
@@ -231,6 +232,18 @@ class FailsOnce(Windowed):
         if self.failing:
             self.failing = False
             raise RuntimeError("a stranger's")
+
+
+def test_columns_of_one_name_of_parts_of_two_classes() -> None:
+    class Speed(Part):
+        def numbers(self, course: Course) -> dict[str, float]:
+            return {"pace": 1.0}
+
+    class Motion(Part):
+        def numbers(self, course: Course) -> dict[str, float]:
+            return {"pace": 2.0}
+
+    assert Course([Speed(), Motion()]).numbers() == {"pace": 1.0, "Motion.pace": 2.0}
 
 
 def test_a_step_that_a_part_has_ended_leaves_nothing_saved() -> None:

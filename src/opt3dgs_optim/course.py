@@ -476,7 +476,10 @@ class Course:
                     )
             # Of two parts of one class the second's columns are "faded#2", as in checkpoints.
             mark = name.partition("#")[2]
-            columns |= {f"{key}#{mark}" if mark else key: value for key, value in own.items()}
+            for key, value in own.items():
+                column = f"{key}#{mark}" if mark else key
+                # Of parts of two classes with one name for a column, the second's is told apart.
+                columns[f"{name}.{key}" if column in columns else column] = value
         return columns
 
     def judge(self, over_ranks: Any = None) -> list[Change]:
@@ -486,6 +489,12 @@ class Course:
         """
         shown = [(name, part, part.evidence(self)) for name, part in self._named.items()]
         known = [(name, part, seen) for name, part, seen in shown if seen is not None]
+        for name, _, seen in known:
+            if not isinstance(seen, Tensor) or seen.dim() != 1 or seen.is_complex():
+                raise ValueError(
+                    f"{name}.evidence: {seen!r}, but a tensor [k] of real numbers, or None, is "
+                    "needed"
+                )
         if not known:
             return []
         # What a part has not begun to count yet lies on the host, which NCCL does not take.
@@ -493,10 +502,15 @@ class Course:
         widest = torch.float32 if device.type == "mps" else torch.float64
         packed = torch.cat([seen.detach().to(device, widest) for _, _, seen in known])
         numbers = (packed if over_ranks is None else over_ranks(packed)).tolist()
-        changes = []
+        said = list[tuple[str, str | None]]()
         for name, part, seen in known:
             own, numbers = numbers[: seen.numel()], numbers[seen.numel() :]
             why = part.useless(own, self)
+            if not (why is None or isinstance(why, str)):
+                raise ValueError(f"{name}.useless: {why!r}, but a reason, or None, is needed")
+            said.append((name, why))
+        changes = []
+        for name, why in said:
             if why is not None and name not in self.switched_off:
                 self.switched_off[name] = why
                 changes.append(Change("switched_off", name, why))

@@ -95,12 +95,13 @@ class Fading(Part):
 
         The events of iterations whose step the trainer left out come with the next step.
         """
+        last, current = state.last_step, course.current
+        if last is None or last > current:  # the first step, or the clock was set back
+            last = current - 1
         # The step of iteration i comes after i + 1 observations.
-        now = self.events_before(course.iteration, course.total_steps)
-        last = state.last_step
-        if last is None or last > course.current:  # the first step, or the clock was set back
-            last = course.current - 1
-        done = self.events_before(last + 1, course.total_steps)
+        done, now = _events_between(
+            last + 1, current + 1, course.total_steps, self.start, self.stop, self.events
+        )
         if done == now:  # most steps
             return grad
         count = param.shape[0] if param.dim() > 0 else 0
@@ -125,6 +126,14 @@ class Fading(Part):
 
 
 @functools.lru_cache(maxsize=64)  # every parameter asks for the same two iterations
+def _events_between(
+    first: int, last: int, total_steps: int, start: float, stop: float, events: int
+) -> tuple[int, int]:
+    """Numbers of events before the steps of two iterations."""
+    before = _events_before(first, total_steps, start, stop, events)
+    return before, _events_before(last, total_steps, start, stop, events)
+
+
 def _events_before(iteration: int, total_steps: int, start: float, stop: float, events: int) -> int:
     length = stop - start
     share = (iteration / total_steps - start) / length
