@@ -1,8 +1,7 @@
 """What mkdocs does to these pages besides Markdown; see `hooks` in mkdocs.yml.
 
-Formulas become MathML (no script, no font), and the cells of tables get their column's name, so
-that a phone can show a row as a card. Every page has the version at its foot. A built page that
-would fetch anything from the net fails the build.
+Formulas become MathML (no script, no font), and tables of many columns get narrow ones. Every page
+has the version at its foot. A built page that would fetch anything from the net fails the build.
 """
 
 from __future__ import annotations
@@ -34,24 +33,14 @@ def on_config(config: Any, **_: Any) -> None:
 def on_page_content(html: str, **_: Any) -> str:
     """Turn the formulas into MathML, let a picture open by itself."""
     html = FORMULA.sub(lambda m: mathml(m[2], block=m[1] == "div"), html)
-    html = TABLE.sub(lambda m: labelled(m[0]), html)
+    html = TABLE.sub(lambda m: narrowed(m[0]), html)
     return PICTURE.sub(r'<a class="picture" href="\1">\g<0></a>', html)
 
 
-def labelled(table: str) -> str:
-    """A table whose cells name their column, for a screen that is too narrow for its header."""
-    head, body = table.split("</thead>")
-    names = [re.sub(r"<[^>]+>", "", name) for name in re.findall(r"<th[^>]*>(.*?)</th>", head)]
-
-    def row(match: re.Match[str]) -> str:
-        left = iter(names)
-        cell = r"<td([^>]*)>(.*?)</td>"
-        put = r'<td data-label="{}"\1><span>\2</span></td>'
-        return re.sub(cell, lambda m: m.expand(put.format(next(left, ""))), match[0], flags=re.S)
-
-    if len(names) > COLUMNS:
-        head = head.replace("<table>", "<table data-wide>")
-    return f"{head}</thead>{re.sub(r'<tr>.*?</tr>', row, body, flags=re.S)}"
+def narrowed(table: str) -> str:
+    """A table, marked where it has so many columns that its cells must be narrow."""
+    wide = len(re.findall(r"<th[ >]", table)) > COLUMNS
+    return table.replace("<table>", "<table data-wide>") if wide else table
 
 
 def on_post_build(config: Any, **_: Any) -> None:

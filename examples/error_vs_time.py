@@ -4,9 +4,11 @@ python examples/error_vs_time.py                      (the embedded scene; nothi
 python examples/error_vs_time.py --scene DIR --points 20000 --iterations 7500 -o runs/mine
 
 The ways of training are called arms here. `mcmc` is 3DGS-MCMC as its authors publish it, with which
-all others are compared. `adam` is the same trainer without density control. `awsgld` adds AW-SGLD's
-multiplier to 3DGS-MCMC, and `constant`, its control, a constant of that multiplier's mean. `paper`
-is the paper's preset, `defaults` are the package's. Seconds are those of its own process.
+all others are compared; in `rates-x3` all of its steps are three times as long. `adam` is torch's
+Adam from the start of INRIA's trainer, without density control, noise and penalties. `awsgld` adds
+AW-SGLD's multiplier to 3DGS-MCMC, and `constant`, its control, a constant of that multiplier's
+mean. `paper` is the paper's preset, `defaults` are the package's. Seconds are those of its own
+process.
 
 The embedded scene gives 2,000 points to start from, and the trainings grow to 4,000 Gaussians in
 3,000 iterations. Both matter. 3DGS-MCMC starts from Gaussians a tenth as wide as INRIA's trainer,
@@ -41,7 +43,7 @@ from opt3dgs_optim.runs import Run, read_run
 from opt3dgs_optim.runs.report import write_report
 from opt3dgs_optim.runs.stats import compare
 
-DEFAULT_ARMS = "mcmc,adam,awsgld,constant,paper,defaults"
+DEFAULT_ARMS = "mcmc,rates-x3,adam,awsgld,constant,paper,defaults"
 
 
 @dataclass

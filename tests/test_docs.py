@@ -319,9 +319,8 @@ def test_formulas_become_mathml() -> None:
     assert "<mo><</mo>" in html.unescape(made)
 
 
-def test_cells_of_tables_name_their_column() -> None:
-    head = "<table>\n<thead>\n<tr>\n<th>part</th>\n<th><code>dB</code></th>\n</tr>\n</thead>\n"
-    rows = "<tbody>\n<tr>\n<td>a</td>\n<td style='x'>1</td>\n</tr>\n</tbody>\n</table>"
-    made = build_hooks().on_page_content(head + rows)
-    assert '<td data-label="part"><span>a</span></td>' in made
-    assert "<td data-label=\"dB\" style='x'><span>1</span>" in made
+@pytest.mark.parametrize(("columns", "narrow"), [(2, False), (10, False), (11, True)])
+def test_a_table_of_many_columns_has_narrow_ones(columns: int, narrow: bool) -> None:
+    heads = "".join(f"<th style='x'>{i}</th>\n" for i in range(columns))
+    table = f"<table>\n<thead>\n<tr>\n{heads}</tr>\n</thead>\n<tbody></tbody>\n</table>"
+    assert ("<table data-wide>" in build_hooks().on_page_content(table)) is narrow

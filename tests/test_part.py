@@ -396,6 +396,12 @@ def test_a_window_holds_for_energies_and_the_photometric_term() -> None:
     assert losses == [7.0 if i in part.observed else 1.0 for i in range(12)]
 
 
+@pytest.mark.parametrize("parts", ["paper", {"fading": 1}, 3])
+def test_parts_that_are_no_list(parts: Any) -> None:
+    with pytest.raises(TypeError, match=r"parts=.*, but a list of parts is needed"):
+        PhaseScheduler(100, parts=parts)
+
+
 def test_a_part_that_needs_the_parameters_units_comes_first() -> None:
     """A pair of the positions' difference in the world and gradients in the own frame is none."""
     with pytest.raises(ValueError, match=r"Curvature after OwnFrame.*Curvature must come first"):

@@ -64,9 +64,9 @@ trainer with the lines, the method or the plugin of this package.
 ## What ran
 
 {iterations} iterations of the real script on a CPU through `on_cpu.py`, \
-on {scene}, stock and with the lines. So short a run shows that a trainer runs, saves and resumes \
-with the lines; how good it gets is not to be read from it. \
-Parts of these runs: {parts}. {date}, torch {torch}, {machine}.
+on {scene}, as published and with the lines of this package. So short a run shows that a \
+trainer runs, saves and resumes with the lines; how good it gets is not to be read from it. \
+Parts that were on in the end: {parts}. {date}, torch {torch}, {machine}.
 
 | trainer and options | commit | lines of `diff` | stock | edited | saved | resumed | \
 what is different |
@@ -210,7 +210,7 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
         today=datetime.date.today().isoformat(),
         **{key: trials[key] for key in ("iterations", "scene", "machine")},
         **{key: _span(trials, key) for key in ("date", "torch")},
-        parts="; ".join(sorted({row["parts"] for row in trials["rows"]} - {"-"})),
+        parts=" or ".join(sorted({row["parts"] for row in trials["rows"]} - {"-"})),
         ran="".join(ran),
         long=_long_runs(),
         counts=(len(trials["rows"]), len(TRIALS), saved, len(rows), len(names), len(edited)),

@@ -78,6 +78,11 @@ def constant(iterations: int, nu: float | None) -> list[Part]:
 _ARMS = (
     Arm(BASELINE, "3DGS-MCMC as its authors publish it: the baseline"),
     Arm(
+        "rates-x3",
+        "3DGS-MCMC with all steps times three: what a larger learning rate gains",
+        fixed(lambda: ConstantMultiplier(3.0)),
+    ),
+    Arm(
         "adam",
         "torch's Adam from the start of INRIA's trainer: no density control, no noise",
         mcmc=False,

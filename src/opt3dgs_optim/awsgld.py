@@ -12,7 +12,7 @@ from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import gaussian_of
 from opt3dgs_optim.overrides import AdamOptions, TemporaryOverrides
 from opt3dgs_optim.part import Group, Part
-from opt3dgs_optim.parts.histogram import EnergyHistogram
+from opt3dgs_optim.parts.histogram import EnergyHistogram, refuse_to_maximize
 from opt3dgs_optim.parts.noise import IsotropicNoise, PositionNoise
 from opt3dgs_optim.stepadam import StepAdam
 
@@ -45,7 +45,8 @@ class AWSGLD(StepAdam):
         preconditioner: `"adam"`, or `"none"` for the plain SGLD drift `lr * nu * grad`, which
             samples exp(-energy / temperature) together with `IsotropicNoise(temperature=...)`.
         adam: `foreach, maximize, capturable, differentiable, fused, decoupled_weight_decay`, as in
-            `torch.optim.Adam`. On a GPU the fused path is used where none is asked for.
+            `torch.optim.Adam`, but `maximize` cannot be set beside a histogram: minimise the
+            negated loss instead. On a GPU the fused path is used where none is asked for.
 
     The energy is the closure's value, or comes from `histogram.observe(loss)`, called once per
     iteration before `step()`. One that is not finite skips the step.
@@ -111,12 +112,20 @@ class AWSGLD(StepAdam):
         if preconditioner == "none":
             betas, eps = (0.0, betas[1]), PLAIN_EPS
             parts.append(_PlainDrift())
+        self.histogram, self.noise = histogram, noise  # looked at where groups are added
         super().__init__(params, lr, betas, eps, weight_decay, amsgrad, **adam)
-        self.histogram, self.noise = histogram, noise
         self.follow(_ObservedCourse(parts))
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
-        """As torch's; with `preconditioner="none"` betas and eps are not a group's own either."""
+        """As torch's; with `preconditioner="none"` betas and eps are not a group's own either.
+
+        Raises:
+            ValueError: the group is to maximise, and there is a histogram; or it is of float16, and
+                `preconditioner` is "none". Then it is not added.
+        """
+        options = param_group if isinstance(param_group, dict) else {}  # of others torch says it
+        if self.histogram is not None and options.get("maximize", self.defaults["maximize"]):
+            refuse_to_maximize("AWSGLD")
         super().add_param_group(param_group)
         if self.defaults["eps"] == PLAIN_EPS:
             group = self.param_groups[-1]

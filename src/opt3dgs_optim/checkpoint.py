@@ -7,7 +7,8 @@ under `"optimizer"` what belongs to this optimizer,
     windows    for which iterations each part's state is valid, see `Part.window`
     records    by group and parameter: the iteration of its last step, the numbers kept for it, and
                the parts in whose units Adam's moments are, where there are such
-    kept       by parameter: the keys of what parts keep per row, beside the moments
+    kept       by parameter: the keys of what parts keep per row, beside the moments, and of the
+               numbers that they keep for it; under "training" those of the course
 
 All are plain numbers, strings, lists and dicts, so that `torch.load(weights_only=True)` and torch's
 distributed checkpoints take them. Checkpoints of format 2 are still read.
@@ -15,9 +16,11 @@ distributed checkpoints take them. Checkpoints of format 2 are still read.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Collection, Iterable, Mapping
 from itertools import chain
+from numbers import Integral
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -48,6 +51,7 @@ ROW_KEYS_OF_FORMAT_2 = {
     "num_averaged": "Averaging.count",
 }
 SHARE_OF_FORMAT_2 = "visible_share"
+TRAINING = "training"  # in "kept", in the place of a parameter's number
 GROUP_KEYS_OF_FORMAT_2 = (SLOT, "faded", "fresh_since", SHARE_OF_FORMAT_2)
 
 
@@ -66,6 +70,7 @@ class Saved(NamedTuple):
     windows: dict[str, Window | None]
     records: list[list[SavedRecord]]  # by group, by parameter
     rows: list[dict[str, Tensor]]  # by parameter: what parts keep per row
+    parts: frozenset[str] = frozenset()  # names of those that have kept something
 
 
 def number_of_steps(states: Iterable[Mapping[str, Any]]) -> int:
@@ -79,18 +84,20 @@ def pack_optimizer(
     windows: Mapping[str, Window | None],
 ) -> dict[str, Any]:
     """What belongs to one optimizer. Synchronises with the device."""
-    keys, kept = optimizer.course.row_keys, {}
-    for i, param in enumerate(_parameters(optimizer)):
+    keys = optimizer.course.row_keys
+    kept = {TRAINING: sorted(optimizer.course.kept_numbers)}
+    every = zip(_parameters(optimizer), chain.from_iterable(records), strict=True)
+    for i, (param, record) in enumerate(every):
         present = [key for key in keys if key in optimizer.state.get(param, {})]
-        if present:
-            kept[str(i)] = present
+        if present or record.numbers:
+            kept[str(i)] = [*present, *record.numbers]
     return {
         "steps": number_of_steps(optimizer.state.values()),
         "windows": {name: list(window) for name, window in windows.items() if window is not None},
         "records": [
             [
                 {
-                    "last_step": record.last_step,
+                    "last_step": _last_step(optimizer, record),
                     "numbers": {key: value.item() for key, value in record.numbers.items()},
                     **({"units": list(record.units)} if record.units else {}),
                 }
@@ -100,6 +107,14 @@ def pack_optimizer(
         ],
         "kept": kept,
     }
+
+
+def _last_step(optimizer: StepAdam, record: ParameterRecord) -> int | None:
+    """The iteration of a parameter's last step, which an optimizer without parts does not note."""
+    param = None if record.param is None else record.param()
+    if optimizer.course.parts or optimizer.stepped_at < 0 or param is None:
+        return record.last_step
+    return optimizer.stepped_at if optimizer.state.get(param) else None
 
 
 def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Saved, dict[str, Any]]:
@@ -117,9 +132,12 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
         _check_options(call, f"param_groups[{i}]", group)
     shared = groups[0].pop(STATE_KEY, None) if groups else None
     share = [group.get(SHARE_OF_FORMAT_2) for group in groups]
-    for group in groups:
-        for key in GROUP_KEYS_OF_FORMAT_2:
-            group.pop(key, None)
+    is_format_2 = _is_format_2(shared)
+    if is_format_2:  # such keys of others are the trainer's own
+        groups = [
+            {key: value for key, value in group.items() if key not in GROUP_KEYS_OF_FORMAT_2}
+            for group in groups
+        ]
     numbers = list(chain.from_iterable(group["params"] for group in groups))
     nothing = Saved(None, {}, [], [{} for _ in params])
     if len(numbers) != len(params):  # torch says so
@@ -134,14 +152,14 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
         optimizer.course.load_state_dict(clock)
     by_name = any(isinstance(number, str) for number in state)  # torch's distributed checkpoints
     rows, orphaned, rounded = [], False, set[torch.dtype]()
-    known = {*optimizer.course.named(), *(own["windows"] if own is not None else ())}
+    known = frozenset(optimizer.course.named()) | _names_of_parts(own)
     for i, (number, param) in enumerate(zip(numbers, params, strict=True)):
         saved = state.get(number)
         if not saved:
             state.pop(number, None)  # torch takes no None
             rows.append({})
             continue
-        kept, rest = _split(saved, known)
+        kept, rest = _split(saved, known, ROW_KEYS_OF_FORMAT_2 if is_format_2 else {})
         state[number] = rest
         if own is None or stale:
             orphaned |= bool(kept) and own is None
@@ -149,7 +167,7 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
             continue
         # Distributed files leave out what a fresh optimizer has not; that is said below.
         needed = () if by_name else own["kept"].get(str(i), ())
-        kept = _cast_back(optimizer.course, kept, param, rest["exp_avg"], rounded, cast=cast)
+        kept = _cast_back(call, optimizer.course, kept, param, rest["exp_avg"], rounded, cast=cast)
         rows.append(_rows(call, optimizer.course, own, param, rest, kept, needed))
     if rounded:
         warn_user(
@@ -160,7 +178,7 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
     if own is None and by_name and steps and optimizer.course.keeps_state:
         warn_user(
             f"{call}: a distributed checkpoint of {steps} steps without our state, as flattened "
-            "ones and those of a stock trainer are: what the parts keep begins anew, and the clock "
+            "ones and those of a plain Adam are: what the parts keep begins anew, and the clock "
             "needs observe(loss, iteration=...)"
         )
     elif orphaned:
@@ -172,9 +190,17 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
         _warn_of_rows_left_out(call, optimizer.course, clock["iteration"] - 1, rows)
     windows = {} if own is None or stale else own["windows"]
     # Another optimizer's gradients were in the parameters' own units.
-    records = [] if own is None else _without_units(own["records"]) if stale else own["records"]
+    records = [] if own is None else own["records"]
+    if stale and clock is not None:
+        records = _gone_on(records, clock["iteration"] - 1)
     rest = {**loaded, "state": state, "param_groups": groups}
-    return Saved(clock, windows, records, rows), rest
+    return Saved(clock, windows, records, rows, known), rest
+
+
+def _is_format_2(shared: Any) -> bool:
+    """Whether it is the course's part of a checkpoint of format 2."""
+    number = shared.get("format") if isinstance(shared, Mapping) else None
+    return isinstance(number, Integral) and number == 2
 
 
 def _moved_on(
@@ -266,25 +292,34 @@ def _unpack(
         if not pair or not all(isinstance(each, int) for each in window):
             raise ValueError(f"{call}: windows[{name!r}]={window!r}, but two iterations are needed")
         windows[name] = tuple(window)
-    records = _records(call, own["records"], optimizer)
     if own["steps"] is not None:
         check_count(call, "steps", own["steps"], 0)
     check_keys(f"{call}: kept", own["kept"], ())
     for number, names in own["kept"].items():
         if not isinstance(names, (list, tuple)) or not all(isinstance(n, str) for n in names):
             raise ValueError(f"{call}: kept[{number!r}]={names!r}, but a list of keys is needed")
+    if TRAINING in own["kept"]:  # earlier versions did not say
+        check_keys(call, clock, ("kept", "windows"))
+        check_keys(f"{call}: kept", clock["kept"], own["kept"][TRAINING])
+    records = _records(call, own["records"], own["kept"], optimizer)
     return {**own, "windows": windows, "records": records}, clock
 
 
-def _records(call: str, saved: Any, optimizer: StepAdam) -> list[list[SavedRecord]]:
-    """The records of all parameters, by group, checked; there may be more of them."""
+def _records(
+    call: str, saved: Any, kept: Mapping[str, Any], optimizer: StepAdam
+) -> list[list[SavedRecord]]:
+    """The records of all parameters, by group, checked; there may be more of them.
+
+    `kept` are, by parameter, the keys of what must be there.
+    """
     if not isinstance(saved, list):
         raise ValueError(f"{call}: records={saved!r}, but a list is needed")
     entries, records = optimizer.course.number_entries("parameter"), list[list[SavedRecord]]()
+    needed = ([key for key in kept.get(str(i), ()) if key in entries] for i in itertools.count())
     for group in saved:
         if not isinstance(group, list):
             raise ValueError(f"{call}: records has {group!r}, but a list is needed")
-        records.append([_record(call, entry, entries) for entry in group])
+        records.append([_record(call, entry, entries, next(needed)) for entry in group])
     for i, group in enumerate(optimizer.param_groups):
         found, needed = len(records[i]) if i < len(records) else 0, len(group["params"])
         if found < needed:
@@ -294,10 +329,12 @@ def _records(call: str, saved: Any, optimizer: StepAdam) -> list[list[SavedRecor
     return records
 
 
-def _record(call: str, entry: Any, entries: Mapping[str, Kept]) -> SavedRecord:
+def _record(
+    call: str, entry: Any, entries: Mapping[str, Kept], needed: Collection[str]
+) -> SavedRecord:
     """One parameter's record, checked; of the numbers those that are among the `entries`."""
     check_keys(f"{call}: records", entry, ("last_step", "numbers"))
-    check_keys(f"{call}: records", entry["numbers"], ())
+    check_keys(f"{call}: records: numbers", entry["numbers"], needed)
     last_step, units = entry["last_step"], entry.get("units", [])
     if last_step is not None:
         check_count(call, "last_step", last_step, -1, NEVER)
@@ -311,9 +348,23 @@ def _record(call: str, entry: Any, entries: Mapping[str, Kept]) -> SavedRecord:
     return SavedRecord(last_step, numbers, tuple(units))
 
 
-def _without_units(records: list[list[SavedRecord]]) -> list[list[SavedRecord]]:
-    """The same, of moments in the parameters' own units."""
-    return [[SavedRecord(each.last_step, each.numbers) for each in group] for group in records]
+def _gone_on(records: list[list[SavedRecord]], last_step: int) -> list[list[SavedRecord]]:
+    """The same, where another optimizer has made the steps since, the last in that iteration.
+
+    Its gradients were in the parameters' own units.
+    """
+    return [
+        [SavedRecord(None if each.last_step is None else last_step, each.numbers) for each in group]
+        for group in records
+    ]
+
+
+def _names_of_parts(own: Mapping[str, Any] | None) -> frozenset[str]:
+    """The names of the parts of which an optimizer's own part of a checkpoint has something."""
+    if own is None:
+        return frozenset()
+    keys = chain.from_iterable(own["kept"].values())
+    return frozenset(own["windows"]) | {key.rpartition(".")[0] for key in keys}
 
 
 def _from_format_2(
@@ -351,15 +402,15 @@ def is_kept_by_part(key: Any, known: Collection[str]) -> bool:
 
 
 def _split(
-    saved: Mapping[str, Any], known: Collection[str]
+    saved: Mapping[str, Any], known: Collection[str], renamed: Mapping[str, str]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """What parts keep, under today's keys, and what is torch's, the base class's or the trainer's.
 
-    `known` are names of parts.
+    `known` are names of parts, `renamed` today's keys for those of another format.
     """
     kept, rest = {}, {}
     for key, value in saved.items():
-        new = ROW_KEYS_OF_FORMAT_2.get(key, key)
+        new = renamed.get(key, key)
         (kept if is_kept_by_part(new, known) else rest)[new] = value
     return kept, rest
 
@@ -388,6 +439,7 @@ def _check_options(call: str, name: str, group: Any) -> None:
 
 
 def _cast_back(
+    call: str,
     course: Course,
     kept: Mapping[str, Any],
     param: Tensor,
@@ -403,12 +455,16 @@ def _cast_back(
     another dtype has what that declares.
 
     Args:
+        call: what messages name.
         course: whose parts they are.
         kept: what the checkpoint has, under today's keys.
         param: the parameter.
         moment: Adam's first one in the checkpoint, of the dtype of the parameter that was saved.
         rounded: gets the dtypes that have lost digits.
         cast: whether a stock optimizer has loaded it here, of whatever dtype the parameter is now.
+
+    Raises:
+        ValueError: it has numbers that the declared dtype cannot hold.
     """
     found = dict(kept)
     for name, entries in course.declared.items():
@@ -419,10 +475,22 @@ def _cast_back(
                 continue
             of_another_model = value.dtype in (moment.dtype, entry.dtype_for(moment))
             if value.is_floating_point() and (cast or of_another_model):
+                if not _can_be(value, dtype):
+                    raise ValueError(f"{call}: {key} has numbers that {dtype} cannot hold")
                 found[key] = value.to(dtype)
                 if _has_lost_digits(value, dtype):
                     rounded.add(value.dtype)
     return found
+
+
+def _can_be(value: Tensor, declared: torch.dtype) -> bool:
+    """Whether numbers of a floating dtype are numbers of another one, rounded at most."""
+    if declared.is_floating_point or declared.is_complex:
+        return True
+    low, high = (0, 1)
+    if declared is not torch.bool:
+        low, high = torch.iinfo(declared).min, torch.iinfo(declared).max
+    return bool(((value == value.trunc()) & (value >= low) & (value < high + 1)).all())
 
 
 def _has_lost_digits(value: Tensor, declared: torch.dtype) -> bool:

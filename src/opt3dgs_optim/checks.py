@@ -5,7 +5,7 @@ import math
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Integral, Real
 from typing import Any
@@ -78,7 +78,8 @@ def check_energy(
 ) -> torch.Tensor:
     """Return a loss as a detached tensor, 0-d, or raise ValueError unless it is one real number.
 
-    A tensor keeps its dtype; `dtype` is that of any other number, whatever torch's default is.
+    A tensor keeps its dtype and its device. Any other number gets `dtype` and the CPU, whatever
+    torch's defaults are.
     """
     if isinstance(value, torch.Tensor):
         if value.numel() == 1 and not value.is_complex():
@@ -89,7 +90,7 @@ def check_energy(
         got = repr(value)
         try:
             if not isinstance(value, (str, bytes)):  # numpy's scalars, too
-                return torch.tensor(float(value), dtype=dtype)
+                return torch.tensor(float(value), dtype=dtype, device="cpu")
         except (TypeError, ValueError):
             pass
     raise ValueError(f"{call}: {name}={got}, but one real number is needed")
@@ -141,7 +142,7 @@ def warn_user(message: str) -> None:
     warnings.warn(message, stacklevel=level)
 
 
-def check_keys(call: str, state: Any, needed: tuple[str, ...]) -> None:
+def check_keys(call: str, state: Any, needed: Iterable[str]) -> None:
     """ValueError unless `state` is a mapping with at least the keys `needed`."""
     if not isinstance(state, Mapping):
         raise ValueError(f"{call}: {state!r}, but a dict is needed")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import weakref
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -16,15 +16,22 @@ from opt3dgs_optim.checks import (
     LOGGER,
     as_damage,
     as_float,
+    check_choice,
     check_count,
     check_energy,
     check_keys,
     warn_user,
 )
+from opt3dgs_optim.declarations import (
+    check_attributes,
+    check_units,
+    declared_by,
+    parts_by_name,
+)
 from opt3dgs_optim.learnt import are_same, begin_anew, learnt_by, put_back
-from opt3dgs_optim.names import GAUSSIAN, NamedGroup, gaussian_of, set_of
+from opt3dgs_optim.names import NamedGroup, gaussian_of, set_of
 from opt3dgs_optim.part import Kept, Part, Phase, Window, overrides
-from opt3dgs_optim.state import ADAM_KEYS, check_kept_number, key_of
+from opt3dgs_optim.state import check_kept_number, key_of
 
 if TYPE_CHECKING:
     from opt3dgs_optim.stepadam import StepAdam
@@ -36,6 +43,7 @@ READABLE_FORMATS = (2, 3)
 STATE_KEY = "opt3dgs"  # in param_groups[0] of an optimizer's state_dict: the course's state
 NEVER = 2**62  # an iteration that no training reaches
 MAX_CACHED_PLACES = 64
+MAX_STEPS_WITHOUT_CLOCK = 120  # twenty iterations of six optimizers
 # What a line of the run log has of each iteration, and what `RunLog.step` is called with.
 COLUMNS_OF_THE_LOG = frozenset(
     ("self", "kind", "iteration", "seconds", "phase", "event", "energy", "metadata")
@@ -69,7 +77,8 @@ class Course:
 
     Raises:
         TypeError: one of the parts is none.
-        ValueError: a part occurs twice, or declares what it keeps in a way that cannot be.
+        ValueError: a part occurs twice, or declares what it keeps in a way that cannot be; or a
+            number is outside what is allowed.
     """
 
     def __init__(
@@ -81,7 +90,7 @@ class Course:
         adaptive: bool = False,
     ) -> None:
         call = type(self).__name__
-        if not isinstance(parts, Iterable):
+        if not isinstance(parts, Iterable) or isinstance(parts, (str, Mapping)):
             raise TypeError(f"{call}: parts={parts!r}, but a list of parts is needed")
         self._parts = tuple(parts)
         for part in self._parts:
@@ -89,12 +98,15 @@ class Course:
                 raise TypeError(f"{call}: parts has {part!r}, but a Part is needed")
             if sum(part is other for other in self._parts) > 1:
                 raise ValueError(f"{call}: parts has {part!r} twice, but each acts once per step")
-            _check_attributes(call, part)
-        _check_units(call, self._parts)
-        self.total_steps, self.switch_step = total_steps, switch_step or 0
+            check_attributes(call, part)
+        check_units(call, self._parts)
+        self.total_steps = check_count(call, "total_steps", total_steps, 1)
+        self.switch_step = 0
+        if switch_step is not None:
+            self.switch_step = check_count(call, "switch_step", switch_step, 0, total_steps)
         self._has_phases = switch_step is not None
         self.keeps_state = self._has_phases or bool(self._parts)  # for a checkpoint
-        self.adaptive = adaptive
+        self.adaptive = check_choice(call, "adaptive", adaptive)
         self.switched_off: dict[str, str] = {}  # part's name -> why
         self._current = -1
         self._windows: tuple[int | None, dict[str, Window | None]] = (None, {})  # at an iteration
@@ -114,8 +126,8 @@ class Course:
         # With what they held: a lost one is not missed where another one holds that.
         self._followers: list[tuple[weakref.ref[StepAdam], frozenset[Any]]] = []
         self.holds_twice = False  # whether two that exist have held the same Gaussian parameter
-        self._named = _by_name(self._parts)
-        self.declared = {name: _declared(call, part) for name, part in self._named.items()}
+        self._named = parts_by_name(self._parts)
+        self.declared = {name: declared_by(call, part) for name, part in self._named.items()}
         self.row_keys = tuple(
             key_of(name, kept)
             for name, entries in self.declared.items()
@@ -259,6 +271,11 @@ class Course:
         """The name of one of the parts."""
         return next(name for name, known in self._named.items() if known is part)
 
+    def lines(self) -> list[str]:
+        """What the parts say of themselves, one line each, and which are switched off, and why."""
+        why = {name: f": switched off, {said}" for name, said in self.switched_off.items()}
+        return [f"{part}{why.get(name, '')}" for name, part in self._named.items()]
+
     # -- what parts know of each other, and of the Gaussians --------------------------------------
 
     def register(self, optimizer: StepAdam) -> None:
@@ -390,6 +407,11 @@ class Course:
         iteration, value = self._published.get((name, place), (self.current, None))
         return value if earlier or iteration == self.current else None
 
+    def set_back(self) -> None:
+        """Begin anew what is kept for a time: the clock goes back to an earlier iteration."""
+        self.rewinds += 1
+        self._published = {}
+
     def last_published(self, name: str) -> Any:
         """What a part has published last under a name, about whichever Gaussians; or None."""
         found = [entry for (key, _), entry in self._published.items() if key == name]
@@ -426,6 +448,13 @@ class Course:
         self.steps += 1
         if energy is None:
             self.valid = True  # of this step nothing is known
+            if self.total_steps > 1 and self.current < 0 and self.steps > MAX_STEPS_WITHOUT_CLOCK:
+                self.warn_once(
+                    "no clock",
+                    f"{type(self).__name__}: {self.steps} steps without a closure that returns the "
+                    "loss, so that the clock stands still and parts that follow it do nothing; "
+                    "give step() one, or use a PhaseScheduler",
+                )
         else:
             self.current += 1
             self.take(energy)
@@ -526,6 +555,7 @@ class Course:
 
     def state_dict(self) -> dict[str, Any]:
         """Clock, parts and what is switched off, as plain numbers, strings, lists and dicts."""
+        self.open_windows()  # the clock may have been set back since the last step
         return {
             "format": FORMAT,
             "iteration": self.iteration,
@@ -566,8 +596,12 @@ class Course:
                     part.load_state_dict(state["parts"][name])
                 elif not are_same(part.state_dict(), self._unlearnt[name]):
                     begin_anew(name, part, self._unlearnt[name])
+            if counts[0] - 1 < self.current:
+                self.set_back()
             self.current, self.num_observed = counts[0] - 1, counts[1]
             self._rewinds_followed = self.rewinds
+            self._windows = (None, {})  # they may follow what a part has learnt, too
+            self._published = {}
             windows = self.open_windows()
             self.kept_numbers.clear()
             for key, number in numbers.items():
@@ -617,6 +651,16 @@ class Course:
         }
 
 
+class NoCourse:
+    """In the place of the course of an optimizer that follows none yet."""
+
+    def __get__(self, optimizer: Any, kind: type) -> Any:
+        raise AttributeError(
+            f"{kind.__name__} has no parts yet: call follow(Course([...])) first, or have a "
+            "PhaseScheduler upgrade an Adam"
+        )
+
+
 def _holds_opacities(optimizer: StepAdam) -> bool:
     return any(gaussian_of(group) == "opacities" for group in optimizer.param_groups)
 
@@ -629,16 +673,8 @@ def _held(optimizer: StepAdam) -> frozenset[Any]:
 
 def restored_number(value: float, kept: Kept) -> Tensor:
     """A number of a checkpoint, as wide as it may be until a parameter says how wide it is."""
-    return torch.tensor(value, dtype=torch.float64 if kept.dtype.is_floating_point else kept.dtype)
-
-
-def _by_name(parts: Iterable[Part]) -> dict[str, Part]:
-    named: dict[str, Part] = {}
-    for part in parts:
-        kind = type(part).__name__
-        again = sum(name.split("#")[0] == kind for name in named)
-        named[f"{kind}#{again + 1}" if again else kind] = part
-    return named
+    dtype = torch.float64 if kept.dtype.is_floating_point else kept.dtype
+    return torch.tensor(value, dtype=dtype, device="cpu")
 
 
 def check_format(call: str, value: Any) -> None:
@@ -646,42 +682,3 @@ def check_format(call: str, value: Any) -> None:
     whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not whole or value not in READABLE_FORMATS:
         raise ValueError(f"{call}: format={value!r}, but one of {READABLE_FORMATS} is needed")
-
-
-def _check_attributes(call: str, part: Part) -> None:
-    """ValueError unless a part's class says in a known way when and on what it acts."""
-    kind, names, during = type(part).__name__, part.names, part.during
-    if not (isinstance(part.keeps, (tuple, list)) and all(isinstance(k, Kept) for k in part.keeps)):
-        raise ValueError(f"{call}: {kind}.keeps={part.keeps!r}, but a tuple of Kept is needed")
-    if during is not None and not isinstance(during, Phase):
-        raise ValueError(f"{call}: {kind}.during={during!r}, but a Phase or None is needed")
-    if names is not None and not (isinstance(names, (tuple, list)) and {*names} <= {*GAUSSIAN}):
-        raise ValueError(
-            f"{call}: {kind}.names={names!r}, but None or a tuple of gsplat's names is needed: "
-            f"{', '.join(GAUSSIAN)}"
-        )
-
-
-def _check_units(call: str, parts: Sequence[Part]) -> None:
-    """ValueError where a part that needs the parameter's own units comes after one with others."""
-    for i, part in enumerate(parts):
-        for before in parts[:i]:
-            shared = part.names is None or before.names is None or {*part.names} & {*before.names}
-            if part.needs_units and before.own_units and shared:
-                late, early = type(part).__name__, type(before).__name__
-                raise ValueError(
-                    f"{call}: parts has {late} after {early}, which feeds gradients in units of "
-                    f"its own, but {late} needs those of the parameter; {late} must come first"
-                )
-
-
-def _declared(call: str, part: Part) -> dict[str, Kept]:
-    """What a part keeps, by name; ValueError where a name occurs twice, or is Adam's."""
-    entries = {kept.name: kept for kept in part.keeps}
-    if len(entries) < len(part.keeps) or any(name in ADAM_KEYS for name in entries):
-        names = [kept.name for kept in part.keeps]
-        raise ValueError(
-            f"{call}: {type(part).__name__} keeps {names}, but different names, none of them "
-            f"Adam's own ({', '.join(ADAM_KEYS)}), are needed"
-        )
-    return entries

@@ -53,7 +53,8 @@ def _installed(distribution: str) -> str | None:
 def _draw(*shape: int, device: torch.device, seed: int = 0) -> Tensor:
     # Drawn on the CPU, so that every device gets the same numbers.
     generator = torch.Generator().manual_seed(seed)
-    return torch.randn(*shape, dtype=torch.float64, generator=generator).to(device)
+    like = {"dtype": torch.float64, "device": "cpu"}
+    return torch.randn(*shape, generator=generator, **like).to(device)
 
 
 def _pairs(device: torch.device) -> tuple[Tensor, Tensor]:
@@ -76,7 +77,7 @@ def adam_when_all_is_off(device: torch.device) -> str:
                 optimizer.step()
         if not torch.equal(ours, theirs):
             raise ArithmeticError(f"{make.__name__} with nothing on differs from torch.optim.Adam")
-    return "AWSGLD with nu and noise off, LQNAdam without pairs: bit for bit"
+    return "AWSGLD without histogram and noise, and LQNAdam's first step: bit for bit torch's Adam"
 
 
 def _curvature_step(device: torch.device, dtype: torch.dtype, backend: Backend) -> Tensor:

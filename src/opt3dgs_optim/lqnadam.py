@@ -28,12 +28,12 @@ class LQNAdam(StepAdam):
     The gradient's place in Adam is taken by H g, scaled to the gradient's length. Adam then divides
     by its own second moment, so that of H g little more than the direction is left. It follows that
 
-    - on smooth, well-conditioned problems it is **slower than Adam** with a tuned learning rate. On
-      quadratics of three coordinates in random axes with a condition of 100 Adam's error is smaller
-      by more than a factor of 100 after 200 steps; with 10,000 by a factor of about 3;
-    - it is **faster in narrow valleys**, given time: in the curved one of Rosenbrock's function by
-      a factor of 3 after 200 steps, on quadratics of condition 10,000 by more than 100 after 1,000
-      steps;
+    - on quadratics it is **slower than Adam** with a tuned learning rate for the first few hundred
+      steps. After 200 steps, with three coordinates in random axes, Adam's error is smaller by more
+      than a factor of 100 where the condition is 100, and by a factor of 3 where it is 10,000;
+    - it is **faster in narrow valleys**, given time. After 1,000 steps its error on the quadratics
+      of condition 10,000 is smaller than Adam's by more than a factor of 100. In the curved valley
+      of Rosenbrock's function it is smaller by a factor of 3 after 200 steps;
     - in the last phase of a splatting training, for which the paper proposes it, it changes next to
       nothing here: positions hardly move by then (`docs/evidence.md`).
 

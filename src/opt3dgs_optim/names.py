@@ -1,4 +1,4 @@
-"""Which parameter group is which Gaussian parameter, in the names trainers use."""
+"""Names that trainers and torch use: of Gaussian parameters in groups, and of Adam's state."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -36,6 +36,8 @@ _WORDS_OF_OTHERS = frozenset(
         *("exposure", "exposures", "grid", "grids", "mlp", "pose", "poses"),
     )
 )
+MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # torch's names of Adam's, the last amsgrad's
+ADAM_KEYS = ("step", *MOMENTS)
 SLOT = "gaussian"  # of a parameter group: gsplat's name of what it holds
 _CANONICAL = {alias: name for name, aliases in GAUSSIAN_NAMES.items() for alias in aliases}
 
@@ -92,7 +94,7 @@ class NamedGroup(dict[str, Any]):
         raise KeyError(key)
 
     def get(self, key: str, default: Any = None) -> Any:
-        return self.gaussian if key == SLOT else super().get(key, default)
+        return super().get(key, self.gaussian if key == SLOT else default)
 
     def written_elsewhere(self) -> str | None:
         """The option that somebody has changed in the group that stood in its place, or None."""
@@ -147,6 +149,13 @@ def free_slot(
 def group_name(index: int, group: Mapping[str, Any]) -> str:
     """How a group is called in messages."""
     return str(group.get("name") or group.get(SLOT) or f"group {index}")
+
+
+def group_line(index: int, group: Mapping[str, Any]) -> str:
+    """What a group says of itself in one line: its name, its sizes and its learning rate."""
+    sizes = [list(param.shape) for param in group["params"]]
+    size = sizes[0] if len(sizes) == 1 else f"{len(sizes)} tensors"
+    return f"{group_name(index, group)} {size}: lr {float(group['lr']):.4g}"
 
 
 def block(name: str, lines: Iterable[str]) -> str:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
-from numbers import Number
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from numbers import Integral, Number, Real
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import check_choice
+from opt3dgs_optim.checks import as_float, check_choice, set_options
 from opt3dgs_optim.names import GAUSSIAN
 
 if TYPE_CHECKING:
@@ -42,14 +43,19 @@ class Kept:
         per: `"row"` keeps a tensor whose first dimension is the parameter's, one row per point;
             `"parameter"` a number per parameter; `"training"` one number for the whole training.
         shape: per row, the dimensions after the first, or a function of the parameter [N, ..] that
-            gives them; None: those of the parameter itself.
+            gives them; None: those of the parameter itself. A number has none.
         dtype: of what is kept. A floating one is never narrower than the parameter's: what belongs
             to float64 positions is kept in float64. What has a number for each of the parameter's
             is complex where that is.
-        initial: the value of a number before it is written. Rows begin as zeros, because trainers
-            that add points append zero rows: an all-zero row must mean "nothing yet".
-        allowed: the smallest and the largest number that it may be; None: any. One of a checkpoint
-            beyond that is damage. A number that is not finite is, too, unless `initial` is none.
+        initial: the value of a number before it is written, one that the dtype has. Rows begin as
+            zeros, because trainers that add points append zero rows: an all-zero row must mean
+            "nothing yet".
+        allowed: the smallest and the largest number that it may be, with `initial` from one to the
+            other; None: any. One of a checkpoint beyond that is damage. A number that is not finite
+            is, too, unless `initial` is none.
+
+    Raises:
+        ValueError: an option is outside what is allowed, or does not go with the others.
     """
 
     name: str
@@ -60,7 +66,7 @@ class Kept:
     allowed: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        """ValueError where an option is outside what is allowed."""
+        """Check the options, and make plain numbers of Python's of them."""
         check_choice("Kept", "per", self.per, ("row", "parameter", "training"))
         if not isinstance(self.name, str) or not self.name.isidentifier():
             raise ValueError(f"Kept: name={self.name!r}, but a word without dots is needed")
@@ -68,14 +74,18 @@ class Kept:
             raise ValueError(f"Kept: dtype={self.dtype!r}, but a torch.dtype is needed")
         if not isinstance(self.initial, Number):
             raise ValueError(f"Kept: initial={self.initial!r}, but a number is needed")
-        shape: Any = self.shape
-        if not (shape is None or callable(shape) or isinstance(shape, (tuple, list))):
-            raise ValueError(
-                f"Kept: shape={shape!r}, but a tuple of the dimensions after the first, a function "
-                "of the parameter, or None is needed"
-            )
         if self.per == "row" and self.initial != 0:
             raise ValueError(f"Kept: initial={self.initial!r}, but rows begin as zeros")
+        if self.per != "row" and self.shape is not None:
+            raise ValueError(
+                f"Kept: shape={self.shape!r} and per={self.per!r}, but None is needed for a number"
+            )
+        shape = self.shape
+        if not (shape is None or callable(shape)):
+            shape = _checked_shape(shape, ", a function of the parameter, or None")
+        initial = _checked_initial(self.initial, self.dtype)
+        allowed = _checked_interval(self.allowed, initial, self.dtype)
+        set_options(self, shape=shape, initial=initial, allowed=allowed)
 
     def shape_for(self, param: Tensor) -> tuple[int, ...]:
         """The whole shape of what is kept of a parameter [N, ..]."""
@@ -83,7 +93,7 @@ class Kept:
             return ()
         if self.shape is None:
             return tuple(param.shape)
-        rest = self.shape(param) if callable(self.shape) else self.shape
+        rest = _checked_shape(self.shape(param)) if callable(self.shape) else self.shape
         return (*param.shape[:1], *rest)
 
     def dtype_for(self, param: Tensor) -> torch.dtype:
@@ -101,12 +111,72 @@ class Kept:
         return torch.full(shape, value, dtype=dtype, device=param.device)
 
 
+def _checked_shape(shape: Any, others: str = "") -> tuple[int, ...]:
+    """The dimensions after the first; ValueError unless they are whole numbers from 0."""
+    rest = [as_float(each) for each in shape] if isinstance(shape, (tuple, list)) else [-1.0]
+    if not all(each >= 0 and each.is_integer() for each in rest):
+        raise ValueError(
+            f"Kept: shape={shape!r}, but a tuple of the dimensions after the first, whole numbers "
+            f"from 0{others} is needed"
+        )
+    return tuple(map(int, rest))
+
+
+def _checked_initial(initial: Any, dtype: torch.dtype) -> Any:
+    """The number as one of Python's own; ValueError unless the dtype has it."""
+    number = _number_of(initial, dtype)
+    if number is None:
+        raise ValueError(f"Kept: initial={initial!r}, but a number that {dtype} has is needed")
+    return number
+
+
+def _number_of(value: Any, dtype: torch.dtype) -> Any:
+    """A number as one of Python's own; None where the dtype has none of that size, or kind."""
+    try:
+        if dtype.is_complex:
+            number = complex(value)
+            parts = number.real, number.imag
+        elif not isinstance(value, Real):
+            return None
+        elif dtype.is_floating_point:
+            number = float(value)
+            parts = (number,)
+        else:
+            number, is_bool = int(cast(Any, value)), dtype == torch.bool
+            low, high = (0, 1) if is_bool else (torch.iinfo(dtype).min, torch.iinfo(dtype).max)
+            return number if number == value and low <= number <= high else None
+    except (OverflowError, ValueError):  # one beyond all floats, or no finite one for an integer
+        return None
+    largest = torch.finfo(dtype).max
+    return number if all(abs(p) <= largest or not math.isfinite(p) for p in parts) else None
+
+
+def _checked_interval(allowed: Any, initial: Any, dtype: torch.dtype) -> Any:
+    """The pair of numbers; ValueError unless `initial` lies between them."""
+    if allowed is None:
+        return None
+    is_pair = isinstance(allowed, (tuple, list)) and len(allowed) == 2
+    pair: Any = allowed if is_pair else (None, None)
+    low, high = map(as_float, pair)
+    if not low <= high or dtype.is_complex:
+        needed = "None" if dtype.is_complex else "a pair of numbers (low, high), low <= high,"
+        raise ValueError(f"Kept: allowed={allowed!r}, but {needed} is needed for {dtype}")
+    low, high = (int(each) if isinstance(each, Integral) else float(each) for each in pair)
+    if not low <= initial <= high:
+        raise ValueError(
+            f"Kept: allowed={allowed!r}, but what it begins with, initial={initial!r}, is needed "
+            "among these"
+        )
+    return low, high
+
+
 class Part:
     """One thing that a training's steps can have: a factor, another gradient, noise, ...
 
     A part overrides the hooks that it needs, and a hook that is not overridden is never called. It
     knows nothing of masks, of GradScaler, of `maximize` or of steps that do not count: a hook gets
-    the gradient of what is minimised, unscaled, and zero in rows that a mask holds still.
+    the gradient of what is minimised, unscaled, and zero in rows that a mask holds still. Energies
+    alone are as the trainer says them, also where it maximises.
 
     What a part keeps is declared in `keeps`, and the optimizer does the rest. It makes each entry
     when a hook first reads it, on the parameter's device and in the declared dtype; it stores it
@@ -131,7 +201,7 @@ class Part:
         keeps: what it keeps.
         own_units: whether `before` feeds Adam a gradient in other units than the parameter's. Then
             Adam's moments are in these units, too, and begin anew where the part begins to act on
-            a parameter or ends, in a checkpoint of the stock trainer, say.
+            a parameter or ends, in a checkpoint of the unchanged trainer, say.
         needs_units: whether `before` needs a gradient in the parameter's own units. Then the part
             cannot come after one that has other units.
     """

@@ -32,6 +32,11 @@ MEAN_ABS = math.sqrt(2 / math.pi)  # mean absolute deviation of a Gaussian of de
 RESOLUTION = 1e-6  # smallest deviation, as a share of the present distance from the mean
 
 
+def host_tensor(numbers: Any) -> Tensor:
+    """Numbers of Python's, in lists or not, as a float64 tensor on the CPU."""
+    return torch.tensor(numbers, dtype=torch.float64, device="cpu")
+
+
 class Tally:
     """How many energies have counted, where only the device knows which of them are finite.
 
@@ -45,7 +50,7 @@ class Tally:
         self.warmup = warmup
         self.count = torch.zeros((), dtype=torch.int64, device=nu.device)
         self.sums = nu.new_zeros(3)
-        self._powers = torch.arange(3).to(nu)
+        self._powers = torch.arange(3, dtype=nu.dtype, device=nu.device)
 
     def add(self, nu: Tensor, valid: Tensor | Literal[True]) -> None:
         """Take the nu of an energy that has been counted; in the warm-up it becomes 1, in place."""
@@ -179,7 +184,7 @@ class FixedPartitions(Partitions):
             )
 
     def load(self, state: Mapping[str, Any]) -> None:
-        self.weights.copy_(torch.tensor(state["weights"], dtype=torch.float64))
+        self.weights.copy_(host_tensor(state["weights"]))
         # Range and temperature are there already, with all their digits.
         _, _, _, count, nu = state["scalars"]
         self._count.fill_(count)
@@ -229,13 +234,15 @@ class MovingPartitions(Partitions):
         like: dict[str, Any] = {"dtype": dtype, "device": device}
         m, h2 = self.num_partitions, BANDWIDTH**2
         width = 2 * REACH / m
-        center = (torch.arange(m, dtype=torch.float64) + 0.5) * width - REACH
+        # Made on the CPU: whatever torch's default device is, and not every device has float64.
+        wide: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}
+        center = (torch.arange(m, **wide) + 0.5) * width - REACH
         # Log of the Gaussian around z = MEAN_ABS * t, up to what softmax takes away.
         self._log_kernel = (-center * center / (2 * h2)).to(**like)
         self._log_kernel_slope = (center * (MEAN_ABS / h2)).to(**like)
         # With V = [k q, t]: rows of slope * (sum k q c + even * z), sum k q + even, -slope * z.
         slope, even = 0.5 * (1 + 2 * h2) / h2, EVEN / m
-        rows = torch.zeros(3, m + 1, dtype=torch.float64)
+        rows = torch.zeros(3, m + 1, **wide)
         rows[0, :m], rows[1, :m] = slope * center, 1.0
         rows[0, m], rows[2, m] = slope * even * MEAN_ABS, -slope * MEAN_ABS
         self._rows = rows.to(**like)
@@ -251,7 +258,7 @@ class MovingPartitions(Partitions):
         tiny = 1e-150 if dtype.itemsize == 8 else 1e-30
         self._tiny = torch.full((), tiny, **like)
         paces = [Pace.of(count) for count in range(MEMORY + 1)]
-        self._paces = torch.tensor(paces, dtype=torch.float64).to(**like)
+        self._paces = host_tensor(paces).to(**like)
         self._constants = (REACH, BANDWIDTH, EVEN, MEAN_ABS, RESOLUTION, tiny)
         # Views are made once: a view is an operator too.
         self._mean, self._deviation, self._mean_slope = self._state[:3].unbind()
@@ -276,7 +283,7 @@ class MovingPartitions(Partitions):
         """Nu from the present density, then its update with an energy, 0-d, the `count`-th."""
         if isinstance(count, Tensor):
             # An energy that does not count becomes the mean, and moves nothing.
-            energy = torch.where(torch.as_tensor(valid), energy, self._mean)
+            energy = torch.where(torch.as_tensor(valid, device=energy.device), energy, self._mean)
             pace: Any = torch.nn.functional.embedding(count.clamp(max=MEMORY), self._paces).unbind()
             mean = torch.lerp(energy, self._mean, pace[-1])
         else:
@@ -334,7 +341,7 @@ class MovingPartitions(Partitions):
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Restore `state()`."""
-        self._state.copy_(torch.tensor(state["recent"], dtype=torch.float64))
+        self._state.copy_(host_tensor(state["recent"]))
         # The smallest deviation of float64 is zero in float32, and zero over zero is not a number.
         self._deviation.clamp_(min=self._constants[-1])
         self.nu.fill_(state["nu"])

@@ -63,6 +63,7 @@ class PhaseScheduler(Course):
             copy, or what comes out of a pickle, has none.
         process_group: a `torch.distributed` process group over whose ranks the energy is averaged;
             every rank must call `observe` as often, and a loss that is not finite skips all steps.
+            What comes out of a pickle has none.
 
     Call order in each iteration: `pixel_loss`, backward, `observe(loss)`, `step()` of every
     optimizer. The state travels inside `param_groups[0]` of every upgraded optimizer's
@@ -123,6 +124,7 @@ class PhaseScheduler(Course):
         self._iterations_since_look = 0
         self._num_optimizers = 0
         self._observed_again = 0  # the same iteration, in a row
+        self._times_set_back = 0  # by `observe`
         self._adam_steps: int | None = None  # of moments that came without a state of ours
 
     @classmethod
@@ -204,20 +206,29 @@ class PhaseScheduler(Course):
             loss: the total training loss, 0-d; detached here. With gradient accumulation, once
                 per optimizer step, with the mean over its batches; with a GradScaler, unscaled.
             iteration: the trainer's own count from 0, where it may differ from the number of
-                calls: in a training that goes on from a checkpoint of the stock trainer, say.
+                calls: in a training that goes on from a checkpoint of the unchanged trainer, say.
+
+        Raises:
+            ValueError: the loss is no number, `iteration` no whole one, or the log is closed.
         """
         value = check_energy(f"{CALL}.observe", "loss", loss)
         if iteration is not None:
             iteration = check_count(f"{CALL}.observe", "iteration", iteration, 0)
-            if iteration < self.current:  # what is kept for a time begins anew
-                self.rewinds += 1
+        if getattr(self.log, "closed", False):
+            raise ValueError(f"{CALL}.observe: its log is closed; set log to None, or to another")
+        if self._over_ranks is not None:
+            value = self._averaged(value)
+        if iteration is not None:
+            if iteration < self.current:
+                self.set_back()
+                self._times_set_back += 1
                 self._removed_rows.forget()
             self._watch_count(iteration)
         before = max(self.current, 0)
         self.current = self.iteration if iteration is None else iteration
         self._watch_clock(before)
         self._watch_rows()
-        self.take(value if self._over_ranks is None else self._over_ranks(value))
+        self.take(value)
         self._watch_losses()
         if self.log is not None:
             phase = self.phase_of(self.current)
@@ -227,11 +238,24 @@ class PhaseScheduler(Course):
                 if self.log is not None:
                     self.log.event(event, self.current, part=part, reason=reason)
 
+    def _averaged(self, energy: Tensor) -> Tensor:
+        """The mean energy over the ranks."""
+        assert self._over_ranks is not None
+        try:
+            return self._over_ranks(energy)
+        except RuntimeError:  # NCCL takes no numbers of the host
+            groups = (group for each in self.followers() for group in each.param_groups)
+            devices = {param.device for group in groups for param in group["params"]}
+            device = next((each for each in devices if each.type != "cpu"), None)
+            if device is None or energy.device.type != "cpu":
+                raise
+            return self._over_ranks(energy.to(device))
+
     def pixel_loss(self, render: Tensor, target: Tensor) -> Tensor:
         """The photometric term of two images in 0..1: mean |error|, unless a part says another.
 
         Raises:
-            ValueError: their shapes differ.
+            ValueError: their shapes differ, or a part returns something else than a number.
         """
         if render.shape != target.shape:
             raise ValueError(
@@ -240,7 +264,15 @@ class PhaseScheduler(Course):
             )
         error = render - target
         part = self.pixel_part()
-        return error.abs().mean() if part is None else part.pixel_loss(error)
+        if part is None:
+            return error.abs().mean()
+        found: Any = part.pixel_loss(error)
+        if not isinstance(found, Tensor) or found.dim():
+            got = f"a tensor of {tuple(found.shape)}" if isinstance(found, Tensor) else repr(found)
+            raise ValueError(
+                f"{self.name_of(part)}.pixel_loss: returned {got}, but a 0-d tensor is needed"
+            )
+        return found
 
     def pixel_part(self) -> Part | None:
         """The part whose photometric term holds for the iteration whose loss comes next."""
@@ -315,7 +347,7 @@ class PhaseScheduler(Course):
             warn_user(
                 f"{CALL}: Adam's moments have made {adam_steps} steps, but this is iteration "
                 f"{self.current} of {self.total_steps}; a training that goes on from a checkpoint "
-                "of the stock trainer needs observe(loss, iteration=...)"
+                "of the unchanged trainer needs observe(loss, iteration=...)"
             )
 
     def _has_ended(self) -> bool:
@@ -363,7 +395,7 @@ class PhaseScheduler(Course):
         """Say once that the trainer's count stands still, or begins anew again and again."""
         stands = iteration == self.current and self.steps > 0
         self._observed_again = self._observed_again + 1 if stands else 0
-        if self._observed_again > PATIENCE or self.rewinds > MAX_REWINDS:
+        if self._observed_again > PATIENCE or self._times_set_back > MAX_REWINDS:
             what = f"was {iteration} {PATIENCE} times in a row" if stands else "was set back again"
             self._report(
                 "count",
@@ -482,11 +514,8 @@ class PhaseScheduler(Course):
         switch = f"switch at {self.switch_step}"
         if self.switch_step >= self.total_steps:
             switch = "no switch"
-        lines = [f"iteration {self.iteration} of {self.total_steps}, {self.phase.value}, {switch}"]
-        for name, part in self.named().items():
-            off = self.switched_off.get(name)
-            lines.append(str(part) + ("" if off is None else f": switched off, {off}"))
-        return block(CALL, lines)
+        clock = f"iteration {self.iteration} of {self.total_steps}, {self.phase.value}, {switch}"
+        return block(CALL, [clock, *self.lines()])
 
 
 class RankMean:
@@ -517,6 +546,10 @@ class RankMean:
         total = values.detach().to(torch.float32 if half else values.dtype, copy=True)
         self._reduce(total, group=self._group)
         return total / self._size
+
+    def __reduce__(self) -> Any:
+        """Nothing: another process has groups of its own."""
+        return type(None), ()
 
     def __deepcopy__(self, memo: Any) -> RankMean:
         """A process group is one, however often an optimizer is copied."""

@@ -15,10 +15,9 @@ from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
 from opt3dgs_optim.checks import as_float, check_keys
+from opt3dgs_optim.names import ADAM_KEYS, MOMENTS
 from opt3dgs_optim.part import Kept
 
-MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # torch's names of Adam's, the last amsgrad's
-ADAM_KEYS = ("step", *MOMENTS)
 Rows = Tensor | np.ndarray | Sequence[int] | Sequence[bool]  # indices, or a mask
 Declared = Mapping[str, Mapping[str, Kept]]  # a part's name -> a name -> what it keeps under it
 
@@ -60,7 +59,8 @@ class RowOwnership:
 
     def drop_foreign(self, param: Tensor, state: dict[str, Any], keys: Iterable[str]) -> None:
         """Remove the tensors under `keys` that are of other rows than the parameter's present."""
-        for key in [key for key in keys if key in state]:
+        # What a stock optimizer has loaded may be anything, and is checked after the upgrade.
+        for key in [key for key in keys if isinstance(state.get(key), Tensor)]:
             owner, rows = self._owners.get(state[key], (None, 0))
             if owner is None or owner() is not param or rows != rows_of(param):
                 del state[key]
@@ -68,7 +68,7 @@ class RowOwnership:
     def claim(self, param: Tensor, state: dict[str, Any], keys: Iterable[str]) -> None:
         """Take the tensors under `keys` as those of the parameter's present rows."""
         for key in keys:
-            if key in state:
+            if isinstance(state.get(key), Tensor):
                 self._owners[state[key]] = weakref.ref(param), rows_of(param)
 
 
@@ -169,6 +169,11 @@ class ParameterRecord:
         view.release()
         return view
 
+    def forget_after(self, iteration: int) -> None:
+        """Know of no step after an iteration: the clock was set back, and they are to come."""
+        if self.last_step is not None and self.last_step > iteration:
+            self.last_step = None
+
     def is_of(self, param: Tensor) -> bool:
         """Whether that parameter was there last."""
         return self.param is not None and self.param() is param
@@ -177,21 +182,30 @@ class ParameterRecord:
         return {**vars(self), "_view": None, "param": None}
 
 
-def records_of(params: list[Tensor], records: list[ParameterRecord]) -> list[ParameterRecord]:
+def records_of(
+    params: list[Tensor],
+    records: list[ParameterRecord],
+    elsewhere: Iterable[ParameterRecord] = (),
+) -> list[ParameterRecord]:
     """One record for each of a group's parameters, of the records that it has had.
 
     A parameter that was there keeps its own, wherever it stands now. Another one has the record of
     its place, where density control has put it, if nobody else has that. Where places have gone,
-    nobody knows which, and it begins anew.
+    nobody knows which, and it begins anew. `elsewhere` are the records of other groups, where a
+    parameter may have stood.
     """
     before = [None if record.param is None else record.param() for record in records]
     known = {id(param): i for i, param in enumerate(before) if param is not None}
     kept = {known[id(param)] for param in params if id(param) in known}
+    moved = {id(r.param()): r for r in elsewhere if r.param is not None and r.param() is not None}
     free = range(len(records)) if len(records) <= len(params) else ()
     found = list[ParameterRecord]()
     for place, param in enumerate(params):
         i = known.get(id(param), place if place in free and place not in kept else None)
-        found.append(ParameterRecord() if i is None else records[i])
+        if id(param) not in known and id(param) in moved:
+            found.append(moved[id(param)])
+        else:
+            found.append(ParameterRecord() if i is None else records[i])
         found[-1].param = weakref.ref(param)
     return found
 
@@ -470,7 +484,7 @@ def check_kept_number(call: str, key: str, kept: Kept, value: Any) -> Any:
     try:
         if isinstance(value, numbers) and isinstance(value, bool) == (kind is bool):
             number = kind(value)
-            torch.tensor(number, dtype=kept.dtype)  # raises where it does not fit
+            torch.tensor(number, dtype=kept.dtype, device="cpu")  # raises where it does not fit
             finite = cmath.isfinite(number) or not cmath.isfinite(kept.initial)
             if finite and (kept.allowed is None or kept.allowed[0] <= number <= kept.allowed[1]):
                 return number
@@ -518,7 +532,7 @@ def restart_rows(kept: dict[str, Tensor], entries: Mapping[str, Kept], param: Te
         if (value.is_floating_point() or value.is_complex()) and not is_finite_sum(value):
             wrong |= ~_finite_rows(value, wrong.shape).to(wrong.device)
         allowed = entries[key].allowed
-        if allowed is not None:
+        if allowed is not None and not value.is_complex():
             beyond = (value < allowed[0]) | (value > allowed[1])
             while beyond.dim() > wrong.dim():
                 beyond = beyond.any(-1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import chain
 from typing import Any, cast
 
@@ -20,7 +20,7 @@ from opt3dgs_optim.checkpoint import (
     restore_records,
 )
 from opt3dgs_optim.checks import LOGGER, as_damage, energy_of
-from opt3dgs_optim.course import STATE_KEY, Course
+from opt3dgs_optim.course import STATE_KEY, Course, NoCourse
 from opt3dgs_optim.in_step import (
     NO_PARTS,
     STEP_HOOKS,
@@ -30,7 +30,17 @@ from opt3dgs_optim.in_step import (
     StepInProgress,
     check_mask_fits,
 )
-from opt3dgs_optim.names import NamedGroup, block, free_slot, gaussian_of, group_name, split_name
+from opt3dgs_optim.names import (
+    ADAM_KEYS,
+    MOMENTS,
+    NamedGroup,
+    block,
+    free_slot,
+    gaussian_of,
+    group_line,
+    group_name,
+    split_name,
+)
 from opt3dgs_optim.overrides import (
     TemporaryOverrides,
     WeightDecay,
@@ -45,8 +55,6 @@ from opt3dgs_optim.overrides import (
 )
 from opt3dgs_optim.part import Group, Part, Window
 from opt3dgs_optim.state import (
-    ADAM_KEYS,
-    MOMENTS,
     HeldRows,
     ParameterRecord,
     ParameterState,
@@ -75,11 +83,12 @@ class StepAdam(Adam):
     of this class *and* of the class that it had.
     """
 
-    course: Course
+    course: Course = cast(Course, NoCourse())  # until `follow`
     any_group = False  # whether the parts act on groups that are no Gaussian parameter's, too
     _base: type[Adam] = Adam  # whose step it is that the parts surround
     _ownership: RowOwnership
-    _slots: list[tuple[str, str | None]]  # by group: the set of Gaussians, and which parameter
+    # By group: the set of Gaussians, and which parameter.
+    _slots: Sequence[tuple[str, str | None]] = ()
     _known: list[NamedGroup]  # the groups at the last look
     _open_windows: dict[str, Window | None]
     stepped_at = -1  # the iteration of its last step, of whatever parameters
@@ -96,8 +105,6 @@ class StepAdam(Adam):
         Another class than torch's Adam has arithmetic of its own, and its step gets the mask.
         """
         self.course, self._base, self._ownership = course, base, RowOwnership()
-        if "_slots" not in vars(self):
-            self._slots = []
         self._known, self._open_windows = [], {}
         self.name_groups()
         self._patch_step_function()  # of a class that was given to a made optimizer
@@ -151,10 +158,11 @@ class StepAdam(Adam):
                 taken = slot[1] or "left alone"
                 LOGGER.info("a group was added: %s, %s", group_name(i, group), taken)
         self.course.forget_places()
-        self._known, self._slots = cast(list[NamedGroup], list(groups)), []
+        self._known, self._slots = cast(list[NamedGroup], list(groups)), ()
+        every = [record for group in self._known for record in group.records]
         for group in self._known:
             if not are_of(group.records, group["params"]):
-                group.records = records_of(group["params"], group.records)
+                group.records = records_of(group["params"], group.records, every)
 
     @property
     def _records(self) -> list[list[ParameterRecord]]:
@@ -242,10 +250,10 @@ class StepAdam(Adam):
         if not isinstance(counts, Tensor):
             return counts
         groups = self.param_groups
-        if self._base is Adam:  # only torch's fused step can be told on the device not to be made
-            droppable = all(group["fused"] for group in groups)
-        else:  # another base's own step can be given an empty mask
-            droppable = mask is not None
+        # Only torch's fused step can be told on the device not to be made, or another base's own,
+        # which can be given an empty mask.
+        fused = all(group["fused"] for group in groups)
+        droppable = fused if self._base is Adam else mask is not None
         tensors = chain.from_iterable(group["params"] for group in groups)
         if droppable and all(counts.is_cpu or not param.is_cpu for param in tensors):
             return counts
@@ -515,6 +523,9 @@ class StepAdam(Adam):
         if now is self._open_windows and self._rewinds == course.rewinds:
             return
         rewound, self._rewinds = self._rewinds != course.rewinds, course.rewinds
+        if rewound:
+            for record in chain.from_iterable(self._records):
+                record.forget_after(course.current)
         for name, window in now.items():
             if rewound or window is None or self._open_windows.get(name) != window:
                 self._drop_kept(name)
@@ -544,7 +555,8 @@ class StepAdam(Adam):
         """
         call = f"{self.call_name}.reset_rows"
         if not any(param is each for group in self.param_groups for each in group["params"]):
-            raise ValueError(f"{call}: a parameter of shape {tuple(param.shape)} is none of these")
+            shown = f"of shape {tuple(param.shape)}" if isinstance(param, Tensor) else repr(param)
+            raise ValueError(f"{call}: a parameter {shown} is none of these")
         index, state = check_rows(call, rows, param), self.state.get(param, {})
         self._ownership.drop_foreign(param, state, self.course.row_keys)
         for key in (*MOMENTS, *self.course.row_keys):
@@ -594,6 +606,8 @@ class StepAdam(Adam):
         if not self.course.keeps_state:
             return super().state_dict()
         self.name_groups()
+        if self.course.parts:
+            self._follow_windows()  # the clock may have been set back since the last step
         own = pack_optimizer(self, self._records, self._open_windows)
         with TemporaryOverrides() as temporary:
             shared = {**self.course.state_dict(), "optimizer": own}
@@ -646,11 +660,11 @@ class StepAdam(Adam):
         self.name_groups()
         for group in self._known:
             group.records = records_of(group["params"], [])
-        known = self.course.named().keys()
+        known, self.stepped_at = self.course.named().keys(), -1
         params = chain.from_iterable(group["params"] for group in self.param_groups)
         for param, rows in zip(params, saved.rows, strict=True):
             own = self.state.get(param)
-            for key in [key for key in own or () if is_kept_by_part(key, known)]:
+            for key in [key for key in own or () if is_kept_by_part(key, known | saved.parts)]:
                 del self.state[param][key]
             for key, value in rows.items():
                 self.state[param][key] = value.detach().to(param.device, copy=True)
@@ -682,9 +696,5 @@ class StepAdam(Adam):
         return next(own)
 
     def __repr__(self) -> str:
-        lines = [str(part) for part in self.course.parts]
-        for i, group in enumerate(self.param_groups):
-            sizes = [list(param.shape) for param in group["params"]]
-            size = sizes[0] if len(sizes) == 1 else f"{len(sizes)} tensors"
-            lines.append(f"{group_name(i, group)} {size}: lr {float(group['lr']):.4g}")
-        return block(type(self).__name__, lines)
+        groups = (group_line(i, group) for i, group in enumerate(self.param_groups))
+        return block(type(self).__name__, [*self.course.lines(), *groups])

@@ -199,6 +199,7 @@ def _look_at(
 def _made_class(optimizer: Any, shown: str) -> type[StepAdam]:
     """The class that the optimizer gets; TypeError where its own cannot be kept."""
     kind = type(optimizer)
+    _check_attributes(optimizer, shown)
     try:
         made = upgraded_class(kind)
         # What assignment of a class asks: the same layout.
@@ -209,6 +210,30 @@ def _made_class(optimizer: Any, shown: str) -> type[StepAdam]:
             f"parts can be made ({error})"
         ) from None
     return made
+
+
+def _check_attributes(optimizer: Any, shown: str) -> None:
+    """TypeError where attributes of the trainer's would hide those of the parts, or be hidden."""
+    kind, everything = type(optimizer), {*vars(StepAdam), *StepAdam.__annotations__}
+    between = [each for each in kind.__mro__ if each not in Adam.__mro__]
+    theirs = {*vars(optimizer)}.union(*map(vars, between))
+    clash = sorted(name for name in everything & theirs if not hasattr(Adam, name))
+    if clash:
+        raise TypeError(
+            f"{CALL}: {shown}, a {kind.__module__}.{kind.__qualname__}, has {', '.join(clash)}, "
+            "which is a name of the parts' own; give it another one"
+        )
+    replaced = sorted(name for name in everything & {*vars(optimizer)} if name != "step")
+    if replaced:
+        raise TypeError(
+            f"{CALL}: somebody has replaced {', '.join(replaced)} of {shown}, a "
+            f"{kind.__module__}.{kind.__qualname__}; do that after the upgrade"
+        )
+    if any({"__reduce__", "__reduce_ex__"} & {*vars(each)} for each in between):
+        raise TypeError(
+            f"{CALL}: {shown} is a {kind.__module__}.{kind.__qualname__}, whose __reduce__ a copy "
+            "with parts could not keep; what a copy needs can be in __getstate__ and __setstate__"
+        )
 
 
 @functools.cache
@@ -229,6 +254,8 @@ def upgraded_class(base: type[Adam]) -> type[StepAdam]:
         return _new_upgraded, (base,), self.__getstate__()
 
     names = {"__module__": base.__module__, "__qualname__": base.__qualname__, "_made_of": base}
+    if base.__repr__ is not Adam.__repr__:
+        names["__repr__"] = base.__repr__
     return type(base.__name__, bases, {**names, "__new__": new, "__reduce_ex__": reduce})
 
 

@@ -32,7 +32,8 @@ class GatedNoise(PositionNoise):
     """A part of a trainer's own: useless while no point is near the opacity gate."""
 
     def evidence(self, course: Course) -> Tensor:
-        source: Any = self.gaussians() if callable(self.gaussians) else self.gaussians
+        given: Any = self.gaussians
+        source: Any = given() if callable(given) else given
         return (source["opacities"].detach() < 0).any().float().reshape(1)
 
     def useless(self, evidence: list[float], course: Course) -> str | None:

@@ -75,8 +75,9 @@ def page(record: dict[str, Any], results: Results) -> str:
         goals_line(results),
         times_table(results),
         "## What a step does",
-        "Launches are torch's operators, waits are values that Python reads, for which a GPU would "
-        "have to be waited for. Bytes are kept beside parameters and gradients.",
+        "Operators are torch's. Values read are those that Python reads on a CPU. Where they would "
+        "lie on a GPU the package leaves them there, which the tests check. Bytes are kept beside "
+        "parameters and gradients.",
         counts_table(results),
     ]
     return "\n\n".join(part for part in parts if part) + "\n"

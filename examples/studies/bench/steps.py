@@ -246,17 +246,19 @@ def times_table(results: Results) -> str:
 
 def counts_table(results: Results) -> str:
     """Markdown: what a step launches, waits for, keeps and moves, at the most points measured."""
-    rows = []
+    rows, on_device = [], False
     for name in next(iter(results.values())):
         points = max((n for n, found in results.items() if "waits" in found[name]), default=0)
         if not points:
             continue
         row = results[points][name]
+        on_device |= "launches" in row
         rate = f"{row['gb_per_second']:,.0f}" if "gb_per_second" in row else "-"
         peak = f"{row['peak_bytes'] / points:,.0f}" if "peak_bytes" in row else "-"
         kept, launches = f"{row['bytes_per_point']:,.0f}", row.get("launches", row["operators"])
         rows.append((name, f"{points:,}", launches, row["waits"], kept, peak, rate))
-    heads = ("", "points", "launches", "waits", "bytes kept per point", "more within the step")
+    counted = ("launches", "waits") if on_device else ("operators", "values read")
+    heads = ("", "points", *counted, "bytes kept per point", "more within the step")
     return table((*heads, "GB/s, at least"), "lr", rows)
 
 

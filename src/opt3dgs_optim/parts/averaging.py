@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from opt3dgs_optim.course import Course
+from opt3dgs_optim.names import gaussian_of
 from opt3dgs_optim.part import Group, Kept, Part, State, Window
 from opt3dgs_optim.state import broadcast_rows, is_finite_sum
+
+# What it publishes from step to step: the last three iterations in which a parameter was stepped.
+STEPPED = "stepped in"
 
 
 @dataclass(frozen=True, repr=False)
@@ -21,7 +26,9 @@ class Averaging(Part):
     Every step follows one view, so the parameters wander about what fits all of them, the further
     the higher their learning rates; their mean does not. Averaging covers the last thirtieth of the
     run. In the last tenth of that the mean takes the parameters' place, because trainers save
-    before their last step. Until then nothing is changed.
+    before their last step. Until then nothing is changed. The last two steps of a parameter are
+    always among these, also where few are averaged: some trainers count images, a batch of them
+    per step, and some step a parameter in every 16th iteration only.
 
     With masked steps every row has the mean of its own iterates, and takes it in a step that moves
     it. Rows that density control edits begin anew. Numbers that are not finite are left alone, such
@@ -48,5 +55,21 @@ class Averaging(Part):
         weight = 1.0 / broadcast_rows(count, param)
         mean.lerp_(iterate.to(mean.dtype), weight.to(mean.dtype))
         # Trainers save before the last step, or do not make it.
-        if end - course.current <= max(2, (end - start) / 10):
+        last_two = 2 * _stride(group, param, course)
+        if end - course.current <= max(last_two, (end - start) / 10):
             param.copy_(mean if whole else torch.where(param.isfinite(), mean, param))
+
+
+def _stride(group: Group, param: Tensor, course: Course) -> int:
+    """The iterations from one step of a parameter to the next; 1 before its second.
+
+    The shorter one of the last two times: a parameter that had no gradient for long, or a
+    checkpoint of a later iteration, makes one of them longer. Iterations that the clock has been
+    set back over are forgotten.
+    """
+    name, now = f"{STEPPED} {gaussian_of(group)}", course.current
+    stepped = course.published(name, param, earlier=True) or ()
+    if stepped[-1:] != (now,):
+        stepped = (*(each for each in stepped if each < now), now)[-3:]
+        course.publish(name, param, stepped)
+    return min((later - before for before, later in pairwise(stepped)), default=1)

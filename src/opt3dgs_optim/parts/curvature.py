@@ -14,7 +14,7 @@ from opt3dgs_optim.course import Course
 from opt3dgs_optim.lbfgs.history import MAX_HISTORY, history_shape, laid_out, new_history
 from opt3dgs_optim.lbfgs.two_loop import foresight, lqn_direction
 from opt3dgs_optim.names import check_names
-from opt3dgs_optim.part import Group, Kept, Part, Phase, State
+from opt3dgs_optim.part import Group, Kept, Part, Phase, State, Window
 from opt3dgs_optim.state import rows_of
 
 HISTORY = "history"
@@ -90,10 +90,13 @@ class Curvature(Part):
         self.backend: Backend = check_choice(call, "backend", backend, BACKENDS)
         self.keeps = (KeptHistory(HISTORY, history_size=self.history_size),)
         self._step = -1  # of the tally
-        self._tally = torch.zeros(2)  # [accepted, candidates] of the last step
+        self._tally = torch.zeros(2, device="cpu")  # [accepted, candidates] of the last step
         # Those and [foresight, points looked at], of all steps.
-        self._seen = torch.zeros(4, dtype=torch.float32)
+        self._seen = torch.zeros(4, dtype=torch.float32, device="cpu")
         self._probes = 0
+        # For which iterations, and in which pass over them, these were counted.
+        self._counted_in: Window | None = None
+        self._pass: int | None = None
 
     def __repr__(self) -> str:
         share = self.accepted_share
@@ -118,6 +121,7 @@ class Curvature(Part):
         gradient = grad.reshape(position.shape)
         history = self._history(state, position)
         if course.adaptive:
+            self._begin_to_count(course)
             self._seen = self._seen.to(grad.device)
             if course.num_observed % PROBE_STEPS == 0:
                 self._seen[2:] += foresight(history, self.history_size, position, gradient)
@@ -132,6 +136,13 @@ class Curvature(Part):
         if course.adaptive:
             self._seen[:2] += tally
         return fed.reshape(grad.shape)
+
+    def _begin_to_count(self, course: Course) -> None:
+        """Forget what was seen in another exploitation: of a shorter run, or of an earlier pass."""
+        window, known = course.window_of_part(self), self._counted_in
+        if known not in (None, window) or self._pass not in (None, course.rewinds):
+            self._seen, self._probes = torch.zeros_like(self._seen), 0
+        self._counted_in, self._pass = window, course.rewinds
 
     def _history(self, state: Any, position: Tensor) -> Tensor:
         """The points' history, laid out for what will compute on it."""
@@ -151,8 +162,9 @@ class Curvature(Part):
 
     def state_dict(self) -> dict[str, Any]:
         """What `adaptive` judges by; the pairs are in the optimizers' state."""
-        seen = self._seen.tolist()
-        return {"history_size": self.history_size, "seen": seen, "probes": self._probes}
+        counted = {"seen": self._seen.tolist(), "probes": self._probes}
+        window = None if self._counted_in is None else list(self._counted_in)
+        return {"history_size": self.history_size, "window": window, **counted}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore `state_dict()`.
@@ -176,10 +188,18 @@ class Curvature(Part):
                 f"{call}: history_size={size}, but pairs of history_size={self.history_size} are "
                 "needed"
             )
-        self._seen, self._probes = torch.tensor(seen, dtype=torch.float32), probes
+        window = state.get("window")  # earlier versions did not say
+        if window is not None and not (
+            isinstance(window, (list, tuple)) and [*map(type, window)] == [int, int]
+        ):
+            raise ValueError(f"{call}: window={window!r}, but None or two iterations are needed")
+        self._seen = torch.tensor(seen, dtype=torch.float32, device="cpu")
+        self._probes, self._pass = probes, None
+        self._counted_in = None if window is None else (window[0], window[1])
 
     def evidence(self, course: Course) -> Tensor:
         """[4]: pairs accepted, candidates, sum of their foresight, points looked at."""
+        self._begin_to_count(course)
         return self._seen
 
     def useless(self, evidence: list[float], course: Course) -> str | None:

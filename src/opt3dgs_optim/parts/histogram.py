@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ from opt3dgs_optim.checks import (
 )
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Group, Part, Phase
-from opt3dgs_optim.partitions import FixedPartitions, MovingPartitions, Tally
+from opt3dgs_optim.partitions import FixedPartitions, MovingPartitions, Tally, host_tensor
 
 # The temperature is not given in the paper; zeta * tau / du = 1.5 at its zeta and du.
 PAPER: dict[str, Any] = {"energy_range": (0.0, 0.2), "temperature": 2e-3, "warmup": 2500}
@@ -65,7 +65,7 @@ class EnergyHistogram(Part):
             the energy, where nu seldom leaves 0 to 2, and (-5, 5) for those of a range.
 
     Raises:
-        ValueError: an option is outside what is allowed.
+        ValueError: an option is outside what is allowed; in a step, a group has `maximize=True`.
     """
 
     during = Phase.EXPLORATION
@@ -168,7 +168,13 @@ class EnergyHistogram(Part):
         return value
 
     def factor(self, group: Group, course: Course | None = None) -> float | Tensor | None:
-        """Nu, a number where the energies live on a CPU."""
+        """Nu, a number where the energies live on a CPU.
+
+        Raises:
+            ValueError: the group is to maximise; nothing has moved yet.
+        """
+        if group.get("maximize"):
+            refuse_to_maximize(CALL)
         return self._factor if self.num_observed else None
 
     @property
@@ -183,7 +189,7 @@ class EnergyHistogram(Part):
 
     def _moments(self) -> Tensor:
         sums = self._sums if self._tally is None else self._tally.sums
-        return torch.as_tensor(sums, dtype=self._law.nu.dtype)
+        return torch.as_tensor(sums, dtype=self._law.nu.dtype, device=self._law.nu.device)
 
     def _num_taken(self) -> int:
         """Number of finite energies. Synchronises."""
@@ -264,7 +270,7 @@ class EnergyHistogram(Part):
             self._factor = self._law.nu.item()
         else:
             self._tally.count.fill_(int(state["num_taken"]))
-            self._tally.sums.copy_(torch.tensor(state["sums"], dtype=torch.float64))
+            self._tally.sums.copy_(host_tensor(state["sums"]))
             self._factor = self._law.nu
 
     def __repr__(self) -> str:
@@ -277,6 +283,14 @@ class EnergyHistogram(Part):
             return f"{line}1, warm-up: {taken} of {self.warmup} energies"
         mean, deviation = float(self.mean_multiplier), float(self.multiplier_std)
         return f"{line}{float(self.multiplier):.4g}, mean {mean:.4g} +- {deviation:.2g}"
+
+
+def refuse_to_maximize(call: str) -> NoReturn:
+    """ValueError: energies are what is minimised, and nu would act the wrong way round."""
+    raise ValueError(
+        f"{call}: maximize=True, but a histogram makes steps longer at low energies, and maximize="
+        "False is needed; minimise the negated loss instead, and observe that"
+    )
 
 
 def _is_host(device: torch.device) -> bool:

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from opt3dgs_optim.checks import check_count, set_options
 from opt3dgs_optim.course import Course
+from opt3dgs_optim.names import ADAM_KEYS
 from opt3dgs_optim.part import Group, Kept, Part, Phase, State
-from opt3dgs_optim.state import ADAM_KEYS
 
 # Iterations after the switch in which moments may still be restarted, where steps did not count.
 MAX_LATE_ITERATIONS = 10

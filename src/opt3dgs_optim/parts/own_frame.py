@@ -38,11 +38,14 @@ class OwnFrame(Part):
     `min_aspect` of the longest.
 
     Adam's moments of the positions then belong to the own frame; everything else stays as it is.
-    Where a training begins with it in the middle, from a checkpoint of the stock trainer, say, they
-    begin anew. The stock trainer would have to zero them to go on without it.
+    Where a training begins with it in the middle, from a checkpoint of the unchanged trainer, say,
+    they begin anew. A trainer without it would have to zero them to go on.
     Scales and quaternions are looked up in the groups of the upgraded optimizers (gsplat's,
     INRIA's, nerfstudio's names and others). Where they are not found, it is said once, and the
     positions are stepped as the trainer would.
+
+    Beside it `Fading` was measured with the positions left out of its `names`: a faded step of them
+    would be half a standard deviation long.
 
     It keeps nothing from step to step. A step takes one buffer of the positions' size, and their
     frames (28 bytes per point).

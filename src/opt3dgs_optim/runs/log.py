@@ -167,6 +167,11 @@ class RunLog(AbstractContextManager["RunLog"]):
         passed = 0.0 if self._since is None else max(self._clock() - self._since, 0.0)
         return self._base + passed
 
+    @property
+    def closed(self) -> bool:
+        """Whether nothing can be written any more."""
+        return self._file.closed
+
     def step(
         self, iteration: SupportsIndex, *, phase: str | Enum | None = None, **columns: Number
     ) -> None:
@@ -314,7 +319,7 @@ def _to_pinned(values: list[Tensor]) -> tuple[Tensor, Any]:
     """Copy CUDA scalars to the host in stream order: (pinned [n] float64, event of completion)."""
     device = values[0].device
     packed = [v.detach().reshape(()).to(device, torch.float64, non_blocking=True) for v in values]
-    host = torch.empty(len(values), dtype=torch.float64, pin_memory=True)
+    host = torch.empty(len(values), dtype=torch.float64, device="cpu", pin_memory=True)
     host.copy_(torch.stack(packed), non_blocking=True)
     ready = torch.cuda.Event()
     ready.record(torch.cuda.current_stream(device))

@@ -197,7 +197,7 @@ def test_control_runs_after_what_it_controls() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: find_arm("sgd"), "'sgd' is unknown; there are mcmc, adam"),
+        (lambda: find_arm("sgd"), "'sgd' is unknown; there are mcmc, rates-x3"),
         (lambda: FitOptions(iterations=0), "iterations=0"),
         (lambda: FitOptions(points=0), "points=0"),
         (lambda: FitOptions(sh_degree_interval=0), "sh_degree_interval=0"),
