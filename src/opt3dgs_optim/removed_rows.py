@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import torch
@@ -25,6 +25,15 @@ EDITS = {
 }
 
 
+class Look(NamedTuple):
+    """Where opacities were: in which group of an optimizer, and where in memory, how many."""
+
+    optimizer: weakref.ref[Optimizer]
+    place: int
+    group: weakref.ref[Any]
+    memory: list[tuple[int, torch.Size]]
+
+
 class RemovedRows:
     """Looks between two iterations for rows that have disappeared from the opacities.
 
@@ -41,6 +50,7 @@ class RemovedRows:
     def __init__(self) -> None:
         self._seen: WeakKeyDictionary[Optimizer, list[Tensor]] = WeakKeyDictionary()
         self._told: set[bool] = set()  # of the edits since the last look: whether they remove rows
+        self._looked_at: list[Look] = []  # what must be as it was for nothing to be new
 
     def listen(self, scene: Any) -> None:
         """Be told of the edits that a strategy tells `scene` of.
@@ -70,6 +80,20 @@ class RemovedRows:
         """Begin anew, as after a rewind: what was seen and told holds no more."""
         self._seen.clear()
         self._told.clear()
+        self._looked_at = []
+
+    def are_known(self) -> bool:
+        """Whether the opacities are where they were at the last look; asked in every iteration."""
+        if self._told or not self._looked_at:
+            return False
+        for optimizer, place, group, memory in self._looked_at:
+            holder, held = optimizer(), group()
+            groups = [] if holder is None else holder.param_groups
+            if held is None or place >= len(groups) or groups[place] is not held:
+                return False
+            if [(p.data_ptr(), p.shape) for p in held["params"]] != memory:
+                return False
+        return True
 
     def found(self, optimizers: Iterable[Optimizer]) -> bool:
         """Whether rows were removed since the last look.
@@ -79,9 +103,17 @@ class RemovedRows:
         """
         found, was_told = any(self._told), bool(self._told)
         self._told.clear()
+        self._looked_at = []
         for optimizer in optimizers:
-            groups = [g for g in optimizer.param_groups if gaussian_of(g) == "opacities"]
-            params = [param for group in groups for param in group["params"]]
+            groups = [
+                (i, group)
+                for i, group in enumerate(optimizer.param_groups)
+                if gaussian_of(group) == "opacities"
+            ]
+            params = [param for _, group in groups for param in group["params"]]
+            for i, group in groups:
+                memory = [(param.data_ptr(), param.shape) for param in group["params"]]
+                self._looked_at.append(Look(weakref.ref(optimizer), i, weakref.ref(group), memory))
             seen = self._seen.get(optimizer, [])
             if len(seen) != len(params):  # seen first, or a set of Gaussians came or went
                 self._seen[optimizer] = seen = [param.detach() for param in params]

@@ -106,10 +106,12 @@ def _include(grad: Tensor, kept: Tensor) -> float | Tensor:
         share = share.clamp_(min=MIN_SEEN_SHARE).to(kept)
         return kept.copy_(torch.where(of_a_view.to(kept.device), kept.lerp(share, WEIGHT), kept))
     # Numbers of Python's: each small operator would take as long as the sum does.
-    mean, count = kept.item(), torch.count_nonzero(seen).item()
-    if count > 0:
-        mean += WEIGHT * (max(count / seen.shape[0], MIN_SEEN_SHARE) - mean)
-        kept.fill_(mean)
+    before, count = kept.item(), torch.count_nonzero(seen).item()
+    share = max(count / seen.shape[0], MIN_SEEN_SHARE)
+    if count == 0 or share == before:
+        return before
+    mean = before + WEIGHT * (share - before)
+    kept.fill_(mean)
     return mean
 
 
