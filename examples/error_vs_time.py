@@ -205,7 +205,9 @@ def _train_all(trainings: list[Training], args: argparse.Namespace, said: str) -
         bar.update(total - left - args.iterations * len(waiting) - bar.n)
         bar.set_postfix_str(", ".join(f"{t.arm.name} #{t.seed}" for t in running))
 
-    with tqdm(total=total, unit="it", desc=f"{len(waiting)} trainings", smoothing=0.05) as bar:
+    what = f"{len(waiting)} trainings"
+    # Without a terminal a bar would be a line for each of its states.
+    with tqdm(total=total, unit="it", desc=what, smoothing=0.05, disable=None) as bar:
         side_by_side(waiting, args.jobs, may_start, begin, ended, look)
 
 

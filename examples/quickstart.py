@@ -57,7 +57,7 @@ def train(scene: Scene, options: FitOptions, looks: int) -> list[Training]:
     for fit in fits.values():
         fit.compile_kernels()
     every = max(options.iterations // looks, 1)
-    with tqdm(total=len(ARMS) * options.iterations, unit="it") as bar:
+    with tqdm(total=len(ARMS) * options.iterations, unit="it", disable=None) as bar:
         while True:
             for training, fit in zip(made, fits.values(), strict=True):
                 training.look(fit, clocks[training.name])

@@ -73,7 +73,7 @@ def _figure(comparison: Comparison, footer: str) -> Any:
     better = {True: "; higher is better", False: "; lower is better", None: ""}
     caption = "Lines: mean over seeds; bands: least to greatest"
     caption += f"{better[comparison.higher_is_better]}. Dashed: "
-    caption += f"the baseline's final mean. Dotted: next phase. {footer}"
+    caption += f"the baseline's final mean. {footer}"
     figure.supxlabel(textwrap.fill(printable(caption)[:520], 175), fontsize=7.5, color="#666666")
     return figure
 
@@ -107,8 +107,6 @@ def _panel(panel: Any, comparison: Comparison, axis: str) -> None:
         panel.plot(x, table.mean(axis=0), lw=1.8, **_look(arm))
         # Without the steep first fifth, which would flatten the differences to be seen.
         shown += [y[x >= 0.2 * x[-1]] for x, y in curves]
-        for switch in _switches(arm.runs[0], axis):
-            panel.axvline(switch, lw=1.0, ls=":", color=FAINT, zorder=1)
     if not shown:
         panel.text(0.5, 0.5, "nothing finite", transform=panel.transAxes, ha="center", color=FAINT)
         return
@@ -133,10 +131,3 @@ def _on_common_grid(curves: list[Curve]) -> Curve:
     x = np.unique(np.concatenate([[start, end], *(x for x, _ in curves)]))
     x = x[(x >= start) & (x <= end)]
     return x, np.stack([np.interp(x, *curve) for curve in curves])
-
-
-def _switches(run: Run, axis: str) -> list[float]:
-    """Where the steps' phase becomes another."""
-    phase = run.steps.get("phase", np.array([], str))
-    told = np.flatnonzero(phase != "")
-    return [float(run.steps[axis][i]) for i in told[1:][phase[told][1:] != phase[told][:-1]]]
