@@ -679,3 +679,41 @@ def test_what_a_parts_pixel_loss_returns_is_checked(returned: Any) -> None:
     phases = PhaseScheduler(TOTAL, parts=[Says()])
     with pytest.raises(ValueError, match=r"Says\.pixel_loss: returned .*, but a 0-d tensor"):
         phases.pixel_loss(torch.ones(2, 2), torch.zeros(2, 2))
+
+
+@pytest.mark.parametrize("flat", [False, True])
+@pytest.mark.parametrize("files", [False, True])
+@pytest.mark.parametrize("stepped", [False, True])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_numbers_take_torchs_distributed_checkpoints(
+    flat: bool, files: bool, stepped: bool, tmp_path: Any
+) -> None:
+    """They come along, or begin anew where such files leave them out; nothing fails."""
+    dcp_state = pytest.importorskip("torch.distributed.checkpoint.state_dict")
+    options = dcp_state.StateDictOptions(flatten_optimizer_state_dict=flat)
+
+    def model(training: Training) -> torch.nn.Module:
+        module = torch.nn.Module()
+        module.splats = torch.nn.ParameterDict(training.params)
+        return module
+
+    first = Training(Tally()).run(0, 10)
+    second = Training(Tally()).run(0, 3 if stepped else 0)
+    saved = dcp_state.get_optimizer_state_dict(model(first), first.adam, options=options)
+    if files:
+        checkpoint: Any = pytest.importorskip("torch.distributed.checkpoint")
+        checkpoint.save({"optimizer": saved}, checkpoint_id=tmp_path, no_dist=True)
+        mine = dcp_state.get_optimizer_state_dict(model(second), second.adam, options=options)
+        checkpoint.load({"optimizer": mine}, checkpoint_id=tmp_path, no_dist=True)
+        saved = mine
+    for param in second.params.values():
+        param.grad = None
+    left_out = files and not stepped
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        dcp_state.set_optimizer_state_dict(
+            model(second), second.adam, optim_state_dict=saved, options=options
+        )
+    assert any("Tally.t begin anew" in str(each.message) for each in said) is left_out or flat
+    counted = second.run(10, 11).phases.kept_numbers["Tally.t"]
+    assert (second.phases.iteration, counted) == (11, 1 if left_out else 11) or flat

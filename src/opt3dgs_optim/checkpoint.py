@@ -142,15 +142,15 @@ def inspect_checkpoint(optimizer: StepAdam, loaded: dict[str, Any]) -> tuple[Sav
     nothing = Saved(None, {}, [], [{} for _ in params])
     if len(numbers) != len(params):  # torch says so
         return nothing, {**loaded, "param_groups": groups}
-    own, clock = _unpack(call, shared, optimizer, share)  # dict[str, Any], or None
     state, cast = dict(loaded["state"]), bool(loaded.get("cast"))
+    by_name = any(isinstance(number, str) for number in state)  # torch's distributed checkpoints
+    own, clock = _unpack(call, shared, optimizer, share, by_name=by_name)
     steps = number_of_steps(_checked_states(call, groups, params, state))
     stale = own is not None and own["steps"] not in (None, steps)
     if own is not None and clock is not None:
         clock = _moved_on(call, own, clock, steps) if stale else clock
         # Here, because a window may follow the clock, or what a part has learnt.
         optimizer.course.load_state_dict(clock)
-    by_name = any(isinstance(number, str) for number in state)  # torch's distributed checkpoints
     rows, orphaned, rounded = [], False, set[torch.dtype]()
     known = frozenset(optimizer.course.named()) | _names_of_parts(own)
     for i, (number, param) in enumerate(zip(numbers, params, strict=True)):
@@ -271,7 +271,7 @@ def _parameters(optimizer: StepAdam) -> list[Tensor]:
 
 
 def _unpack(
-    call: str, shared: Any, optimizer: StepAdam, share: list[Any]
+    call: str, shared: Any, optimizer: StepAdam, share: list[Any], *, by_name: bool
 ) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
     """The optimizer's own part of a checkpoint, checked, and the course's."""
     if shared is None:
@@ -300,7 +300,13 @@ def _unpack(
             raise ValueError(f"{call}: kept[{number!r}]={names!r}, but a list of keys is needed")
     if TRAINING in own["kept"]:  # earlier versions did not say
         check_keys(call, clock, ("kept", "windows"))
-        check_keys(f"{call}: kept", clock["kept"], own["kept"][TRAINING])
+        numbers = own["kept"][TRAINING]
+        if by_name and not set(numbers) <= set(clock["kept"]):
+            warn_user(
+                f"{call}: {', '.join(numbers)} begin anew: torch's distributed files leave out "
+                "what an optimizer that has made no step does not keep yet"
+            )
+        check_keys(f"{call}: kept", clock["kept"], () if by_name else numbers)
     records = _records(call, own["records"], own["kept"], optimizer)
     return {**own, "windows": windows, "records": records}, clock
 
