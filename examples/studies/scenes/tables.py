@@ -346,9 +346,10 @@ def decisions_table(study: Study, beside: int) -> str:
         brief = settings_of(study, beside, PIECES.get(part, 0))
         shorter = difference(study, brief, decision.arm, decision.control)
         short = cells_of(shorter)[0] if len(shorter.pairs) == len(MANY_VIEWS_SCENES) else "-"
-        rows.append((part, by, *shown, f"{on} ({decision.verdict})", short))
+        rows.append((part, f"{on} ({decision.verdict})", by, *shown, short))
     heads = (
         "part",
+        "default",
         "decided by comparing",
         "images",
         "iterations",
@@ -356,10 +357,9 @@ def decisions_table(study: Study, beside: int) -> str:
         "PSNR",
         "SSIM",
         "LPIPS",
-        "default",
         f"PSNR at {beside:,}",
     )
-    return table(heads, "lllrlrrrlr", rows)
+    return table(heads, "llllrlrrrr", rows)
 
 
 def paper_table(study: Study, settings: Sequence[Setting], *, brief: bool = False) -> str:
