@@ -38,7 +38,7 @@ class LQNAdam(StepAdam):
       nothing here: positions hardly move by then (`docs/evidence.md`).
 
     The first two compare the best of six learning rates for each; `tests/test_lqnadam_claims.py`
-    measures them.
+    of a clone measures them.
 
     Memory: Adam's, and for each row of three coordinates 160 bytes with five pairs.
 
