@@ -47,7 +47,10 @@ CURVATURE = [
 PARTS = ("annealing", "averaging", "fading", "out_of_view", "own_frame")
 STATE = [  # the fast ones of those that are about it
     *(f"test_{name}.py" for name in ("state", "masks", "part", "checkpoints")),
-    *(f"test_cases_{name}.py" for name in ("several_tensors", "moved_rows", "copies")),
+    *(
+        f"test_cases_{name}.py"
+        for name in ("several_tensors", "moved_rows", "copies", "across_passes")
+    ),
 ]
 # Of these tests: those that compile C++, a law that the loop oracle sees sooner, other classes.
 CHOSEN = "not slow and not hosts and not compiles and not processes"  # by their markers
@@ -65,9 +68,11 @@ TARGETS = {
     "parts/noise.py": [
         "parts/test_noise.py",
         "parts/test_noise_covariance.py",
+        "test_cases_noise.py",
         "test_options.py",
     ],
     **{f"parts/{name}.py": [f"parts/test_{name}.py", "test_options.py"] for name in PARTS},
+    "parts/averaging.py": ["parts/test_averaging.py", "test_cases_strides.py", "test_options.py"],
     "frames.py": ["parts/test_own_frame.py", "parts/test_noise_covariance.py"],
     "removed_rows.py": ["test_removed_rows.py"],
     "state.py": STATE,
