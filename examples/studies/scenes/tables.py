@@ -178,13 +178,22 @@ def headline_table(study: Study, sizes: Iterable[Sequence[Setting]]) -> str:
         tuned = [arm for arm in whole if arm in TUNED]
         psnr = {arm: fmean(fmean(r.final for r in of) for of in found[arm]) for arm in tuned}
         best = max(tuned, key=psnr.__getitem__, default=None)
+        size = SIZES.get(settings[0].size, settings[0].size)
+        points, count = _each(s.points for s in settings), _each(map(len, seeds))
+        about = f"{size}: {points} Gaussians, {count} {'seed' if count == '1' else 'seeds'}"
         for arm in whole:
             if arm not in TUNED or arm == best:
                 what = TUNED.get(arm, label(arm))
                 cells = [_cell(of, seeds=False) for of in found[arm]]
-                size = SIZES.get(settings[0].size, settings[0].size)
-                rows.append((size, f"**{what}**" if arm == DEFAULTS else what, *cells))
+                rows.append((about, f"**{what}**" if arm == DEFAULTS else what, *cells))
+                about = size
     return table(["size", "training", *scenes], "l", rows)
+
+
+def _each(numbers: Iterable[int]) -> str:
+    """A number, or those of each scene where they differ."""
+    every = [f"{number:,}" for number in numbers]
+    return every[0] if len(set(every)) == 1 else ", ".join(every)
 
 
 def scenes_gain_table(study: Study, settings: Sequence[Setting], arm: str, control: str) -> str:

@@ -301,13 +301,13 @@ def test_the_headline_is_of_the_seeds_that_both_have() -> None:
     setting = replace(quarter[0].setting, size="images_2")
     half = [replace(r, setting=setting) for r in quarter if (r.arm, r.seed) != (BASELINE, 1)]
     half += [replace(r, arm=OWN_FRAME_ARM) for r in half if r.arm == DEFAULT_ARM]
-    rest = " / 0.700 / 0.200 |"
+    rest, points = " / 0.700 / 0.200 |", f"{setting.points:,}"
     study = Study([*quarter, *half])
     assert headline_table(study, [[setting], [quarter[0].setting]]).splitlines()[2:] == [
-        f"| half | 3DGS-MCMC | 20.00{rest}",
+        f"| half: {points} Gaussians, 1 seed | 3DGS-MCMC | 20.00{rest}",
         f"| half | **the defaults** | 30.00{rest}",
         f"| half | with `OwnFrame` | 30.00{rest}",
-        f"| quarter | 3DGS-MCMC | 24.00{rest}",
+        f"| quarter: {points} Gaussians, 2 seeds | 3DGS-MCMC | 24.00{rest}",
         f"| quarter | **the defaults** | 30.50{rest}",
     ]
 
@@ -358,7 +358,8 @@ def test_the_headline_has_the_best_tuned_rates_where_every_training_has_them() -
         study = Study(records)
         lines = headline_table(study, [study.settings()]).splitlines()[2:5]
         psnr = max(p for arm, p in arms.items() if arm.endswith(best[-1]) and "-x" in arm)
-        assert lines[0] == f"| quarter | 3DGS-MCMC | 20.00{rest}"
+        about = f"quarter: {long[0].setting.points:,} Gaussians, 2 seeds"
+        assert lines[0] == f"| {about} | 3DGS-MCMC | 20.00{rest}"
         assert lines[1].endswith(f"{best} | {psnr:.2f}{rest}")
         assert lines[2] == f"| quarter | **the defaults** | 21.00{rest}"
 
