@@ -19,6 +19,7 @@ from torch.nn import Parameter
 from torch.optim import Adam
 
 from opt3dgs_optim import Averaging, PhaseScheduler
+from opt3dgs_optim.parts.averaging import _stride
 
 SHARE = Averaging.share
 
@@ -205,3 +206,24 @@ def test_two_parts_and_several_steps_of_one_iteration_make_no_stride() -> None:
         if iteration < TOTAL - 10:
             assert bool((param < before).all()), "at no mean yet"
     assert torch.equal(param, adam.state[param]["Averaging#2.mean"])
+
+
+@pytest.mark.parametrize(
+    ("stepped", "stride"),
+    [
+        ((5,), 1),
+        ((0, 1, 17), 1),
+        ((0, 1, 17, 33), 16),  # of the last two times alone
+        ((0, 16, 32, 32), 16),  # two steps in one iteration
+        ((0, 16, 500), 16),
+        ((0, 16, 32, 8), 8),  # the clock was set back
+    ],
+)
+def test_the_stride_is_the_shorter_of_the_last_two(stepped: tuple[int, ...], stride: int) -> None:
+    run = Run(1000)
+    (group,) = run.optimizers["means"].param_groups
+    found = 0
+    for now in stepped:
+        run.phases.current = now
+        found = _stride(group, run.params["means"], run.phases)
+    assert found == stride

@@ -68,8 +68,7 @@ def _stride(group: Group, param: Tensor, course: Course) -> int:
     set back over are forgotten.
     """
     name, now = f"{STEPPED} {gaussian_of(group)}", course.current
-    stepped = course.published(name, param, earlier=True) or ()
-    if stepped[-1:] != (now,):
-        stepped = (*(each for each in stepped if each < now), now)[-3:]
-        course.publish(name, param, stepped)
-    return min((later - before for before, later in pairwise(stepped)), default=1)
+    before = course.published(name, param, earlier=True) or ()
+    stepped = (*(each for each in before if each < now), now)[-3:]
+    course.publish(name, param, stepped)
+    return min((later - earlier for earlier, later in pairwise(stepped)), default=1)
