@@ -17,6 +17,7 @@ from torch.optim import Adam
 from trainers import assert_same, gaussians, values_of
 
 from opt3dgs_optim import AWSGLD, IsotropicNoise, PhaseScheduler, PositionNoise
+from opt3dgs_optim.parts.noise import LEFT_AT
 
 ROWS = 4
 SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": ()}
@@ -312,6 +313,28 @@ def test_a_rate_of_zero_is_not_said_and_hides_no_other(
     rates: dict[str, float], expected: int
 ) -> None:
     assert warned("AB", rates) == expected
+
+
+def test_positions_are_copied_in_one_step_only() -> None:
+    """That in which they are compared; a copy in every step would cost as much as the noise."""
+    names = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": ()}
+    params = {name: Parameter(torch.randn(6, *shape)) for name, shape in names.items()}
+    phases = PhaseScheduler(300, parts=[PositionNoise(scale=1.0)])
+    adams = phases.upgrade({name: Adam([param], lr=0.01) for name, param in params.items()})
+    copies = 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for _ in range(40):
+            for param in params.values():
+                param.grad = torch.randn_like(param)
+            phases.observe(0.1)
+            for adam in adams.values():
+                adam.step()
+            _, _, copied = phases.published(LEFT_AT, params["means"])
+            copies += copied is not None
+            with torch.no_grad():
+                params["means"].add_(0.01)
+    assert copies == 1
 
 
 def test_gaussians_of_this_file_move() -> None:
