@@ -358,3 +358,22 @@ def test_an_overflow_in_the_positions_puts_no_point_out_of_view(fused: bool) -> 
         return state_of(adams, splats["scales"])["exp_avg_sq"]
 
     assert torch.equal(second_moments(overflow=True), second_moments(overflow=False))
+
+
+@pytest.mark.parametrize("share", [-0.01, 1.01, float("nan")])
+def test_a_share_that_none_can_be_is_damage(share: float) -> None:
+    saved = []
+    for _ in range(2):
+        phases = only(2_000, OutOfView())
+        param = torch.nn.Parameter(torch.zeros(4, 3))
+        adam: Any = phases.upgrade(torch.optim.Adam([{"params": [param], "name": "means"}]))
+        if saved:
+            with pytest.raises(ValueError, match=r"seen_share=.* in \[0, 1\]"):
+                adam.load_state_dict(saved[0])
+            continue
+        param.grad = torch.ones(4, 3)
+        phases.observe(0.1)
+        adam.step()
+        saved.append(adam.state_dict())
+        (record,) = saved[0]["param_groups"][0]["opt3dgs"]["optimizer"]["records"][0]
+        record["numbers"]["OutOfView.seen_share"] = share
