@@ -217,7 +217,8 @@ def _check_attributes(optimizer: Any, shown: str) -> None:
     kind, everything = type(optimizer), {*vars(StepAdam), *StepAdam.__annotations__}
     between = [each for each in kind.__mro__ if each not in Adam.__mro__]
     theirs = {*vars(optimizer)}.union(*map(vars, between))
-    clash = sorted(name for name in everything & theirs if not hasattr(Adam, name))
+    own = {name for name in everything if not name.startswith("__") and not hasattr(Adam, name)}
+    clash = sorted(own & theirs)
     if clash:
         raise TypeError(
             f"{CALL}: {shown}, a {kind.__module__}.{kind.__qualname__}, has {', '.join(clash)}, "
