@@ -215,7 +215,7 @@ class StepAdam(Adam):
         with torch.set_grad_enabled(self.defaults["differentiable"]):
             # torch's distributed checkpoints make a step of length zero, to have Adam's moments.
             begun = not self.course.needs_energies or self.course.num_observed > 0
-            idle = not begun and loss is None and self._free_slot()
+            idle = not begun and loss is None and self._stands_still()
             # Without parts a closure may return whatever it does in the trainer's own Adam.
             told = loss if self.course.parts or loss is None else energy_of(loss)
             acting = not idle and self.course.stepping(told, self)
@@ -226,7 +226,7 @@ class StepAdam(Adam):
                 self._step(mask, acting)
         return loss
 
-    def _free_slot(self) -> bool:
+    def _stands_still(self) -> bool:
         """Whether no learning rate moves anything."""
         return not any(is_moving_rate(group["lr"]) for group in self.param_groups)
 
