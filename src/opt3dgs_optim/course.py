@@ -153,7 +153,7 @@ class Course:
             acting = [part for part in on if phase is None or part.during in (None, phase)]
             having = {hook: [part for part in acting if overrides(part, hook)] for hook in HOOKS}
             self._hooks[phase] = having
-        self.current = self._current
+        self._choose_hooks(self._current)
 
     # -- the clock -------------------------------------------------------------------------------
 
@@ -170,11 +170,25 @@ class Course:
     @current.setter
     def current(self, iteration: int) -> None:
         self._current = iteration
-        # Noted here, because every optimizer asks, and so that a compiled loss does not depend on
-        # the iteration but at the switch.
-        self.hooks = self._hooks[self.phase_of(iteration)]  # of the step that comes next
+        first, end = self._hooks_hold
+        if not first <= iteration < end:
+            self._choose_hooks(iteration)
+
+    def _choose_hooks(self, iteration: int) -> None:
+        """Note which hooks the step has that comes next, and which parts the pixel loss after it.
+
+        Noted, because every optimizer asks, and so that a compiled loss does not depend on the
+        iteration but at the switch.
+        """
+        phase = self.phase_of(iteration)
+        self.hooks = self._hooks[phase]
         having = self._hooks[self.phase_of(iteration + 1)]["pixel_loss"]
         self.pixel_parts = [part for part in having if self._in_window(part, iteration + 1)]
+        # Windows may follow what a part learns, so that they are asked in every iteration.
+        self._hooks_hold = (iteration, iteration)
+        if not any(hooks["pixel_loss"] for hooks in self._hooks.values()):
+            first, end = self.window_of(phase) or (-NEVER, NEVER)
+            self._hooks_hold = (first or -NEVER, end)
 
     @property
     def iteration(self) -> int:

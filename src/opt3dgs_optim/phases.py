@@ -446,8 +446,9 @@ class PhaseScheduler(Course):
 
     def _watch_rows(self) -> None:
         """Switch off what loses with clone, split and prune once the trainer removes Gaussians."""
-        known = self._holders is not None and self._removed_rows.are_known()
-        if known or self._chosen or REMOVAL in self.switched_off.values():
+        if self._chosen or (self._holders is not None and self._removed_rows.are_known()):
+            return
+        if REMOVAL in self.switched_off.values():
             return
         if not self._removed_rows.found(self.holders_of_opacities()):
             return

@@ -97,8 +97,7 @@ def _include(grad: Tensor, kept: Tensor) -> float | Tensor:
     Returns:
         The mean share: a number on a CPU. A GPU's is not read.
     """
-    stride = 1 + grad.shape[0] // MAX_POINTS_LOOKED_AT
-    seen = _has_gradient(grad[::stride] if stride > 1 else grad)
+    seen = _has_gradient(_every(1 + grad.shape[0] // MAX_POINTS_LOOKED_AT, grad))
     if not grad.is_cpu:
         # Not `mean`, which takes twice as long.
         share = seen.sum(dtype=torch.float32).div_(seen.shape[0])
@@ -113,6 +112,15 @@ def _include(grad: Tensor, kept: Tensor) -> float | Tensor:
     mean = before + WEIGHT * (share - before)
     kept.fill_(mean)
     return mean
+
+
+def _every(interval: int, rows: Tensor) -> Tensor:
+    """`rows[::interval]`, in less time: indexing finds out first what it is given."""
+    if interval == 1:
+        return rows
+    shape, strides = rows.shape, rows.stride()
+    count = -(-shape[0] // interval)
+    return rows.as_strided((count, *shape[1:]), (interval * strides[0], *strides[1:]))
 
 
 def _has_gradient(grad: Tensor) -> Tensor:
