@@ -92,26 +92,35 @@ def colors_forward(means, viewpoint, sh0, shN, degree):
 
 
 @kernel
-def colors_backward(grad_colors, colors, means, viewpoint, shN, degree):
-    """Gradients by sh0, shN and means, from that by max(colors, 0); `colors` as returned above."""
-    count = (degree + 1) ** 2
+def colors_backward(grad_colors, colors, means, viewpoint, shN, degree, index, count):
+    """Gradients by sh0 and shN of all `count` points, float32, and by the visible points' means.
+
+    From the gradient by max(colors, 0); `colors` as returned above. `index` [V] says which points
+    are visible: those of the others are zero.
+    """
+    functions, none = (degree + 1) ** 2, np.float32(0.0)
     basis = np.zeros(16)
     grad_basis = np.zeros(16)
-    grad_sh0 = np.zeros((means.shape[0], 1, 3))
-    grad_shN = np.zeros(shN.shape)
+    grad_sh0 = np.zeros((count, 1, 3), np.float32)
+    grad_shN = np.zeros((count, shN.shape[1], 3), np.float32)
     grad_means = np.zeros((means.shape[0], 3))
     for point in range(means.shape[0]):
         x, y, z, distance = _direction(means, point, viewpoint)
         _basis(x, y, z, degree, basis)
-        grad_basis[:] = 0
-        for channel in range(3):
-            if colors[point, channel] < 0:
-                continue
-            grad = grad_colors[point, channel]
-            grad_sh0[point, 0, channel] = basis[0] * grad
-            for k in range(1, count):
-                grad_shN[point, k - 1, channel] = basis[k] * grad
-                grad_basis[k] += shN[point, k - 1, channel] * grad
+        red = grad_colors[point, 0] if colors[point, 0] >= 0 else none
+        green = grad_colors[point, 1] if colors[point, 1] >= 0 else none
+        blue = grad_colors[point, 2] if colors[point, 2] >= 0 else none
+        row = index[point]
+        grad_sh0[row, 0, 0] = basis[0] * red
+        grad_sh0[row, 0, 1] = basis[0] * green
+        grad_sh0[row, 0, 2] = basis[0] * blue
+        for k in range(1, functions):
+            grad_shN[row, k - 1, 0] = basis[k] * red
+            grad_shN[row, k - 1, 1] = basis[k] * green
+            grad_shN[row, k - 1, 2] = basis[k] * blue
+            through = np.float64(shN[point, k - 1, 0] * red)
+            through += shN[point, k - 1, 1] * green
+            grad_basis[k] = through + shN[point, k - 1, 2] * blue
         if degree >= 1:
             grad_x, grad_y, grad_z = _direction_gradient(x, y, z, degree, grad_basis)
             # Normalising the direction leaves the part of its gradient across the ray.

@@ -98,15 +98,16 @@ class Rasterize(torch.autograd.Function):
             by_means2d, by_covariances, means, quats, scales, viewmat, lens
         )
         by_sh0, by_shN, by_means_color = colors_backward(
-            sums[:, 6:9], colors, means, viewpoint, shN, degree
+            sums[:, 6:9], colors, means, viewpoint, shN, degree, index, count
         )
-        grads = (by_means + by_means_color, by_quats, by_scales, by_logits, by_sh0, by_shN)
 
         def of_all(grad: np.ndarray) -> Tensor:
             everything = np.zeros((count, *grad.shape[1:]), np.float32)
             everything[index] = grad
             return torch.from_numpy(everything)
 
+        of_points = map(of_all, (by_means + by_means_color, by_quats, by_scales, by_logits))
+        of_colors = map(torch.from_numpy, (by_sh0, by_shN))
         by_offset = of_all(by_means2d) if ctx.needs_input_grad[7] else None
         by_all = torch.from_numpy(by_background).float(), by_offset
-        return *map(of_all, grads), *by_all, None, None
+        return *of_points, *of_colors, *by_all, None, None

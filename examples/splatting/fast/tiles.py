@@ -142,13 +142,16 @@ def list_points(order, splats, geometry, width, height):
     """The points of each tile, front to back: tile t has entries [starts[t], starts[t + 1])."""
     across, down = -(-width // WIDTH), -(-height // HEIGHT)
     bands = 0
-    for point in order:
+    for point in range(splats.shape[0]):
         first, end = int(splats[point, FIRST_ROW]), int(splats[point, END_ROW])
         bands += max((end - 1) // HEIGHT + 1 - first // HEIGHT, 0)
     ranges = np.empty((bands, 3), np.int32)  # first tile, end, point
     starts = np.zeros(across * down + 1, np.int64)
     used = 0
-    for point in order:
+    for place in range(order.shape[0]):
+        point, coming = order[place], order[min(place + AHEAD, order.shape[0] - 1)]
+        prefetch(splats, coming)
+        prefetch(geometry, coming)
         first, end = int(splats[point, FIRST_ROW]), int(splats[point, END_ROW])
         if first >= end:
             continue
