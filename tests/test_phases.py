@@ -65,6 +65,18 @@ def test_gsplat_and_inria_ways_agree() -> None:
     assert_same(*ends)
 
 
+def test_hooks_follow_the_switch_wherever_it_is_moved() -> None:
+    phases = PhaseScheduler(TOTAL, SWITCH, parts=[FreshMoments(settling=0)])
+    acting = []
+    for iteration in (0, 10, 39, 40, 41, 5):
+        phases.current = iteration
+        acting.append(bool(phases.hooks["before"]))
+    assert acting == [False, False, False, True, True, False]
+    phases.switch_step = 7
+    phases.current = 7
+    assert phases.hooks["before"]
+
+
 def test_upgrade_works_in_place_and_keeps_what_the_trainer_set() -> None:
     splats = make_splats()
     before = gsplat_optimizers(splats, betas=(0.8, 0.95), fused=True)

@@ -170,8 +170,7 @@ class Course:
     @current.setter
     def current(self, iteration: int) -> None:
         self._current = iteration
-        first, end = self._hooks_hold
-        if not first <= iteration < end:
+        if self._asks_windows or (iteration >= self.switch_step) != self._hooks_are_late:
             self._choose_hooks(iteration)
 
     def _choose_hooks(self, iteration: int) -> None:
@@ -180,15 +179,12 @@ class Course:
         Noted, because every optimizer asks, and so that a compiled loss does not depend on the
         iteration but at the switch.
         """
-        phase = self.phase_of(iteration)
-        self.hooks = self._hooks[phase]
+        self.hooks = self._hooks[self.phase_of(iteration)]
         having = self._hooks[self.phase_of(iteration + 1)]["pixel_loss"]
         self.pixel_parts = [part for part in having if self._in_window(part, iteration + 1)]
-        # Windows may follow what a part learns, so that they are asked in every iteration.
-        self._hooks_hold = (iteration, iteration)
-        if not any(hooks["pixel_loss"] for hooks in self._hooks.values()):
-            first, end = self.window_of(phase) or (-NEVER, NEVER)
-            self._hooks_hold = (first or -NEVER, end)
+        # They hold until the switch; windows of a pixel loss may be anywhere.
+        self._hooks_are_late = iteration >= self.switch_step
+        self._asks_windows = any(hooks["pixel_loss"] for hooks in self._hooks.values())
 
     @property
     def iteration(self) -> int:
