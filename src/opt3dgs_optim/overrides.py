@@ -12,6 +12,7 @@ from torch import Tensor
 from torch._C._autograd import _profiler_enabled
 from torch._compile import _disable_dynamo
 from torch.autograd import profiler
+from torch.compiler import is_dynamo_compiling
 from torch.optim import Adam, Optimizer
 from torch.optim.optimizer import _global_optimizer_post_hooks, _global_optimizer_pre_hooks
 
@@ -78,7 +79,7 @@ def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def called(*args: P.args, **kwargs: P.kwargs) -> R:
-        if torch.compiler.is_dynamo_compiling():
+        if is_dynamo_compiling():
             return disabled(*args, **kwargs)
         return function(*args, **kwargs)
 
@@ -96,7 +97,7 @@ def as_step(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def called(*args: P.args, **kwargs: P.kwargs) -> R:
-        if torch.compiler.is_dynamo_compiling():
+        if is_dynamo_compiling():
             return disabled(*args, **kwargs)
         optimizer: Any = args[0]
         # A subclass's step may be around this one, and torch's hooks around that.
@@ -241,7 +242,7 @@ def zero_nonfinite(grad: Tensor) -> bool | Tensor:
 
 def refuse_capture(optimizer: Any) -> None:
     """RuntimeError in the capture of a CUDA graph: its replays would repeat what parts say now."""
-    if not torch.cuda.is_initialized() or not optimizer.course.parts:
+    if not optimizer.course.parts or not torch.cuda.is_initialized():
         return
     if torch.cuda.is_current_stream_capturing():
         raise RuntimeError(
