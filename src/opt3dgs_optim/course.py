@@ -439,8 +439,7 @@ class Course:
         """Tell the parts that act of the energy of the iteration `current`, 0-d, detached."""
         self.num_observed += 1
         self.energy_device = energy.device
-        is_finite = math.isfinite if energy.device.type == "cpu" else torch.isfinite
-        self.valid = is_finite(energy)
+        self.valid = math.isfinite(energy.item()) if energy.is_cpu else torch.isfinite(energy)
         for part in self.hooks["observe"]:
             if self._in_window(part, self.current):
                 part.observe(energy, self.valid, self)
