@@ -118,7 +118,7 @@ def conclusions(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
         ),
         "own-frame": scenes_gain_table(study, half, OWN_FRAME_ARM, BASELINE),
         "own-frame-or-not": scenes_gain_table(study, half, OWN_FRAME_ARM, DEFAULTS),
-        "headline": headline_table(study, [half, long]),
+        "headline": headline_table(study, [[s for s in full if s.iterations == LONG], half, long]),
         "reach": reach_table(study, long, DEFAULTS, SHORTER),
         "tuned": tuned_table(study, tuned, PLUSH),
         "tuned-brief": tuned_table(study, tuned, PLUSH, brief=True),

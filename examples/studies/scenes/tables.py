@@ -162,32 +162,45 @@ def headline_table(study: Study, sizes: Iterable[Sequence[Setting]]) -> str:
     Args:
         sizes: the settings of the same scenes at each size.
     """
-    rows, scenes = [], list[str]()
-    for settings in sizes:
-        scenes = [setting.scene for setting in settings]
-        seeds = [study.runs(s, BASELINE).keys() & study.runs(s, DEFAULTS).keys() for s in settings]
+    every = [list(settings) for settings in sizes]
+    rows, scenes = [], [setting.scene for setting in every[-1]] if every else []
+    for settings in every:
+        seeds = {
+            setting: sorted(study.runs(setting, BASELINE).keys() & study.runs(setting, DEFAULTS))
+            for setting in settings
+        }
+        both = [setting for setting, of in seeds.items() if of]
         found = {
-            arm: [
-                [runs[seed] for seed in sorted(of) if seed in runs]
-                for setting, of in zip(settings, seeds, strict=True)
+            arm: {
+                setting.scene: [runs[seed] for seed in seeds[setting] if seed in runs]
+                for setting in both
                 for runs in [study.runs(setting, arm)]
-            ]
+            }
             for arm in (BASELINE, *TUNED, DEFAULTS, OWN_FRAME_ARM)
         }
-        whole = [arm for arm in found if [*map(len, found[arm])] == [*map(len, seeds)]]
+        count = sum(len(seeds[setting]) for setting in both)
+        whole = [arm for arm, of in found.items() if count and sum(map(len, of.values())) == count]
         tuned = [arm for arm in whole if arm in TUNED]
-        psnr = {arm: fmean(fmean(r.final for r in of) for of in found[arm]) for arm in tuned}
+        psnr = {
+            arm: fmean(fmean(r.final for r in of) for of in found[arm].values()) for arm in tuned
+        }
         best = max(tuned, key=psnr.__getitem__, default=None)
-        size = SIZES.get(settings[0].size, settings[0].size)
-        points, count = _each(s.points for s in settings), _each(map(len, seeds))
-        about = f"{size}: {points} Gaussians, {count} {'seed' if count == '1' else 'seeds'}"
+        about = _size_of(both, [len(seeds[setting]) for setting in both]) if both else ""
         for arm in whole:
             if arm not in TUNED or arm == best:
                 what = TUNED.get(arm, label(arm))
-                cells = [_cell(of, seeds=False) for of in found[arm]]
+                cells = [_cell(found[arm].get(scene, []), seeds=False) for scene in scenes]
                 rows.append((about, f"**{what}**" if arm == DEFAULTS else what, *cells))
-                about = size
+                about = about.partition(":")[0]
     return table(["size", "training", *scenes], "l", rows)
+
+
+def _size_of(settings: Sequence[Setting], seeds: Sequence[int]) -> str:
+    """As "half: 50,000 Gaussians, 3 seeds"."""
+    first, count = settings[0], _each(seeds)
+    about = f"{SIZES.get(first.size, first.size)}: {_each(s.points for s in settings)} Gaussians"
+    about += f", degree {first.sh_degree}" * (first.sh_degree > 0)
+    return f"{about}, {count} {'seed' if count == '1' else 'seeds'}"
 
 
 def _each(numbers: Iterable[int]) -> str:

@@ -312,6 +312,25 @@ def test_the_headline_is_of_the_seeds_that_both_have() -> None:
     ]
 
 
+def test_the_headline_shows_a_size_that_one_of_its_scenes_was_trained_at() -> None:
+    both = (BASELINE, 20.0), (DEFAULT_ARM, 21.0)
+    quarter = [rotated_record(arm, scene, 0, psnr=p) for arm, p in both for scene in "ab"]
+    setting = replace(quarter[0].setting, size="images", sh_degree=3)
+    full = [replace(r, setting=setting) for r in quarter if r.setting.scene == "a"]
+    alone = [replace(r, setting=replace(setting, scene="b")) for r in full if r.arm == BASELINE]
+    study = Study([*quarter, *full, *alone])
+    sizes = [[s for s in study.settings() if s.size == size] for size in ("images", "images_4")]
+    points, rest = f"{setting.points:,} Gaussians", " / 0.700 / 0.200 |"
+    assert headline_table(study, sizes).splitlines() == [
+        "| size | training | a | b |",
+        "|---|---|---|---|",
+        f"| full: {points}, degree 3, 1 seed | 3DGS-MCMC | 20.00{rest} - |",
+        f"| full | **the defaults** | 21.00{rest} - |",
+        f"| quarter: {points}, 1 seed | 3DGS-MCMC | 20.00{rest} 20.00{rest}",
+        f"| quarter | **the defaults** | 21.00{rest} 21.00{rest}",
+    ]
+
+
 def test_tuned_rates_stand_beside_the_defaults_of_the_same_seeds() -> None:
     """Of the seeds that other rates were trained with: seed 1 has no other."""
     own = rotated_record(BASELINE, "plush", 0, psnr=20.0)
