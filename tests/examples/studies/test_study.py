@@ -592,16 +592,16 @@ def test_every_arm_trains(arm: StudyArm) -> None:
 
 
 def test_a_factor_on_the_positions_is_on_them_alone() -> None:
-    stock, doubled = (
+    stock, longer = (
         Fit(_embedded(), replace(find_study_arm(name), mcmc=False), FitOptions(60, 120))
-        for name in (BASELINE, "positions-x2")
+        for name in (BASELINE, "positions-x3")
     )
     starts = {name: p.detach().clone() for name, p in stock.gaussians.items()}
-    for fit in (stock, doubled):
+    for fit in (stock, longer):
         fit.step()
     for name, start in starts.items():
-        one, other = (fit.gaussians[name].detach() - start for fit in (stock, doubled))
-        factor = 2.0 if name == "means" else 1.0
+        one, other = (fit.gaussians[name].detach() - start for fit in (stock, longer))
+        factor = 3.0 if name == "means" else 1.0
         assert torch.allclose(other, factor * one, rtol=1e-3, atol=1e-6), name
 
 
