@@ -105,7 +105,7 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
                 scenes, [*ADAPTIVE_ARMS, f"adc+{OWN_FRAME}{AVERAGED}"], 1, share=share
             )
         ],
-        # 800x800 and 800x532. The shorter ones first: one of the others takes three core-hours.
+        # 800x800 and 800x532. The shorter ones first: one of the others takes two core-hours.
         "whole": [
             spec
             for scenes, iterations in ((("bonsai",), 7_500), (("lego", "bonsai"), 30_000))
