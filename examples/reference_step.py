@@ -93,10 +93,11 @@ def default_step(
         # standard deviations. A full step has 0.1 of them at the start and 0.001 at the end. An
         # axis counts as no thinner than a tenth of the longest.
         if own_frame and name == "means":
-            axes, z = own_axes(params["quats"], params["scales"]), torch.zeros_like(param)
+            q, deviations = own_axes(params["quats"], params["scales"])
+            z = torch.zeros_like(param)
             rate = rates[name] * (0.1 * 0.01 ** (iteration / total) / rates[name])
-            adam_(z, products(axes, grad), own, rate)  # B^T g
-            param.add_(products(axes.transpose(0, 1), z))  # B z
+            adam_(z, (rotated(q, grad.T, -1) * deviations).T.contiguous(), own, rate)  # B^T g
+            param.add_(rotated(q, z.T * deviations, 1).T)  # B z
         else:
             adam_(param, grad, own, rates[name])
 
@@ -118,25 +119,31 @@ def events_before(iteration: int, total: int) -> int:
     return int(share * min(300, length * total / 4))
 
 
-def own_axes(quats: Tensor, scales: Tensor) -> Tensor:
-    """B = R diag(s) of every Gaussian, [3, 3, N]: s its standard deviations, R its rotation."""
-    q = quats.T.contiguous()
-    # Of length sqrt(2), so that products of two components are doubled.
-    w, x, y, z = q * (2**0.5 / (q * q).sum(0).sqrt().clamp(min=1e-12))
-    rotation = [
-        [1 - (y * y + z * z), x * y - w * z, x * z + w * y],
-        [x * y + w * z, 1 - (x * x + z * z), y * z - w * x],
-        [x * z - w * y, y * z + w * x, 1 - (x * x + y * y)],
-    ]
-    deviations = scales.T.exp()
-    deviations = torch.maximum(deviations, deviations.amax(0) * 0.1)
-    return torch.stack([torch.stack(row) for row in rotation]) * deviations
+def own_axes(quats: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
+    """Of B = R diag(s) of every Gaussian: the quaternion [4, N] of its rotation R, and s [3, N].
+
+    The quaternion is of length sqrt(2), so that products of two components are doubled.
+    """
+    q, deviations = quats.T, scales.T.exp()
+    size = q[0] * q[0]
+    for component in q[1:]:
+        size = torch.addcmul(size, component, component)
+    q = q * (size.sqrt().clamp(min=1e-12).reciprocal() * 2**0.5)
+    return q, torch.maximum(deviations, deviations.amax(0) * 0.1)
 
 
-def products(matrices: Tensor, vectors: Tensor) -> Tensor:
-    """The sums over i of matrices[i, j] times component i of the vectors [N, 3], [N, 3]."""
-    x, y, z = vectors.T
-    return torch.addcmul(torch.addcmul(matrices[0] * x, matrices[1], y), matrices[2], z).T
+def rotated(q: Tensor, v: Tensor, direction: int) -> Tensor:
+    """R v of vectors [3, N], or R^T v where the direction is -1: v + w t + a x t with t = a x v."""
+    w, a = q[0], q[1:]
+    t = add_cross(torch.zeros_like(v), a, v)
+    return add_cross(torch.addcmul(v, w, t, value=direction), a, t)
+
+
+def add_cross(total: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """The total [3, N] and the cross product a x b."""
+    following, before = [1, 2, 0], [2, 0, 1]
+    total = torch.addcmul(total, a[following], b[before])
+    return torch.addcmul(total, a[before], b[following], value=-1)
 
 
 # -- the paper's step ------------------------------------------------------------------------------

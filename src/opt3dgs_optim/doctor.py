@@ -13,7 +13,7 @@ from torch import Tensor
 from opt3dgs_optim import cuda
 from opt3dgs_optim.awsgld import AWSGLD
 from opt3dgs_optim.backend import Backend, backend_info
-from opt3dgs_optim.frames import axes_of
+from opt3dgs_optim.frames import axes_of, repeated_columns
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, two_loop
 from opt3dgs_optim.lqnadam import LQNAdam
 from opt3dgs_optim.parts.histogram import EnergyHistogram
@@ -100,9 +100,9 @@ def _own_frame(device: torch.device, dtype: torch.dtype, backend: Backend) -> Te
     if backend == "cuda":
         given = vectors, quats, scales, MIN_ASPECT
         return torch.cat([cuda.own_frame_gradient(*given), cuda.own_frame_displacement(*given)])
-    axes = axes_of(quats, scales, dtype, MIN_ASPECT)  # [3, 3, N]
-    sums = ("ijn,ni->nj", "ijn,nj->ni")
-    return torch.cat([torch.einsum(each, axes, vectors) for each in sums])
+    axes = axes_of(quats, scales, dtype, MIN_ASPECT)
+    taken = (take(repeated_columns(vectors, dtype)) for take in (axes.into, axes.out_of))
+    return torch.cat([found.T for found in taken])
 
 
 # What each kernel is compared in.

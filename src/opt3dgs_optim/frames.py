@@ -3,10 +3,12 @@
 A Gaussian's covariance is Sigma = B B^T with B = R diag(s), R the rotation of its quaternion and s
 its standard deviations. B takes a vector of the own frame into the world, B^T a gradient of the
 world into the own frame. An axis may count as no thinner than a share of the longest one.
-Coordinates are handled as columns [N], which is what a CPU is fast at.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,20 +17,8 @@ from opt3dgs_optim import cuda
 from opt3dgs_optim.lbfgs.pairs import columns, put, row_chunks
 from opt3dgs_optim.state import is_finite_sum
 
+CHUNK = 65_536  # rows that a CPU works on at a time: smaller ones spend too much on each operation
 MIN_QUATERNION = 1e-12  # as torch.nn.functional.normalize: a zero quaternion is no rotation
-
-
-def rotate(w: Tensor, axis: list[Tensor], v: list[Tensor]) -> list[Tensor]:
-    """Rotate v by the unit quaternion (w, axis): v + w t + axis x t with t = 2 axis x v."""
-    t = [2 * component for component in _cross(axis, v)]
-    return [a + w * b + c for a, b, c in zip(v, t, _cross(axis, t), strict=True)]
-
-
-def unit_quaternion(quats: Tensor, dtype: torch.dtype) -> tuple[Tensor, list[Tensor]]:
-    """Real part [N] and axis, three of [N], of quaternions [N, 4], wxyz, not normalised."""
-    q = columns(quats, dtype)
-    w, *axis = (q / (q * q).sum(0).sqrt().clamp(min=MIN_QUATERNION)).unbind()
-    return w, axis
 
 
 class Frames:
@@ -46,62 +36,89 @@ class Frames:
         self, quats: Tensor, scales: Tensor, dtype: torch.dtype, min_aspect: float
     ) -> None:
         self._wide = torch.float64 if dtype == torch.float64 else torch.float32
-        self._axes: Tensor | None = None  # B as columns, [3, 3, N]; None: a kernel makes it
+        self._axes: list[tuple[slice, Axes]] = []  # by rows; none: a kernel makes them
         if not cuda.has_own_frames(quats):
-            self._axes = axes_of(quats, scales, self._wide, min_aspect)
+            self._axes = [
+                (rows, axes_of(quats[rows], scales[rows], self._wide, min_aspect))
+                for rows in row_chunks(quats, CHUNK)
+            ]
         else:
             self._given = quats.clone(), scales.clone(), min_aspect
 
     def gradient(self, grad: Tensor) -> Tensor:
         """B^T g [N, 3]: of gradients per world unit [N, 3], those per standard deviation."""
-        if self._axes is None:
+        if not self._axes:
             return cuda.own_frame_gradient(grad, *self._given)
-        return self._product(grad, self._axes)
+        return self._each(Axes.into, grad)
 
     def displacement(self, step: Tensor) -> Tensor:
         """B z [N, 3]: of steps z [N, 3] in standard deviations, those in world units."""
-        if self._axes is None:
+        if not self._axes:
             return cuda.own_frame_displacement(step, *self._given)
-        return self._product(step, self._axes.transpose(0, 1))
+        return self._each(Axes.out_of, step)
 
-    def _product(self, vectors: Tensor, matrix: Tensor) -> Tensor:
-        """sum over i of v_i matrix[i], for vectors [N, 3] and a matrix of columns [3, 3, N]."""
+    def _each(self, take: Callable[[Axes, Tensor], Tensor], vectors: Tensor) -> Tensor:
         result = torch.empty_like(vectors)
-        for rows in row_chunks(vectors):
-            x, y, z = columns(vectors[rows], self._wide).unbind()
-            found = matrix[0][:, rows] * x
-            found.addcmul_(matrix[1][:, rows], y).addcmul_(matrix[2][:, rows], z)
-            put(result[rows], found.unbind())
+        for rows, axes in self._axes:
+            put(result[rows], take(axes, repeated_columns(vectors[rows], self._wide)))
         return result
 
 
-def axes_of(quats: Tensor, scales: Tensor, dtype: torch.dtype, min_aspect: float) -> Tensor:
-    """B = R diag(s) as columns, [3, 3, N]; arguments as in `Frames`."""
-    result = torch.empty(3, 3, len(quats), dtype=dtype, device=quats.device)
-    for rows in row_chunks(quats):
-        q = columns(quats[rows], dtype)
-        deviations = columns(scales[rows], dtype).exp_()
-        _hold_broken(q, deviations)
-        size = (q * q).sum(0).sqrt_().clamp_(min=MIN_QUATERNION)
-        w, x, y, z = (q * (2**0.5 / size)).unbind()  # so that products are already doubled
-        xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
-        wx, wy, wz = w * x, w * y, w * z
-        rotation = [
-            *((yy + zz).neg_().add_(1.0), xy - wz, xz + wy),
-            *(xy + wz, (xx + zz).neg_().add_(1.0), yz - wx),
-            *(xz - wy, yz + wx, (xx + yy).neg_().add_(1.0)),
-        ]
-        b = result[:, :, rows]
-        if min_aspect:
-            deviations = torch.maximum(deviations, deviations.amax(0) * min_aspect)
-        for place, entry, deviation in zip(
-            [place for row in b.unbind() for place in row.unbind()],
-            rotation,
-            deviations.unbind() * 3,
-            strict=True,
-        ):
-            torch.mul(entry, deviation, out=place)
-    return result
+class Axes(NamedTuple):
+    """The axes of n Gaussians, with coordinates as rows [n], which is what a CPU is fast at.
+
+    Three coordinates are followed by the first two once more: so the rows that a cross product
+    multiplies lie beside each other, for all three coordinates at once. The quaternion is of length
+    sqrt 2, so that products of two of its entries are doubled already.
+    """
+
+    real: Tensor  # [n], of the quaternion
+    axis: Tensor  # [5, n], its imaginary part
+    deviations: Tensor  # [3, n]
+
+    def into(self, vectors: Tensor) -> Tensor:
+        """B^T v [3, n] of vectors as `repeated_columns` [5, n], which are overwritten."""
+        return self._rotated(vectors, -1.0).mul_(self.deviations)
+
+    def out_of(self, vectors: Tensor) -> Tensor:
+        """B v [3, n], as `into`."""
+        vectors[:3].mul_(self.deviations)
+        return self._rotated(vectors, 1.0)
+
+    def _rotated(self, v: Tensor, direction: float) -> Tensor:
+        """R v, or R^T v where the direction is -1: v + w t + a x t with t = a x v."""
+        t, a = torch.empty_like(v), self.axis
+        v[3:].copy_(v[:2])
+        torch.mul(a[1:4], v[2:5], out=t[:3])
+        t[:3].addcmul_(a[2:5], v[1:4], value=-1.0)
+        t[3:].copy_(t[:2])
+        rotated = v[:3].addcmul_(self.real, t[:3], value=direction)
+        return rotated.addcmul_(a[1:4], t[2:5]).addcmul_(a[2:5], t[1:4], value=-1.0)
+
+
+def repeated_columns(vectors: Tensor, dtype: torch.dtype) -> Tensor:
+    """Vectors [n, 3] as rows [n] of their coordinates, [5, n], with room for two of them again."""
+    found = torch.empty(5, len(vectors), dtype=dtype, device=vectors.device)
+    columns(vectors, dtype, out=found[:3])
+    return found
+
+
+def axes_of(quats: Tensor, scales: Tensor, dtype: torch.dtype, min_aspect: float) -> Axes:
+    """The axes as they are used; arguments as in `Frames`, for as many points as fit a cache."""
+    q = torch.empty(6, len(quats), dtype=dtype, device=quats.device)
+    columns(quats, dtype, out=q[:4])
+    deviations = columns(scales, dtype).exp_()
+    _hold_broken(q[:4], deviations)
+    size = q[0] * q[0]
+    for component in q[1:4]:
+        size.addcmul_(component, component)
+    q[:4].mul_(size.sqrt_().clamp_(min=MIN_QUATERNION).reciprocal_().mul_(2**0.5))
+    q[4:].copy_(q[1:3])
+    if min_aspect:
+        least = torch.maximum(deviations[0], deviations[1])
+        least = torch.maximum(least, deviations[2], out=least).mul_(min_aspect)
+        torch.maximum(deviations, least, out=deviations)
+    return Axes(q[0], q[1:], deviations)
 
 
 def _hold_broken(quats: Tensor, deviations: Tensor) -> None:
@@ -115,7 +132,3 @@ def _hold_broken(quats: Tensor, deviations: Tensor) -> None:
     broken = ~(quats.isfinite().all(0) & deviations.isfinite().all(0))
     quats.masked_fill_(broken, 0.0)
     deviations.masked_fill_(broken, 0.0)
-
-
-def _cross(a: list[Tensor], b: list[Tensor]) -> list[Tensor]:
-    return [a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)]

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from opt3dgs_optim.checks import check_choice, check_number, set_options
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.frames import rotate, unit_quaternion
-from opt3dgs_optim.lbfgs.pairs import columns, put, row_chunks
+from opt3dgs_optim.frames import axes_of, repeated_columns
+from opt3dgs_optim.lbfgs.pairs import put, row_chunks
 from opt3dgs_optim.part import Group, Part, Phase, State
 
 HOLDERS = (Mapping, torch.nn.ParameterDict)  # of tensors by name; the second is no Mapping
@@ -273,14 +273,12 @@ def covariance_noise(scales: Tensor, quats: Tensor, opacities: Tensor, eta: Tens
         opacities: [N] or [N, 1] logits.
         eta: [N, 3] standard normal.
     """
-    noise = torch.empty_like(eta)
+    noise, wide = torch.empty_like(eta), torch.promote_types(eta.dtype, torch.float32)
     for rows in row_chunks(eta):
-        w, axis = unit_quaternion(quats[rows], quats.dtype)
-        # R^T eta: rotation by the conjugate quaternion; then the variances; then R.
-        local = rotate(w, [-a for a in axis], list(columns(eta[rows], eta.dtype).unbind()))
-        variance = (2 * columns(scales[rows], scales.dtype)).exp().unbind()
-        shaped = [a * b for a, b in zip(variance, local, strict=True)]
+        axes = axes_of(quats[rows], scales[rows], wide, 0.0)  # Sigma = B B^T
+        vectors = repeated_columns(eta[rows], wide)
+        axes.into(vectors)
         opacity = torch.sigmoid(opacities[rows].reshape(-1))
         gate = torch.sigmoid(-GATE_SHARPNESS * (opacity - GATE_OPACITY))
-        put(noise[rows], [v * gate for v in rotate(w, axis, shaped)])
+        put(noise[rows], axes.out_of(vectors).mul_(gate))
     return noise
