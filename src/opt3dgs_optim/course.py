@@ -366,7 +366,12 @@ class Course:
         place = self.place_of(param)
         if place is None:
             return {}
-        return {name: each for where, name, each in self._gaussians() if where == place}
+        found = dict[str, Tensor]()
+        for group in self._groups():
+            params, name = group["params"], group.gaussian
+            if name and group.set_name == place.set_name and place.number < len(params):
+                found[name] = params[place.number]
+        return found
 
     def number_kept(self, part: Part, name: str, param: Tensor) -> Tensor | None:
         """What a part keeps per parameter for another parameter than that of the present hook.
@@ -385,11 +390,6 @@ class Course:
             for group in optimizer.param_groups:
                 if isinstance(group, NamedGroup) and group.gaussian is not None:
                     yield group
-
-    def _gaussians(self) -> Iterator[tuple[Place, str, Tensor]]:
-        for group in self._groups():
-            for number, param in enumerate(group["params"]):
-                yield Place(group.set_name, number), group["gaussian"], param
 
     def publish(self, name: str, param: Tensor, value: Any) -> None:
         """Tell other parts something about the set of Gaussians that a parameter belongs to.
