@@ -59,14 +59,14 @@ def default_step(
     # Those of dropped iterations come with the next one.
     events = range(state.get("events", 0), events_before(iteration + 1, total))
     state["events"] = events.stop
-    # A point is out of view if its position has no gradient. At most 2,048 points are asked, and
-    # the share of those in view is a mean over the last 100 views or so.
+    # A point is out of view if its position has no gradient. The share of those in view is a mean
+    # over the last 100 views or so, of which one in four is looked at, and at most 2,048 points.
     in_view = grads["means"].any(1)
     seen = in_view[:: 1 + num_points // 2_048]
     kept = state.setdefault("share", torch.tensor(1.0))
     share, now = kept.item(), int(seen.sum()) / len(seen)
-    if now > 0:
-        share += 1 / 100 * (max(now, 0.01) - share)
+    if now > 0 and (iteration + 1) * (5**0.5 - 1) / 2 % 1 < 1 / 4:
+        share += 1 / 25 * (max(now, 0.01) - share)
         kept.fill_(share)
 
     for name, param in params.items():

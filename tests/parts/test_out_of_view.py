@@ -25,9 +25,15 @@ from trainers import (
 )
 
 from opt3dgs_optim import Fading, OutOfView, Part
-from opt3dgs_optim.parts.out_of_view import MAX_POINTS_LOOKED_AT, MAX_SEEN_SHARE, _include
+from opt3dgs_optim.parts.out_of_view import (
+    MAX_POINTS_LOOKED_AT,
+    MAX_SEEN_SHARE,
+    _is_looked_at,
+    _mean_share,
+)
 
 POINTS, SEEN = 200, 4  # a view sees 2 % of them
+FIRST_LOOKED_AT = (2, 5, 10)  # views, from 1
 PULL = 1e-3  # of the regulariser; the images' gradients are about 1
 
 
@@ -141,11 +147,21 @@ def test_a_resumed_training_goes_on_as_it_was(make: Any) -> None:
 
 def test_the_share_is_the_mean_over_a_hundred_views() -> None:
     splats, phases, optimizers = upgraded(60, OutOfView())
-    shares = []
-    for i in range(3):
+    shares, looks = [], []
+    for i in range(10):
         iterate(splats, optimizers, phases, i, i + 1, seen=3)  # of 12
         shares.append(share_of(optimizers))
-    assert shares == pytest.approx([1 - 0.75 * (1 - 0.99**k) for k in (1, 2, 3)], rel=1e-6)
+        looks.append(sum(view <= i + 1 for view in FIRST_LOOKED_AT))
+    assert shares == pytest.approx([1 - 0.75 * (1 - 0.96**k) for k in looks], rel=1e-6)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 5, 7, 8, 16, 50])
+def test_one_view_in_four_is_looked_at_whatever_their_order(order: int) -> None:
+    """Of each camera of a rig, say, whose photos come in turns."""
+    assert tuple(view for view in range(1, 11) if _is_looked_at(view)) == FIRST_LOOKED_AT
+    for first in range(order):
+        looked_at = [_is_looked_at(view) for view in range(first, 100 * order, order)]
+        assert 18 <= sum(looked_at) <= 32
 
 
 def test_two_trainings_may_share_it() -> None:
@@ -169,7 +185,7 @@ def test_of_many_points_some_are_asked_and_all_are_held() -> None:
     grad[torch.arange(points) % 16 < 3, 2] = 1.0  # 3 of 16; of every fourth, a quarter
     phases.take(torch.tensor(0.1))
     hook(phases, optimizers["means"], torch.zeros(points, 3), grad)
-    assert share_of(optimizers) == pytest.approx(0.02 + 0.01 * (0.25 - 0.02))
+    assert share_of(optimizers) == pytest.approx(0.02 + 0.04 * (0.25 - 0.02))
     found = hook(phases, optimizers["opacities"], torch.zeros(points), torch.full((points,), PULL))
     assert torch.equal(found > 0, grad[:, 2] == 0)
 
@@ -181,7 +197,7 @@ def test_of_twice_as_many_points_as_are_looked_at_every_second_is_asked() -> Non
     grad[0] = 1.0
     phases.take(torch.tensor(0.1))
     hook(phases, optimizers["means"], torch.zeros_like(grad), grad)
-    assert share_of(optimizers) == pytest.approx(0.02 + 0.01 * (0.01 - 0.02))
+    assert share_of(optimizers) == pytest.approx(0.02 + 0.04 * (0.01 - 0.02))
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (3,), (2, 3)])
@@ -214,7 +230,7 @@ def test_the_run_log_has_the_share() -> None:
     splats, phases, optimizers = upgraded(60, OutOfView())
     assert phases.numbers() == {"visible_share": 1.0}, "before the first view"
     iterate(splats, optimizers, phases, 0, 3, seen=3)
-    assert phases.numbers() == {"visible_share": pytest.approx(1 - 0.75 * (1 - 0.99**3))}
+    assert phases.numbers() == {"visible_share": pytest.approx(1 - 0.75 * 0.04)}
 
 
 @pytest.mark.parametrize("on_device", [False, True])
@@ -224,7 +240,7 @@ def test_an_iteration_that_does_not_count_leaves_no_trace(
     if on_device:
         devices.on_a_device(monkeypatch)
     splats, phases, optimizers = large(2_000, OutOfView(), make=fused)
-    iterate(splats, optimizers, phases, 0, 3, seen=SEEN)
+    iterate(splats, optimizers, phases, 0, FIRST_LOOKED_AT[1] - 1, seen=SEEN)
     share, before = share_of(optimizers), values_of(splats)
     second = state_of(optimizers, splats["opacities"])["exp_avg_sq"].clone()
     for name, param in splats.items():
@@ -245,12 +261,12 @@ def test_where_the_positions_come_later_it_looks_at_their_gradient() -> None:
     iterate(splats, optimizers, phases, 0, 3, seen=SEEN)
     set_share(optimizers, 0.2)
     phases.take(torch.tensor(0.1))
-    phases.current += 1
+    phases.current = FIRST_LOOKED_AT[1] - 1
     splats["means"].grad = torch.zeros(POINTS, 3)
     splats["means"].grad[:SEEN] = 1.0
     pull = torch.full((POINTS,), PULL)
     found = hook(phases, optimizers["opacities"], torch.zeros(POINTS), pull)
-    share = 0.2 + 0.01 * (SEEN / POINTS - 0.2)  # what it will be after the positions' step
+    share = 0.2 + 0.04 * (SEEN / POINTS - 0.2)  # what it will be after the positions' step
     least = torch.full((POINTS,), (PULL / (3 * share)) ** 2)
     least[:SEEN] = 0.0
     torch.testing.assert_close(found, least, rtol=1e-5, atol=0.0)
@@ -290,7 +306,8 @@ def test_no_points_are_no_error(shape: tuple[int, ...]) -> None:
 def test_views_that_see_next_to_nothing_count_as_a_hundredth() -> None:
     splats, phases, optimizers = large(2_000, OutOfView())
     iterate(splats, optimizers, phases, 0, 400, seen=1)
-    assert share_of(optimizers) == pytest.approx(0.01 + 0.01 * 0.99**400, rel=1e-6)
+    looks = sum(map(_is_looked_at, range(1, 401)))
+    assert share_of(optimizers) == pytest.approx(0.01 + 0.01 * 0.96**looks, rel=1e-6)
 
 
 def test_a_gradient_that_is_zero_everywhere_is_of_no_view() -> None:
@@ -302,18 +319,20 @@ def test_a_gradient_that_is_zero_everywhere_is_of_no_view() -> None:
 
 
 @pytest.mark.parametrize("seen", [0, 1, 3, POINTS])
-def test_a_gpu_takes_a_view_into_the_mean_as_the_host_does(seen: int) -> None:
+@pytest.mark.parametrize("view", [1, 2])
+def test_a_gpu_takes_a_view_into_the_mean_as_the_host_does(seen: int, view: int) -> None:
     """And is not waited for."""
     grad = torch.zeros(POINTS, 3)
     grad[:seen] = 1.0
     kept = torch.tensor(0.5)
-    _include(grad, kept)
+    found = _mean_share(grad, kept, view)
+    assert (found == 0.5) == (view == 1 or seen == 0)
     with SimulatedDevice() as gpu:
         there, own = on_device(torch.tensor(0.5)), on_device(grad)
         gpu.forget()
-        _include(own, there)
+        said = _mean_share(own, there, view)
         assert gpu.synchronisations == []
-        assert float(on_host(there)) == float(kept)
+        assert float(on_host(there)) == float(on_host(said)) == pytest.approx(float(kept))
 
 
 def test_the_share_of_a_single_point_is_known() -> None:
@@ -321,8 +340,8 @@ def test_the_share_of_a_single_point_is_known() -> None:
     splats = make_splats(1)
     optimizers = phases.upgrade(gsplat_optimizers(splats))
     set_share(optimizers, 0.5)
-    iterate(splats, optimizers, phases, 0, 1, seen=1)
-    assert share_of(optimizers) == pytest.approx(0.5 + 0.5 / 100)
+    iterate(splats, optimizers, phases, 0, FIRST_LOOKED_AT[0], seen=1)
+    assert share_of(optimizers) == pytest.approx(0.5 + 0.5 / 25)
 
 
 @pytest.mark.parametrize(("share", "acts"), [(0.32, True), (0.35, False)])
