@@ -160,7 +160,8 @@ def headline_table(study: Study, sizes: Iterable[Sequence[Setting]]) -> str:
     stand beside where they have all of these trainings: the best of other learning rates, OwnFrame.
 
     Args:
-        sizes: the settings of the same scenes at each size.
+        sizes: the settings at each size. Those of the last have all scenes; a scene that another
+            size lacks has a dash there.
     """
     every = [list(settings) for settings in sizes]
     rows, scenes = [], [setting.scene for setting in every[-1]] if every else []

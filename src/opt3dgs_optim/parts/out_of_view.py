@@ -111,7 +111,7 @@ def _mean_share(grad: Tensor, kept: Tensor, view: int) -> float | Tensor:
     """
     if not _is_looked_at(view):
         return kept.item() if grad.is_cpu else kept
-    seen = _has_gradient(_every(1 + grad.shape[0] // MAX_POINTS_LOOKED_AT, grad))
+    seen = _has_gradient(grad[:: 1 + grad.shape[0] // MAX_POINTS_LOOKED_AT])
     if not grad.is_cpu:
         # Not `mean`, which takes twice as long.
         share = seen.sum(dtype=torch.float32).div_(seen.shape[0])
@@ -126,15 +126,6 @@ def _mean_share(grad: Tensor, kept: Tensor, view: int) -> float | Tensor:
     mean = before + WEIGHT * (share - before)
     kept.fill_(mean)
     return mean
-
-
-def _every(interval: int, rows: Tensor) -> Tensor:
-    """`rows[::interval]`, in less time: indexing finds out first what it is given."""
-    if interval == 1:
-        return rows
-    shape, strides = rows.shape, rows.stride()
-    count = -(-shape[0] // interval)
-    return rows.as_strided((count, *shape[1:]), (interval * strides[0], *strides[1:]))
 
 
 def _has_gradient(grad: Tensor) -> Tensor:
