@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from studies.scenes.analysis import METRICS, Difference, Study, difference
 from studies.scenes.arms import BASELINE, DEFAULTS, OWN_FRAME_ARM
@@ -34,9 +34,10 @@ COMPARISONS = {
 PIECES = {"OutOfView": 9}
 
 
-# On before anything could be trained at full size, which must confirm every other part.
+# On before anything could be trained at full size.
 ON_BEFORE = ("Fading", "Averaging", "OutOfView")
 CONFIRMING = 30_000  # iterations
+MIN_FULL_SCENES = 2  # at full size, where one training takes hours and seeds are few
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,9 @@ class Decision:
     control: str
     iterations: int | None  # None: not measured on enough scenes
     found: Difference | None
+    full: Difference  # at full size and length
     size: str = QUARTER  # of the photos
-    confirmed: bool = True  # by trainings at full size, or on before there were any
+    new: bool = False  # was not on before there were trainings at full size
 
     @property
     def verdict(self) -> str:
@@ -60,12 +62,23 @@ class Decision:
             return verdict
         if seeds < MIN_SEEDS:
             return "pays, one seed"
-        return verdict if self.confirmed else "pays, not confirmed at full size"
+        if len(self.full.pairs) < MIN_FULL_SCENES:
+            return "pays, not confirmed at full size" if self.new else verdict
+        return "pays, but not at full size" if self._fails_at_full_size() else verdict
 
     @property
     def on(self) -> bool:
         """A part that was not shown to pay is off."""
         return self.verdict == "pays"
+
+    def _fails_at_full_size(self) -> bool:
+        """A new part fails by a metric whose mean is behind; another by one behind everywhere."""
+        scenes = [replace(self.full, pairs={s: p}) for s, p in self.full.pairs.items()]
+        judged = [self.full] if self.new else scenes
+        return any(
+            all(sign * each.of(metric)[0] < 0 for each in judged)
+            for metric, (sign, _) in METRICS.items()
+        )
 
 
 def points_of(scene: str) -> int:
@@ -100,25 +113,19 @@ def decide(study: Study) -> dict[str, Decision]:
     Each part is judged against the same training without it: the multiplier against a constant of
     its mean, curvature against the same phase without it, annealing and pooling on top of the
     defaults. At half size one seed decides nothing while there are several at a quarter. A part
-    that pays must be confirmed at full size, but for those that were on before.
+    that pays must not be behind at full size; those that were on before need not be trained there.
     """
     made = {}
+    every = every_scene(study, CONFIRMING) + every_scene(study, CONFIRMING, sh_degree=3)
+    whole = [setting for setting in every if setting.size == FULL]
     for part, (arm, control) in COMPARISONS.items():
-        made[part] = Decision(arm, control, None, None)
-        confirmed = part in ON_BEFORE or is_confirmed(study, arm, control)
+        full, new = difference(study, whole, arm, control), part not in ON_BEFORE
+        made[part] = Decision(arm, control, None, None, full, new=new)
         for size, iterations in LADDER:
             settings = settings_of(study, iterations, PIECES.get(part, 0), size)
             found = difference(study, settings, arm, control)
             seeds = min(map(len, found.pairs.values()), default=0)
             if len(found.pairs) >= MIN_SCENES and (size != HALF or seeds >= MIN_SEEDS):
-                made[part] = Decision(arm, control, iterations, found, size, confirmed)
+                made[part] = Decision(arm, control, iterations, found, full, size, new)
                 break
     return made
-
-
-def is_confirmed(study: Study, arm: str, control: str) -> bool:
-    """Whether an arm was trained at full size and length, and is behind in no metric there."""
-    every = every_scene(study, CONFIRMING) + every_scene(study, CONFIRMING, sh_degree=3)
-    found = difference(study, [s for s in every if s.size == FULL], arm, control)
-    ahead = (sign * found.of(metric)[0] >= 0 for metric, (sign, _) in METRICS.items())
-    return found.count > 0 and all(ahead)

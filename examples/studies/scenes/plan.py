@@ -131,7 +131,7 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         "rates": [  # the trainer's own, all of them times a factor
             spec
             for rates in (0.1, 0.3, 1.0, 3.0, 10.0)
-            for spec in rotated(("plush",), TODAY, 1, 7_500, rates=rates)
+            for spec in rotated(("plush",), [*TODAY, OWN_FRAME_ARM], 1, 7_500, rates=rates)
         ],
     }
 

@@ -54,6 +54,7 @@ from studies.scenes.records import (
 )
 from studies.scenes.tables import (
     arms_table,
+    averaging_line,
     costs_table,
     crowd,
     decisions_table,
@@ -65,6 +66,7 @@ from studies.scenes.tables import (
     paper_table,
     reach_table,
     scenes_gain_table,
+    sizes_table,
     tuned_table,
 )
 
@@ -112,6 +114,7 @@ def conclusions(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
     return {
         "rotated-machines": machines_line(trained),
         "decisions": decisions_table(study, BRIEF),
+        "averaging": averaging_line(study),
         "every-scene": scenes_gain_table(study, degrees, DEFAULTS, BASELINE),
         "full": metrics_table(
             study, full, FULL_ARMS, plain=True, head=lambda s: f"{s.scene}, {s.iterations:,}"
@@ -119,6 +122,11 @@ def conclusions(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
         "own-frame": scenes_gain_table(study, half, OWN_FRAME_ARM, BASELINE),
         "own-frame-or-not": scenes_gain_table(study, half, OWN_FRAME_ARM, DEFAULTS),
         "headline": headline_table(study, [[s for s in full if s.iterations == LONG], half, long]),
+        "each-size": sizes_table(
+            study,
+            [long, half, [s for s in full if s.iterations == LONG]],
+            ("rates-x2", DEFAULTS, OWN_FRAME_ARM),
+        ),
         "reach": reach_table(study, long, DEFAULTS, SHORTER),
         "tuned": tuned_table(study, tuned, PLUSH),
         "tuned-brief": tuned_table(study, tuned, PLUSH, brief=True),

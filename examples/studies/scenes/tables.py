@@ -8,7 +8,7 @@ from dataclasses import replace
 from statistics import fmean
 
 from studies.pages import table
-from studies.scenes.analysis import METRICS, Difference, Study, difference
+from studies.scenes.analysis import METRICS, Difference, Study, difference, same_start
 from studies.scenes.arms import (
     ADAPTIVE,
     ADAPTIVE_DEFAULTS,
@@ -17,10 +17,18 @@ from studies.scenes.arms import (
     OWN_FRAME_ARM,
     arm_of,
 )
-from studies.scenes.decisions import MANY_VIEWS_SCENES, PIECES, decide, settings_of
+from studies.scenes.decisions import (
+    FULL,
+    HALF,
+    MANY_VIEWS_SCENES,
+    PIECES,
+    QUARTER,
+    decide,
+    settings_of,
+)
 from studies.scenes.records import Costs, Plain, Record, Setting
 
-SIZES = {"images_4": "quarter", "images_2": "half", "images": "full"}
+SIZES = {QUARTER: "quarter", HALF: "half", FULL: "full"}
 # How pages that are read without the list of variants name them.
 LABELS = {
     BASELINE: "3DGS-MCMC",
@@ -153,6 +161,28 @@ def metrics_table(
     return table([first, *map(head, settings)], "l", rows)
 
 
+def averaging_line(study: Study) -> str:
+    """In how many trainings of the baseline, and of all variants, the last iterates' mean gained.
+
+    A training and the same one with its mean have the first 29/30 in common, bit for bit.
+    """
+    found = [
+        (arm.averages, [s * (r.curve[m][-1] - other.curve[m][-1]) for m, (s, _) in METRICS.items()])
+        for r in study.records()
+        if (arm := arm_of(r.arm)).averages is not None
+        and (other := study.runs(r.setting, arm.averages).get(r.seed)) is not None
+        and same_start(r, other)
+    ]
+    alone = [gains for name, gains in found if name == BASELINE]
+    psnr = [gains[0] for _, gains in found]
+    return (
+        f"Added to 3DGS-MCMC alone it gained PSNR, SSIM and LPIPS in "
+        f"{sum(min(gains) > 0 for gains in alone)} of {len(alone)} trainings. Added to any variant "
+        f"it gained PSNR in {sum(gain > 0 for gain in psnr)} of {len(psnr)}, "
+        f"and changed it by {min(psnr):+.2f} dB at worst."
+    )
+
+
 def headline_table(study: Study, sizes: Iterable[Sequence[Setting]]) -> str:
     """The baseline beside the defaults at each size: what a reader sees first.
 
@@ -223,6 +253,41 @@ def scenes_gain_table(study: Study, settings: Sequence[Setting], arm: str, contr
             rows.append((setting.scene, crowd(setting), stock, ours, cells_of(found)[0]))
     names = label(control), label(arm)
     return table(("scene", "Gaussians, images", *names, "gain in PSNR, dB"), "llllr", rows)
+
+
+def sizes_table(study: Study, sizes: Sequence[Sequence[Setting]], arms: Iterable[str]) -> str:
+    """One line per scene and arm: what it gains over the baseline at its end, at every size.
+
+    PSNR / SSIM / LPIPS, means over the seeds that both have.
+
+    Args:
+        sizes: the settings at each size, smallest first.
+    """
+    named = [*arms]  # read for every scene
+    rows = []
+    for scene in MANY_VIEWS_SCENES:
+        for arm in named:
+            cells = [
+                _gain_at_end(
+                    difference(study, [s for s in size if s.scene == scene], arm, BASELINE)
+                )
+                for size in sizes
+            ]
+            if any(cell != "-" for cell in cells):
+                rows.append((scene, TUNED.get(arm, label(arm)), *cells))
+    names = [SIZES[QUARTER], SIZES[HALF], SIZES[FULL]]
+    return table(("scene", "training", *names), "llrrr", rows)
+
+
+def _gain_at_end(found: Difference) -> str:
+    pairs = [pair for pairs in found.pairs.values() for pair in pairs]
+    if not pairs:
+        return "-"
+    gains = [
+        _signed(fmean(a.curve[m][-1] - b.curve[m][-1] for a, b, _ in pairs), math.nan, digits)
+        for m, digits in (("psnr", 2), ("ssim", 3), ("lpips", 3))
+    ]
+    return f"{' / '.join(gains)} ({counted(len(pairs), 'seed')})"
 
 
 def reach_table(study: Study, long: Sequence[Setting], arm: str, shorter: Sequence[int]) -> str:
@@ -408,6 +473,8 @@ def _cell(records: Sequence[Record], *, gaussians: bool = False, seeds: bool = T
     values = [fmean(float(r.curve[m][-1]) for r in records) for m in METRICS]
     psnr, ssim, lpips = values
     of = f" ({len(records)} seeds)" if seeds and len(records) > 1 else ""
+    if seeds and len(records) == 1 and records[0].seed:
+        of = f" (seed {records[0].seed})"
     count = fmean(float(r.curve["num_points"][-1]) for r in records)
     beside = f", {count:,.0f} Gaussians" if gaussians else ""
     return f"{psnr:.2f} / {ssim:.3f} / {lpips:.3f}{beside}{of}"

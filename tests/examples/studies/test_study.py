@@ -44,11 +44,13 @@ from studies.scenes.records import (
 )
 from studies.scenes.run import main as run_study
 from studies.scenes.tables import (
+    averaging_line,
     headline_table,
     machines_line,
     paper_table,
     reach_table,
     scenes_gain_table,
+    sizes_table,
     tuned_table,
 )
 from studies.scenes.training import Spec, fit_of, machine, train
@@ -237,33 +239,41 @@ def test_half_size_decides_where_it_was_trained_with_two_seeds(seeds: int) -> No
     assert (decision.size, decision.verdict) == expected
 
 
+UNCONFIRMED, REFUTED = "pays, not confirmed at full size", "pays, but not at full size"
+
+
 @pytest.mark.parametrize(
-    ("full", "verdict"),
+    ("full", "of_a_new_part", "of_an_old_one"),
     [
-        ({}, "pays"),
-        ({"ssim": 0.6999}, "pays, not confirmed at full size"),
-        ({"lpips": 0.2001}, "pays, not confirmed at full size"),
-        (None, "pays, not confirmed at full size"),
+        ((), UNCONFIRMED, "pays"),  # never trained
+        (({"psnr": 25.0},), UNCONFIRMED, "pays"),  # one scene says nothing
+        (({"psnr": 15.0},), UNCONFIRMED, "pays"),
+        (({}, {}), "pays", "pays"),  # as good as without it
+        (({"psnr": 20.2}, {"psnr": 19.9}), "pays", "pays"),
+        (({"psnr": 20.1}, {"psnr": 19.8}), REFUTED, "pays"),  # behind in the mean
+        (({"ssim": 0.7001}, {"ssim": 0.6998}), REFUTED, "pays"),
+        (({"psnr": 21.0, "lpips": 0.2001}, {"psnr": 21.0, "lpips": 0.2002}), REFUTED, REFUTED),
     ],
 )
-def test_a_new_part_must_be_confirmed_at_full_size(
-    full: dict[str, float] | None, verdict: str
+def test_full_size_has_the_last_word(
+    full: tuple[dict[str, float], ...], of_a_new_part: str, of_an_old_one: str
 ) -> None:
-    arm, control = COMPARISONS["OwnFrame"]
-    records = [
-        rotated_record(name, scene, seed, psnr=20.0 + (name == arm))
-        for scene in MANY_VIEWS_SCENES
-        for seed in (0, 1)
-        for name in (arm, control)
-    ]
-    others = {"size": "images", "points": 200_000, "sh_degree": 3, "iterations": 30_000}
-    for name, better in ((arm, full), (control, {})):
-        if better is not None:
-            made = rotated_record(name, "bonsai", 0, **better)
-            records.append(replace(made, setting=replace(made.setting, **others)))
-    decision = decide(Study(records))["OwnFrame"]
-    assert decision.verdict == verdict
-    assert decision.on == (verdict == "pays")
+    for part, verdict in (("OwnFrame", of_a_new_part), ("Fading", of_an_old_one)):
+        arm, control = COMPARISONS[part]
+        records = [
+            rotated_record(name, scene, seed, psnr=20.0 + (name == arm))
+            for scene in MANY_VIEWS_SCENES
+            for seed in (0, 1)
+            for name in (arm, control)
+        ]
+        others = {"size": "images", "points": 200_000, "sh_degree": 3, "iterations": 30_000}
+        for scene, better in zip(MANY_VIEWS_SCENES, full, strict=False):
+            for name, metrics in ((arm, better), (control, {})):
+                made = rotated_record(name, scene, 0, **metrics)
+                records.append(replace(made, setting=replace(made.setting, **others)))
+        decision = decide(Study(records))[part]
+        assert decision.verdict == verdict
+        assert decision.on == (verdict == "pays")
 
 
 def test_every_scene_and_size_has_its_line() -> None:
@@ -280,6 +290,33 @@ def test_every_scene_and_size_has_its_line() -> None:
         f"| banana | 4,000, quarter | {ends} |",
         f"| banana | 5,000, half | {ends} |",
     ]
+
+
+def test_every_size_of_a_scene_stands_in_one_line() -> None:
+    quarter = [
+        rotated_record(arm, "bonsai", seed, psnr=20.0 + (arm == DEFAULT_ARM), ssim=0.7 + seed / 10)
+        for arm in (BASELINE, DEFAULT_ARM)
+        for seed in (0, 1)
+    ]
+    full = [replace(r, setting=replace(r.setting, size="images")) for r in quarter if r.seed == 0]
+    study = Study([*quarter, *full, rotated_record(DEFAULT_ARM, "lego", 0)])
+    sizes = [[r.setting for r in records[:1]] for records in (quarter, [], full)]
+    said = sizes_table(study, sizes, (DEFAULT_ARM, "annealed"))
+    gain = "+1.00 / 0.000 / 0.000"
+    line = f"| bonsai | the defaults | {gain} (2 seeds) | - | {gain} (1 seed) |"
+    assert said.splitlines()[2:] == [line]
+
+
+def test_trainings_that_the_mean_did_not_help_are_counted() -> None:
+    ends = {"mcmc": 20.0, "mcmc+averaged": 20.2, "faded": 21.0, "faded+averaged": 20.9}
+    made = [rotated_record(arm, "bonsai", 0, psnr=psnr) for arm, psnr in ends.items()]
+    for each in made:
+        better = each.arm.endswith("+averaged")
+        each.curve["ssim"][-1] += better / 100
+        each.curve["lpips"][-1] -= better / 100
+    said = averaging_line(Study([*made, rotated_record("faded+averaged", "lego", 0)]))
+    assert "PSNR, SSIM and LPIPS in 1 of 1 trainings" in said
+    assert "PSNR in 1 of 2, and changed it by -0.10 dB at worst" in said
 
 
 def test_when_the_baselines_quality_is_reached_over_the_seeds_of_both() -> None:
