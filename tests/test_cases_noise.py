@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import math
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -17,7 +18,8 @@ from torch.optim import Adam
 from trainers import assert_same, gaussians, values_of
 
 from opt3dgs_optim import AWSGLD, IsotropicNoise, PhaseScheduler, PositionNoise
-from opt3dgs_optim.parts.noise import LEFT_AT
+from opt3dgs_optim.frames import LARGEST
+from opt3dgs_optim.parts.noise import LEFT_AT, covariance_noise
 
 ROWS = 4
 SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": ()}
@@ -344,3 +346,20 @@ def test_gaussians_of_this_file_move() -> None:
     means = torch.zeros(ROWS, 3)
     PositionNoise(source, 1.0).add_to(means, 1.0)
     assert bool((means != 0).all())
+
+
+@pytest.mark.parametrize("log_scale", [44.5, 80.0, 800.0, float("inf"), float("nan"), -1e4])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_gaussians_of_any_size_leave_the_noise_finite(log_scale: float, dtype: torch.dtype) -> None:
+    """One whose variance is infinite, or unknown, is not moved; the others are, as without it."""
+    draw = torch.Generator().manual_seed(3)
+    eta, quats = torch.randn(5, 3, generator=draw), torch.randn(5, 4, generator=draw)
+    scales, opacities = torch.zeros(5, 3), torch.full((5,), -9.0)
+    without = covariance_noise(*(t.to(dtype) for t in (scales, quats, opacities, eta)))
+    scales[2, 1] = log_scale
+    found = covariance_noise(*(t.to(dtype) for t in (scales, quats, opacities, eta)))
+    assert bool(found.isfinite().all())
+    others = torch.arange(5) != 2
+    assert torch.equal(found[others], without[others])
+    if not math.exp(min(log_scale, 700.0)) < LARGEST[dtype]:
+        assert bool((found[2] == 0).all())

@@ -387,6 +387,8 @@ class Course:
 
     def _groups(self) -> Iterator[NamedGroup]:
         for optimizer in self.followers():
+            if not all(type(group) is NamedGroup for group in optimizer.param_groups):
+                optimizer.name_groups()  # a trainer has put others there since its last step
             for group in optimizer.param_groups:
                 if isinstance(group, NamedGroup) and group.gaussian is not None:
                     yield group

@@ -33,10 +33,19 @@ def check_attributes(call: str, part: Part) -> None:
 
 
 def check_units(call: str, parts: Sequence[Part]) -> None:
-    """ValueError where a part that needs the parameter's own units comes after one with others."""
+    """ValueError where a part that needs the parameter's own units comes after one with others.
+
+    Or where two of one class say how long a step is in units of their own.
+    """
     for i, part in enumerate(parts):
         for before in parts[:i]:
             shared = part.names is None or before.names is None or {*part.names} & {*before.names}
+            at_once = None in (part.during, before.during) or part.during is before.during
+            if part.own_units and type(part) is type(before) and shared and at_once:
+                raise ValueError(
+                    f"{call}: parts has {before!r} and {part!r}, each of which steps the same "
+                    "parameters in units of its own; one of them is needed"
+                )
             if part.needs_units and before.own_units and shared:
                 late, early = type(part).__name__, type(before).__name__
                 raise ValueError(

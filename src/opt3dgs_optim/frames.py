@@ -7,6 +7,7 @@ world into the own frame. An axis may count as no thinner than a share of the lo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -17,7 +18,11 @@ from opt3dgs_optim import cuda
 from opt3dgs_optim.lbfgs.pairs import columns, put, row_chunks
 from opt3dgs_optim.state import is_finite_sum
 
+FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 CHUNK = 65_536  # rows that a CPU works on at a time: smaller ones spend too much on each operation
+# What Adam squares stays finite up to half of the root of the largest number, a power of two.
+_EXPONENTS = {dtype: math.frexp(torch.finfo(dtype).max)[1] for dtype in FLOATS}
+LARGEST = {dtype: 2.0 ** (exponent // 2 - 1) for dtype, exponent in _EXPONENTS.items()}
 MIN_QUATERNION = 1e-12  # as torch.nn.functional.normalize: a zero quaternion is no rotation
 
 
@@ -43,13 +48,22 @@ class Frames:
                 for rows in row_chunks(quats, CHUNK)
             ]
         else:
-            self._given = quats.clone(), scales.clone(), min_aspect
+            quats, scales = (each.to(self._wide, copy=True) for each in (quats, scales))
+            self._given = quats, scales, min_aspect
 
     def gradient(self, grad: Tensor) -> Tensor:
-        """B^T g [N, 3]: of gradients per world unit [N, 3], those per standard deviation."""
-        if not self._axes:
-            return cuda.own_frame_gradient(grad, *self._given)
-        return self._each(Axes.into, grad)
+        """B^T g [N, 3]: of gradients per world unit [N, 3], those per standard deviation.
+
+        No number is so large that Adam's second moment would be infinite, which it would stay.
+        """
+        largest = LARGEST[grad.dtype]
+        if self._axes:
+            return self._each(lambda axes, v: axes.into(v).clamp_(-largest, largest), grad)
+        found = cuda.own_frame_gradient(grad.to(self._wide), *self._given)
+        # The kernel bounds it as what it computes in needs it.
+        return (
+            found if found.dtype == grad.dtype else found.clamp_(-largest, largest).to(grad.dtype)
+        )
 
     def displacement(self, step: Tensor) -> Tensor:
         """B z [N, 3]: of steps z [N, 3] in standard deviations, those in world units."""
@@ -121,14 +135,21 @@ def axes_of(quats: Tensor, scales: Tensor, dtype: torch.dtype, min_aspect: float
     return Axes(q[0], q[1:], deviations)
 
 
-def _hold_broken(quats: Tensor, deviations: Tensor) -> None:
-    """Take Gaussians whose frame is not finite for points: nothing is fed, and nothing moves.
+def is_below(numbers: Tensor, bound: float) -> bool:
+    """Whether all of a CPU's numbers are below a bound, and none is NaN."""
+    return not numbers.numel() or numbers.amax().item() < bound
 
-    Else a gradient of zero would become a NaN, which stays in Adam's moments for ever. In place, of
-    columns [4, N] and [3, N].
+
+def _hold_broken(quats: Tensor, deviations: Tensor) -> None:
+    """Take Gaussians without a frame of finite size for points: nothing is fed, and nothing moves.
+
+    Else a gradient of zero would become a NaN, which stays in Adam's moments for ever. So would
+    noise by deviations whose square is infinite. In place, of columns [4, N] and [3, N].
     """
-    if quats.is_cpu and is_finite_sum(quats) and is_finite_sum(deviations):
+    largest = LARGEST[deviations.dtype]
+    # The largest of numbers with a NaN is NaN.
+    if quats.is_cpu and is_finite_sum(quats) and is_below(deviations, largest):
         return
-    broken = ~(quats.isfinite().all(0) & deviations.isfinite().all(0))
+    broken = ~(quats.isfinite().all(0) & (deviations < largest).all(0))
     quats.masked_fill_(broken, 0.0)
     deviations.masked_fill_(broken, 0.0)

@@ -13,7 +13,13 @@ from torch import Tensor
 
 from opt3dgs_optim.overrides import TemporaryOverrides, WeightDecay
 from opt3dgs_optim.part import Group, Part
-from opt3dgs_optim.state import HeldRows, ParameterState, PickedRows, broadcast_rows
+from opt3dgs_optim.state import (
+    HeldRows,
+    ParameterRecord,
+    ParameterState,
+    PickedRows,
+    broadcast_rows,
+)
 
 if TYPE_CHECKING:
     from opt3dgs_optim.course import Course
@@ -75,8 +81,11 @@ class ActingParts:
     def displace(
         self, group: Group, param: Tensor, step: Tensor, state: ParameterState, course: Course
     ) -> Tensor:
-        """What the parameter moves by in the place of Adam's step."""
-        for name, part in self.displacement:
+        """What the parameter moves by in the place of Adam's step.
+
+        The last part first: it made of what the others had fed what Adam has seen.
+        """
+        for name, part in reversed(self.displacement):
             found = part.displacement(group, param, step, state.of(name), course)
             _check_returned(name, "displacement", found, step)
             step = found
@@ -120,7 +129,12 @@ class MovingParameter:
 
 @dataclass(slots=True)
 class StepInProgress:
-    """What a step has to finish, or to undo, once Adam has moved the parameters."""
+    """What a step has to finish, or to undo, once Adam has moved the parameters.
+
+    Attributes:
+        fed: parameters, and what Adam is fed in the place of their gradients.
+        moved: groups, and what Adam moves in the place of their parameters.
+    """
 
     mask: Tensor | None
     acting: bool
@@ -128,6 +142,33 @@ class StepInProgress:
     overrides: TemporaryOverrides
     moving: list[MovingParameter] = field(default_factory=list)
     decays: list[WeightDecay] = field(default_factory=list)
+    fed: list[tuple[Tensor, Tensor]] = field(default_factory=list)
+    moved: list[tuple[Group, list[Tensor]]] = field(default_factory=list)
+    _renewed: list[tuple[ParameterRecord, Any, dict[str, Any], dict[str, Any]]] = field(
+        default_factory=list
+    )
+
+    def put_in_place(self) -> None:
+        """Have Adam read what the hooks have said, now that none looks at the Gaussians any more.
+
+        Before that a hook of a later group would find Adam's buffers in the place of the trainer's
+        tensors.
+        """
+        for param, fed in self.fed:
+            self.overrides.attribute(param, "grad", fed)
+        for group, params in self.moved:
+            self.overrides.item(group, "params", params)
+
+    def remember(self, record: ParameterRecord, state: dict[str, Any] | None) -> None:
+        """Of a parameter whose moments may begin anew: their units, and what its state holds."""
+        known = {} if state is None else state
+        self._renewed.append((record, record.units, known, dict(known)))
+
+    def take_back(self) -> None:
+        """Undo what no override undoes: a hook has raised, and there will be no step."""
+        for record, units, state, moments in self._renewed:
+            record.units = units
+            state.update(moments)
 
 
 def _is_number(factor: Any) -> bool:

@@ -140,12 +140,19 @@ class WeightDecay:
     """Decoupled weight decay of a group, by the learning rate that the trainer has given it.
 
     Args:
+        params: of the group, or what Adam moves in their place.
         rows: [N] bool, those that a mask lets move; None: all.
     """
 
-    def __init__(self, group: Group, counts: Tensor | bool, rows: Tensor | None = None) -> None:
+    def __init__(
+        self,
+        group: Group,
+        params: list[Tensor],
+        counts: Tensor | bool,
+        rows: Tensor | None = None,
+    ) -> None:
         self._kept: Any = 1 - group["lr"] * group["weight_decay"]
-        self._params, self._counts, self._rows = list(group["params"]), counts, rows
+        self._params, self._counts, self._rows = list(params), counts, rows
 
     @torch.no_grad()
     def make(self) -> None:
@@ -167,6 +174,7 @@ class WeightDecay:
 def scale_learning_rate(
     overrides: TemporaryOverrides,
     group: Group,
+    params: list[Tensor],
     factors: list[Any],
     counts: Tensor | bool,
     decays: list[WeightDecay],
@@ -175,8 +183,8 @@ def scale_learning_rate(
     """lr times the factors, never left in the group: schedulers would compound it.
 
     Not on decoupled weight decay, which would grow weights where a factor is negative: that goes to
-    `decays`. `counts` is whether the step will be made, 0-d where only the device knows; `read`
-    gives a device's number to the host.
+    `decays`, for `params`, which Adam moves. `counts` is whether the step will be made, 0-d where
+    only the device knows; `read` gives a device's number to the host.
     """
     if not factors:
         return
@@ -191,7 +199,7 @@ def scale_learning_rate(
         else:
             factor = factor.to(device=device, dtype=torch.float32, non_blocking=True)
     if group.get("decoupled_weight_decay") and group["weight_decay"]:
-        decays.append(WeightDecay(group, counts))
+        decays.append(WeightDecay(group, params, counts))
         overrides.item(group, "weight_decay", 0.0)
     overrides.item(group, "lr", rate * factor)
 

@@ -260,7 +260,8 @@ class Part:
         """What the parameter moves by instead of Adam's `step`, of its shape.
 
         Adam's step, learning rate and factors included, is added to the parameter elsewhere; a part
-        with this hook gets it by itself, and the parameter has not moved yet.
+        with this hook gets it by itself, and the parameter has not moved yet. Of several parts the
+        last one is asked first, which had the last word on what Adam is fed.
         """
         raise NotImplementedError
 

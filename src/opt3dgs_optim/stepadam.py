@@ -269,16 +269,19 @@ class StepAdam(Adam):
             check_mask_fits(self.call_name, self.param_groups, mask, self._takes_mask)
         with TemporaryOverrides() as temporary:
             step = StepInProgress(mask, acting, counts, temporary)
-            for group in self.param_groups:
-                parts = self._parts_of(group) if acting else NO_PARTS
-                if acting and course.asks_parts:
-                    parts = self._ready(parts, group)
-                self._prepare_group(step, cast(NamedGroup, group), parts)
-                if parts.factor:
-                    factors = parts.factors(group, course)
-                    scale_learning_rate(
-                        temporary, group, factors, counts, step.decays, course.on_host
-                    )
+            try:
+                for group in self.param_groups:
+                    parts = self._parts_of(group) if acting else NO_PARTS
+                    if acting and course.asks_parts:
+                        parts = self._ready(parts, group)
+                    moved = self._prepare_group(step, cast(NamedGroup, group), parts)
+                    if parts.factor:
+                        given = temporary, group, moved, parts.factors(group, course), counts
+                        scale_learning_rate(*given, step.decays, course.on_host)
+            except BaseException:
+                step.take_back()
+                raise
+            step.put_in_place()
             self._make(step)
         for moving in step.moving:
             self._finish(moving, course)
@@ -341,18 +344,15 @@ class StepAdam(Adam):
         step(self, mask, mask.numel()) if takes_number else step(self, mask)
 
     def _prepare_group(
-        self,
-        step: StepInProgress,
-        group: NamedGroup,
-        parts: ActingParts,
-    ) -> None:
-        """Have the base's step read what the parts say of a group's gradients."""
+        self, step: StepInProgress, group: NamedGroup, parts: ActingParts
+    ) -> list[Tensor]:
+        """Ask the parts what the base's step is to read; return the tensors that it is to move."""
         masked = step.mask is not None and self._takes_mask(group, step.mask.numel())
         # Another base's own step knows its mask; what the parts do does not.
         rows = step.mask if masked and (self._base is Adam or parts.any) else None
         if parts.displacement and group["weight_decay"] and group.get("decoupled_weight_decay"):
             # Of the parameter itself, not of the buffer that Adam will move.
-            step.decays.append(WeightDecay(group, step.counts, rows))
+            step.decays.append(WeightDecay(group, group["params"], step.counts, rows))
             step.overrides.item(group, "weight_decay", 0.0)
         params, counts = list(group["params"]), step.counts
         guarded = rows is not None or counts is not True
@@ -368,6 +368,7 @@ class StepAdam(Adam):
             if not (grad.is_cpu and is_finite_sum(grad)):
                 self._zero_nonfinite(param)
             if record.units != parts.units:
+                step.remember(record, self.state.get(param))
                 self._take_units(group, param, record, parts.units)
             if needed and plain:
                 self._feed(step, group, param, record, parts)
@@ -386,7 +387,8 @@ class StepAdam(Adam):
                 if moves and param.requires_grad:
                     record.last_moved = now
         if parts.displacement or rows is not None:
-            step.overrides.item(group, "params", params)
+            step.moved.append((group, params))
+        return params
 
     def _feed(
         self,
@@ -404,7 +406,7 @@ class StepAdam(Adam):
         grad = cast(Tensor, param.grad)
         fed = parts.feed(group, param, grad, view, course)
         if fed is not grad:
-            step.overrides.attribute(param, "grad", fed)
+            step.fed.append((param, fed))
         self._ownership.claim(param, view.adam, course.row_keys)
         view.let_go()
 
@@ -470,7 +472,7 @@ class StepAdam(Adam):
             step.overrides.extra_item(self.state, moving.buffer, view.adam)
             return moving.buffer
         if fed is not param.grad:
-            step.overrides.attribute(param, "grad", fed)
+            step.fed.append((param, fed))
         return param
 
     def _finish(self, moving: MovingParameter, course: Course) -> None:
@@ -492,10 +494,8 @@ class StepAdam(Adam):
         found = zero_nonfinite(cast(Tensor, param.grad))
         if isinstance(found, Tensor):
             if self.course.num_observed % DEVICE_LOOK_INTERVAL == 0:
-                seen = (
-                    found if self._nonfinite is None else self._nonfinite.to(found.device) | found
-                )
-                self._nonfinite = seen
+                known = self._nonfinite
+                self._nonfinite = found if known is None else known.to(found.device) | found
             return
         if found:
             self._report_nonfinite(f"a gradient of shape {tuple(param.shape)}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import math
 import os
 import shutil
 import subprocess
@@ -22,6 +23,7 @@ from torch import Tensor
 import opt3dgs_optim
 from opt3dgs_optim import cuda, partitions
 from opt3dgs_optim.cuda import BLOCK, macros
+from opt3dgs_optim.frames import LARGEST, Frames
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history
 from opt3dgs_optim.partitions import MovingPartitions, Tally
 
@@ -295,6 +297,35 @@ def compare_frames(kernels: HostKernels, rows: int, min_aspect: float) -> float:
     size = vectors.norm(dim=1, keepdim=True) * scales.exp().amax(1, keepdim=True)
     gaps = torch.cat([(a.double() - b) / size for a, b in zip(found, expected, strict=True)])
     return float(gaps.abs().nan_to_num(nan=torch.inf).max()) if rows else 0.0
+
+
+def compare_extreme_frames(kernels: HostKernels, dtype: torch.dtype) -> None:
+    """AssertionError where Adam's second moments would not stay finite, or torch's frames differ.
+
+    Gaussians from the smallest to the largest, with gradients of any size.
+
+    Args:
+        dtype: of the positions.
+    """
+    wide, bound = kernels.dtype, LARGEST[dtype]
+    sizes = torch.linspace(-1.0, 1.0, 41, dtype=wide)[:, None].repeat(1, 3)
+    scales = math.log(torch.finfo(wide).max) * sizes
+    quats = torch.randn(41, 4, generator=torch.Generator().manual_seed(1), dtype=wide)
+    by_torch = Frames(quats, scales, dtype, 0.1)
+    with mock.patch.object(cuda, "has_own_frames", return_value=True):
+        by_kernel = Frames(quats, scales, dtype, 0.1)
+    huge = scales[:, 0].exp() > LARGEST[wide]
+    for size in (1.0, 1e3, torch.finfo(dtype).max / 8):
+        grads = torch.tensor([size, -size / 2, size / 4], dtype=dtype).repeat(41, 1)
+        with kernels.launched():
+            found = by_kernel.gradient(grads)
+            moved = by_kernel.displacement(torch.full_like(grads, 0.1))
+        torch.testing.assert_close(found, by_torch.gradient(grads), rtol=1e-2, atol=0.0)
+        assert found.square().isfinite().all(), "the square of what is fed is infinite"
+        assert (found[huge] == 0).all(), "a Gaussian of infinite size is fed"
+        assert (moved[huge] == 0).all(), "a Gaussian of infinite size moves"
+        assert found[~huge & (sizes[:, 0] > 0)].abs().amax(1).gt(0).all(), "others are not fed"
+    assert found.amax() == -found.amin() == bound, "the bound is not reached"
 
 
 def relative_difference(result: Tensor, reference: Tensor) -> float:

@@ -19,6 +19,7 @@ from kernel_host import (
     SOURCES,
     HostKernels,
     compare_energies,
+    compare_extreme_frames,
     compare_frames,
     compare_runs,
     compile_host,
@@ -65,6 +66,9 @@ MUTANTS = (
     Mutant("the inverse rotation", "own_frame.cu", "rotated(v, -w)", "rotated(v, w)"),
     Mutant("a thin axis", "own_frame.cu", "{larger(s.x, least)", "{s.x"),
     Mutant("the longest axis", "own_frame.cu", "larger(larger(s.x, s.y), s.z)", "larger(s.x, s.y)"),
+    Mutant("an infinite size", "own_frame.cu", "!(longest < largest(norm))", "false"),
+    Mutant("the bound of what is fed", "own_frame.cu", "bounded(own.y)", "own.y"),
+    Mutant("the bound below zero", "own_frame.cu", "x < -most ? -most : x", "x"),
     Mutant("a quaternion of zero", "own_frame.cu", "norm > T(1e-12) ? norm : T(1e-12)", "norm"),
     Mutant("one thread", "histogram.cu", "if (blockIdx.x > 0 || threadIdx.x > 0) return;", ""),
     Mutant("mean of the slope", "histogram.cu", "slope - state[2]", "slope"),
@@ -89,6 +93,7 @@ def complaint(kernels: HostKernels) -> str | None:
             kernels.two_loop(grad, history), two_loop(grad, history, SIZE)
         )
         turned = max(compare_frames(kernels, ROWS, aspect) for aspect in (0.0, 0.1))
+        compare_extreme_frames(kernels, kernels.dtype)
         gap = max(compare_energies(kernels, energies(name, 500)) for name in ("spike", "broken"))
     except AssertionError as error:
         return str(error)

@@ -19,6 +19,7 @@ from kernel_host import (
     There,
     built,
     compare_energies,
+    compare_extreme_frames,
     compare_frames,
     compare_runs,
     compiler,
@@ -264,6 +265,13 @@ def test_shapes_of_the_own_frame_are_checked_first(
             v, q, s = {**case, wrong: bad}.values()
             with pytest.raises(ValueError, match=message):
                 function(v, q, s)
+
+
+@pytest.mark.parametrize("dtype", [*DTYPES, torch.float16, torch.bfloat16], ids=str)
+def test_what_adam_squares_stays_finite(kernels: dict, dtype: torch.dtype) -> None:
+    """Of Gaussians of any size, with gradients of any size, by kernels as by torch."""
+    wide = torch.float64 if dtype == torch.float64 else torch.float32
+    compare_extreme_frames(kernels[5, wide], dtype)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16], ids=str)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import copy
 import gc
+import itertools
+import math
 import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import devices
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -28,7 +31,7 @@ from trainers import (
     upgraded,
 )
 
-from opt3dgs_optim import Averaging, Fading, OwnFrame, Part, PositionNoise
+from opt3dgs_optim import Averaging, Fading, OwnFrame, Part, Phase, PhaseScheduler, PositionNoise
 from opt3dgs_optim.frames import Frames
 
 TOTAL = 60
@@ -304,14 +307,123 @@ def test_a_frame_that_is_not_finite_holds_its_gaussian_alone(
     assert bool((ends[1][2] != start[2]).all()) == (grad != 0)
 
 
-def test_two_of_them_have_frames_of_their_own() -> None:
-    splats = scene(6, 8)
-    phases = only(TOTAL, OwnFrame(min_aspect=0.0), OwnFrame(min_aspect=1.0))
-    adams: Any = phases.upgrade({n: torch.optim.Adam([p]) for n, p in splats.items()})
-    splats["means"].grad = torch.ones_like(splats["means"])
-    phases.observe(0.1)
-    adams["means"].step()
-    assert bool(splats["means"].isfinite().all())
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("fused", [False, True])
+def test_no_size_of_a_gaussian_ruins_its_moments(dtype: torch.dtype, fused: bool) -> None:
+    """Sizes and gradients from the smallest to the largest: all stays finite, and can be loaded."""
+    top = math.log(torch.finfo(dtype).max)
+    sizes, strengths = torch.linspace(-top, top, 23), torch.linspace(-0.9, 0.9, 7)
+    scales = sizes.repeat_interleave(7)[:, None].repeat(1, 3)
+    grads = (strengths * top).exp().repeat(23)[:, None] * torch.tensor([1.0, -0.5, 0.2])
+    splats = {
+        "means": Parameter(torch.zeros(161, 3, dtype=dtype)),
+        "scales": Parameter(scales.to(dtype)),
+        "quats": Parameter(torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=dtype).repeat(161, 1)),
+    }
+    phases = only(TOTAL, OwnFrame(rate=0.01))
+    adams: Any = phases.upgrade(
+        {n: torch.optim.Adam([p], lr=1e-3, eps=1e-4, fused=fused) for n, p in splats.items()}
+    )
+    for _ in range(8):
+        splats["means"].grad = grads.to(dtype)
+        phases.observe(0.1)
+        adams["means"].step()
+    assert all(
+        bool(each.isfinite().all()) for each in adams["means"].state[splats["means"]].values()
+    )
+    ordinary = scales[:, 0].abs() < 3
+    assert bool(splats["means"][ordinary].isfinite().all())
+    assert bool((splats["means"][ordinary].abs().amax(1) > 0).any())
+    adams["means"].load_state_dict(adams["means"].state_dict())
+
+
+@pytest.mark.parametrize("during", list(itertools.product((None, *Phase), repeat=2)), ids=str)
+def test_two_that_act_at_once_are_refused(during: tuple[Phase | None, Phase | None]) -> None:
+    """Each says how long a step is: the product of both is no length."""
+
+    class Phased(OwnFrame):
+        pass
+
+    first, second = Phased(rate=0.05), Phased(min_aspect=1.0)
+    for part, phase in zip((first, second), during, strict=True):
+        object.__setattr__(part, "during", phase)
+    if None in during or during[0] is during[1]:
+        message = (
+            r"PhaseScheduler: parts has Phased\(rate=0.05.* and Phased\(.* one of them is needed"
+        )
+        with pytest.raises(ValueError, match=message):
+            PhaseScheduler(TOTAL, parts=[first, second])
+    else:
+        PhaseScheduler(TOTAL, parts=[first, second])
+
+
+class Turned(Part):
+    """Positions stepped in a world that is turned: by itself it changes nothing but rounding."""
+
+    names = ("means",)
+    own_units = True
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(4)))[
+        0
+    ].double()
+
+    def before(self, group: Any, param: Any, grad: Tensor, state: Any, course: Any) -> Tensor:
+        return grad @ self.turn
+
+    def displacement(self, group: Any, param: Any, step: Tensor, state: Any, course: Any) -> Tensor:
+        return step @ self.turn.T
+
+
+@pytest.mark.parametrize("turned_first", [False, True])
+def test_two_units_of_their_own_are_undone_in_reverse(turned_first: bool) -> None:
+    """Fed B2^T B1^T g, moved by B1 B2 z: downhill, whichever comes first."""
+    parts: list[Part] = [OwnFrame(final=0.1), Turned()]
+    splats = scene(40, 2, size=0.3)
+    phases = only(200, *(reversed(parts) if turned_first else parts))
+    adams: Any = phases.upgrade({n: torch.optim.Adam([p], eps=1e-30) for n, p in splats.items()})
+    lengths = []
+    for _ in range(200):
+        lengths.append(float(splats["means"].detach().norm(dim=1).mean()))
+        splats["means"].grad = splats["means"].detach().clone()
+        phases.observe(0.1)
+        adams["means"].step()
+    assert lengths[-1] < 0.5 * lengths[0]
+
+
+@pytest.mark.parametrize(
+    "lr",
+    [
+        *(np.float32(0.0), np.float32(1e-40), np.float64(0.0), np.float64(1e-320)),
+        *(np.int64(0), 0, torch.tensor(0), torch.tensor(0.0, dtype=torch.bfloat16)),
+        *(np.float32(1e-3), np.float64(1e-3), np.int64(1), 1, torch.tensor(1)),
+        *(torch.tensor(1e-3), torch.tensor(1e-3, dtype=torch.float16)),
+    ],
+    ids=repr,
+)
+def test_a_learning_rate_of_any_type(lr: Any) -> None:
+    splats = scene(5, 3)
+    start = splats["means"].detach().clone()
+    run(splats, pull(torch.ones(5, 3)), 2, lr=lr)
+    moved = (splats["means"].detach() - start).abs().amax(1) / splats["scales"].exp().amax(1)
+    if float(lr) < 1e-30:
+        assert not moved.any()
+    else:
+        assert bool(((moved > 0.01) & (moved < 0.5)).all())
+
+
+def test_the_log_has_a_rate_while_it_acts() -> None:
+    splats = make_splats()
+    phases = only(TOTAL, OwnFrame())
+    adams = phases.upgrade(gsplat_optimizers(splats))
+    train(splats, adams, phases, 0, 3)
+    (part,) = phases.parts
+    assert part.numbers(phases)["own_frame_rate"] == pytest.approx(0.1, rel=0.2)
+    group = adams["quats"].param_groups.pop()
+    with pytest.warns(UserWarning, match="until then they are stepped as without this part"):
+        train({**splats}, {n: a for n, a in adams.items() if n != "quats"}, phases, 3, 4)
+    assert part.numbers(phases) == {}
+    adams["quats"].param_groups.append(group)
+    train(splats, adams, phases, 4, 5)
+    assert "own_frame_rate" in part.numbers(phases)
 
 
 # -- whose units Adam's moments are in ---------------------------------------------------------

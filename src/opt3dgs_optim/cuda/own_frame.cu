@@ -1,6 +1,7 @@
 // Vectors into and out of each Gaussian's own frame B = R diag(s), one thread per Gaussian: R is the rotation of
 // its quaternion, and s are its standard deviations. `two_loop.cuh` goes in front, for Real and its vectors.
 // A deviation counts as no less than min_aspect of the Gaussian's longest.
+// What is fed is bounded, so that Adam's second moment, the mean of its square, stays finite.
 // quats: [rows, 4], wxyz, of any length, beginning at a multiple of 16 bytes; scales: [rows, 3], logarithms.
 
 template <typename T> POINT Vec3<T> cross(Vec3<T> a, Vec3<T> b) {
@@ -10,6 +11,15 @@ template <typename T> POINT Vec3<T> cross(Vec3<T> a, Vec3<T> b) {
 template <typename T> POINT Vec3<T> product(Vec3<T> a, Vec3<T> b) { return {a.x * b.x, a.y * b.y, a.z * b.z}; }
 
 template <typename T> POINT T larger(T a, T b) { return b > a ? b : a; }
+
+// Half of the root of the largest number, a power of two.
+POINT float largest(float) { return 0x1p63f; }
+POINT double largest(double) { return 0x1p511; }
+
+template <typename T> POINT T bounded(T x) {
+  const T most = largest(x);
+  return x > most ? most : x < -most ? -most : x;
+}
 
 template <typename T> struct Frame {
   T w;
@@ -25,11 +35,12 @@ template <typename T> struct Frame {
     axis = over(xyz, size);
     const Vec3<T> log_scale = read_row(scales, row);
     const Vec3<T> s = {exp(log_scale.x), exp(log_scale.y), exp(log_scale.z)};
-    const T least = min_aspect * larger(larger(s.x, s.y), s.z);
+    const T longest = larger(larger(s.x, s.y), s.z), least = min_aspect * longest;
     deviations = {larger(s.x, least), larger(s.y, least), larger(s.z, least)};
-    // What is not finite less itself is no zero. Such a Gaussian counts as a point: nothing moves it.
+    // What is not finite less itself is no zero. Such a Gaussian, or one without a finite size, counts
+    // as a point: nothing moves it.
     const T total = norm + s.x + s.y + s.z;
-    if (!(total - total == T(0))) {
+    if (!(total - total == T(0)) || !(longest < largest(norm))) {
       w = T(0);
       axis = deviations = {T(0), T(0), T(0)};
     }
@@ -47,13 +58,14 @@ template <typename T> struct Frame {
 
 POINT long long this_row() { return static_cast<long long>(blockIdx.x) * blockDim.x + threadIdx.x; }
 
-// results = B^T grads
+// results = B^T grads, bounded
 extern "C" __global__ void __launch_bounds__(128)
     own_frame_gradient(const Real* __restrict__ grads, const Real* __restrict__ quats,
                        const Real* __restrict__ scales, Real* __restrict__ results, long long rows, Real min_aspect) {
   const long long row = this_row();
   if (row >= rows) return;
-  write_row(results, row, Frame<Real>(quats, scales, row, min_aspect).into(read_row(grads, row)));
+  const Vec3<Real> own = Frame<Real>(quats, scales, row, min_aspect).into(read_row(grads, row));
+  write_row(results, row, Vec3<Real>{bounded(own.x), bounded(own.y), bounded(own.z)});
 }
 
 // results = B steps

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,7 +15,7 @@ from opt3dgs_optim.frames import Frames
 from opt3dgs_optim.part import Group, Part, State
 
 CALL = "OwnFrame"
-FRAMES = "frames"  # what it publishes from gradient to step
+FRAMES, RATE = "frames", "own_frame_rate"  # what it publishes: until the step, and of the step
 
 
 @dataclass(frozen=True, repr=False)
@@ -30,8 +30,8 @@ class OwnFrame(Part):
     large Gaussian does not notice throws a small one out of its place. Here Adam is fed the
     gradient in the Gaussian's own frame, and what it answers is a step along the Gaussian's axes: a
     full step is `rate` standard deviations. It does not depend on the unit of the scene, nor on the
-    positions' learning rate, which counts in one way only: at 0 the positions are held. Position
-    noise and everything else that reads that rate are not changed.
+    positions' learning rate. At a rate of 0 the positions are held. Position noise, decoupled
+    weight decay and everything else that reads that rate are not changed.
 
     Trained Gaussians are thin, often far thinner than a pixel. Steps in proportion to such an axis
     would hold the Gaussian fast across its own surface, so that an axis counts as no thinner than
@@ -39,10 +39,13 @@ class OwnFrame(Part):
 
     Adam's moments of the positions then belong to the own frame; everything else stays as it is.
     Where a training begins with it in the middle, from a checkpoint of the unchanged trainer, say,
-    they begin anew. A trainer without it would have to zero them to go on.
+    they begin anew. A trainer without it would have to zero them to go on. `load_state_dict` takes
+    over the moments of a checkpoint with it; those that are carried by hand begin anew.
+    What it is fed is bounded, so that Adam's moments stay finite. A Gaussian whose deviations are
+    so large that their square is infinite is neither fed nor moved, nor is one with a NaN.
     Scales and quaternions are looked up in the groups of the upgraded optimizers (gsplat's,
     INRIA's, nerfstudio's names and others). Where they are not found, it is said once, and the
-    positions are stepped as the trainer would.
+    positions of that group are stepped as the trainer would.
 
     Beside it `Fading` was measured with the positions left out of its `names`: a faded step of them
     would be half a standard deviation long.
@@ -104,8 +107,9 @@ class OwnFrame(Part):
             )
             if not fits:
                 shapes = {name: tuple(each.shape) for name, each in gaussians.items()}
+                course.publish(RATE, param, None)
                 course.warn_once(
-                    CALL,
+                    f"{CALL} {course.place_of(param)}",
                     f"{CALL}: the positions, of shape {tuple(param.shape)}, need scales [N, 3] and "
                     f"quats [N, 4] of the same points among the upgraded optimizers, which hold "
                     f"{shapes}; until then they are stepped as without this part",
@@ -135,10 +139,12 @@ class OwnFrame(Part):
 
     def factor(self, group: Group, course: Course) -> float | Tensor:
         """What makes of the positions' learning rate the one of the own frame."""
-        lr = group["lr"]  # one that is subnormal counts as 0
+        lr, rate = group["lr"], self.at(course.progress)
         if isinstance(lr, Tensor):
-            return torch.where(lr < torch.finfo(lr.dtype).tiny, 1.0, self.at(course.progress) / lr)
-        return self.at(course.progress) / lr if lr >= sys.float_info.min else 1.0
+            lr = lr if lr.is_floating_point() else lr.to(torch.float32)
+            return torch.where(lr < torch.finfo(lr.dtype).tiny, 1.0, rate / lr)
+        tiny = np.finfo(lr.dtype if isinstance(lr, np.floating) else np.float64).tiny
+        return rate / float(lr) if lr >= tiny else 1.0  # one that is subnormal counts as 0
 
     def displacement(
         self, group: Group, param: Tensor, step: Tensor, state: State, course: Course
@@ -147,11 +153,13 @@ class OwnFrame(Part):
         name = _name(self, course)
         frames: Frames = course.published(name, param)
         course.publish(name, param, None)  # gives their memory back
+        course.publish(RATE, param, self.at(course.progress))
         return frames.displacement(step)
 
     def numbers(self, course: Course) -> Mapping[str, float]:
-        """`own_frame_rate`: standard deviations of a full step."""
-        return {"own_frame_rate": self.at(course.progress)}
+        """`own_frame_rate`: standard deviations of a full step, while it acts."""
+        rate = course.last_published(RATE)
+        return {} if rate is None else {RATE: rate}
 
 
 def _name(part: OwnFrame, course: Course) -> str:
