@@ -31,8 +31,17 @@ from trainers import (
     upgraded,
 )
 
-from opt3dgs_optim import Averaging, Fading, OwnFrame, Part, Phase, PhaseScheduler, PositionNoise
-from opt3dgs_optim.frames import Frames
+from opt3dgs_optim import (
+    Averaging,
+    Fading,
+    OwnFrame,
+    Part,
+    Phase,
+    PhaseScheduler,
+    PositionNoise,
+    cuda,
+)
+from opt3dgs_optim.frames import LARGEST, Frames
 
 TOTAL = 60
 
@@ -766,3 +775,35 @@ def test_the_rate_falls_by_a_hundred_over_the_run() -> None:
         *(0.1, 0.1),
         *(pytest.approx(0.001), pytest.approx(0.001)),
     ]
+
+
+def test_the_bound_is_half_of_the_root_of_the_largest_number() -> None:
+    expected = {torch.float16: 7, torch.bfloat16: 63, torch.float32: 63, torch.float64: 511}
+    assert {dtype: 2.0**exponent for dtype, exponent in expected.items()} == LARGEST
+    for dtype, bound in LARGEST.items():
+        assert 0.2 < (bound**2 / torch.finfo(dtype).max) < 0.3
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32], ids=str)
+def test_what_a_device_is_given_and_what_becomes_of_its_answer(
+    dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The frames as they were, in single precision; in half precision its bound is another."""
+    given = list[Tensor]()
+
+    def kernel(grad: Tensor, quats: Tensor, scales: Tensor, min_aspect: float) -> Tensor:
+        given[:] = grad, quats, scales
+        return torch.tensor([[3e4, -3e4, 2.0]]).expand_as(grad).clone()
+
+    monkeypatch.setattr(cuda, "has_own_frames", lambda _: True)
+    monkeypatch.setattr(cuda, "own_frame_gradient", kernel)
+    quats, scales = torch.ones(5, 4, dtype=dtype), torch.zeros(5, 3, dtype=dtype)
+    frames = Frames(quats, scales, dtype, 0.1)
+    quats += 1  # as one optimizer of all groups moves them before the step is asked for
+    scales += 1
+    found = frames.gradient(torch.ones(5, 3, dtype=dtype))
+    assert [each.dtype for each in given] == [torch.float32] * 3
+    assert [float(each.mean()) for each in given] == [1.0, 1.0, 0.0]
+    assert found.dtype == dtype
+    most = 128.0 if dtype == torch.float16 else 3e4
+    assert found[0].tolist() == [most, -most, 2.0]
