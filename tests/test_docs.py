@@ -146,7 +146,7 @@ def test_the_readme_shows_what_the_command_prints(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("title", "kind"),
     [
-        ("**3dgs-mcmc**, `", "3dgs-mcmc"),
+        ("**3dgs-mcmc** and", "3dgs-mcmc"),
         ("**INRIA's gaussian-splatting**", "inria"),
         ("**gsplat**, `simple_trainer.py`", "gsplat"),
     ],
