@@ -64,6 +64,7 @@ TUNED = {
 OURS = {  # the last lines of `tuned_table`
     "**`Fading` alone**, learning rates as published": "faded",
     "**the defaults**, learning rates as published": DEFAULTS,
+    "with `OwnFrame`, learning rates as published": OWN_FRAME_ARM,
 }
 
 
