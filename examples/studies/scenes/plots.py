@@ -93,19 +93,22 @@ def plot_one(study: Study, setting: Setting, path: Path) -> None:
         # The iterates, and their mean in the end: what the trainer has at each of these times.
         DEFAULTS: (pairs[0][2], [study.runs(setting, DEFAULTS)[arm.seed] for arm, _, _ in pairs]),
     }
+    ends = {}
     for arm, (cost, records) in lines.items():
         shares = records[0].curve["iteration"] * cost / setting.iterations
         mean = np.mean([record.curve["psnr"] for record in records], axis=0)
         # The first look is off the scale of what is compared.
         axis.plot(shares[1:], mean[1:], color=COLOURS[arm], linewidth=2.5)
-        text = f"{label(arm)}\n{mean[-1]:.1f} dB"
+        ends[arm] = float(shares[-1]), float(mean[-1])
+    for arm, end in ends.items():
+        above = end[1] == max(value for _, value in ends.values())
         axis.annotate(
-            text,
-            (shares[-1], mean[-1]),
+            f"{label(arm)}, {end[1]:.1f} dB",
+            end,
             xytext=(6, 0),
             textcoords="offset points",
             color=COLOURS[arm],
-            va="center",
+            va="bottom" if above else "top",  # they may end close to each other
         )
     axis.set_xlim(0, 1.4)
     axis.set_xticks([0, 0.25, 0.5, 0.75, 1.0])

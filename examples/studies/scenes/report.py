@@ -79,7 +79,7 @@ LONG, BRIEF = 30_000, 7_500
 SHORTER = (BRIEF, 10_000)  # lengths that may do instead of the baseline's
 ADAPTIVE_ARMS = (ADAPTIVE, "adc+annealed+faded", ADAPTIVE_DEFAULTS)
 PLUSH = Setting("plush", 4_000, BRIEF, "sfm", rotated=True)  # where other rates were tried, too
-LARGEST = Setting("bonsai", 50_000, LONG, "sfm", rotated=True, size="images_2")  # the README's
+LARGEST = Setting("lego", 50_000, LONG, "sfm", rotated=True, size="images_2")  # the README's
 FULL_ARMS = (BASELINE, "faded", DEFAULTS, OWN_FRAME_ARM)
 UNSEEN_ARMS = (BASELINE, "faded", "faded+out-of-view+averaged")
 
