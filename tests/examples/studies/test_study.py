@@ -661,11 +661,12 @@ def test_the_readmes_arm_is_all_that_a_new_one_takes(
         plan(tmp_path, tmp_path, ["embedded"], arms=["nonsense"])
 
 
+@pytest.mark.parametrize("gain", [3.0, 0.1, -0.1])
 def test_the_readmes_curve_is_of_the_seeds_that_both_have(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    gain: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     ends = (BASELINE, 0, 20.0), (BASELINE, 1, 22.0), (BASELINE, 2, 90.0)
-    ends = *ends, (DEFAULT_ARM, 0, 23.0), (DEFAULT_ARM, 1, 25.0)
+    ends = *ends, (DEFAULT_ARM, 0, 20.0 + gain), (DEFAULT_ARM, 1, 22.0 + gain)
     study = Study([rotated_record(arm, "a", seed, psnr=psnr) for arm, seed, psnr in ends])
     kept: list[Any] = []
     monkeypatch.setattr(plots.plt, "close", kept.append)
@@ -673,9 +674,10 @@ def test_the_readmes_curve_is_of_the_seeds_that_both_have(
     plots.plot_one(study, setting, tmp_path / "one.png")
     (figure,) = kept
     (axis,) = figure.axes
-    assert [float(line.get_ydata()[-1]) for line in axis.lines] == [21.0, 24.0]
-    assert [text.get_text() for text in axis.texts] == [
-        "3DGS-MCMC\n21.0 dB",
-        "the defaults\n24.0 dB",
-    ]
+    assert [float(line.get_ydata()[-1]) for line in axis.lines] == [21.0, 21.0 + gain]
+    first, second = axis.texts
+    assert first.get_text() == "3DGS-MCMC, 21.0 dB"
+    assert second.get_text() == f"the defaults, {21.0 + gain:.1f} dB"
+    figure.canvas.draw()
+    assert not first.get_window_extent().overlaps(second.get_window_extent())
     assert (tmp_path / "one.png").stat().st_size > 1000
