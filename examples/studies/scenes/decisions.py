@@ -12,7 +12,8 @@ QUARTER, HALF, FULL = "images_4", "images_2", "images"
 # What decides: the first of these that enough scenes and seeds were trained at.
 LADDER = ((HALF, 30_000), (QUARTER, 30_000), (QUARTER, 7_500))
 POINTS, HALF_POINTS = 4_000, 50_000
-NUM_POINTS = {"embedded": 2_000, "bonsai": 10_000, "bonsai-aligned": 10_000, "lego": 10_000}
+ALIGNED = "bonsai-aligned"  # bonsai with the poses of `register.py`
+NUM_POINTS = {"embedded": 2_000, "bonsai": 10_000, ALIGNED: 10_000, "lego": 10_000}
 MANY_VIEWS_SCENES = ("bonsai", "lego", "plush")  # forty training views or more
 MIN_SCENES, MIN_SEEDS = 3, 2
 # part -> (the arm with it, the arm without it)

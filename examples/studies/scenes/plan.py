@@ -19,13 +19,14 @@ from studies.scenes.arms import (
     OWN_FRAME_ARM,
     find_study_arm,
 )
-from studies.scenes.decisions import MANY_VIEWS_SCENES, points_of
+from studies.scenes.decisions import ALIGNED, MANY_VIEWS_SCENES, points_of
 from studies.scenes.training import Spec
 
 FEW_VIEWS_SCENES = ("embedded", "banana", "lund_door", "brighton_beach")
 STOCK = (BASELINE, f"{BASELINE}{AVERAGED}")
 TODAY = (*STOCK, "faded", DEFAULTS)
 FRAMES = (OWN_FRAME_ARM, f"{OWN_FRAME}{AVERAGED}")
+ALIGNED_ARMS = (BASELINE, DEFAULTS, OWN_FRAME_ARM)
 RATES = tuple(arm.name for arm in LIST if arm.name.startswith(("rates-", "positions-")))
 ADAPTIVE_ARMS = (ADAPTIVE, ADAPTIVE_DEFAULTS)
 
@@ -112,6 +113,12 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
             for spec in rotated(
                 scenes, [*STOCK, DEFAULTS, *FRAMES], 1, iterations, 20, size="images", sh_degree=3
             )
+        ],
+        # Bonsai with the poses of `register.py`: SCENES/bonsai-aligned.
+        "aligned": [
+            *rotated((ALIGNED,), [*ALIGNED_ARMS, "rates-x2"], seeds, 30_000),
+            *at_half((ALIGNED,), ALIGNED_ARMS, seeds, share=5),
+            *rotated((ALIGNED,), ALIGNED_ARMS, 1, 30_000, 20, size="images", sh_degree=3),
         ],
         # One size of a training after the other.
         "crowded": [  # 40,000 Gaussians on images of a quarter of their size

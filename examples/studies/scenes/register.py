@@ -6,8 +6,9 @@
 
 Poses that were found by matching each photo with its neighbours alone may fall into parts that do
 not fit together: an orbit that comes back sees the scene a second time, at another place. No
-training can fit that. Here photos are matched with their neighbours, and every third one with every
-other third one, so that orbits close.
+training can fit that, though every photo may fit its own points. Here photos are matched with their
+neighbours, and every third one with every other third one, and all are posed at once, so that
+orbits close.
 
 pycolmap and Pillow in one process corrupted the heap (seen twice), so that nothing else reads
 pictures here. One thread is the default, since mapping with several is not the same twice.
@@ -24,6 +25,7 @@ from typing import Any
 import numpy as np
 
 NEIGHBOURS, STRIDE = 12, 3  # photos that follow, and every so manieth other
+PARTS = 14  # of the photos, each of which is to look at the same thing
 MAX_RATIO = 2.0  # of a photo's median reprojection error to the median over all photos
 
 
@@ -55,6 +57,27 @@ def that_do_not_fit(errors: dict[str, float], max_ratio: float = MAX_RATIO) -> l
     """The photos whose error is more than so many times the median over all photos."""
     usual = float(np.median(list(errors.values())))
     return [name for name, error in errors.items() if error > max_ratio * usual]
+
+
+def spread_of_looks(reconstruction: Any, parts: int = PARTS) -> float:
+    """How far apart the points are that parts of the photos look at, over the cameras' distance.
+
+    In the order of their names. What a part looks at is the point next to the optical axes of its
+    cameras. Around one object it is far below 1, also where every photo fits its own points: an
+    orbit that comes back to a second copy of the object has two such points.
+    """
+    images = sorted(reconstruction.images.values(), key=lambda image: image.name)
+    found = []
+    for part in np.array_split(np.arange(len(images)), min(parts, len(images) // 2)):
+        centres = np.array([images[i].projection_center() for i in part])
+        axes = np.array([images[i].viewing_direction() for i in part])
+        across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [n, 3, 3], off each axis
+        moved = (across @ centres[:, :, None]).sum(0)
+        point = np.linalg.lstsq(across.sum(0), moved, rcond=None)[0][:, 0]
+        found.append((point, np.linalg.norm(centres - point, axis=1).mean()))
+    points = np.array([point for point, _ in found])
+    gaps = np.linalg.norm(points[:, None] - points, axis=2)
+    return float(gaps.max() / np.median([distance for _, distance in found]))
 
 
 def pairs_of(count: int) -> list[tuple[int, int]]:
@@ -113,6 +136,9 @@ def report(reconstruction: Any) -> str:
     lines = [f"{len(errors)} photos, median reprojection error {usual:.2f} pixels"]
     lines += [f"{name}: {errors[name]:.2f} pixels" for name in bad]
     lines.append(f"{len(bad)} photos have more than {MAX_RATIO:g} times that")
+    spread = spread_of_looks(reconstruction)
+    lines.append(f"parts of them look at points {spread:.2f} of the cameras' distance apart")
+    lines.append("(around one object that is far below 1; seen from one side it says nothing)")
     return "\n".join(lines)
 
 

@@ -31,6 +31,7 @@ from studies.scenes.arms import (
     arm_of,
 )
 from studies.scenes.decisions import (
+    ALIGNED,
     HALF,
     PIECES,
     QUARTER,
@@ -108,6 +109,7 @@ def conclusions(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
     degrees = [*every, *every_scene(study, LONG, sh_degree=3)]
     half = settings_of(study, LONG, size=HALF)
     full = [s for s in study.settings() if s.rotated and s.size == "images" and not s.views]
+    aligned = [s for s in study.settings() if s.scene == ALIGNED]
     nine = settings_of(study, LONG, PIECES["OutOfView"])
     trained = [r for r in study.records() if r.setting.rotated]
     tuned = [small_trainings(study), settings_of(study, BRIEF), long, half]
@@ -115,6 +117,9 @@ def conclusions(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
         "rotated-machines": machines_line(trained),
         "decisions": decisions_table(study, BRIEF),
         "averaging": averaging_line(study),
+        "aligned": metrics_table(
+            study, aligned, (BASELINE, "rates-x2", DEFAULTS, OWN_FRAME_ARM), plain=True, head=crowd
+        ),
         "every-scene": scenes_gain_table(study, degrees, DEFAULTS, BASELINE),
         "full": metrics_table(
             study, full, FULL_ARMS, plain=True, head=lambda s: f"{s.scene}, {s.iterations:,}"

@@ -70,7 +70,7 @@ OURS = {  # the last lines of `tuned_table`
 
 def label(arm: str) -> str:
     """What an arm is called beside text that explains it; its own name where it has no other."""
-    return LABELS.get(arm, f"`{arm}`")
+    return LABELS.get(arm) or TUNED.get(arm, f"`{arm}`")
 
 
 def counted(count: int, what: str) -> str:
@@ -220,7 +220,7 @@ def headline_table(study: Study, sizes: Iterable[Sequence[Setting]]) -> str:
         about = _size_of(both, [len(seeds[setting]) for setting in both]) if both else ""
         for arm in whole:
             if arm not in TUNED or arm == best:
-                what = TUNED.get(arm, label(arm))
+                what = label(arm)
                 cells = [_cell(found[arm].get(scene, []), seeds=False) for scene in scenes]
                 rows.append((about, f"**{what}**" if arm == DEFAULTS else what, *cells))
                 about = about.partition(":")[0]
@@ -275,7 +275,7 @@ def sizes_table(study: Study, sizes: Sequence[Sequence[Setting]], arms: Iterable
                 for size in sizes
             ]
             if any(cell != "-" for cell in cells):
-                rows.append((scene, TUNED.get(arm, label(arm)), *cells))
+                rows.append((scene, label(arm), *cells))
     names = [SIZES[QUARTER], SIZES[HALF], SIZES[FULL]]
     return table(("scene", "training", *names), "llrrr", rows)
 

@@ -37,7 +37,34 @@ def photo(name: str, offsets: list[float], unseen: int = 0) -> Any:
         offset = offsets[int(xyz[0])]
         return None if np.isnan(offset) else np.array([xyz[0], offset])
 
-    return SimpleNamespace(name=name, points2D=points, project_point=project)
+    number = sum(map(ord, name))
+    return SimpleNamespace(
+        name=name,
+        points2D=points,
+        project_point=project,
+        projection_center=lambda: np.array([np.cos(number), np.sin(number), 0.0]),
+        viewing_direction=lambda: -np.array([np.cos(number), np.sin(number), 0.0]),
+    )
+
+
+@pytest.mark.parametrize("second", [0.0, 5.0])
+def test_an_orbit_around_two_copies_is_seen(second: float) -> None:
+    """Every photo fits its own points there."""
+
+    def camera(i: int) -> Any:
+        angle, centre = i / 10, np.array([second * (i >= 56), 0.0, 1.0])
+        away = np.array([np.cos(angle), np.sin(angle), 0.3])
+        axis = -away / np.linalg.norm(away)
+        return SimpleNamespace(
+            name=f"{i:03}",
+            projection_center=lambda: centre + 2 * away,
+            viewing_direction=lambda: axis,
+        )
+
+    model = SimpleNamespace(images={i: camera(i) for i in range(112)})
+    found = register.spread_of_looks(model)
+    distance = 2 * np.hypot(1.0, 0.3)
+    assert found == pytest.approx(second / distance, abs=1e-6)
 
 
 def test_a_photo_that_does_not_fit_is_named() -> None:
