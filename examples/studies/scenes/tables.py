@@ -8,7 +8,7 @@ from dataclasses import replace
 from statistics import fmean
 
 from studies.pages import table
-from studies.scenes.analysis import METRICS, Difference, Study, difference, same_start
+from studies.scenes.analysis import METRICS, Difference, Study, difference
 from studies.scenes.arms import (
     ADAPTIVE,
     ADAPTIVE_DEFAULTS,
@@ -168,11 +168,12 @@ def averaging_line(study: Study) -> str:
     A training and the same one with its mean have the first 29/30 in common, bit for bit.
     """
     found = [
-        (arm.averages, [s * (r.curve[m][-1] - other.curve[m][-1]) for m, (s, _) in METRICS.items()])
-        for r in study.records()
-        if (arm := arm_of(r.arm)).averages is not None
-        and (other := study.runs(r.setting, arm.averages).get(r.seed)) is not None
-        and same_start(r, other)
+        (trunk, [sign * (a.curve[m][-1] - b.curve[m][-1]) for m, (sign, _) in METRICS.items()])
+        for setting in study.settings()
+        for arm in study.arms([setting])
+        if (trunk := arm_of(arm).averages) is not None
+        for pairs in difference(study, [setting], arm, trunk).pairs.values()
+        for a, b, _ in pairs
     ]
     alone = [gains for name, gains in found if name == BASELINE]
     psnr = [gains[0] for _, gains in found]
