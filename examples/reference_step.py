@@ -73,9 +73,10 @@ def default_step(
         grad, own = grads[name], state.setdefault(name, new_moments(param))
 
         # Fading: the moments of a random fifth of the points are shrunk, the same in all tensors.
-        # Of more than 10,000 points, fewer of the events happen.
+        # Of more than 10,000 points, fewer of the events happen. Own frames are left alone.
         thinning = min(1.0, 10_000 / num_points) ** (2 / 3)
-        for event in events:
+        in_own_frame = own_frame and name == "means"
+        for event in () if in_own_frame else events:
             if int((event + 1) * thinning) > int(event * thinning):
                 generator = torch.Generator().manual_seed(event)
                 chosen = torch.rand(num_points, generator=generator) < 0.2
@@ -92,7 +93,7 @@ def default_step(
         # OwnFrame: a position is stepped by B z, with Adam's step z in the Gaussian's own frame, in
         # standard deviations. A full step has 0.1 of them at the start and 0.001 at the end. An
         # axis counts as no thinner than a tenth of the longest.
-        if own_frame and name == "means":
+        if in_own_frame:
             q, deviations = own_axes(params["quats"], params["scales"])
             z = torch.zeros_like(param)
             rate = rates[name] * (0.1 * 0.01 ** (iteration / total) / rates[name])

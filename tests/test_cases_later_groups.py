@@ -161,6 +161,7 @@ def test_a_group_that_another_optimizer_replaces_is_found(replaced: str, parts: 
 
 @pytest.mark.parametrize("hook", ["before", "factor", "ready"])
 @pytest.mark.parametrize("make", [inria_optimizer, gsplat_optimizers])
+@pytest.mark.filterwarnings("ignore:.*of means begin anew")
 def test_a_step_that_a_hook_refuses_changes_nothing(hook: str, make: Any) -> None:
     """Not even whose units the moments of a group before are in."""
 

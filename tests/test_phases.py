@@ -32,6 +32,7 @@ from trainers import (
 from opt3dgs_optim import (
     AWSGLD,
     DEFAULTS,
+    DEFAULTS_ADC,
     Annealing,
     Averaging,
     ConstantMultiplier,
@@ -231,6 +232,8 @@ def test_presets() -> None:
     assert warmup is not None
     assert (short.switch_step, warmup.warmup) == (2_900, 250)
     assert PhaseScheduler(10).parts == DEFAULTS == (Fading(), OutOfView(), Averaging())
+    for preset in (DEFAULTS, DEFAULTS_ADC, short.parts):
+        assert len({type(part) for part in preset}) == len(preset)
     assert PhaseScheduler(10, parts=[]).parts == ()
     more = ConstantMultiplier(2.0)
     assert PhaseScheduler(10, parts=[*DEFAULTS, more]).parts[-1] == more

@@ -29,8 +29,8 @@ from torch import Tensor
 
 from opt3dgs_optim.checks import LOGGER, check_count, check_keys, check_number, warn_user
 from opt3dgs_optim.course import NEVER, STATE_KEY, Course, check_format, restored_number
-from opt3dgs_optim.names import SLOT, group_name
-from opt3dgs_optim.part import Kept, Window
+from opt3dgs_optim.names import ADAM_KEYS, SLOT, gaussian_of, group_name
+from opt3dgs_optim.part import Group, Kept, Window
 from opt3dgs_optim.state import (
     ParameterRecord,
     check_kept,
@@ -71,6 +71,44 @@ class Saved(NamedTuple):
     records: list[list[SavedRecord]]  # by group, by parameter
     rows: list[dict[str, Tensor]]  # by parameter: what parts keep per row
     parts: frozenset[str] = frozenset()  # names of those that have kept something
+
+
+def take_units(
+    group: Group,
+    record: ParameterRecord,
+    state: dict[str, Any] | None,
+    units: tuple[str, ...],
+    course: Course,
+) -> None:
+    """Begin Adam's moments anew, which are in the units of other parts than those that act.
+
+    Args:
+        state: Adam's of the parameter; None before its first step.
+        units: the names of the parts that act, and have units of their own.
+    """
+    known, record.units = record.units, units
+    if not state:
+        return
+    if known is None:  # moments that somebody has put there, past our load_state_dict
+        course.expect(number_of_steps([state]))
+        known = ()
+    if known == units:
+        return
+    for key in [key for key in ADAM_KEYS if key in state]:
+        # Not in place: where a load fails later on, all of it is undone.
+        value = state[key]
+        state[key] = torch.zeros_like(value) if isinstance(value, Tensor) else 0
+    name, parts = gaussian_of(group), ", ".join(units or known)
+    what = f"Adam's moments of {name} begin anew, since {parts} "
+    what += "begins to act" if units else "ceases to act"
+    if record.last_moved is None:  # no step in this process: they were loaded
+        course.warn_once(
+            f"units of {name}",
+            f"{what}: those that were loaded are in other units; to go on with them, give the "
+            "parts of the training that they come from",
+        )
+    else:
+        LOGGER.info("iteration %d: %s", course.current, what)
 
 
 def number_of_steps(states: Iterable[Mapping[str, Any]]) -> int:

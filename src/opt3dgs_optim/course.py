@@ -135,7 +135,7 @@ class Course:
             if kept.per == "row"
         )
         self._unlearnt = {name: learnt_by(part) for name, part in self._named.items()}
-        self.asks_parts = any(overrides(part, "ready") for part in self._parts)
+        self.asks_parts = any(p.own_units or overrides(p, "ready") for p in self._parts)
         self._windowed = [
             name
             for name, part in self._named.items()
@@ -358,7 +358,8 @@ class Course:
 
         They are looked up in the optimizers' groups, because density control replaces them:
         `means, scales, quats, opacities, sh0, shN` as far as optimizers of this course hold them,
-        raw, as the trainer keeps them. Empty for any other tensor.
+        raw, as the trainer keeps them. Empty for any other tensor. Of several optimizers that hold
+        one of these names, that of the parameter comes first, and then the latest.
 
         Args:
             param: a Gaussian parameter, of shape [N, ..].
@@ -366,12 +367,17 @@ class Course:
         place = self.place_of(param)
         if place is None:
             return {}
-        found = dict[str, Tensor]()
-        for group in self._groups():
-            params, name = group["params"], group.gaussian
-            if name and group.set_name == place.set_name and place.number < len(params):
-                found[name] = params[place.number]
-        return found
+        found, own = dict[str, Tensor](), dict[str, Tensor]()
+        for optimizer in self.followers():
+            held = {
+                str(group.gaussian): group["params"][place.number]
+                for group in optimizer.gaussian_groups()
+                if group.set_name == place.set_name and place.number < len(group["params"])
+            }
+            found |= held
+            if any(each is param for each in held.values()):
+                own = held
+        return found | own
 
     def number_kept(self, part: Part, name: str, param: Tensor) -> Tensor | None:
         """What a part keeps per parameter for another parameter than that of the present hook.
@@ -386,12 +392,7 @@ class Course:
         return next((record.numbers.get(key) for record in found if record is not None), None)
 
     def _groups(self) -> Iterator[NamedGroup]:
-        for optimizer in self.followers():
-            if not all(type(group) is NamedGroup for group in optimizer.param_groups):
-                optimizer.name_groups()  # a trainer has put others there since its last step
-            for group in optimizer.param_groups:
-                if isinstance(group, NamedGroup) and group.gaussian is not None:
-                    yield group
+        return (group for each in self.followers() for group in each.gaussian_groups())
 
     def publish(self, name: str, param: Tensor, value: Any) -> None:
         """Tell other parts something about the set of Gaussians that a parameter belongs to.

@@ -204,11 +204,14 @@ class Part:
             a parameter or ends, in a checkpoint of the unchanged trainer, say.
         needs_units: whether `before` needs a gradient in the parameter's own units. Then the part
             cannot come after one that has other units.
+        spares_own_units: whether the part leaves a parameter alone while another one that acts on
+            it has units of its own.
     """
 
     during: ClassVar[Phase | None] = None
     own_units: ClassVar[bool] = False
     needs_units: ClassVar[bool] = False
+    spares_own_units: ClassVar[bool] = False
     keeps: tuple[Kept, ...] = ()
     names: Any = GAUSSIAN  # tuple[str, ...] | None
 

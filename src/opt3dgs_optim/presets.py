@@ -20,7 +20,8 @@ LEFT_OUT_WITH_REMOVAL: tuple[type[Part], ...] = (Fading,)
 DEFAULTS_ADC: tuple[Part, ...] = (
     Annealing(names=("quats", "opacities", "sh0", "shN")),
     Fading(names=("means", "quats", "opacities", "sh0", "shN")),
-    *DEFAULTS[1:],
+    OutOfView(),
+    Averaging(),
 )
 
 

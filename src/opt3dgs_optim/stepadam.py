@@ -18,6 +18,7 @@ from opt3dgs_optim.checkpoint import (
     number_of_steps,
     pack_optimizer,
     restore_records,
+    take_units,
 )
 from opt3dgs_optim.checks import LOGGER, as_damage, energy_of
 from opt3dgs_optim.course import STATE_KEY, Course, NoCourse
@@ -31,7 +32,6 @@ from opt3dgs_optim.in_step import (
     check_mask_fits,
 )
 from opt3dgs_optim.names import (
-    ADAM_KEYS,
     MOMENTS,
     NamedGroup,
     block,
@@ -98,6 +98,7 @@ class StepAdam(Adam):
     _nonfinite: Tensor | None = None  # seen on a device, and not looked at yet
     # Sought for these hooks and windows: by the Gaussian parameter, who acts on it.
     _acting: tuple[Any, Any, dict[str | None, ActingParts]] = (None, None, {})
+    _gone: Sequence[NamedGroup] = ()  # groups that a trainer has taken away since the last step
 
     def follow(self, course: Course, base: type[Adam] = Adam) -> None:
         """Have the parts of `course` from now on, around the step of `base`.
@@ -105,7 +106,7 @@ class StepAdam(Adam):
         Another class than torch's Adam has arithmetic of its own, and its step gets the mask.
         """
         self.course, self._base, self._ownership = course, base, RowOwnership()
-        self._known, self._open_windows = [], {}
+        self._known, self._gone, self._open_windows = [], (), {}
         self.name_groups()
         self._patch_step_function()  # of a class that was given to a made optimizer
         if base is Adam and course.parts and can_be_fused(self):
@@ -128,7 +129,8 @@ class StepAdam(Adam):
         """Know what each group holds: what was said of it, or else what its name says.
 
         A group that takes the place of another goes on with what was kept for that one. It is the
-        one that stood where it stands, if that had the same name, or else the one of its name.
+        one that stood where it stands, if that had the same name, or else the one of its name,
+        which may have gone since the last step: a trainer may empty the list, and fill it again.
         """
         groups = self.param_groups
         if len(groups) == len(self._known):
@@ -137,7 +139,8 @@ class StepAdam(Adam):
                     break
             else:
                 return
-        gone = [old for old in self._known if all(old is not group for group in groups)]
+        gone = [*self._gone, *self._known]
+        gone = [old for old in gone if all(old is not group for group in groups)]
         for i, group in enumerate(groups):
             if type(group) is NamedGroup:
                 continue
@@ -158,11 +161,17 @@ class StepAdam(Adam):
                 taken = slot[1] or "left alone"
                 LOGGER.info("a group was added: %s, %s", group_name(i, group), taken)
         self.course.forget_places()
-        self._known, self._slots = cast(list[NamedGroup], list(groups)), ()
+        self._known, self._slots, self._gone = cast(list[NamedGroup], list(groups)), (), gone
         every = [record for group in self._known for record in group.records]
         for group in self._known:
             if not are_of(group.records, group["params"]):
                 group.records = records_of(group["params"], group.records, every)
+
+    def gaussian_groups(self) -> list[NamedGroup]:
+        """Those that hold Gaussian parameters, also where a trainer has exchanged them just now."""
+        if not all(type(group) is NamedGroup for group in self.param_groups):
+            self.name_groups()
+        return [g for g in cast(list[NamedGroup], self.param_groups) if g.gaussian is not None]
 
     @property
     def _records(self) -> list[list[ParameterRecord]]:
@@ -263,6 +272,7 @@ class StepAdam(Adam):
         """Override what the base's step reads by what the parts say, and restore it."""
         course, counts = self.course, self._counts(mask)
         self.name_groups()
+        self._gone = ()
         if acting:
             self._follow_windows()
         if mask is not None:
@@ -311,9 +321,11 @@ class StepAdam(Adam):
         ]
 
     def _ready(self, parts: ActingParts, group: Group) -> ActingParts:
-        """Without the parts that say that they cannot act on the group in this step."""
+        """Without the parts that cannot act on the group in this step, or leave it to another."""
         every = {name: part for hook in STEP_HOOKS for name, part in getattr(parts, hook)}
-        ready = {name for name, part in every.items() if part.ready(group, self.course)}
+        ready = {name: part for name, part in every.items() if part.ready(group, self.course)}
+        if any(part.own_units for part in ready.values()):
+            ready = {name: part for name, part in ready.items() if not part.spares_own_units}
         return ActingParts.sought(
             lambda hook: [pair for pair in getattr(parts, hook) if pair[0] in ready]
         )
@@ -368,8 +380,9 @@ class StepAdam(Adam):
             if not (grad.is_cpu and is_finite_sum(grad)):
                 self._zero_nonfinite(param)
             if record.units != parts.units:
-                step.remember(record, self.state.get(param))
-                self._take_units(group, param, record, parts.units)
+                held = self.state.get(param)
+                step.remember(record, held)
+                take_units(group, record, held, parts.units, self.course)
             if needed and plain:
                 self._feed(step, group, param, record, parts)
             elif needed:
@@ -409,28 +422,6 @@ class StepAdam(Adam):
             step.fed.append((param, fed))
         self._ownership.claim(param, view.adam, course.row_keys)
         view.let_go()
-
-    def _take_units(
-        self, group: Group, param: Tensor, record: ParameterRecord, units: tuple[str, ...]
-    ) -> None:
-        """Begin Adam's moments anew, which are in the units of other parts than those that act."""
-        known, record.units = record.units, units
-        state = self.state.get(param)
-        if not state:
-            return
-        if known is None:  # moments that somebody has put there, past our load_state_dict
-            self.course.expect(number_of_steps([state]))
-            known = ()
-        if known == units:
-            return
-        for key in [key for key in ADAM_KEYS if key in state]:
-            # Not in place: where a load fails later on, all of it is undone.
-            state[key] = torch.zeros_like(state[key]) if isinstance(state[key], Tensor) else 0
-        LOGGER.info(
-            "iteration %d: Adam's moments of %s begin anew, since %s %s to act",
-            *(self.course.current, gaussian_of(group), ", ".join(units or known)),
-            "begins" if units else "ceases",
-        )
 
     def _view_of(self, group: Group, param: Tensor, record: ParameterRecord) -> ParameterState:
         """What the hooks see of a parameter's state, without what is of other rows."""
@@ -674,7 +665,7 @@ class StepAdam(Adam):
         for group, records in zip(self.param_groups, self._records, strict=True):
             for param, record in zip(group["params"], records, strict=True):
                 if not known >= set(record.units or ()):  # without parts no step would notice
-                    self._take_units(group, param, record, ())
+                    take_units(group, record, self.state.get(param), (), self.course)
         self._open_windows = dict(saved.windows)
         self._rewinds = self.course.rewinds
         self.clock_at = self.course.current

@@ -13,7 +13,6 @@ from opt3dgs_optim import (
     DEFAULTS,
     Curvature,
     EnergyHistogram,
-    Fading,
     OwnFrame,
     Part,
     PhaseScheduler,
@@ -34,7 +33,6 @@ LEARNING_RATES = {
     "sh0": 2.5e-3,
     "shN": 1.25e-4,
 }
-BUT_MEANS = tuple(name for name in LEARNING_RATES if name != "means")
 
 
 class Case:
@@ -155,9 +153,7 @@ SUBJECTS: dict[str, Callable[[Case], Callable[[], Any]]] = {
     "defaults, a tenth in view": lambda case: upgraded(case, [*DEFAULTS], tenth=True),
     "defaults, steps of a tenth": lambda case: upgraded(case, [*DEFAULTS], tenth=True, masked=True),
     "defaults, last thirtieth": lambda case: upgraded(case, [*DEFAULTS], at=0.975),
-    "defaults and OwnFrame": lambda case: upgraded(
-        case, [OwnFrame(), Fading(names=BUT_MEANS), *DEFAULTS[1:]]
-    ),
+    "defaults and OwnFrame": lambda case: upgraded(case, [OwnFrame(), *DEFAULTS]),
     "the paper's exploration": lambda case: upgraded(case, [EnergyHistogram.paper(warmup=4)]),
     "the paper's exploitation": lambda case: upgraded(
         case, [SquaredLoss(), Curvature()], exploit=True, at=0.0

@@ -30,6 +30,8 @@ class Fading(Part):
 
     The same points are faded in all these parameters. Which ones depends on `seed`, on the event
     and on the number of points alone, so that a resumed run repeats them. It costs no memory.
+    Positions that `OwnFrame` steps are left alone: a faded step of them would be half a standard
+    deviation long.
 
     Args:
         share: of the points in each event, chance per point in (0, 1].
@@ -54,6 +56,8 @@ class Fading(Part):
     stop: float = 0.5
     seed: int = 0
     names: tuple[str, ...] = GAUSSIAN
+
+    spares_own_units = True
 
     def __post_init__(self) -> None:
         start = check_number(CALL, "start", self.start, 0.0, 1.0)

@@ -12,10 +12,12 @@ from torch import Tensor
 from opt3dgs_optim.checks import check_number, set_options
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.frames import Frames
+from opt3dgs_optim.overrides import is_moving_rate
 from opt3dgs_optim.part import Group, Part, State
 
 CALL = "OwnFrame"
-FRAMES, RATE = "frames", "own_frame_rate"  # what it publishes: until the step, and of the step
+FRAMES, ACTED = "frames", "own_frame_acted"  # what it publishes: until the step, and when it acted
+RATE = "own_frame_rate"
 
 
 @dataclass(frozen=True, repr=False)
@@ -39,19 +41,26 @@ class OwnFrame(Part):
 
     Adam's moments of the positions then belong to the own frame; everything else stays as it is.
     Where a training begins with it in the middle, from a checkpoint of the unchanged trainer, say,
-    they begin anew. A trainer without it would have to zero them to go on. `load_state_dict` takes
-    over the moments of a checkpoint with it; those that are carried by hand begin anew.
-    What it is fed is bounded, so that Adam's moments stay finite. A Gaussian whose deviations are
-    so large that their square is infinite is neither fed nor moved, nor is one with a NaN.
+    they begin anew, which is said. A trainer without it would have to zero them to go on.
+    `load_state_dict` takes over the moments of a checkpoint with it; those that are carried by hand
+    begin anew.
+    What it is fed is bounded, so that Adam's moments stay finite. A Gaussian with a standard
+    deviation above 9e18 (float32; 6e153 in float64) is neither fed nor moved, nor is one with a
+    NaN.
     Scales and quaternions are looked up in the groups of the upgraded optimizers (gsplat's,
-    INRIA's, nerfstudio's names and others). Where they are not found, it is said once, and the
-    positions of that group are stepped as the trainer would.
+    INRIA's, nerfstudio's names and others). The scales must be logarithms of standard deviations
+    and the quaternions wxyz, as in these trainers; nothing shows that they are something else.
+    Where they are not found, or are not [N, 3] and [N, 4], it is said once, and the positions of
+    that group are stepped as the other parts have it.
 
-    Beside it `Fading` was measured with the positions left out of its `names`: a faded step of them
-    would be half a standard deviation long.
+    `Fading` leaves positions alone while this part steps them.
 
-    It keeps nothing from step to step. A step takes one buffer of the positions' size, and their
-    frames (28 bytes per point, 36 on a CPU).
+    A row whose moments begin anew in the middle of a run, as those of Gaussians that are relocated
+    or added, takes steps of up to six full ones at first, since Adam corrects its
+    moments for the parameter's age and not for the row's.
+
+    It keeps nothing from step to step. A step takes three buffers of the positions' size, and their
+    frames: 64 bytes per point, 80 on a CPU.
 
     Args:
         rate: standard deviations of a full step in the first iteration, above 0.
@@ -107,7 +116,6 @@ class OwnFrame(Part):
             )
             if not fits:
                 shapes = {name: tuple(each.shape) for name, each in gaussians.items()}
-                course.publish(RATE, param, None)
                 course.warn_once(
                     f"{CALL} {course.place_of(param)}",
                     f"{CALL}: the positions, of shape {tuple(param.shape)}, need scales [N, 3] and "
@@ -153,13 +161,18 @@ class OwnFrame(Part):
         name = _name(self, course)
         frames: Frames = course.published(name, param)
         course.publish(name, param, None)  # gives their memory back
-        course.publish(RATE, param, self.at(course.progress))
+        if is_moving_rate(group["lr"]):
+            course.publish(ACTED, param, course.current)
         return frames.displacement(step)
 
     def numbers(self, course: Course) -> Mapping[str, float]:
-        """`own_frame_rate`: standard deviations of a full step, while it acts."""
-        rate = course.last_published(RATE)
-        return {} if rate is None else {RATE: rate}
+        """`own_frame_rate`: standard deviations of a full step, while it acts.
+
+        That is, if it has moved positions in this iteration or the one before.
+        """
+        acted = course.last_published(ACTED)
+        has_acted = acted is not None and acted >= course.current - 1
+        return {RATE: self.at(course.progress)} if has_acted else {}
 
 
 def _name(part: OwnFrame, course: Course) -> str:
