@@ -10,7 +10,7 @@ from statistics import fmean, stdev
 import numpy as np
 
 from studies.scenes.arms import BASELINE, arm_of
-from studies.scenes.records import COSTED, Costs, Record, Setting
+from studies.scenes.records import COSTED, MISPOSED, RIGHT, Costs, Record, Setting
 
 METRICS = {"psnr": (1.0, 2), "ssim": (1.0, 4), "lpips": (-1.0, 4)}  # sign of better, digits
 MIN_PAIRS = 3  # of scene and seed, for a spread that means something
@@ -125,7 +125,8 @@ def difference(
 ) -> Difference:
     """The arm against its control on all scenes and seeds that have both.
 
-    A branch whose trunk was trained again since is not compared with the trunk of now.
+    Bonsai with wrong poses counts only where nothing was trained with the right ones. A branch
+    whose trunk was trained again since is not compared with the trunk of now.
     """
     control = control or arm_of(arm).control
     pairs = {}
@@ -139,6 +140,8 @@ def difference(
                 (_at_any_length(study, ours[seed]), _at_any_length(study, theirs[seed]), cost)
                 for seed in shared
             ]
+    if RIGHT in pairs:
+        pairs.pop(MISPOSED, None)
     return Difference(arm, control, pairs)
 
 

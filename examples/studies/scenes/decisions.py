@@ -6,14 +6,13 @@ from dataclasses import dataclass, replace
 
 from studies.scenes.analysis import METRICS, Difference, Study, difference
 from studies.scenes.arms import BASELINE, DEFAULTS, OWN_FRAME_ARM
-from studies.scenes.records import Setting
+from studies.scenes.records import MISPOSED, Setting
 
 QUARTER, HALF, FULL = "images_4", "images_2", "images"
 # What decides: the first of these that enough scenes and seeds were trained at.
 LADDER = ((HALF, 30_000), (QUARTER, 30_000), (QUARTER, 7_500))
 POINTS, HALF_POINTS = 4_000, 50_000
-ALIGNED = "bonsai-aligned"  # bonsai with the poses of `register.py`
-NUM_POINTS = {"embedded": 2_000, "bonsai": 10_000, ALIGNED: 10_000, "lego": 10_000}
+NUM_POINTS = {"embedded": 2_000, "bonsai": 10_000, MISPOSED: 10_000, "lego": 10_000}
 MANY_VIEWS_SCENES = ("bonsai", "lego", "plush")  # forty training views or more
 MIN_SCENES, MIN_SEEDS = 3, 2
 # part -> (the arm with it, the arm without it)
@@ -90,9 +89,12 @@ def points_of(scene: str) -> int:
 def settings_of(
     study: Study, iterations: int, tiled: int = 0, size: str = QUARTER
 ) -> list[Setting]:
-    """The rule's scenes, with rotated views and the points that belong to a size."""
-    every = every_scene(study, iterations, tiled=tiled)
-    every = [s for s in every if s.scene in MANY_VIEWS_SCENES and s.size == size]
+    """The rule's scenes, with rotated views and the points that belong to a size.
+
+    And bonsai with its wrong poses, which `difference` takes where there is nothing else.
+    """
+    scenes, every = (*MANY_VIEWS_SCENES, MISPOSED), every_scene(study, iterations, tiled=tiled)
+    every = [s for s in every if s.scene in scenes and s.size == size]
     return [s for s in every if s.points == (HALF_POINTS if size == HALF else points_of(s.scene))]
 
 

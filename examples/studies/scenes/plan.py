@@ -19,14 +19,13 @@ from studies.scenes.arms import (
     OWN_FRAME_ARM,
     find_study_arm,
 )
-from studies.scenes.decisions import ALIGNED, MANY_VIEWS_SCENES, points_of
+from studies.scenes.decisions import MANY_VIEWS_SCENES, points_of
 from studies.scenes.training import Spec
 
 FEW_VIEWS_SCENES = ("embedded", "banana", "lund_door", "brighton_beach")
 STOCK = (BASELINE, f"{BASELINE}{AVERAGED}")
 TODAY = (*STOCK, "faded", DEFAULTS)
 FRAMES = (OWN_FRAME_ARM, f"{OWN_FRAME}{AVERAGED}")
-ALIGNED_ARMS = (BASELINE, DEFAULTS, OWN_FRAME_ARM)
 RATES = tuple(arm.name for arm in LIST if arm.name.startswith(("rates-", "positions-")))
 ADAPTIVE_ARMS = (ADAPTIVE, ADAPTIVE_DEFAULTS)
 
@@ -63,7 +62,8 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
     """The trainings of every stage; their scenes are names, not yet folders.
 
     A quarter of the photos' width with 4,000 or 10,000 Gaussians, half of it with 50,000, and the
-    whole with 200,000 and harmonics of degree 3.
+    whole with 200,000 and harmonics of degree 3. Bonsai is meant with poses that fit, as those of
+    `register.py` do.
     """
     rotated = partial(cross, rotated=True)
     at_half = partial(rotated, iterations=30_000, size="images_2")
@@ -96,6 +96,7 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         "own-frame-quarter": rotated(MANY_VIEWS_SCENES, FRAMES, seeds, 30_000),
         # Stock with other constant rates: what a longer step is to be compared with.
         "rates-tuned": [
+            *rotated(MANY_VIEWS_SCENES, ["rates-x2"], seeds, 30_000),
             *rotated(MANY_VIEWS_SCENES, RATES, 1, 30_000),
             *(s for x, share in half_sizes for s in at_half(x, RATES, 1, share=share)),
         ],
@@ -106,20 +107,16 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
                 scenes, [*ADAPTIVE_ARMS, f"adc+{OWN_FRAME}{AVERAGED}"], 1, share=share
             )
         ],
-        # 800x800 and 800x532. The shorter ones first: one of the others takes two core-hours.
-        "whole": [
-            spec
-            for scenes, iterations in ((("bonsai",), 7_500), (("lego", "bonsai"), 30_000))
-            for spec in rotated(
-                scenes, [*STOCK, DEFAULTS, *FRAMES], 1, iterations, 20, size="images", sh_degree=3
-            )
-        ],
-        # Bonsai with the poses of `register.py`: SCENES/bonsai-aligned.
-        "aligned": [
-            *rotated((ALIGNED,), [*ALIGNED_ARMS, "rates-x2"], seeds, 30_000),
-            *at_half((ALIGNED,), ALIGNED_ARMS, seeds, share=5),
-            *rotated((ALIGNED,), ALIGNED_ARMS, 1, 30_000, 20, size="images", sh_degree=3),
-        ],
+        # 800x532 and 800x800, two core-hours each.
+        "whole": rotated(
+            ("bonsai", "lego"),
+            (OWN_FRAME_ARM, DEFAULTS, BASELINE),
+            1,
+            30_000,
+            20,
+            size="images",
+            sh_degree=3,
+        ),
         # One size of a training after the other.
         "crowded": [  # 40,000 Gaussians on images of a quarter of their size
             *rotated(("bonsai",), TODAY, 1, 7_500, 4),

@@ -9,19 +9,18 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from studies.scenes.analysis import Study, difference
 from studies.scenes.arms import BASELINE, DEFAULTS
 from studies.scenes.decisions import points_of
-from studies.scenes.records import Setting
+from studies.scenes.records import MISPOSED, RIGHT, Setting
 from studies.scenes.tables import label
 
 # Okabe and Ito's colours: told apart with any kind of colour vision.
 COLOURS = {BASELINE: "#000000", DEFAULTS: "#0072b2", "paper": "#d55e00"}
-VIEWS = {"bonsai": 220, "lego": 87, "plush": 84}  # to train on, of the scenes with many
-SCENE_COLOURS = {"bonsai": "#0072b2", "lego": "#d55e00", "plush": "#009e73"}
+VIEWS = {RIGHT: 220, MISPOSED: 220, "lego": 87, "plush": 84}  # to train on, of scenes with many
+SCENE_COLOURS = {RIGHT: "#0072b2", MISPOSED: "#999999", "lego": "#d55e00", "plush": "#009e73"}
 SIZE_AXES = {  # of `plot_sizes`, and what else is to know of the trainings there
     "Gaussians": "quarter size, 7,500 iterations",
     "training views": "quarter size, 7,500 iterations",
@@ -78,7 +77,7 @@ def plot_metrics(
         axis.set_title(f"{title}, held-out views", fontsize=10)
     for axis in axes[-1]:
         axis.set_xlabel("time (1: 3DGS-MCMC's end)")
-    _finish(figure, axes[0, 0], path)
+    _finish(figure, path)
 
 
 def plot_one(study: Study, setting: Setting, path: Path) -> None:
@@ -159,13 +158,16 @@ def plot_sizes(study: Study, path: Path) -> None:
             panel.set_xlabel(f"{axis}\n({SIZE_AXES[axis]})", fontsize=9)
     axes[0, 0].set_title("gain in PSNR (dB)", fontsize=10)
     axes[0, 1].set_title("change of LPIPS", fontsize=10)
-    _finish(figure, axes[list(SIZE_AXES).index("iterations"), 0], path)  # which has all scenes
+    _finish(figure, path)
 
 
-def _finish(figure: Figure, axis: Axes, path: Path) -> None:
-    """Save a figure with the legend of one of its axes below all of them."""
-    handles, labels = axis.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+def _finish(figure: Figure, path: Path) -> None:
+    """Save a figure with one legend of all its axes below them."""
+    every = [axis.get_legend_handles_labels() for axis in figure.axes]
+    lines = {name: line for lines, names in every for line, name in zip(lines, names, strict=True)}
+    figure.legend(
+        lines.values(), lines, loc="outside lower center", ncols=len(lines), frameon=False
+    )
     figure.savefig(path, dpi=DPI)
     plt.close(figure)
 

@@ -31,6 +31,9 @@ OLD_NAMES = {
     "adc+defaults-but-scales+averaged": "adc+annealed+faded-but-scales+averaged",
 }
 
+# Records of bonsai from before `register.py` posed it anew, which is what `bonsai` is now.
+RIGHT, MISPOSED = "bonsai", "bonsai-misposed"
+
 COSTED = ("scene", "size", "iterations", "tiled", "sh_degree")  # what a cost is measured for
 Costs = dict[tuple[Any, ...], float]  # these of a `Setting`, and the arm -> share of stock's
 Plain = dict[str, Any]  # a record as it is in the files

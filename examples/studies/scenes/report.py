@@ -31,8 +31,8 @@ from studies.scenes.arms import (
     arm_of,
 )
 from studies.scenes.decisions import (
-    ALIGNED,
     HALF,
+    MANY_VIEWS_SCENES,
     PIECES,
     QUARTER,
     decide,
@@ -44,6 +44,7 @@ from studies.scenes.plots import VIEWS, plot_metrics, plot_one, plot_sizes
 from studies.scenes.records import (
     COSTS,
     FOLDER,
+    MISPOSED,
     Plain,
     Setting,
     gather,
@@ -93,7 +94,7 @@ def the_study() -> Study:
 def is_open(record: Plain) -> bool:
     """Whether a record is of an open question: an arm of today's list, whole rotating views."""
     archived = record["tiled"] or not record["rotated"] or arm_of(record["arm"]).archived
-    return not archived
+    return not archived and record["scene"] != MISPOSED
 
 
 def tables(study: Study) -> dict[str, str]:
@@ -109,30 +110,28 @@ def conclusions(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
     degrees = [*every, *every_scene(study, LONG, sh_degree=3)]
     half = settings_of(study, LONG, size=HALF)
     full = [s for s in study.settings() if s.rotated and s.size == "images" and not s.views]
-    aligned = [s for s in study.settings() if s.scene == ALIGNED]
+    # Quarter, half and full size. Bonsai has its right poses here, as far as it was trained.
+    sizes = [
+        [s for s in settings if s.scene in MANY_VIEWS_SCENES and s.iterations == LONG]
+        for settings in (long, half, full)
+    ]
     nine = settings_of(study, LONG, PIECES["OutOfView"])
     trained = [r for r in study.records() if r.setting.rotated]
-    tuned = [small_trainings(study), settings_of(study, BRIEF), long, half]
+    brief = [s for s in settings_of(study, BRIEF) if s.scene in MANY_VIEWS_SCENES]
+    tuned = [small_trainings(study), brief, *sizes[:2]]
     return {
         "rotated-machines": machines_line(trained),
         "decisions": decisions_table(study, BRIEF),
         "averaging": averaging_line(study),
-        "aligned": metrics_table(
-            study, aligned, (BASELINE, "rates-x2", DEFAULTS, OWN_FRAME_ARM), plain=True, head=crowd
-        ),
         "every-scene": scenes_gain_table(study, degrees, DEFAULTS, BASELINE),
         "full": metrics_table(
             study, full, FULL_ARMS, plain=True, head=lambda s: f"{s.scene}, {s.iterations:,}"
         ),
-        "own-frame": scenes_gain_table(study, half, OWN_FRAME_ARM, BASELINE),
-        "own-frame-or-not": scenes_gain_table(study, half, OWN_FRAME_ARM, DEFAULTS),
-        "headline": headline_table(study, [[s for s in full if s.iterations == LONG], half, long]),
-        "each-size": sizes_table(
-            study,
-            [long, half, [s for s in full if s.iterations == LONG]],
-            ("rates-x2", DEFAULTS, OWN_FRAME_ARM),
-        ),
-        "reach": reach_table(study, long, DEFAULTS, SHORTER),
+        "own-frame": scenes_gain_table(study, sizes[1], OWN_FRAME_ARM, BASELINE),
+        "own-frame-or-not": scenes_gain_table(study, sizes[1], OWN_FRAME_ARM, DEFAULTS),
+        "headline": headline_table(study, sizes[::-1]),
+        "each-size": sizes_table(study, sizes, ("rates-x2", DEFAULTS, OWN_FRAME_ARM)),
+        "reach": reach_table(study, sizes[0], DEFAULTS, SHORTER),
         "tuned": tuned_table(study, tuned, PLUSH),
         "tuned-brief": tuned_table(study, tuned, PLUSH, brief=True),
         "paper": paper_table(study, quarter),
@@ -172,7 +171,7 @@ def appendix(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
         )
     rates = like(study, PLUSH, "rates")
     made["rates"] = metrics_table(study, rates, mcmc, head=lambda s: f"times {s.rates:g}")
-    views = like(study, Setting("bonsai", 10_000, BRIEF, "sfm", rotated=True), "views")
+    views = like(study, Setting(MISPOSED, 10_000, BRIEF, "sfm", rotated=True), "views")
     views.sort(key=lambda s: s.views or VIEWS[s.scene])
     made["views"] = metrics_table(study, views, mcmc, head=lambda s: str(s.views or VIEWS[s.scene]))
     tiled = [s for s in rotated if s.tiled]
@@ -219,7 +218,8 @@ def like(study: Study, setting: Setting, field: str) -> list[Setting]:
 def plots(study: Study) -> list[Path]:
     """Draw everything; return the files."""
     arms = (BASELINE, "paper", DEFAULTS)
-    plot_metrics(study, settings_of(study, LONG), arms, FOLDER / "rotated.png", SHORTER)
+    posed = [s for s in settings_of(study, LONG) if s.scene in MANY_VIEWS_SCENES]
+    plot_metrics(study, posed, arms, FOLDER / "rotated.png", SHORTER)
     plot_sizes(study, FOLDER / "sizes.png")
     plot_one(study, LARGEST, FOLDER / "largest.png")
     return [FOLDER / name for name in ("rotated.png", "sizes.png", "largest.png")]

@@ -144,22 +144,29 @@ def metrics_table(
     seed: int | None = None,
     plain: bool = False,
 ) -> str:
-    """PSNR / SSIM / LPIPS of every arm in every setting.
+    """PSNR / SSIM / LPIPS of every arm in every setting that has one of them.
 
     Args:
         head: what stands above a setting's column.
         seed: of this one, with the last number of Gaussians, which differs; None: means over all.
         plain: name the arms by `LABELS`.
     """
+    named = [*arms]  # read for every setting
+    columns = {
+        setting: [
+            [r for key, r in study.runs(setting, arm).items() if seed in (None, key)]
+            for arm in named
+        ]
+        for setting in settings
+    }
+    columns = {setting: found for setting, found in columns.items() if any(found)}
     rows = []
-    for arm in arms:
-        runs = [study.runs(setting, arm) for setting in settings]
-        found = [[r for key, r in by_seed.items() if seed in (None, key)] for by_seed in runs]
+    for arm, *found in zip(named, *columns.values(), strict=True):
         if any(found):
             cells = [_cell(records, gaussians=seed is not None) for records in found]
             rows.append((label(arm) if plain else f"`{arm}`", *cells))
     first = "training" if plain else "variant"
-    return table([first, *map(head, settings)], "l", rows)
+    return table([first, *map(head, columns)], "l", rows)
 
 
 def averaging_line(study: Study) -> str:

@@ -29,11 +29,20 @@ from studies.scenes.arms import (
     find_study_arm,
 )
 from studies.scenes.arms import DEFAULTS as DEFAULT_ARM
-from studies.scenes.decisions import COMPARISONS, MANY_VIEWS_SCENES, decide, every_scene, points_of
+from studies.scenes.decisions import (
+    COMPARISONS,
+    MANY_VIEWS_SCENES,
+    decide,
+    every_scene,
+    points_of,
+    settings_of,
+)
 from studies.scenes.plan import plan, stages
 from studies.scenes.records import (
     ARCHIVE,
     COLUMNS,
+    MISPOSED,
+    RIGHT,
     Record,
     Setting,
     gather,
@@ -47,6 +56,7 @@ from studies.scenes.tables import (
     averaging_line,
     headline_table,
     machines_line,
+    metrics_table,
     paper_table,
     reach_table,
     scenes_gain_table,
@@ -198,6 +208,32 @@ def test_a_branch_is_not_compared_with_a_trunk_that_was_trained_again() -> None:
     again = replace(trunk, curve=trunk.curve | {"psnr": trunk.curve["psnr"] + 0.1})
     assert difference(Study([branch, trunk]), [trunk.setting], branch.arm).count == 1
     assert difference(Study([branch, again]), [trunk.setting], branch.arm).count == 0
+
+
+def test_wrong_poses_count_only_where_nothing_was_trained_with_the_right_ones() -> None:
+    psnr = {RIGHT: 30.0, MISPOSED: 25.0, "lego": 20.0}
+    records = [
+        rotated_record(arm, scene, 0, psnr=end + (arm != BASELINE))
+        for scene, end in psnr.items()
+        for arm in (BASELINE, DEFAULT_ARM, "faded")
+        if (scene, arm) != (RIGHT, "faded")
+    ]
+    study = Study(records)
+    settings = settings_of(study, 7_500)
+    for arm, scenes in ((DEFAULT_ARM, {RIGHT, "lego"}), ("faded", {MISPOSED, "lego"})):
+        assert set(difference(study, settings, arm, BASELINE).pairs) == scenes
+    assert not any(report.is_open(r) for r in load(report.FOLDER) if r["scene"] == MISPOSED)
+
+
+def test_a_scene_without_any_of_the_arms_has_no_column() -> None:
+    records = [rotated_record(BASELINE, "lego", 0), rotated_record("faded", "plush", 0)]
+    study = Study(records)
+    (_, _, row), (_, _, seed) = (
+        metrics_table(study, study.settings(), (arm, "annealed"), seed=seed).splitlines()
+        for arm, seed in ((BASELINE, None), ("faded", 0))
+    )
+    assert row == "| `mcmc` | 20.00 / 0.700 / 0.200 |"
+    assert seed.startswith("| `faded` | 20.00 / 0.700 / 0.200, ")
 
 
 def test_means_of_iterates_are_of_the_trunks_in_the_records() -> None:
@@ -448,7 +484,7 @@ def test_dots_are_the_ends_of_shorter_trainings_of_every_seed(
         replace(rotated_record(DEFAULT_ARM, "a", s, psnr=20 + s), setting=short) for s in (0, 1)
     ]
     panels: list[Any] = []
-    monkeypatch.setattr(plots, "_finish", lambda _figure, axis, _path: panels.append(axis))
+    monkeypatch.setattr(plots, "_finish", lambda figure, _path: panels.append(figure.axes[0]))
     costs = {("a", "images_4", 3_000, 0, 0, "faded"): 1.5}
     for known in (others, others[:1]):  # the second without one of the seeds
         study = Study([*long, *known], costs)
@@ -659,6 +695,19 @@ def test_the_readmes_arm_is_all_that_a_new_one_takes(
     assert [type(part).__name__ for part in fit.phases.parts][:2] == ["Fading", "Averaging"]
     with pytest.raises(ValueError, match="'nonsense' is unknown"):
         plan(tmp_path, tmp_path, ["embedded"], arms=["nonsense"])
+
+
+def test_a_legend_names_what_one_panel_lacks(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    trained = (BASELINE, "a"), (BASELINE, "b"), ("paper", "b")
+    study = Study([rotated_record(arm, scene, 0) for arm, scene in trained])
+    kept: list[Any] = []
+    monkeypatch.setattr(plots.plt, "close", kept.append)
+    plots.plot_metrics(study, study.settings(), (BASELINE, "paper"), tmp_path / "one.png")
+    (legend,) = kept[0].legends
+    names = [text.get_text() for text in legend.get_texts()]
+    assert names == ["3DGS-MCMC", "the paper's preset"]
 
 
 @pytest.mark.parametrize("gain", [3.0, 0.1, -0.1])
