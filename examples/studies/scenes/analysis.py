@@ -45,12 +45,18 @@ class Study:
 
     def cost(self, setting: Setting, arm: str, control: str = BASELINE) -> float:
         """Seconds of an iteration, as a share of the control's; 1 where not both were measured."""
+        return self.measured_cost(setting, arm, control) or 1.0
+
+    def measured_cost(self, setting: Setting, arm: str, control: str = BASELINE) -> float | None:
+        """As `cost`; None where not both were measured."""
+        names = [arm_of(each).averages or each for each in (arm, control)]
+        if names[0] == names[1]:
+            return 1.0
         where = [getattr(setting, name) for name in COSTED]
         ours, theirs = (
-            1.0 if name == BASELINE else self._costs.get((*where, name))
-            for name in (arm_of(each).averages or each for each in (arm, control))
+            1.0 if name == BASELINE else self._costs.get((*where, name)) for name in names
         )
-        return 1.0 if ours is None or theirs is None else ours / theirs
+        return None if ours is None or theirs is None else ours / theirs
 
 
 @dataclass(frozen=True)

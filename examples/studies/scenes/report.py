@@ -203,9 +203,12 @@ def fixed_views(study: Study, fixed: Sequence[Setting]) -> str:
         kind += f", {share:g} of the Gaussians" * (share != 1.0)
         kind += f", harmonics of degree {setting.sh_degree}" * (setting.sh_degree > 0)
         kinds[kind].append(setting)
-    return "\n\n".join(
-        f"**{kind}**\n\n{differences_table(study, settings, study.arms(settings))}"
+    made = {
+        kind: differences_table(study, settings, study.arms(settings))
         for kind, settings in kinds.items()
+    }
+    return "\n\n".join(
+        f"**{kind}**\n\n{text}" for kind, text in made.items() if len(text.splitlines()) > 2
     )
 
 

@@ -26,7 +26,7 @@ from studies.scenes.decisions import (
     decide,
     settings_of,
 )
-from studies.scenes.records import Costs, Plain, Record, Setting
+from studies.scenes.records import MISPOSED, Costs, Plain, Record, Setting
 
 SIZES = {QUARTER: "quarter", HALF: "half", FULL: "full"}
 # How pages that are read without the list of variants name them.
@@ -106,8 +106,8 @@ def differences_table(study: Study, settings: Sequence[Setting], arms: Iterable[
     for found in (difference(study, settings, arm) for arm in arms):
         if found.count and found.arm != found.control:
             names = f"`{found.arm}`", f"`{found.control}`"
-            counts = f"{len(found.pairs)}, {found.count}"
-            rows.append((*names, counts, *cells_of(found), f"{found.cost:.2f}", found.verdict))
+            cost = _cost_of(study, found)
+            rows.append((*names, counts_of(found), *cells_of(found), cost, found.verdict))
     names, metrics = ("variant", "compared with"), ("PSNR", "SSIM", "LPIPS")
     heads = (*names, "scenes, trainings", *metrics, "time of an iteration, ratio", "by the rule")
     return table(heads, "lllrrrrl", rows)
@@ -128,6 +128,18 @@ def costs_table(costs: Costs, arms: Sequence[str]) -> str:
         if any(share is not None for share in found):
             rows.append((scene, about, f"{iterations:,}", *cells))
     return table(("scene", "images", "iterations", *map(label, shown)), "llr", rows)
+
+
+def _cost_of(study: Study, found: Difference) -> str:
+    """The time of an iteration, as the control's share; a dash where it was not measured."""
+    every = [pair[0].setting for pairs in found.pairs.values() for pair in pairs]
+    known = [study.measured_cost(setting, found.arm, found.control) for setting in every]
+    return "-" if None in known else f"{found.cost:.2f}"
+
+
+def counts_of(found: Difference) -> str:
+    """Scenes and trainings, with a mark where bonsai has its wrong poses."""
+    return f"{len(found.pairs)}, {found.count}{' †' * (MISPOSED in found.pairs)}"
 
 
 def cells_of(found: Difference) -> list[str]:
@@ -244,9 +256,9 @@ def _size_of(settings: Sequence[Setting], seeds: Sequence[int]) -> str:
 
 
 def _each(numbers: Iterable[int]) -> str:
-    """A number, or those of each scene where they differ."""
+    """A number, or those of each scene, in the columns' order, where they differ."""
     every = [f"{number:,}" for number in numbers]
-    return every[0] if len(set(every)) == 1 else ", ".join(every)
+    return every[0] if len(set(every)) == 1 else " / ".join(every)
 
 
 def scenes_gain_table(study: Study, settings: Sequence[Setting], arm: str, control: str) -> str:
@@ -436,9 +448,8 @@ def decisions_table(study: Study, beside: int) -> str:
         by = f"`{decision.arm}` and `{decision.control}`"
         found, shown = decision.found, ["-"] * 6
         if found is not None:
-            count = f"{len(found.pairs)}, {found.count}"
             size = SIZES[decision.size]
-            shown = [size, f"{decision.iterations:,}", count, *cells_of(found)]
+            shown = [size, f"{decision.iterations:,}", counts_of(found), *cells_of(found)]
         on = "on" if decision.on else "off"
         brief = settings_of(study, beside, PIECES.get(part, 0))
         shorter = difference(study, brief, decision.arm, decision.control)
@@ -470,8 +481,7 @@ def paper_table(study: Study, settings: Sequence[Setting], *, brief: bool = Fals
         found = difference(study, settings, arm, control)
         if found.count:
             psnr, *others = cells_of(found)
-            counts = f"{len(found.pairs)}, {found.count}"
-            rows.append((part, without, counts, psnr, *([] if brief else others)))
+            rows.append((part, without, counts_of(found), psnr, *([] if brief else others)))
     heads = ("part", "compared with", "scenes, trainings", "PSNR, dB")
     return table(heads if brief else (*heads, "SSIM", "LPIPS"), "lllr", rows)
 
