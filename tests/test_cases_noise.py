@@ -17,7 +17,14 @@ from torch.nn import Parameter, ParameterDict
 from torch.optim import Adam
 from trainers import assert_same, gaussians, values_of
 
-from opt3dgs_optim import AWSGLD, IsotropicNoise, PhaseScheduler, PositionNoise
+from opt3dgs_optim import (
+    AWSGLD,
+    Averaging,
+    IsotropicNoise,
+    Part,
+    PhaseScheduler,
+    PositionNoise,
+)
 from opt3dgs_optim.frames import LARGEST
 from opt3dgs_optim.parts.noise import LEFT_AT, covariance_noise
 
@@ -315,6 +322,22 @@ def test_a_rate_of_zero_is_not_said_and_hides_no_other(
     rates: dict[str, float], expected: int
 ) -> None:
     assert warned("AB", rates) == expected
+
+
+@pytest.mark.parametrize("noise_first", [True, False])
+def test_the_mean_of_the_iterates_is_no_noise_of_the_trainers(noise_first: bool) -> None:
+    """Averaging puts it in the positions' place in the last steps, after the noise or before."""
+    sizes = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": ()}
+    params = {name: Parameter(torch.randn(6, *shape)) for name, shape in sizes.items()}
+    parts: list[Part] = [PositionNoise(scale=1.0), Averaging()]
+    phases = PhaseScheduler(600, parts=parts if noise_first else parts[::-1])
+    adams = phases.upgrade({name: Adam([param], lr=0.01) for name, param in params.items()})
+    for _ in range(600):
+        for param in params.values():
+            param.grad = torch.randn_like(param)
+        phases.observe(0.1)
+        for adam in adams.values():
+            adam.step()
 
 
 def test_positions_are_copied_in_one_step_only() -> None:

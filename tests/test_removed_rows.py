@@ -335,6 +335,24 @@ def test_a_scene_is_left_alone_where_the_upgrade_fails() -> None:
     assert scene.on_remove.__func__ is Scene.on_remove
 
 
+def test_a_scene_is_listened_to_where_a_second_upgrade_fails() -> None:
+    scene, phases = Scene(), PhaseScheduler(TOTAL)
+    phases.upgrade(gsplat_optimizers(make_splats(3)), scene=scene)
+    other = torch.optim.SGD([{"params": [Parameter(torch.ones(3, 3))], "name": "means"}], lr=0.1)
+    with pytest.raises(TypeError, match="SGD"):
+        phases.upgrade({"means": other}, scene=scene)
+    assert phases._removed_rows.listens_to(scene)
+
+
+def test_a_scene_is_left_alone_where_a_warning_is_an_error() -> None:
+    scene, splats = Scene(), make_splats(3)
+    groups = [{"params": [splats["means"]], "name": "means"}]
+    groups += [{"params": [Parameter(torch.ones(3, 2))], "name": "of as many rows"}]
+    with pytest.raises(UserWarning, match="of as many rows"):
+        PhaseScheduler(TOTAL).upgrade(torch.optim.Adam(groups), scene=scene)
+    assert scene.on_remove.__func__ is Scene.on_remove
+
+
 def test_many_schedulers_listen_to_one_scene_one_after_the_other() -> None:
     scene, watch = Scene(), RemovedRows()
     for _ in range(2_000):

@@ -13,7 +13,6 @@ from opt3dgs_optim import (
     ConstantMultiplier,
     EnergyHistogram,
     Part,
-    Phase,
     PhaseScheduler,
     PositionNoise,
     paper_parts,
@@ -38,7 +37,6 @@ class Arm:
     parts: MakeParts | None = None  # None: torch's own Adam in the trainer
     mcmc: bool = True  # relocation, growth, noise and regularisers of 3DGS-MCMC
     needs: str | None = None  # the arm whose mean nu it takes, seed by seed
-    noise_during: Phase | None = None  # None: in both phases
 
     def make(
         self, iterations: int, switch: float, nu: float | None, gaussians: Mapping[str, Tensor]
@@ -55,7 +53,7 @@ class Arm:
             raise ValueError(f"arm {self.name}: needs the mean nu of {self.needs}; run it first")
         parts = [] if self.parts is None else self.parts(iterations, nu)
         if self.mcmc:
-            parts.append(PositionNoise(gaussians, NOISE_LR, during=self.noise_during))
+            parts.append(PositionNoise(gaussians, NOISE_LR))
         return PhaseScheduler(iterations, switch, parts)
 
 

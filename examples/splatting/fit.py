@@ -132,8 +132,7 @@ class Fit:
 
     def step(self) -> Tensor:
         """One iteration; returns the detached loss."""
-        index = self._next_view()
-        view = self.scene.train[index]
+        view = self.scene.train[self._next_view()]
         image = self._train_image(view)
         pixel_loss = None if self.phases is None else self.phases.pixel_loss
         loss = photometric_loss(image, view.image, pixel_loss)
@@ -141,9 +140,6 @@ class Fit:
             loss = loss + regularisers(self.gaussians)
         loss.backward()
         if self.phases is not None:
-            for part in self.phases.parts:
-                if hasattr(part, "view"):  # a study's own
-                    part.view = index  # pyright: ignore[reportAttributeAccessIssue]
             self.phases.observe(loss, iteration=self.iteration)
         for optimizer in self.optimizers.values():
             optimizer.step()

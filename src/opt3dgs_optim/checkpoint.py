@@ -101,11 +101,11 @@ def take_units(
     name, parts = gaussian_of(group), ", ".join(units or known)
     what = f"Adam's moments of {name} begin anew, since {parts} "
     what += "begins to act" if units else "ceases to act"
-    if record.last_moved is None:  # no step in this process: they were loaded
+    if record.last_moved is None:  # no step by these parts yet: others have made them
         course.warn_once(
             f"units of {name}",
-            f"{what}: those that were loaded are in other units; to go on with them, give the "
-            "parts of the training that they come from",
+            f"{what}: those that were there are in other units; to go on with moments of a "
+            "checkpoint, give the parts of the training that it is of",
         )
     else:
         LOGGER.info("iteration %d: %s", course.current, what)

@@ -73,7 +73,8 @@ class Course:
         parts: what the steps have, in the order in which it is applied.
         total_steps: iterations of the training.
         switch_step: the first iteration of exploitation; None: no phases, all parts always act.
-        adaptive: whether parts are switched off that this training shows no need of.
+        adaptive: whether parts are switched off that this training shows no need of. Whoever tells
+            the course of losses calls `judge` for it, as `PhaseScheduler.observe` does.
 
     Raises:
         TypeError: one of the parts is none.
@@ -488,7 +489,8 @@ class Course:
         known = self._numbers_read.get(id(number))
         if known is None or known[0] != self.num_observed or known[1]() is not number:
             known = self.num_observed, weakref.ref(number), number.item()
-            self._numbers_read = {id(number): known}
+            kept = {i: e for i, e in self._numbers_read.items() if e[0] == self.num_observed}
+            self._numbers_read = {**kept, id(number): known}
         return known[2]
 
     def expect(self, steps: int) -> None:
@@ -630,10 +632,12 @@ class Course:
         """Undo what happens within to the clock, to the parts and to the followers, if it fails."""
         known, numbers, followers = dict(vars(self)), dict(self.kept_numbers), [*self._followers]
         parts = [(part, {**vars(part)}, part.state_dict()) for part in self._parts]
+        reported = set(self._reported)
         try:
             yield
         except BaseException:
             vars(self).update(known)
+            self._reported &= reported
             self.kept_numbers.clear()
             self.kept_numbers.update(numbers)
             self._followers[:] = followers

@@ -138,7 +138,8 @@ def histogram_kernel(device: torch.device) -> str:
         ours.observe(energy.to(device, torch.float32))
         theirs.observe(energy.float())
     difference = float((ours.mean_multiplier.cpu() - theirs.mean_multiplier).abs())
-    found = f"mean multiplier of {ENERGIES} energies differs by {difference:.1e} (limit 1e-03)"
+    found = f"mean multiplier of {ENERGIES} energies differs by {difference:.1e}"
+    found += f" (limit {HISTOGRAM_LIMIT:.0e})"
     if not difference <= HISTOGRAM_LIMIT:
         raise ArithmeticError(found)
     return found

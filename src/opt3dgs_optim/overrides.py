@@ -17,7 +17,7 @@ from torch.optim import Adam, Optimizer
 from torch.optim.optimizer import _global_optimizer_post_hooks, _global_optimizer_pre_hooks
 
 from opt3dgs_optim.part import Group
-from opt3dgs_optim.state import broadcast_rows, is_finite_sum
+from opt3dgs_optim.state import broadcast_rows
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -188,16 +188,18 @@ def scale_learning_rate(
     """
     if not factors:
         return
-    rate, factor = group["lr"], functools.reduce(operator.mul, factors)
+    device = next((param.device for param in group["params"]), torch.device("cpu"))
+    # Fused Adam reads a float32 rate from the device. Other paths need a number on the host, as do
+    # parameters there, where a copy that is not waited for may be read before it is made.
+    on_device = device.type != "cpu" and (group["fused"] or group["capturable"])
+    # Each by itself: a product would be read again for every group.
+    known: list[Any] = [
+        read(each) if isinstance(each, Tensor) and (each.is_cpu or not on_device) else each
+        for each in factors
+    ]
+    rate, factor = group["lr"], functools.reduce(operator.mul, known)
     if isinstance(factor, Tensor):
-        device = next((param.device for param in group["params"]), torch.device("cpu"))
-        # Fused Adam reads a float32 rate from the device. Other paths need a number on the host, as
-        # do parameters there, where a copy that is not waited for may be read before it is made.
-        on_device = device.type != "cpu" and factor.device.type != "cpu"
-        if not on_device or not (group["fused"] or group["capturable"]):
-            factor = read(factor)
-        else:
-            factor = factor.to(device=device, dtype=torch.float32, non_blocking=True)
+        factor = factor.to(device=device, dtype=torch.float32, non_blocking=True)
     if group.get("decoupled_weight_decay") and group["weight_decay"]:
         decays.append(WeightDecay(group, params, counts))
         overrides.item(group, "weight_decay", 0.0)
@@ -236,10 +238,11 @@ def zero_nonfinite(grad: Tensor) -> bool | Tensor:
     """Take numbers in a gradient that are not finite as zero, in place.
 
     Returns whether there were any, 0-d where only the device knows.
+
+    Args:
+        grad: on a CPU, one whose sum is not finite.
     """
     if grad.is_cpu:
-        if is_finite_sum(grad):
-            return False
         found = not bool(grad.isfinite().all())
         grad.nan_to_num_(0.0, 0.0, 0.0)
         return found

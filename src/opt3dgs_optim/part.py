@@ -274,7 +274,8 @@ class Part:
     def numbers(self, course: Course) -> Mapping[str, float | Tensor]:
         """Columns of the run log for the iteration observed last: numbers or 0-d tensors.
 
-        The log's own are `kind`, `iteration`, `seconds`, `phase`, `event` and `energy`.
+        The log's own are `kind`, `iteration`, `seconds`, `phase`, `event`, `energy`, `metadata` and
+        `self`.
         """
         return {}
 

@@ -179,6 +179,7 @@ class PhaseScheduler(Course):
                 f"{', '.join(EDITS)}, but an object that a strategy tells of its row edits, or "
                 "None, is needed"
             )
+        newly = scene is not None and not self._removed_rows.listens_to(scene)
         if scene is not None:
             try:
                 self._removed_rows.listen(scene)
@@ -189,8 +190,9 @@ class PhaseScheduler(Course):
                 ) from None
         try:
             found = upgrade(optimizers, self)
-        except (TypeError, ValueError):
-            self._removed_rows.leave(scene)
+        except BaseException:
+            if newly:
+                self._removed_rows.leave(scene)
             raise
         self._num_optimizers += found
         return optimizers

@@ -65,6 +65,11 @@ class RemovedRows:
             if callable(method):
                 setattr(scene, name, _Telling(method, removes, self))
 
+    def listens_to(self, scene: Any) -> bool:
+        """Whether it is told of the edits of a scene already."""
+        methods = [getattr(scene, name, None) for name in EDITS]
+        return any(isinstance(each, _Telling) and each.watch() is self for each in methods)
+
     def leave(self, scene: Any) -> None:
         """Listen no more to a scene."""
         for name in EDITS:

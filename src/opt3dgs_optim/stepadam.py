@@ -233,6 +233,7 @@ class StepAdam(Adam):
                 self._step_base(None)
             else:
                 self._step(mask, acting)
+            self._gone = ()
         return loss
 
     def _stands_still(self) -> bool:
@@ -272,7 +273,6 @@ class StepAdam(Adam):
         """Override what the base's step reads by what the parts say, and restore it."""
         course, counts = self.course, self._counts(mask)
         self.name_groups()
-        self._gone = ()
         if acting:
             self._follow_windows()
         if mask is not None:
@@ -611,7 +611,8 @@ class StepAdam(Adam):
         Raises:
             ValueError: it does not fit; then nothing has been loaded.
         """
-        before = self.state, self.param_groups, self._known, self._open_windows
+        names = "state", "param_groups", "_known", "_open_windows", "stepped_at"
+        before = {name: getattr(self, name) for name in names}
         call, found = f"{self.call_name}.load_state_dict", list[Saved]()
 
         def inspect(_: Any, loaded: dict[str, Any]) -> dict[str, Any]:
@@ -631,7 +632,7 @@ class StepAdam(Adam):
                     if self._base is Adam and self.defaults["fused"]:
                         use_fused(self)
         except BaseException:
-            self.state, self.param_groups, self._known, self._open_windows = before
+            vars(self).update(before)
             self._acting = (None, None, {})
             raise
         finally:

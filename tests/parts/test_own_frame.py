@@ -8,6 +8,7 @@ import itertools
 import math
 import sys
 import warnings
+import weakref
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -509,6 +510,25 @@ def test_two_models_with_an_adam_each_have_the_frames_of_their_own() -> None:
     assert bool((moved < 0.1 * 3**0.5 * 1.001).all())
 
 
+@pytest.mark.parametrize("parts", [(), (Averaging(),)])
+def test_groups_that_a_trainer_takes_away_are_given_up_at_the_next_step(
+    parts: tuple[Part, ...],
+) -> None:
+    splats, phases, adam = upgraded(TOTAL, *parts, make=inria_optimizer)
+    gone = []
+    for i in range(3):
+        extra = Parameter(torch.ones(2))
+        gone.append(weakref.ref(extra))
+        adam.add_param_group({"params": [extra], "name": "another"})
+        del extra
+        train(splats, adam, phases, i, i + 1)
+        adam.param_groups.pop()
+    train(splats, adam, phases, 3, 4)
+    gc.collect()
+    # The last one may be known until the groups change again.
+    assert [ref() for ref in gone[:2]] == [None] * 2
+
+
 @pytest.mark.parametrize("reversed_", [False, True])
 def test_moments_go_on_where_a_trainer_empties_its_groups_and_fills_them_again(
     reversed_: bool,
@@ -582,10 +602,39 @@ def test_moments_of_other_units_begin_anew(
     """Those of the world would hold a small Gaussian for thousands of steps, or throw it."""
     fresh, _ = positions_after(None, first=first, second=second)
     acts = "begins" if second == (OwnFrame(),) else "ceases"
-    with pytest.warns(UserWarning, match=f"begin anew, since OwnFrame {acts} to act: those that"):
+    with pytest.warns(
+        UserWarning, match=f"begin anew, since OwnFrame {acts} to act: those that were there"
+    ):
         moved, count = positions_after(resumed(*second), first=first, second=second)
     assert count.item() == 1
     torch.testing.assert_close(moved, fresh, rtol=1e-12, atol=0.0)
+
+
+def test_moments_of_this_process_that_begin_anew_are_said_to_have_been_there() -> None:
+    splats = make_splats()
+    adams = gsplat_optimizers(splats)
+    train(splats, adams, None, 0, 3)
+    phases = only(TOTAL, OwnFrame())
+    phases.upgrade(adams)
+    with pytest.warns(UserWarning, match="begins to act: those that were there are in other units"):
+        train(splats, adams, phases, 3, 4)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_checkpoint_of_other_units_that_a_warning_refuses_changes_nothing() -> None:
+    """And is refused again."""
+    splats, phases, adams = upgraded(TOTAL, OwnFrame())
+    train(splats, adams, phases, 0, 3)
+    foreign = copy.deepcopy(adams["means"].state_dict())
+    splats, phases, adams = upgraded(TOTAL)
+    train(splats, adams, phases, 0, 5)
+    before = copy.deepcopy(adams["means"].state_dict())
+    for _ in range(2):
+        with pytest.raises(UserWarning, match="begin anew, since OwnFrame ceases to act"):
+            adams["means"].load_state_dict(foreign)
+        after = adams["means"].state_dict()
+        assert after["param_groups"] == before["param_groups"]
+        assert_same(after["state"][0], before["state"][0])
 
 
 @pytest.mark.parametrize("parts", [(), (OwnFrame(),)])

@@ -258,6 +258,8 @@ def test_resume_supersedes_and_continues_the_clock(tmp_path, monkeypatch):
     assert run.metadata == {"arm": "a", "machine": "b"}
     with RunLog.resume(path, iteration=0) as log:
         assert log.seconds == 0
+        with pytest.raises(ValueError, match="kind='resumed' is the log's own"):
+            log.event("resumed", 0)
     assert len(read_run(path).steps["iteration"]) == 0
 
 

@@ -53,13 +53,13 @@ def median_errors(reconstruction: Any) -> dict[str, float]:
     return dict(sorted(found.items()))
 
 
-def that_do_not_fit(errors: dict[str, float], max_ratio: float = MAX_RATIO) -> list[str]:
-    """The photos whose error is more than so many times the median over all photos."""
+def that_do_not_fit(errors: dict[str, float]) -> list[str]:
+    """The photos whose error is more than `MAX_RATIO` times the median over all photos."""
     usual = float(np.median(list(errors.values())))
-    return [name for name, error in errors.items() if error > max_ratio * usual]
+    return [name for name, error in errors.items() if error > MAX_RATIO * usual]
 
 
-def spread_of_looks(reconstruction: Any, parts: int = PARTS) -> float:
+def spread_of_looks(reconstruction: Any) -> float:
     """How far apart the points are that parts of the photos look at, over the cameras' distance.
 
     In the order of their names. What a part looks at is the point next to the optical axes of its
@@ -68,7 +68,7 @@ def spread_of_looks(reconstruction: Any, parts: int = PARTS) -> float:
     """
     images = sorted(reconstruction.images.values(), key=lambda image: image.name)
     found = []
-    for part in np.array_split(np.arange(len(images)), min(parts, len(images) // 2)):
+    for part in np.array_split(np.arange(len(images)), min(PARTS, len(images) // 2)):
         centres = np.array([images[i].projection_center() for i in part])
         axes = np.array([images[i].viewing_direction() for i in part])
         across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [n, 3, 3], off each axis

@@ -302,5 +302,5 @@ class NothingToAddError(ValueError):
 
 def refusal(line: int | ast.AST, reason: str) -> ValueError:
     """The error that says which line cannot be read with certainty, and why."""
-    number = line if isinstance(line, int) else getattr(line, "lineno", 1)
+    number = line if isinstance(line, int) else line_of(line)
     return ValueError(f"line {number}: {reason}")

@@ -57,7 +57,8 @@ class Averaging(Part):
         # Trainers save before the last step, or do not make it.
         last_two = 2 * _stride(group, param, course)
         if end - course.current <= max(last_two, (end - start) / 10):
-            param.copy_(mean if whole else torch.where(param.isfinite(), mean, param))
+            # .data: no write that a part should notice by the version counter.
+            param.data.copy_(mean if whole else torch.where(param.isfinite(), mean, param))
 
 
 def _stride(group: Group, param: Tensor, course: Course) -> int:

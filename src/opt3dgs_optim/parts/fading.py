@@ -123,7 +123,10 @@ class Fading(Part):
         return ("exp_avg", self.exp_avg), ("exp_avg_sq", second), ("max_exp_avg_sq", second)
 
     def numbers(self, course: Course) -> Mapping[str, float]:
-        """`faded`: the share of up to 10,000 points that the present iteration's events fade."""
+        """`faded`: the share of up to 10,000 points that the present iteration's events fade.
+
+        In the parameters that it acts on; one that it leaves alone is not counted out.
+        """
         now, total = course.iteration, course.total_steps
         events = self.events_before(now, total) - self.events_before(now - 1, total)
         return {"faded": 1.0 - (1.0 - self.share) ** events}

@@ -168,7 +168,7 @@ class OwnFrame(Part):
     def numbers(self, course: Course) -> Mapping[str, float]:
         """`own_frame_rate`: standard deviations of a full step, while it acts.
 
-        That is, if it has moved positions in this iteration or the one before.
+        That is, if positions were stepped in this iteration or the one before, with a rate above 0.
         """
         acted = course.last_published(ACTED)
         has_acted = acted is not None and acted >= course.current - 1

@@ -18,6 +18,7 @@ except ImportError:  # Windows
     fcntl = None
 
 START = b'{"kind":"start"'  # how the first line of every session begins
+RESUMED = "resumed"  # the event that says where a run goes on
 KINDS = ("start", "step", "evaluation", "event")
 
 Columns = dict[str, np.ndarray]
@@ -163,7 +164,7 @@ def read_run(path: str | os.PathLike[str]) -> Run:
     lines, records = _lines(path), []
     starts = [line for line in lines if line["kind"] == "start"]
     for line in lines:
-        if line["kind"] == "event" and line["event"] == "resumed":
+        if line["kind"] == "event" and line["event"] == RESUMED:
             records = [r for r in records if r["iteration"] <= line["iteration"]]
         records.append(line)
     return Run(

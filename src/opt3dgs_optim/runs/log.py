@@ -26,7 +26,14 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.checks import LOGGER, check_count, warn_user
-from opt3dgs_optim.runs.lines import LineFile, encoded, number, read_run, with_plain_keys
+from opt3dgs_optim.runs.lines import (
+    RESUMED,
+    LineFile,
+    encoded,
+    number,
+    read_run,
+    with_plain_keys,
+)
 
 Number = float | Tensor | np.number | np.bool_ | np.ndarray  # of one element
 RESERVED = ("kind", "iteration", "seconds", "phase", "event", "metadata")
@@ -140,7 +147,7 @@ class RunLog(AbstractContextManager["RunLog"]):
         past = [r["seconds"] for r in read_run(path).records[:-1] if r["iteration"] <= iteration]
         log._base, log._since = past[-1] if past else 0.0, log._clock()
         log._continued_at = None  # the event says it
-        log.event("resumed", iteration)
+        log._event(RESUMED, iteration, {})
         return log
 
     def mirror(self, writer: Any) -> None:
@@ -212,9 +219,15 @@ class RunLog(AbstractContextManager["RunLog"]):
     def event(self, kind: str, iteration: SupportsIndex, **info: Any) -> None:
         """Log that something happened: `log.event("pruned", iteration, points=1_200)`.
 
-        `info` may hold what `metadata` may, and one-element tensors. Raises as `step`.
+        `info` may hold what `metadata` may, and one-element tensors. Raises as `step`, and for a
+        `kind` of "resumed", by which `resume` tells readers what to leave out.
         """
+        if kind == RESUMED:
+            raise ValueError(f"RunLog.event: kind={kind!r} is the log's own; choose another")
         _check_names("RunLog.event", info)
+        self._event(kind, iteration, info)
+
+    def _event(self, kind: str, iteration: SupportsIndex, info: Mapping[str, Any]) -> None:
         line = self._line("event", iteration) | {"event": kind} | with_plain_keys(info)
         self._pending.append(_Pending(line))
         self._drain(wait=True)
