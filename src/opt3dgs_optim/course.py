@@ -136,7 +136,6 @@ class Course:
             if kept.per == "row"
         )
         self._unlearnt = {name: learnt_by(part) for name, part in self._named.items()}
-        self.asks_parts = any(p.own_units or overrides(p, "ready") for p in self._parts)
         self._windowed = [
             name
             for name, part in self._named.items()

@@ -101,8 +101,8 @@ def _own_frame(device: torch.device, dtype: torch.dtype, backend: Backend) -> Te
         given = vectors, quats, scales, MIN_ASPECT
         return torch.cat([cuda.own_frame_gradient(*given), cuda.own_frame_displacement(*given)])
     axes = axes_of(quats, scales, dtype, MIN_ASPECT)
-    taken = (take(repeated_columns(vectors, dtype)) for take in (axes.into, axes.out_of))
-    return torch.cat([found.T for found in taken])
+    each = [repeated_columns(vectors, dtype) for _ in range(4)]
+    return torch.cat([axes.into(*each[:2]).T, axes.out_of(*each[2:]).T])
 
 
 # What each kernel is compared in.

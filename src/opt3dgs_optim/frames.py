@@ -8,7 +8,6 @@ world into the own frame. An axis may count as no thinner than a share of the lo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -19,7 +18,7 @@ from opt3dgs_optim.lbfgs.pairs import columns, put, row_chunks
 from opt3dgs_optim.state import is_finite_sum
 
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
-CHUNK = 65_536  # rows that a CPU works on at a time: smaller ones spend too much on each operation
+CHUNK = 65536  # rows that a CPU works on at a time: smaller ones spend too much on each operation
 # What Adam squares stays finite up to half of the root of the largest number, a power of two.
 _EXPONENTS = {dtype: math.frexp(torch.finfo(dtype).max)[1] for dtype in FLOATS}
 LARGEST = {dtype: 2.0 ** (exponent // 2 - 1) for dtype, exponent in _EXPONENTS.items()}
@@ -42,6 +41,7 @@ class Frames:
     ) -> None:
         self._wide = torch.float64 if dtype == torch.float64 else torch.float32
         self._axes: list[tuple[slice, Axes]] = []  # by rows; none: a kernel makes them
+        self._room: Tensor | None = None  # [2, 5, n] to compute in, for the first n rows
         if not cuda.has_own_frames(quats):
             self._axes = [
                 (rows, axes_of(quats[rows], scales[rows], self._wide, min_aspect))
@@ -58,7 +58,10 @@ class Frames:
         """
         largest = LARGEST[grad.dtype]
         if self._axes:
-            return self._each(lambda axes, v: axes.into(v).clamp_(-largest, largest), grad)
+            result = torch.empty_like(grad)
+            for rows, axes in self._axes:
+                put(result[rows], axes.into(*self._columns(grad[rows])).clamp_(-largest, largest))
+            return result
         found = cuda.own_frame_gradient(grad.to(self._wide), *self._given)
         # The kernel bounds it as what it computes in needs it.
         return (
@@ -66,16 +69,25 @@ class Frames:
         )
 
     def displacement(self, step: Tensor) -> Tensor:
-        """B z [N, 3]: of steps z [N, 3] in standard deviations, those in world units."""
+        """B z [N, 3]: of steps z [N, 3] in standard deviations, those in world units.
+
+        On a CPU it takes the place of the step.
+        """
         if not self._axes:
             return cuda.own_frame_displacement(step, *self._given)
-        return self._each(Axes.out_of, step)
-
-    def _each(self, take: Callable[[Axes, Tensor], Tensor], vectors: Tensor) -> Tensor:
-        result = torch.empty_like(vectors)
         for rows, axes in self._axes:
-            put(result[rows], take(axes, repeated_columns(vectors[rows], self._wide)))
-        return result
+            put(step[rows], axes.out_of(*self._columns(step[rows])))
+        return step
+
+    def _columns(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """Vectors [n, 3] as `repeated_columns`, and room for as many numbers.
+
+        Both lie in the same memory for all rows: new memory costs more than what is computed in it.
+        """
+        if self._room is None:
+            self._room = torch.empty(2, 5, len(vectors), dtype=self._wide, device=vectors.device)
+        room, spare = self._room[:, :, : len(vectors)]
+        return repeated_columns(vectors, self._wide, out=room), spare
 
 
 class Axes(NamedTuple):
@@ -90,18 +102,18 @@ class Axes(NamedTuple):
     axis: Tensor  # [5, n], its imaginary part
     deviations: Tensor  # [3, n]
 
-    def into(self, vectors: Tensor) -> Tensor:
-        """B^T v [3, n] of vectors as `repeated_columns` [5, n], which are overwritten."""
-        return self._rotated(vectors, -1.0).mul_(self.deviations)
+    def into(self, vectors: Tensor, spare: Tensor) -> Tensor:
+        """B^T v [3, n] of vectors as `repeated_columns` [5, n]; both arguments are overwritten."""
+        return self._rotated(vectors, spare, -1.0).mul_(self.deviations)
 
-    def out_of(self, vectors: Tensor) -> Tensor:
+    def out_of(self, vectors: Tensor, spare: Tensor) -> Tensor:
         """B v [3, n], as `into`."""
         vectors[:3].mul_(self.deviations)
-        return self._rotated(vectors, 1.0)
+        return self._rotated(vectors, spare, 1.0)
 
-    def _rotated(self, v: Tensor, direction: float) -> Tensor:
+    def _rotated(self, v: Tensor, t: Tensor, direction: float) -> Tensor:
         """R v, or R^T v where the direction is -1: v + w t + a x t with t = a x v."""
-        t, a = torch.empty_like(v), self.axis
+        a = self.axis
         v[3:].copy_(v[:2])
         torch.mul(a[1:4], v[2:5], out=t[:3])
         t[:3].addcmul_(a[2:5], v[1:4], value=-1.0)
@@ -110,9 +122,9 @@ class Axes(NamedTuple):
         return rotated.addcmul_(a[1:4], t[2:5]).addcmul_(a[2:5], t[1:4], value=-1.0)
 
 
-def repeated_columns(vectors: Tensor, dtype: torch.dtype) -> Tensor:
+def repeated_columns(vectors: Tensor, dtype: torch.dtype, out: Tensor | None = None) -> Tensor:
     """Vectors [n, 3] as rows [n] of their coordinates, [5, n], with room for two of them again."""
-    found = torch.empty(5, len(vectors), dtype=dtype, device=vectors.device)
+    found = torch.empty(5, len(vectors), dtype=dtype, device=vectors.device) if out is None else out
     columns(vectors, dtype, out=found[:3])
     return found
 

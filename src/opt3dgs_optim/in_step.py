@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.overrides import TemporaryOverrides, WeightDecay
-from opt3dgs_optim.part import Group, Part
+from opt3dgs_optim.part import Group, Part, overrides
 from opt3dgs_optim.state import (
     HeldRows,
     ParameterRecord,
@@ -44,16 +44,38 @@ class ActingParts:
     any: bool = field(init=False)
     shaping: bool = field(init=False)
     units: tuple[str, ...] = field(init=False)
+    _asked: list[NamedPart] = field(init=False)  # those that may not be ready
+    _narrowed: dict[frozenset[str], ActingParts] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self.units = tuple(name for name, part in self.before if part.own_units)
         self.shaping = bool(self.before or self.displacement)
         self.any = bool(self.shaping or self.factor or self.after)
+        self._asked = [pair for pair in self._every() if overrides(pair[1], "ready")]
 
     @classmethod
     def sought(cls, find: Callable[[str], list[NamedPart]]) -> ActingParts:
         """What `find` finds for the name of each hook."""
         return cls(*map(find, STEP_HOOKS))
+
+    def _every(self) -> list[NamedPart]:
+        found = {name: part for hook in STEP_HOOKS for name, part in getattr(self, hook)}
+        return list(found.items())
+
+    def ready_for(self, group: Group, course: Course) -> ActingParts:
+        """Without those that cannot act on the group in this step, or leave it to another."""
+        if not (self._asked or self.units):
+            return self
+        lacking = frozenset(name for name, part in self._asked if not part.ready(group, course))
+        if lacking not in self._narrowed:
+            left = [(name, part) for name, part in self._every() if name not in lacking]
+            if any(part.own_units for _, part in left):
+                left = [(name, part) for name, part in left if not part.spares_own_units]
+            names = {name for name, _ in left}
+            self._narrowed[lacking] = ActingParts.sought(
+                lambda hook: [pair for pair in getattr(self, hook) if pair[0] in names]
+            )
+        return self._narrowed[lacking]
 
     def feed(
         self, group: Group, param: Tensor, grad: Tensor, state: ParameterState, course: Course

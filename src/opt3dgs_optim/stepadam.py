@@ -24,7 +24,6 @@ from opt3dgs_optim.checks import LOGGER, as_damage, energy_of
 from opt3dgs_optim.course import STATE_KEY, Course, NoCourse
 from opt3dgs_optim.in_step import (
     NO_PARTS,
-    STEP_HOOKS,
     ActingParts,
     MovingParameter,
     NamedPart,
@@ -281,9 +280,9 @@ class StepAdam(Adam):
             step = StepInProgress(mask, acting, counts, temporary)
             try:
                 for group in self.param_groups:
-                    parts = self._parts_of(group) if acting else NO_PARTS
-                    if acting and course.asks_parts:
-                        parts = self._ready(parts, group)
+                    parts = NO_PARTS
+                    if acting:
+                        parts = self._parts_of(group).ready_for(group, course)
                     moved = self._prepare_group(step, cast(NamedGroup, group), parts)
                     if parts.factor:
                         given = temporary, group, moved, parts.factors(group, course), counts
@@ -319,16 +318,6 @@ class StepAdam(Adam):
         return [
             (name, part) for name, part in named if self._open_windows.get(name, ()) is not None
         ]
-
-    def _ready(self, parts: ActingParts, group: Group) -> ActingParts:
-        """Without the parts that cannot act on the group in this step, or leave it to another."""
-        every = {name: part for hook in STEP_HOOKS for name, part in getattr(parts, hook)}
-        ready = {name: part for name, part in every.items() if part.ready(group, self.course)}
-        if any(part.own_units for part in ready.values()):
-            ready = {name: part for name, part in ready.items() if not part.spares_own_units}
-        return ActingParts.sought(
-            lambda hook: [pair for pair in getattr(parts, hook) if pair[0] in ready]
-        )
 
     def _make(self, step: StepInProgress) -> None:
         """Have the base make the step, if that counts, of the rows that the mask lets move."""

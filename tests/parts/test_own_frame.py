@@ -88,7 +88,7 @@ def test_the_frame_is_that_of_the_covariance(
     # Rounding is relative to the axis, and in the world to the longest of them.
     for found, expected, size in (
         (frames.gradient(v), torch.einsum("nij,ni->nj", b, v.double()), axes),
-        (frames.displacement(v), torch.einsum("nij,nj->ni", b, v.double()), None),
+        (frames.displacement(v.clone()), torch.einsum("nij,nj->ni", b, v.double()), None),
     ):
         unit = scales.exp().amax(1, keepdim=True) if size is None else size
         torch.testing.assert_close(found / unit, expected.to(dtype) / unit, **tight)

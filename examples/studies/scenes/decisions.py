@@ -111,12 +111,12 @@ def every_scene(study: Study, iterations: int, **others: int) -> list[Setting]:
 
 
 def decide(study: Study) -> dict[str, Decision]:
-    """The decision on every part, at the largest and longest trainings that three scenes have.
+    """The decision on every part, at the largest and longest trainings that enough have.
 
-    Each part is judged against the same training without it: the multiplier against a constant of
-    its mean, curvature against the same phase without it, annealing and pooling on top of the
-    defaults. At half size one seed decides nothing while there are several at a quarter. A part
-    that pays must not be behind at full size; those that were on before need not be trained there.
+    That is three scenes, and at half size two seeds of each. Each part is judged against the same
+    training without it: the multiplier against a constant of its mean, curvature against the same
+    phase without it, annealing and pooling on top of the defaults. A part that pays must not be
+    behind at full size; those that were on before need not be trained there.
     """
     made = {}
     every = every_scene(study, CONFIRMING) + every_scene(study, CONFIRMING, sh_degree=3)

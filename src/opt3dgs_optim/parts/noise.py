@@ -277,8 +277,9 @@ def covariance_noise(scales: Tensor, quats: Tensor, opacities: Tensor, eta: Tens
     for rows in row_chunks(eta):
         axes = axes_of(quats[rows], scales[rows], wide, 0.0)  # Sigma = B B^T
         vectors = repeated_columns(eta[rows], wide)
-        axes.into(vectors)
+        spare = torch.empty_like(vectors)
+        axes.into(vectors, spare)
         opacity = torch.sigmoid(opacities[rows].reshape(-1))
         gate = torch.sigmoid(-GATE_SHARPNESS * (opacity - GATE_OPACITY))
-        put(noise[rows], axes.out_of(vectors).mul_(gate))
+        put(noise[rows], axes.out_of(vectors, spare).mul_(gate))
     return noise

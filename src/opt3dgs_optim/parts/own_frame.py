@@ -59,8 +59,10 @@ class OwnFrame(Part):
     or added, takes steps of up to six full ones at first, since Adam corrects its
     moments for the parameter's age and not for the row's.
 
-    It keeps nothing from step to step. A step takes three buffers of the positions' size, and their
-    frames: 64 bytes per point, 80 on a CPU.
+    It keeps nothing from step to step. A step takes 64 bytes per point (float32), for what Adam is
+    fed, the buffer that it moves, the displacement and the frames. On a CPU the displacement takes
+    the buffer's place: that is 60 bytes, and room to compute in, 40 for each of up to 65,536
+    points.
 
     Args:
         rate: standard deviations of a full step in the first iteration, above 0.
