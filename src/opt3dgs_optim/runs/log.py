@@ -219,8 +219,10 @@ class RunLog(AbstractContextManager["RunLog"]):
     def event(self, kind: str, iteration: SupportsIndex, **info: Any) -> None:
         """Log that something happened: `log.event("pruned", iteration, points=1_200)`.
 
-        `info` may hold what `metadata` may, and one-element tensors. Raises as `step`, and for a
-        `kind` of "resumed", by which `resume` tells readers what to leave out.
+        `info` may hold what `metadata` may, and one-element tensors. Raises as `step`.
+
+        Raises:
+            ValueError: the kind is "resumed", by which `resume` tells readers what to leave out.
         """
         if kind == RESUMED:
             raise ValueError(f"RunLog.event: kind={kind!r} is the log's own; choose another")
