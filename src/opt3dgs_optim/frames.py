@@ -18,7 +18,7 @@ from opt3dgs_optim.lbfgs.pairs import columns, put, row_chunks
 from opt3dgs_optim.state import is_finite_sum
 
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
-CHUNK = 65536  # rows that a CPU works on at a time: smaller ones spend too much on each operation
+CHUNK = 65_536  # rows that a CPU works on at a time: smaller ones spend too much on each operation
 # What Adam squares stays finite up to half of the root of the largest number, a power of two.
 _EXPONENTS = {dtype: math.frexp(torch.finfo(dtype).max)[1] for dtype in FLOATS}
 LARGEST = {dtype: 2.0 ** (exponent // 2 - 1) for dtype, exponent in _EXPONENTS.items()}
