@@ -324,37 +324,40 @@ def test_a_rate_of_zero_is_not_said_and_hides_no_other(
     assert warned("AB", rates) == expected
 
 
+def upgraded_by(phases: PhaseScheduler) -> tuple[dict[str, Parameter], dict[str, Adam]]:
+    """Six Gaussians, and an Adam for each of their parameters."""
+    params = {name: Parameter(torch.randn(6, *shape)) for name, shape in SHAPES.items()}
+    return params, phases.upgrade({name: Adam([each], lr=0.01) for name, each in params.items()})
+
+
+def step(params: dict[str, Parameter], adams: dict[str, Adam], phases: PhaseScheduler) -> None:
+    """One iteration with random gradients."""
+    for param in params.values():
+        param.grad = torch.randn_like(param)
+    phases.observe(0.1)
+    for adam in adams.values():
+        adam.step()
+
+
 @pytest.mark.parametrize("noise_first", [True, False])
 def test_the_mean_of_the_iterates_is_no_noise_of_the_trainers(noise_first: bool) -> None:
     """Averaging puts it in the positions' place in the last steps, after the noise or before."""
-    sizes = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": ()}
-    params = {name: Parameter(torch.randn(6, *shape)) for name, shape in sizes.items()}
     parts: list[Part] = [PositionNoise(scale=1.0), Averaging()]
     phases = PhaseScheduler(600, parts=parts if noise_first else parts[::-1])
-    adams = phases.upgrade({name: Adam([param], lr=0.01) for name, param in params.items()})
+    params, adams = upgraded_by(phases)
     for _ in range(600):
-        for param in params.values():
-            param.grad = torch.randn_like(param)
-        phases.observe(0.1)
-        for adam in adams.values():
-            adam.step()
+        step(params, adams, phases)
 
 
 def test_positions_are_copied_in_one_step_only() -> None:
     """That in which they are compared; a copy in every step would cost as much as the noise."""
-    names = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": ()}
-    params = {name: Parameter(torch.randn(6, *shape)) for name, shape in names.items()}
     phases = PhaseScheduler(300, parts=[PositionNoise(scale=1.0)])
-    adams = phases.upgrade({name: Adam([param], lr=0.01) for name, param in params.items()})
+    params, adams = upgraded_by(phases)
     copies = 0
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for _ in range(40):
-            for param in params.values():
-                param.grad = torch.randn_like(param)
-            phases.observe(0.1)
-            for adam in adams.values():
-                adam.step()
+            step(params, adams, phases)
             _, _, copied = phases.published(LEFT_AT, params["means"])
             copies += copied is not None
             with torch.no_grad():

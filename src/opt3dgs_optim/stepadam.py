@@ -280,9 +280,7 @@ class StepAdam(Adam):
             step = StepInProgress(mask, acting, counts, temporary)
             try:
                 for group in self.param_groups:
-                    parts = NO_PARTS
-                    if acting:
-                        parts = self._parts_of(group).ready_for(group, course)
+                    parts = self._parts_of(group).ready_for(group, course) if acting else NO_PARTS
                     moved = self._prepare_group(step, cast(NamedGroup, group), parts)
                     if parts.factor:
                         given = temporary, group, moved, parts.factors(group, course), counts
@@ -600,7 +598,7 @@ class StepAdam(Adam):
         Raises:
             ValueError: it does not fit; then nothing has been loaded.
         """
-        names = "state", "param_groups", "_known", "_open_windows", "stepped_at"
+        names = "state", "param_groups", "_known", "_gone", "_open_windows", "stepped_at"
         before = {name: getattr(self, name) for name in names}
         call, found = f"{self.call_name}.load_state_dict", list[Saved]()
 
