@@ -17,7 +17,7 @@ import torch
 from torch.nn import Parameter
 from torch.optim import Adam, AdamW
 
-from opt3dgs_optim import DEFAULTS, PhaseScheduler, StepAdam
+from opt3dgs_optim import Averaging, Fading, OutOfView, PhaseScheduler, StepAdam
 
 
 class Counting(Adam):
@@ -63,10 +63,11 @@ KINDS: dict[str, type[Adam]] = {
     "a class of a trainer's": Deeper,
     "a trainer's AdamW": Decoupled,
 }
-PARTS = {"no parts": (), "the defaults": DEFAULTS}
+SOME = (Fading(), OutOfView(), Averaging())  # that ask for no other parameter
+PARTS = {"no parts": (), "parts": SOME}
 
 
-def upgraded(kind: type[Adam], parts: Any = DEFAULTS, **options: Any) -> Any:
+def upgraded(kind: type[Adam], parts: Any = SOME, **options: Any) -> Any:
     x = Parameter(torch.ones(4, 3))
     optimizer = kind([{"params": [x], "name": "xyz"}], lr=0.1, **options)  # pyright: ignore
     return PhaseScheduler(90, parts=list(parts)).upgrade(optimizer)

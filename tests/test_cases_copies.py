@@ -29,7 +29,8 @@ WAYS: dict[str, Callable[[Any], Any]] = {
     "pickle": lambda value: pickle.loads(pickle.dumps(value)),
     "torch.save": through_torch,
 }
-QUIET = [arm for arm in ARMS if "Noise" not in arm and arm not in ("everything", "OwnFrame")]
+QUIET = [arm for arm in ARMS if "Noise" not in arm and arm != "everything"]
+SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": ()}
 
 
 class Trainer:
@@ -38,8 +39,8 @@ class Trainer:
     def __init__(self, arm: str, log: RunLog | None = None) -> None:
         draw = torch.Generator().manual_seed(0)
         self.splats = {
-            "means": Parameter(torch.randn(8, 3, generator=draw)),
-            "opacities": Parameter(torch.randn(8, generator=draw)),
+            name: Parameter(torch.randn(8, *shape, generator=draw))
+            for name, shape in SHAPES.items()
         }
         groups = [{"params": [p], "name": n} for n, p in self.splats.items()]
         self.phases = PhaseScheduler(90, 60, list(ARMS[arm](None)), log=log)

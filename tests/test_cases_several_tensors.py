@@ -17,10 +17,10 @@ from torch.nn import Parameter
 from opt3dgs_optim import Kept, Part, PhaseScheduler
 
 TOTAL, SWITCH, ROWS = 90, 60, 20
-SHAPES = {"means": (3,), "opacities": (1,)}
-RATES = {"means": 1e-2, "opacities": 5e-2}
-# Parts that draw numbers, or that need the other parameters, are about one set of Gaussians.
-NOT_ALONE = ("PositionNoise", "IsotropicNoise", "OwnFrame", "everything")
+SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (1,)}
+RATES = {"means": 1e-2, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2}
+# Parts that draw numbers draw them for one set of Gaussians after the other.
+NOT_ALONE = ("PositionNoise", "IsotropicNoise", "everything")
 ALONE = [arm for arm in ARMS if arm not in NOT_ALONE]
 
 

@@ -27,7 +27,8 @@ from opt3dgs_optim import (
 from opt3dgs_optim.names import ADAM_KEYS
 
 TOTAL = 100
-NAMES = ("means", "scales", "opacities")
+SHAPES = {"means": (6, 3), "scales": (6, 3), "quats": (6, 4), "opacities": (6, 1)}
+NAMES = tuple(SHAPES)
 
 
 class Training:
@@ -35,8 +36,7 @@ class Training:
 
     def __init__(self, *parts: Part, dtype: torch.dtype = torch.float32) -> None:
         self.phases = PhaseScheduler(TOTAL, parts=[*parts])
-        shapes = {"means": (6, 3), "scales": (6, 3), "opacities": (6, 1)}
-        self.params = {n: Parameter(torch.zeros(s, dtype=dtype)) for n, s in shapes.items()}
+        self.params = {n: Parameter(torch.zeros(s, dtype=dtype)) for n, s in SHAPES.items()}
         self.adams = {n: Adam([p], lr=0.01) for n, p in self.params.items()}
         self.phases.upgrade(self.adams)
 
@@ -297,7 +297,7 @@ def test_parameters_that_density_control_has_replaced_are_let_go() -> None:
     old = new = state = moments = None
     training.phases.observe(1.0)
     gc.collect()
-    assert [ref() for ref in alive] == [None] * 3
+    assert [ref() for ref in alive] == [None] * len(SHAPES)
     training.run(4, 8)
 
 
