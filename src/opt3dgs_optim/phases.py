@@ -70,7 +70,7 @@ class PhaseScheduler(Course):
     `state_dict()`, so that a trainer which saves its optimizers resumes bit for bit.
 
     Memory: that of Adam. In the last thirtieth of a run the defaults keep a copy of the parameters.
-    `Curvature` takes 32 bytes for each point and pair.
+    `Curvature` takes 160 bytes for each point.
 
     Examples:
         >>> import torch

@@ -47,6 +47,7 @@ PAPER = (  # what the pages say of the paper's parts: the part, what without it,
     ("AW-SGLD, the paper's settings", CONSTANT, "paper", "paper-constant"),
     ("L2 loss in the last thirtieth", "3DGS-MCMC", "l2@1/30", BASELINE),
     ("fresh moments in the last thirtieth", "3DGS-MCMC", "l1+reset@1/30", BASELINE),
+    ("L2 loss and fresh moments there", "3DGS-MCMC", "l2+reset@1/30", BASELINE),
     (
         "L-BFGS directions in the last thirtieth",
         "L2 loss and fresh moments there",
