@@ -10,7 +10,7 @@ from torch import Tensor
 # stand twice. The `features` of 3DGRUT and of gsplat's --app_opt are none of them: they are inputs
 # of a network.
 GAUSSIAN_NAMES: Mapping[str, tuple[str, ...]] = {
-    "means": ("means", "xyz", "positions"),  # 3DGRUT
+    "means": ("means", "xyz", "positions", "means3d"),  # 3DGRUT, gsplat before 1.0
     "scales": ("scales", "scaling", "scale", "log_scales"),  # 3DGRUT, fVDB
     "quats": ("quats", "rotation", "rotations"),  # gaussian-splatting-lightning, Faster-GS
     "opacities": ("opacities", "opacity", "density", "logit_opacities"),  # 3DGRUT, fVDB

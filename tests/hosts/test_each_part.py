@@ -67,7 +67,9 @@ class Gsplat(Trial):
         text = text.replace(made[0], "")
         resume = resume.replace("PATH", 'f"{cfg.result_dir}/begun.pt"')
         save = save.replace("PATH", 'f"{cfg.result_dir}/whole_{step + 1}.pt"')
-        save = f"if step + 1 in (max_steps // 2, max_steps):\n{textwrap.indent(save, '    ')}"
+        rarely = "if (step + 1) % 5_000 == 0:"
+        assert rarely in save
+        save = save.replace(rarely, "if step + 1 in (max_steps // 2, max_steps):")
         start, end = "        init_step = 0\n", "            # eval the full set\n"
         assert text.count(start) == text.count(end) == 1
         text = text.replace(start, made[0] + textwrap.indent(resume, " " * 8) + "\n")

@@ -33,6 +33,7 @@ def names_for(trainer: Trainer, path: Path) -> dict[str, Any]:
         "PATH": path,
         "device": "cpu",
         "phases": trainer.phases,
+        "step": 4_999,  # an iteration in which the lines save
     }
 
 

@@ -84,6 +84,31 @@ def test_a_term_that_may_be_another_is_left_alone(tmp_path: Path, kind: str) -> 
     assert stock == edited
 
 
+def test_what_is_logged_below_is_no_reduction(tmp_path: Path) -> None:
+    """compact3d and SparseGS subscript what a function has made of the loss."""
+    loss = f"{PHOTOS}Ll1 = l1_loss(image, gt_image)\nloss = loss_of() + Ll1"
+    step = (
+        "shown = dict(all=Ll1.item(), loss=loss)\nprint(shown['loss'])\ngaussians.optimizer.step()"
+    )
+    text = short(loss=loss, step=step)
+    assert "Ll1 = phases.pixel_loss(image, gt_image)" in lines_of(tmp_path, text)
+
+
+def test_a_mask_says_nothing_of_what_it_picks(tmp_path: Path) -> None:
+    """Gaussian-Wild's mask is called as the features of a network that makes it."""
+    loss = (
+        f"{PHOTOS}features_mask = image > 0\n"
+        "if iteration > 2:\n    Ll1 = l1_loss(image * features_mask, gt_image * features_mask)\n"
+        "else:\n    Ll1 = l1_loss(image, gt_image)\nloss = loss_of() + Ll1"
+    )
+    found = [line for line in lines_of(tmp_path, short(loss=loss)) if "pixel_loss" in line]
+    assert len(found) == 2
+    depth = loss.replace("image * features_mask, gt_image", "depth * features_mask, gt_image")
+    depth = depth.replace("features_mask = ", "depth = image\nfeatures_mask = ")
+    found = [line for line in lines_of(tmp_path, short(loss=depth)) if "pixel_loss" in line]
+    assert len(found) == 1
+
+
 @pytest.mark.parametrize(
     ("top", "term"),
     [

@@ -17,12 +17,16 @@ from opt3dgs_optim.hosts.syntax import (
     spots,
     values,
 )
+from opt3dgs_optim.names import canonical_name
 
 GAUSSIANS = re.compile(r"gauss|splat|primitive|convex", re.I)  # in the name of their model
-NO_ADAM = re.compile(
-    r"(^|\.)(SGD|ASGD|RMSprop|Rprop|Adagrad|Adadelta|Adafactor|LBFGS|SparseAdam|Muon)$"
+NO_ADAM = re.compile(  # of torch, and what inherits from no Adam of torch's
+    r"(^|\.)(SGD|ASGD|RMSprop|Rprop|Adagrad|Adadelta|Adafactor|LBFGS|SparseAdam|Muon|RAdam|NAdam|"
+    r"\w*Adam\w*8bit|FusedAdam|DeepSpeedCPUAdam)$"
 )
 ADAM = re.compile(r"(^|\.)\w*Adam\w*$")
+# Methods of a model that step its own optimizer, in the place of `X.optimizer.step()`.
+STEPPING = ("optimizer_step", "step")
 
 
 class Step(NamedTuple):
@@ -42,7 +46,11 @@ class Optimizers(NamedTuple):
 
 
 def find_optimizers(
-    tree: ast.Module, own: list[Spot], loop: ast.stmt, steps: list[Step], folder: Path
+    tree: ast.Module,
+    own: list[Spot],
+    loop: ast.stmt,
+    steps: list[Step],
+    models: list[ast.Module],
 ) -> Optimizers:
     """The optimizers of the Gaussians among those that a training loop steps.
 
@@ -51,13 +59,12 @@ def find_optimizers(
         own: every node of the loop's scope.
         loop: the training loop.
         steps: where it steps an optimizer.
-        folder: where the file lies: the model is read from `scene/*.py` beside it.
+        models: of `model_files`.
 
     Raises:
         ValueError: it is not clear which one is the Gaussians'.
     """
     notes: list[str] = []
-    models = _model_files(folder)
     stepped = list(dict.fromkeys(step.optimizer for step in steps))
     for step in steps:
         if not is_reference(ast.parse(step.optimizer, mode="eval").body):
@@ -85,6 +92,7 @@ def find_optimizers(
                 f"parameter's name are acted on (all: {', '.join(sorted(groups))})"
             )
     elif len(named) == 1 and not owners and not dicts:
+        _check_names(own, named[0], steps)
         found = named
     else:
         lines = ", ".join(f"{step.optimizer} in line {step.spot.line}" for step in steps)
@@ -96,11 +104,11 @@ def find_optimizers(
         )
     _check_adam([tree, *models], found[0])
     setups = find_remade([tree, *models], own, loop, found[0])
-    if others := [text for text in stepped if text not in found]:
+    if others := [text for text in stepped if text not in found and not _is_of(own, text, found)]:
         notes.append(f"left alone: {', '.join(others)}")
     if any(_steps_at_times(model) for model in models):
         notes.append(
-            "the model's optimizer_step() steps in some iterations only; between these the loss is "
+            "the model steps its optimizer in some iterations only; between these the loss is "
             "observed, but the mean of the last thirtieth has as few iterates as there are steps"
         )
     return Optimizers(found, setups, notes)
@@ -134,6 +142,60 @@ def _check_adam(trees: list[ast.Module], optimizer: str) -> None:
         )
 
 
+def _check_names(own: list[Spot], optimizer: str, steps: list[Step]) -> None:
+    """ValueError where none of an Adam's groups has a Gaussian parameter's name: poses, say.
+
+    Names that are no constants, as the keys of a dict of parameters, may be any.
+    """
+    given: list[ast.expr | None] = []
+    for spot in own:
+        match spot.node:
+            case ast.Dict(keys, many):
+                pairs = zip(keys, many, strict=True)
+                given += [v for k, v in pairs if isinstance(k, ast.Constant) and k.value == "name"]
+            case ast.Call(ast.Name("dict"), _, keywords):
+                given += [each.value for each in keywords if each.arg == "name"]
+    for _, value in values(own, optimizer):
+        match value:
+            case ast.Dict(keys):
+                given += keys
+            case ast.Call(_, [ast.List()]):
+                continue
+            case ast.Call(_, [ast.Name(name)]) if _are_lists(own, name):
+                continue
+            case _:
+                given.append(None)  # made elsewhere
+    names = [_constant_of(each) for each in given]
+    if None not in names and not any(map(canonical_name, names)):
+        shown = ", ".join(sorted({str(name) for name in names})) or "none"
+        line = next(step.spot.line for step in steps if step.optimizer == optimizer)
+        raise refusal(
+            line,
+            f"no group of {optimizer} has the name of a Gaussian parameter (its names: {shown}): "
+            "it is not clear that it is the Gaussians' optimizer",
+        )
+
+
+def _are_lists(own: list[Spot], name: str) -> bool:
+    """Whether a name gets nothing but lists that are written out."""
+    given = [value for _, value in values(own, name)]
+    return bool(given) and all(isinstance(value, ast.List) for value in given)
+
+
+def _constant_of(name: ast.expr | None) -> str | None:
+    """A group's name, or what is constant of it; None where nothing is."""
+    nodes = [*ast.walk(name)] if name else []
+    given = [node.value for node in nodes if isinstance(node, ast.Constant)]
+    return "".join(each for each in given if isinstance(each, str)) or None
+
+
+def _is_of(own: list[Spot], name: str, found: list[str]) -> bool:
+    """Whether a name gets nothing but items of what is upgraded: `self.optimizers["means"]`."""
+    given = [value for _, value in values(own, name) if value is not None]  # a loop's has none
+    items = [ast.unparse(v.value) for v in given if isinstance(v, ast.Subscript)]
+    return bool(items) and len(items) == len(given) and set(items) <= set(found)
+
+
 def _is_adam(own: list[Spot], name: str) -> bool:
     """Whether a name gets an Adam, or a dict of such, and nothing else."""
     given = [value for _, value in values(own, name)]
@@ -143,7 +205,8 @@ def _is_adam(own: list[Spot], name: str) -> bool:
 def _makes_adam(value: ast.expr | None) -> bool:
     match value:
         case ast.Call(called):
-            return ADAM.search(ast.unparse(called)) is not None
+            text = ast.unparse(called)
+            return ADAM.search(text) is not None and NO_ADAM.search(text) is None
         case ast.DictComp(_, each):
             return _makes_adam(each)
         case ast.Dict(_, many):
@@ -151,15 +214,23 @@ def _makes_adam(value: ast.expr | None) -> bool:
     return False
 
 
-def read_step(tree: ast.Module, spot: Spot, own: list[Spot]) -> Step | None:
+def read_step(
+    tree: ast.Module, spot: Spot, own: list[Spot], models: list[ast.Module]
+) -> Step | None:
     """The step that a call makes: of an optimizer, or of each of many.
+
+    Args:
+        tree: the file's syntax tree.
+        spot: the call.
+        own: every node of the scope.
+        models: of `model_files`.
 
     Raises:
         ValueError: it is stepped in a way that is no Adam's.
     """
     loops = loops_around(spot)
     match spot.node:
-        case ast.Call(ast.Attribute(owner, "optimizer_step")):
+        case ast.Call(ast.Attribute(owner)) as call if _steps_its_own([tree, *models], call):
             return Step(f"{ast.unparse(owner)}.optimizer", spot, loops)
         case ast.Call(ast.Attribute(owner, "step"), given, options) as call:
             name = ast.unparse(owner)
@@ -184,10 +255,38 @@ def read_step(tree: ast.Module, spot: Spot, own: list[Spot]) -> Step | None:
     return Step(name, spot, loops)
 
 
+def _steps_its_own(trees: list[ast.Module], call: ast.Call) -> bool:
+    """Whether a call of `X.optimizer_step()` or `X.step()` steps `X.optimizer`.
+
+    By the methods of these names in the files, and by X's name where there are none.
+    """
+    match call:
+        case ast.Call(ast.Attribute(owner, method)) if method in STEPPING:
+            name = ast.unparse(owner)
+        case _:
+            return False
+    if not GAUSSIANS.search(name) or name.endswith(("optimizer", "optimizers")):
+        return False
+    found = [n for tree in trees for n in ast.walk(tree) if isinstance(n, FUNCTIONS)]
+    found = [function for function in found if function.name == method]
+    if not found:
+        return method == "optimizer_step"
+    return all(_steps_optimizer(function) for function in found)
+
+
+def _steps_optimizer(function: ast.AST) -> bool:
+    """Whether a method has `self.optimizer.step(...)`."""
+    for node in ast.walk(function):
+        match node:
+            case ast.Call(ast.Attribute(ast.Attribute(ast.Name("self"), "optimizer"), "step")):
+                return True
+    return False
+
+
 def _steps_at_times(model: ast.Module) -> bool:
-    """Whether its `optimizer_step` steps in every so many iterations, as FastGS's does."""
+    """Whether it steps its optimizer in every so many iterations, as FastGS's does."""
     for function in ast.walk(model):
-        if isinstance(function, FUNCTIONS) and function.name == "optimizer_step":
+        if isinstance(function, FUNCTIONS) and function.name in STEPPING:
             for spot in spots(function):
                 match spot.node:
                     case ast.Call(ast.Attribute(ast.Attribute(_, "optimizer"), "step")):
@@ -227,15 +326,43 @@ def _is_closure(tree: ast.Module, node: ast.expr, own: list[Spot]) -> bool:
     return False
 
 
-def _model_files(folder: Path) -> list[ast.Module]:
-    """The files of `scene/` that have the model's classes."""
-    trees = []
-    for path in sorted((folder / "scene").glob("*model*.py")):
-        try:
-            trees.append(ast.parse(path.read_bytes()))
-        except (OSError, SyntaxError, ValueError):
-            continue
+def model_files(tree: ast.Module, folder: Path) -> list[ast.Module]:
+    """The files of `scene/` beside a script that have the model's classes.
+
+    Args:
+        tree: the script's syntax tree: of several classes those count that it names, or that
+            `scene/__init__.py` imports, and their bases.
+        folder: where the script lies.
+    """
+    scene = folder / "scene"
+    read = [_read(path) for path in sorted(scene.glob("*model*.py"))]
+    trees = [each for each in read if each is not None]
+    classes = {n.name: n for each in trees for n in each.body if isinstance(n, ast.ClassDef)}
+    named = [name for name in classes if name in _names(tree)]
+    if not named and (package := _read(scene / "__init__.py")):
+        imported = {node.name for node in ast.walk(package) if isinstance(node, ast.alias)}
+        named = [name for name in classes if name in imported]
+    for name in named:  # grows by the bases
+        for base in classes[name].bases:
+            named += [b for b in classes if b in _names(base) and b not in named]
+    for each in trees if named else ():
+        kept = [n for n in each.body if not isinstance(n, ast.ClassDef) or n.name in named]
+        each.body = kept
     return trees
+
+
+def _read(path: Path) -> ast.Module | None:
+    try:
+        return ast.parse(path.read_bytes())
+    except (OSError, SyntaxError, ValueError):
+        return None
+
+
+def _names(tree: ast.AST) -> set[str]:
+    """The names that are read in a tree, and given nothing there."""
+    found = [node for node in ast.walk(tree) if isinstance(node, ast.Name)]
+    given = {node.id for node in found if isinstance(node.ctx, ast.Store)}
+    return {node.id for node in found} - given
 
 
 def _model(trees: list[ast.Module]) -> tuple[set[str], set[str]]:

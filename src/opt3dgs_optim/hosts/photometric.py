@@ -46,6 +46,7 @@ def find_pixel_loss(
         or that it is the mean of the absolute error.
     """
     found: dict[str, list[tuple[Spot, PixelLoss]]] = {}
+    above = [spot for spot in inside if spot.line <= last]  # what is logged below is no loss
     for spot in inside:
         match spot.node:
             case ast.Assign(
@@ -59,7 +60,7 @@ def find_pixel_loss(
                 shown = all(PHOTO.search(each) for each in images)
                 usual = name.lower() in USUAL_L1
                 mean = ast.unparse(spot.node.value).endswith(").mean()")
-                certain = _is_mean(tree, mean) and (mean or not _is_reduced(name, spot, inside))
+                certain = _is_mean(tree, mean) and (mean or not _is_reduced(name, spot, above))
                 if not (usual and shown and not other and loops_around(spot)[-1] is loop):
                     continue
                 if not certain or _is_without_gradient(spot) or not _have_one_shape(pair, inside):
@@ -156,9 +157,14 @@ def _is_reduced(name: str, term: Spot, inside: list[Spot]) -> bool:
 def _written(image: ast.expr, inside: list[Spot]) -> str:
     """An image's expression, and what its names are given in the loop: says what it shows.
 
-    A mask that picks pixels says nothing of what is picked.
+    A mask that picks pixels says nothing of what is picked, as an index or as a factor.
     """
     picked = image.value if isinstance(image, ast.Subscript) else image
+    match picked:
+        case ast.BinOp(left, ast.Mult(), right) if "mask" in ast.unparse(right).lower():
+            picked = left
+        case ast.BinOp(left, ast.Mult(), right) if "mask" in ast.unparse(left).lower():
+            picked = right
     names = {node.id for node in ast.walk(picked) if isinstance(node, ast.Name)}
     given = [value for name in names for _, value in values(inside, name)]
     # What a call is given, as the scale of a smaller photo, says nothing of what comes of it.

@@ -16,7 +16,7 @@ from pathlib import Path
 from opt3dgs_optim.hosts.calls import check_calls
 from opt3dgs_optim.hosts.counting import read_count
 from opt3dgs_optim.hosts.endings import check_end
-from opt3dgs_optim.hosts.optimizers import find_optimizers, read_step
+from opt3dgs_optim.hosts.optimizers import find_optimizers, model_files, read_step
 from opt3dgs_optim.hosts.photometric import PixelLoss, find_pixel_loss
 from opt3dgs_optim.hosts.rhythm import check_rhythm
 from opt3dgs_optim.hosts.syntax import (
@@ -80,24 +80,25 @@ def read_trainer(tree: ast.Module, folder: Path) -> Trainer:
         )
     outermost = loops_around(backwards[0])[0]
     around = [spot for spot in own if outermost in spot.above]
-    steps = [step for spot in around if (step := read_step(tree, spot, own)) is not None]
+    models = model_files(tree, folder)
+    steps = [step for spot in around if (step := read_step(tree, spot, own, models)) is not None]
     steps = [step for step in steps if loop in step.loops] or steps
     statements = [spot.above[-1] for spot in backwards]
     found = [statement for statement in statements if isinstance(statement, ast.stmt)]
     (loss,) = losses
     _check_scale(loss, inside)
     trainer = Trainer(scope, own, loop, loss, found, ast.Constant(0), "")
-    found_optimizers = find_optimizers(tree, own, loop, steps, folder)
+    found_optimizers = find_optimizers(tree, own, loop, steps, models)
     trainer.optimizers, trainer.setups, trainer.notes = found_optimizers
-    main = [step for step in steps if step.optimizer == trainer.optimizers[0]]
-    check_rhythm(tree, loop, inside, backwards, main)
-    _check_loss(tree, backwards[0], loss, inside)
     if not isinstance(loop, ast.For):
         raise refusal(
             loop,
             "the training loop is a `while`: the number of iterations cannot be read from it, only "
             "from a range(...)",
         )
+    main = [step for step in steps if step.optimizer == trainer.optimizers[0]]
+    check_rhythm(tree, loop, inside, backwards, main)
+    _check_loss(tree, backwards[0], loss, inside)
     check_calls(tree, scope, loop, trainer.optimizers[0])
     each_turn = _is_in_each_turn(backwards, inside, loop)
     trainer.total, trainer.iteration = read_count(tree, loop, own, found[-1], each_turn=each_turn)
