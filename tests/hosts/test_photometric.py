@@ -123,3 +123,18 @@ def test_a_mean_is_replaced(tmp_path: Path, top: str, term: str) -> None:
     images = term[term.index("(") : term.index(")") + 1]
     loss = f"{PHOTOS}Ll1 = {term}\nloss = loss_of() + Ll1\nprint(Ll1.item())"
     assert f"Ll1 = phases.pixel_loss{images}" in lines_of(tmp_path, short(top=top, loss=loss))
+
+
+def test_another_term_of_two_photos_is_named(tmp_path: Path) -> None:
+    """GS-IR's second stage trains on a term of another name."""
+    loss = (
+        f"{PHOTOS}Ll1 = l1_loss(image, gt_image)\nif iteration < 2:\n    loss = loss_of() + Ll1\n"
+        "else:\n    pbr_loss = l1_loss(image, gt_image)\n    loss = loss_of() + pbr_loss"
+    )
+    path = tmp_path / "train.py"
+    path.write_text(short(loss=loss))
+    line = 1 + path.read_text().splitlines().index(
+        "            pbr_loss = l1_loss(image, gt_image)"
+    )
+    (note,) = diff(path).notes
+    assert note.startswith(f"l1_loss of two photos stays as it is in line {line},")

@@ -32,7 +32,7 @@ class PixelLoss(NamedTuple):
 
 def find_pixel_loss(
     tree: ast.Module, inside: list[Spot], loop: ast.stmt, last: int
-) -> list[PixelLoss]:
+) -> tuple[list[PixelLoss], list[int]]:
     """The photometric term above a line: `L1 = l1_loss(a, b)`, alone or with `.mean()`.
 
     Args:
@@ -42,10 +42,12 @@ def find_pixel_loss(
         last: the line.
 
     Returns:
-        Several only where branches write the same name; none where it is not certain which it is,
-        or that it is the mean of the absolute error.
+        The terms, and the lines of others of two photos. Several terms only where branches write
+        the same name; none where it is not certain which it is, or that it is the mean of the
+        absolute error.
     """
     found: dict[str, list[tuple[Spot, PixelLoss]]] = {}
+    others: list[int] = []
     above = [spot for spot in inside if spot.line <= last]  # what is logged below is no loss
     for spot in inside:
         match spot.node:
@@ -61,16 +63,19 @@ def find_pixel_loss(
                 usual = name.lower() in USUAL_L1
                 mean = ast.unparse(spot.node.value).endswith(").mean()")
                 certain = _is_mean(tree, mean) and (mean or not _is_reduced(name, spot, above))
-                if not (usual and shown and not other and loops_around(spot)[-1] is loop):
+                if not shown or other or loops_around(spot)[-1] is not loop:
+                    continue
+                if not usual:
+                    others.append(spot.line)
                     continue
                 if not certain or _is_without_gradient(spot) or not _have_one_shape(pair, inside):
-                    return []
+                    return [], []
                 found.setdefault(name, []).append((spot, PixelLoss(spot.node.value, pair)))
     terms = next(iter(found.values())) if len(found) == 1 else []
     places = [spot for spot, _ in terms]
     if not all(are_exclusive(one, other) for one, other in combinations(places, 2)):
-        return []
-    return [term for _, term in terms]
+        return [], []
+    return [term for _, term in terms], others
 
 
 def _is_mean(tree: ast.Module, of_elements: bool) -> bool:

@@ -104,11 +104,17 @@ def read_trainer(tree: ast.Module, folder: Path) -> Trainer:
     trainer.total, trainer.iteration = read_count(tree, loop, own, found[-1], each_turn=each_turn)
     check_end(tree, loop, inside, loss)
     trainer.scene = _scene(inside)
-    trainer.pixel = find_pixel_loss(tree, inside, loop, max(s.lineno for s in found))
+    trainer.pixel, others = find_pixel_loss(tree, inside, loop, max(s.lineno for s in found))
     if not trainer.pixel:
         trainer.notes.append(
             "no L1 = l1_loss(render, photo) was found with certainty: the paper's squared loss "
             "needs phases.pixel_loss(render, photo) in its place, the defaults do not"
+        )
+    elif others:
+        lines = ", ".join(map(str, others))
+        trainer.notes.append(
+            f"l1_loss of two photos stays as it is in line {lines}, which matters to the paper's "
+            "squared loss alone"
         )
     return trainer
 
