@@ -12,7 +12,7 @@ import torch
 from placed_training import ADAMS, ARMS, PRESETS, Training, distance
 from torch.nn import Parameter
 
-from opt3dgs_optim import Averaging, PhaseScheduler
+from opt3dgs_optim import DEFAULTS, Averaging, OwnFrame, Part, PhaseScheduler
 
 DTYPES = {"bfloat16": torch.bfloat16, "float16": torch.float16, "float64": torch.float64}
 EPS: dict[str, Any] = {"adam": {"eps": 1e-4}}  # 1e-15 is 0 in float16
@@ -133,3 +133,53 @@ def test_the_mean_of_float64_positions_has_their_digits() -> None:
         adam.step()
     # 300 steps of 1e-6, the last of which are averaged.
     assert float((p.detach() - 4500000.987654321).abs().max()) < 301e-6 + 1e-8
+
+
+class Enlarging(Part):
+    """Feeds so much more that half precision has no number for it once AMP has scaled it."""
+
+    names = ("means",)
+
+    def before(self, group: Any, param: Any, grad: Any, state: Any, course: Any) -> Any:
+        return grad * 100.0
+
+
+SCALED: dict[str, list[Part]] = {
+    "defaults": [*DEFAULTS],
+    "own frame": [OwnFrame(), *DEFAULTS],
+    "a part that feeds more": [Enlarging()],
+}
+
+
+@pytest.mark.parametrize("parts", SCALED)
+@pytest.mark.parametrize("grad", [2e-8, 1e-5, 0.1, 0.9])
+def test_half_precision_under_a_scale(parts: str, grad: float) -> None:
+    """The scale keeps small gradients, and nothing that parts feed overflows by it."""
+    moved = []
+    for each in ([], SCALED[parts]):
+        values = {
+            "means": torch.zeros(4, 3),
+            "scales": torch.zeros(4, 3),
+            "quats": torch.ones(4, 4),
+        }
+        values["scales"] += 3.0 if grad > 0.01 else 0.0
+        splats = {name: Parameter(value.half()) for name, value in values.items()}
+        adams = {
+            n: torch.optim.Adam([p], lr=0.1, eps=1e-15 if grad < 1e-6 else 1e-4, fused=True)
+            for n, p in splats.items()
+        }
+        phases = PhaseScheduler(100, parts=each)
+        phases.upgrade(adams)
+        scaler = torch.amp.GradScaler("cpu", init_scale=65536.0)  # pyright: ignore
+        loss = splats["means"].float().sum() * grad
+        scaler.scale(loss).backward()
+        phases.observe(loss)
+        scaler.step(adams["means"])
+        scaler.update()
+        state = adams["means"].state[splats["means"]]
+        assert all(state[key].isfinite().all() for key in ("exp_avg", "exp_avg_sq"))
+        moved.append(splats["means"].detach())
+    assert moved[1].isfinite().all()
+    assert moved[1].any() == moved[0].any()
+    if parts == "defaults":
+        assert torch.equal(moved[1], moved[0])

@@ -29,6 +29,7 @@ from opt3dgs_optim.in_step import (
     NamedPart,
     StepInProgress,
     check_mask_fits,
+    in_range_of,
 )
 from opt3dgs_optim.names import (
     MOMENTS,
@@ -432,12 +433,13 @@ class StepAdam(Adam):
         scale, unit = getattr(self, "grad_scale", None), None
         if parts.shaping and (scale is not None or group["maximize"]):
             unit = (-1.0 if group["maximize"] else 1.0) * (1.0 if scale is None else scale)
-            fed = fed / unit
+            # Without the scale half precision would lose small gradients.
+            fed = fed.to(torch.promote_types(fed.dtype, torch.float32)) / unit
         if parts.displacement and group["weight_decay"]:
             fed = fed.add(param.detach(), alpha=group["weight_decay"])
         fed = parts.feed(group, param, fed, view, course)
         if unit is not None:
-            fed = fed * unit
+            fed = in_range_of(cast(Tensor, param.grad), fed * unit)
         if moving.rows is not None and self._base is Adam:
             if moving.rows.is_cpu and not (group["fused"] or parts.displacement):
                 moving.masked = PickedRows(moving.rows, param, fed, view.adam)
