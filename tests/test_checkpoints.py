@@ -549,7 +549,7 @@ def test_damaged_moments_of_a_stock_optimizer_leave_it_one(key: str, how: str, f
     assert [(type(o), set(vars(o)), str(o.state_dict())) for o in stock.values()] == before
     assert all(o.param_groups[0] is g for o, g in zip(stock.values(), groups, strict=True))
     assert flat(phases.state_dict()) == clock
-    assert phases.followers() == []
+    assert [*phases.followers] == []
     # The other one, and the damaged one once it is mended, get their parts.
     damaged.load_state_dict(sound)
     phases.upgrade(stock)
@@ -803,7 +803,7 @@ def test_whatever_a_part_raises_all_of_a_load_is_undone(
     with pytest.raises(expected, match="no"):
         roads[road]()
     assert type(stock) is torch.optim.Adam
-    assert phases.followers() == [other]
+    assert [*phases.followers] == [other]
     assert flat([other.state_dict(), phases.state_dict()]) == before
     for part in phases.parts[1:3]:
         assert isinstance(part, Learnt)
@@ -850,7 +850,7 @@ def test_damaged_entries_of_an_optimizer_are_refused_and_nothing_is_loaded(
     with pytest.raises(ValueError, match=re.escape(said)):
         _ = phases.upgrade(stock) if road == "upgrade" else adam.load_state_dict(saved)
     assert flat([adam.state_dict(), phases.state_dict()]) == before
-    assert phases.followers() == [adam]
+    assert [*phases.followers] == [adam]
 
 
 class Numbers(Part):

@@ -28,8 +28,8 @@ from opt3dgs_optim.declarations import (
     declared_by,
     parts_by_name,
 )
+from opt3dgs_optim.followers import Followers, Place
 from opt3dgs_optim.learnt import are_same, begin_anew, learnt_by, put_back
-from opt3dgs_optim.names import NamedGroup, gaussian_of, set_of
 from opt3dgs_optim.part import Kept, Part, Phase, Window, overrides
 from opt3dgs_optim.state import check_kept_number, key_of
 
@@ -42,20 +42,12 @@ FORMAT = 3  # of a checkpoint
 READABLE_FORMATS = (2, 3)
 STATE_KEY = "opt3dgs"  # in param_groups[0] of an optimizer's state_dict: the course's state
 NEVER = 2**62  # an iteration that no training reaches
-MAX_CACHED_PLACES = 64
 MAX_STEPS_WITHOUT_CLOCK = 120  # twenty iterations of six optimizers
 # What a line of the run log has of each iteration, and what `RunLog.step` is called with.
 COLUMNS_OF_THE_LOG = frozenset(
     ("self", "kind", "iteration", "seconds", "phase", "event", "energy", "metadata")
 )
 P = TypeVar("P", bound=Part)
-
-
-class Place(NamedTuple):
-    """Where a Gaussian parameter stands: which set of Gaussians, which tensor of its group."""
-
-    set_name: str  # "" where an optimizer holds one set
-    number: int  # of the tensor in its group
 
 
 class Change(NamedTuple):
@@ -121,12 +113,7 @@ class Course:
         self._numbers_read: dict[int, tuple[int, weakref.ref[Tensor], float]] = {}
         self._reported: set[str] = set()  # kinds of mistakes that were said
         self._published: dict[tuple[str, Place], tuple[int, Any]] = {}
-        # id of a tensor -> the group that holds it, and where it stands
-        self._places: dict[int, tuple[weakref.ref[NamedGroup], Place]] = {}
-        self._holders: list[weakref.ref[StepAdam]] | None = None  # of opacities; None: not sought
-        # With what they held: a lost one is not missed where another one holds that.
-        self._followers: list[tuple[weakref.ref[StepAdam], frozenset[Any]]] = []
-        self.holds_twice = False  # whether two that exist have held the same Gaussian parameter
+        self.followers = Followers()
         self._named = parts_by_name(self._parts)
         self.declared = {name: declared_by(call, part) for name, part in self._named.items()}
         self.row_keys = tuple(
@@ -288,70 +275,9 @@ class Course:
 
     # -- what parts know of each other, and of the Gaussians --------------------------------------
 
-    def register(self, optimizer: StepAdam) -> None:
-        """Know an optimizer whose steps have these parts, for as long as somebody else holds it."""
-        if optimizer not in self.followers():
-            held = _held(optimizer)
-            self.holds_twice |= any(own & held for ref, own in self._followers if ref() is not None)
-            self._followers.append((weakref.ref(optimizer), held))
-            self.forget_places()
-
-    def followers(self) -> list[StepAdam]:
-        """The optimizers whose steps have these parts, the latest last."""
-        return [each for ref, _ in self._followers if (each := ref()) is not None]
-
-    def holders_of_opacities(self) -> list[StepAdam]:
-        """The followers that hold opacities."""
-        known = self._holders  # asked for in every iteration
-        found = self.followers() if known is None else [o for ref in known if (o := ref())]
-        for optimizer in found:
-            optimizer.name_groups()  # a trainer may have put other groups there
-        if self._holders is None:
-            found = [o for o in self.followers() if _holds_opacities(o)]
-            self._holders = [weakref.ref(each) for each in found]
-        return found
-
-    def stepped_together(self, iteration: int) -> str | None:
-        """A Gaussian parameter of which two optimizers have stepped one each in an iteration."""
-        seen = set[Any]()
-        for ref, held in self._followers:
-            optimizer = ref()
-            if optimizer is not None and optimizer.stepped_at == iteration:
-                if seen & held:
-                    return "#".join(filter(None, min(seen & held)))
-                seen |= held
-        return None
-
-    @property
-    def num_lost_followers(self) -> int:
-        """How many optimizers that had these parts do not exist any more, without another's."""
-        lost = {own for ref, own in self._followers if ref() is None}
-        if not lost:
-            return 0
-        held = frozenset[Any]().union(*map(_held, self.followers()))
-        return sum(not own <= held for own in lost)
-
     def place_of(self, param: Tensor) -> Place | None:
         """Where a Gaussian parameter stands; None for any other tensor."""
-        known = self._places.get(id(param))
-        if known is not None and (group := known[0]()) is not None:
-            place, params = known[1], group["params"]
-            if place.number < len(params) and params[place.number] is param:
-                return place
-        for group in self._groups():
-            for number, each in enumerate(group["params"]):
-                if each is param:
-                    if len(self._places) >= MAX_CACHED_PLACES:  # of tensors that were replaced
-                        self._places.clear()
-                    place = Place(group.set_name, number)
-                    self._places[id(param)] = weakref.ref(group), place
-                    return place
-        return None
-
-    def forget_places(self) -> None:
-        """Look anew for where parameters stand: groups were exchanged."""
-        self._places.clear()
-        self._holders = None
+        return self.followers.place_of(param)
 
     def gaussians_of(self, param: Tensor) -> dict[str, Tensor]:
         """The present tensors of the set of Gaussians that a parameter belongs to.
@@ -359,25 +285,13 @@ class Course:
         They are looked up in the optimizers' groups, because density control replaces them:
         `means, scales, quats, opacities, sh0, shN` as far as optimizers of this course hold them,
         raw, as the trainer keeps them. Empty for any other tensor. Of several optimizers that hold
-        one of these names, that of the parameter comes first, and then the latest.
+        one of these names, that of the parameter comes first, then those that were upgraded by the
+        same call, and then the latest.
 
         Args:
             param: a Gaussian parameter, of shape [N, ..].
         """
-        place = self.place_of(param)
-        if place is None:
-            return {}
-        found, own = dict[str, Tensor](), dict[str, Tensor]()
-        for optimizer in self.followers():
-            held = {
-                str(group.gaussian): group["params"][place.number]
-                for group in optimizer.gaussian_groups()
-                if group.set_name == place.set_name and place.number < len(group["params"])
-            }
-            found |= held
-            if any(each is param for each in held.values()):
-                own = held
-        return found | own
+        return self.followers.gaussians_of(param)
 
     def number_kept(self, part: Part, name: str, param: Tensor) -> Tensor | None:
         """What a part keeps per parameter for another parameter than that of the present hook.
@@ -388,11 +302,8 @@ class Course:
             param: of shape [N, ..]; None is returned where nothing is kept for it yet.
         """
         key = f"{self.name_of(part)}.{name}"
-        found = (each.record_of(param) for each in self.followers())
+        found = (each.record_of(param) for each in self.followers)
         return next((record.numbers.get(key) for record in found if record is not None), None)
-
-    def _groups(self) -> Iterator[NamedGroup]:
-        return (group for each in self.followers() for group in each.gaussian_groups())
 
     def publish(self, name: str, param: Tensor, value: Any) -> None:
         """Tell other parts something about the set of Gaussians that a parameter belongs to.
@@ -629,7 +540,8 @@ class Course:
     @contextmanager
     def undone_on_error(self) -> Iterator[None]:
         """Undo what happens within to the clock, to the parts and to the followers, if it fails."""
-        known, numbers, followers = dict(vars(self)), dict(self.kept_numbers), [*self._followers]
+        known, numbers = dict(vars(self)), dict(self.kept_numbers)
+        followers = dict(vars(self.followers))
         parts = [(part, {**vars(part)}, part.state_dict()) for part in self._parts]
         reported = set(self._reported)
         try:
@@ -639,8 +551,8 @@ class Course:
             self._reported &= reported
             self.kept_numbers.clear()
             self.kept_numbers.update(numbers)
-            self._followers[:] = followers
-            self.forget_places()
+            vars(self.followers).update(followers)
+            self.followers.forget_places()
             for part, attributes, state in parts:
                 put_back(part, attributes, state)
             raise
@@ -655,15 +567,7 @@ class Course:
         }
 
     def __getstate__(self) -> dict[str, Any]:
-        # Copies of the optimizers make themselves known to the copy of the course.
-        return {
-            **vars(self),
-            "_followers": [],
-            "_places": {},
-            "_holders": None,
-            "_published": {},
-            "_numbers_read": {},
-        }
+        return {**vars(self), "_published": {}, "_numbers_read": {}}
 
 
 class NoCourse:
@@ -674,16 +578,6 @@ class NoCourse:
             f"{kind.__name__} has no parts yet: call follow(Course([...])) first, or have a "
             "PhaseScheduler upgrade an Adam"
         )
-
-
-def _holds_opacities(optimizer: StepAdam) -> bool:
-    return any(gaussian_of(group) == "opacities" for group in optimizer.param_groups)
-
-
-def _held(optimizer: StepAdam) -> frozenset[Any]:
-    """Which parameters of which sets of Gaussians an optimizer holds."""
-    groups = optimizer.param_groups
-    return frozenset((set_of(each), name) for each in groups if (name := gaussian_of(each)))
 
 
 def restored_number(value: float, kept: Kept) -> Tensor:

@@ -246,7 +246,7 @@ class PhaseScheduler(Course):
         try:
             return self._over_ranks(energy)
         except RuntimeError:  # NCCL takes no numbers of the host
-            groups = (group for each in self.followers() for group in each.param_groups)
+            groups = (group for each in self.followers for group in each.param_groups)
             devices = {param.device for group in groups for param in group["params"]}
             device = next((each for each in devices if each.type != "cpu"), None)
             if device is None or energy.device.type != "cpu":
@@ -315,7 +315,8 @@ class PhaseScheduler(Course):
             before: the iteration of the energy before this one, whose steps have been made.
         """
         adam_steps, self._adam_steps = self._adam_steps, None
-        if self.holds_twice and (name := self.stepped_together(before)) is not None:
+        name = self.followers.stepped_together(before) if self.followers.holds_twice else None
+        if name is not None:
             self._report(
                 "twice",
                 f"two optimizers that were upgraded by different calls hold {name!r} and step in "
@@ -380,7 +381,7 @@ class PhaseScheduler(Course):
                 "as the iteration after their last step, since the last thirtieth is averaged",
             )
         self._watch_groups()
-        lost, alive = self.num_lost_followers, len(self.followers())
+        lost, alive = self.followers.num_lost, len([*self.followers])
         if not self._has_ended():
             self._watch_optimizers()
         incomplete = lost and alive and not self._has_ended()
@@ -407,7 +408,7 @@ class PhaseScheduler(Course):
 
     def _watch_groups(self) -> None:
         """Say once that somebody goes on to write into a group that another has replaced."""
-        for optimizer in self.followers():
+        for optimizer in self.followers:
             for i, group in enumerate(optimizer.param_groups):
                 key = group.written_elsewhere() if type(group) is NamedGroup else None
                 if key is not None:
@@ -421,7 +422,7 @@ class PhaseScheduler(Course):
     def _watch_optimizers(self) -> None:
         """Say once that one of several optimizers has stopped, as one that was made anew has."""
         # One that has stepped later than now has not stepped since the clock was set back.
-        every = {id(each): each.stepped_at for each in self.followers()}
+        every = {id(each): each.stepped_at for each in self.followers}
         last = max((at for at in every.values() if at <= self.current), default=-1)
         stopped = [at for at in every.values() if 0 <= at < last - LONG_PATIENCE]
         if stopped:
@@ -440,7 +441,7 @@ class PhaseScheduler(Course):
         """
         return any(
             record.last_moved is not None and record.last_moved >= iteration
-            for optimizer in self.followers()
+            for optimizer in self.followers
             for group in optimizer.param_groups
             if gaussian_of(group) is not None
             for record in getattr(group, "records", ())
@@ -448,11 +449,11 @@ class PhaseScheduler(Course):
 
     def _watch_rows(self) -> None:
         """Switch off what loses with clone, split and prune once the trainer removes Gaussians."""
-        if self._chosen or (self._holders is not None and self._removed_rows.are_known()):
+        if self._chosen or (self.followers.are_sought and self._removed_rows.are_known()):
             return
         if REMOVAL in self.switched_off.values():
             return
-        if not self._removed_rows.found(self.holders_of_opacities()):
+        if not self._removed_rows.found(self.followers.holders_of_opacities()):
             return
         self._removed_rows.forget()  # gives the opacities back that it holds
         off = [

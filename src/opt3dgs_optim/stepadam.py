@@ -85,6 +85,7 @@ class StepAdam(Adam):
 
     course: Course = cast(Course, NoCourse())  # until `follow`
     any_group = False  # whether the parts act on groups that are no Gaussian parameter's, too
+    upgraded_in = 0  # which call of `upgrade` it was, of those of the course
     _base: type[Adam] = Adam  # whose step it is that the parts surround
     _ownership: RowOwnership
     # By group: the set of Gaussians, and which parameter.
@@ -113,7 +114,7 @@ class StepAdam(Adam):
             use_fused(self)
         self._claim_rows()
         self.clock_at = course.current
-        course.register(self)
+        course.followers.register(self)
 
     def hold(self, slots: list[tuple[str, str | None]]) -> None:
         """Say which set of Gaussians, and which of its parameters, each group holds."""
@@ -160,7 +161,7 @@ class StepAdam(Adam):
             if self._known and heir is None:
                 taken = slot[1] or "left alone"
                 LOGGER.info("a group was added: %s, %s", group_name(i, group), taken)
-        self.course.forget_places()
+        self.course.followers.forget_places()
         self._known, self._slots, self._gone = cast(list[NamedGroup], list(groups)), (), gone
         every = [record for group in self._known for record in group.records]
         for group in self._known:
@@ -562,7 +563,7 @@ class StepAdam(Adam):
     # -- copies and checkpoints ------------------------------------------------------------------
 
     def __getstate__(self) -> dict[str, Any]:
-        names = ("course", "_base", "_slots", "_open_windows", "_rewinds")
+        names = ("course", "upgraded_in", "_base", "_slots", "_open_windows", "_rewinds")
         self._drop_foreign()  # what is of other rows must not be the copy's own
         state = {**super().__getstate__(), **{name: getattr(self, name) for name in names}}
         state.pop("_ownership", None)  # a base of the trainer's own may give all attributes
@@ -575,7 +576,7 @@ class StepAdam(Adam):
             self.name_groups()
             self._claim_rows()
             self.clock_at = self.course.current
-            self.course.register(self)
+            self.course.followers.register(self)
 
     def state_dict(self) -> dict[str, Any]:
         """torch's, with the course's inside `param_groups[0]`, and nothing of foreign rows."""

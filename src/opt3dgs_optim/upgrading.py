@@ -101,8 +101,10 @@ def _carry_out(plans: list[Plan], course: Course) -> None:
     before = [Unchanged(plan.optimizer) for plan in plans]
     try:
         with course.undone_on_error():
+            course.followers.upgrades += 1
             for plan in plans:
                 optimizer: Any = plan.optimizer
+                optimizer.upgraded_in = course.followers.upgrades
                 # A learning-rate scheduler's wrapper of the old class's.
                 vars(optimizer).pop("step", None)
                 optimizer.__class__ = plan.made

@@ -950,3 +950,33 @@ def test_what_a_device_is_given_and_what_becomes_of_its_answer(
     assert found.dtype == dtype
     most = 128.0 if dtype == torch.float16 else 3e4
     assert found[0].tolist() == [most, -most, 2.0]
+
+
+@pytest.mark.parametrize("together", [False, True])
+@pytest.mark.parametrize("copied", [False, True])
+def test_models_that_are_upgraded_by_calls_of_their_own(together: bool, copied: bool) -> None:
+    """Each is stepped in its own sizes, in the same iteration or in turns; in a copy, too."""
+    phases = PhaseScheduler(TOTAL, parts=[OwnFrame()])
+    models = []
+    for size in (-4.0, 2.0):
+        splats = {"means": torch.zeros(4, 3), "scales": torch.full((4, 3), size)}
+        splats["quats"] = torch.ones(4, 4)
+        params = {name: Parameter(value) for name, value in splats.items()}
+        models.append({n: torch.optim.Adam([p], lr=1e-3) for n, p in params.items()})
+        phases.upgrade(models[-1])
+    if copied:
+        phases, models = copy.deepcopy((phases, models))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of both in one iteration
+        for i in range(4):
+            phases.observe(0.1)
+            for number, adams in enumerate(models):
+                if together or i % 2 == number:
+                    adams["means"].param_groups[0]["params"][0].grad = torch.ones(4, 3)
+                    adams["means"].step()
+    lengths = []
+    for adams in models:
+        means, scales = (adams[name].param_groups[0]["params"][0] for name in ("means", "scales"))
+        lengths.append((means.norm(dim=1) / scales[:, 0].exp()).tolist())
+    most = 0.1 * 3**0.5 * (4 if together else 2)
+    assert 0.5 * most < min(lengths[0] + lengths[1]) <= max(lengths[0] + lengths[1]) <= most
