@@ -49,7 +49,9 @@ class OwnFrame(Part):
     NaN.
     Scales and quaternions are looked up in the groups of the upgraded optimizers (gsplat's,
     INRIA's, nerfstudio's names and others). The scales must be logarithms of standard deviations
-    and the quaternions wxyz, as in these trainers; nothing shows that they are something else.
+    and the quaternions wxyz, as in these trainers; nothing shows that they are something else. Nor
+    does anything show that one of three scales is never trained, as in gsplat's trainer of flat
+    Gaussians (2DGS), whose third one is what it began with: leave the part out there.
     Where they are not found, or are not [N, 3] and [N, 4], it is said once, and the positions of
     that group are stepped as the other parts have it.
 
