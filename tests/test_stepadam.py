@@ -37,6 +37,7 @@ from opt3dgs_optim import (
     FreshMoments,
     IsotropicNoise,
     LQNAdam,
+    OwnFrame,
     Part,
     PhaseScheduler,
     PositionNoise,
@@ -584,3 +585,19 @@ def test_the_object_is_one_for_the_whole_run() -> None:
     ids = {name: (id(opt), id(opt.step.__func__)) for name, opt in optimizers.items()}  # pyright: ignore
     train(splats, optimizers, phases, 0, TOTAL)
     assert ids == {n: (id(o), id(o.step.__func__)) for n, o in optimizers.items()}  # pyright: ignore
+
+
+def test_what_moves_a_buffer_refuses_to_be_differentiable() -> None:
+    """Before anything has moved."""
+    splats = make_splats()
+    phases = PhaseScheduler(60, parts=[OwnFrame()])
+    adams = phases.upgrade(gsplat_optimizers(splats))
+    for adam in adams.values():
+        adam.param_groups[0]["differentiable"] = adam.defaults["differentiable"] = True
+    before = values_of(splats)
+    for param in splats.values():
+        param.grad = torch.ones_like(param)
+    phases.observe(0.1)
+    with pytest.raises(ValueError, match="differentiable=True with OwnFrame is not possible"):
+        adams["means"].step()
+    assert_same(before, splats)

@@ -104,9 +104,9 @@ def take_units(
     if record.last_moved is None:  # no step by these parts yet: others have made them
         course.warn_once(
             f"units of {name}",
-            f"{what}: those that were there count as made in other units, by steps before the first "
-            "observe(loss) or in another training; to go on with moments of a checkpoint, give the "
-            "parts of the training that it is of (a flattened distributed one does not say which)",
+            f"{what}: those that were there count as made in other units, by steps before the "
+            "first observe(loss) or in another training; to go on with moments of a checkpoint, "
+            "give the parts of its training (a flattened distributed one does not say which)",
         )
     else:
         LOGGER.info("iteration %d: %s", course.current, what)

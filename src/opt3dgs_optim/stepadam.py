@@ -348,6 +348,7 @@ class StepAdam(Adam):
         self, step: StepInProgress, group: NamedGroup, parts: ActingParts
     ) -> list[Tensor]:
         """Ask the parts what the base's step is to read; return the tensors that it is to move."""
+        parts.check_options(self.call_name, group)
         masked = step.mask is not None and self._takes_mask(group, step.mask.numel())
         # Another base's own step knows its mask; what the parts do does not.
         rows = step.mask if masked and (self._base is Adam or parts.any) else None

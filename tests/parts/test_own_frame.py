@@ -616,7 +616,9 @@ def test_moments_of_this_process_that_begin_anew_are_said_to_have_been_there() -
     train(splats, adams, None, 0, 3)
     phases = only(TOTAL, OwnFrame())
     phases.upgrade(adams)
-    with pytest.warns(UserWarning, match="begins to act: those that were there count as made in other units"):
+    with pytest.warns(
+        UserWarning, match="begins to act: those that were there count as made in other units"
+    ):
         train(splats, adams, phases, 3, 4)
 
 
