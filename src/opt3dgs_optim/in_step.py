@@ -78,8 +78,8 @@ class ActingParts:
         return self._narrowed[lacking]
 
     def check_options(self, call: str, group: Group) -> None:
-        """ValueError where Adam's step is to have a graph, and a part has it move a buffer."""
-        if self.displacement and group["differentiable"]:
+        """ValueError where Adam's step is to have a graph, while parts have it move a buffer."""
+        if group["differentiable"]:
             names = ", ".join(name for name, _ in self.displacement)
             raise ValueError(
                 f"{call}.step: differentiable=True with {names} is not possible: the buffer that "

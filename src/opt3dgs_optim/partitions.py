@@ -198,12 +198,14 @@ class Pace(NamedTuple):
     low: float  # an energy further away than these counts as one at this distance, as t
     high: float
     has_mean: float  # 0 for the first energy, which is the mean itself, else 1
+    has_slope: float  # 0 where the slope, which has no bound there, would own its mean for long
 
     @classmethod
     def of(cls, count: int) -> Pace:
         """That of the `count`-th energy."""
-        limit = LIMIT / MEAN_ABS if count > UNLIMITED else math.inf
-        return cls(max(1 / max(count, 1), 1 / MEMORY), -limit, limit, float(count > 1))
+        rate, known = max(1 / max(count, 1), 1 / MEMORY), count > UNLIMITED
+        limit = LIMIT / MEAN_ABS if known else math.inf
+        return cls(rate, -limit, limit, float(count > 1), float(known))
 
 
 class MovingPartitions(Partitions):
@@ -246,9 +248,6 @@ class MovingPartitions(Partitions):
         rows[0, :m], rows[1, :m] = slope * center, 1.0
         rows[0, m], rows[2, m] = slope * even * MEAN_ABS, -slope * MEAN_ABS
         self._rows = rows.to(**like)
-        # Rows of slope * sum k q c, sum k q + even, -slope * MEAN_ABS * sum k q, with V = k q.
-        direct = torch.stack([rows[0, :m], rows[1, :m], rows[2, m].expand(m)])
-        self._direct_rows = direct.to(**like)
         self._products, self._sums = torch.zeros(m + 1, **like), torch.zeros(3, **like)
         self._offsets = torch.zeros_like(self._sums)
         self._offsets[1] = even
@@ -285,11 +284,11 @@ class MovingPartitions(Partitions):
             # An energy that does not count becomes the mean, and moves nothing.
             energy = torch.where(torch.as_tensor(valid, device=energy.device), energy, self._mean)
             pace: Any = torch.nn.functional.embedding(count.clamp(max=MEMORY), self._paces).unbind()
-            mean = torch.lerp(energy, self._mean, pace[-1])
+            mean = torch.lerp(energy, self._mean, pace[3])
         else:
             pace = Pace.of(count)
             mean = energy if count == 1 else self._mean
-        rate, low, high, _ = pace
+        rate, low, high, _, has_slope = pace
         # t = z / MEAN_ABS: distance from the mean in mean absolute deviations. Where those have
         # vanished, as after a constant loss, they grow again by the second term.
         distance = torch.sub(energy, mean)
@@ -298,15 +297,10 @@ class MovingPartitions(Partitions):
         log_kernel = torch.addcmul(self._log_kernel, self._log_kernel_slope, t)
         torch.softmax(log_kernel, 0, out=self._kernel)
         torch.mul(self._kernel, self._q, out=self._kq)
-        if isinstance(count, int) and count > UNLIMITED:
-            torch.addmv(self._offsets, self._rows, self._products, out=self._sums)
-            slope = torch.addcdiv(self._base, self._up, self._below, out=self._slope)
-        else:
-            # The same with one operator more. At up to 1e6 deviations from the mean, the sum of two
-            # numbers above would be the difference of two that are nearly alike.
-            sums = torch.addmv(self._offsets, self._direct_rows, self._kq)
-            up, below, per_t = sums.unbind()
-            slope = torch.div(torch.addcmul(up, per_t, t), below, out=self._slope)
+        torch.addmv(self._offsets, self._rows, self._products, out=self._sums)
+        slope = torch.addcdiv(self._base, self._up, self._below, out=self._slope)
+        if not (isinstance(count, int) and count > UNLIMITED):
+            slope.mul_(has_slope)
         nu = torch.sub(slope, self._mean_slope).add_(1.0)
         torch.clamp(
             nu if valid is True else torch.where(valid, nu, self.nu), *self.clamp, out=self.nu

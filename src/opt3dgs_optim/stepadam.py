@@ -348,7 +348,6 @@ class StepAdam(Adam):
         self, step: StepInProgress, group: NamedGroup, parts: ActingParts
     ) -> list[Tensor]:
         """Ask the parts what the base's step is to read; return the tensors that it is to move."""
-        parts.check_options(self.call_name, group)
         masked = step.mask is not None and self._takes_mask(group, step.mask.numel())
         # Another base's own step knows its mask; what the parts do does not.
         rows = step.mask if masked and (self._base is Adam or parts.any) else None
@@ -449,6 +448,7 @@ class StepAdam(Adam):
                 return moving.masked.tensor
             moving.masked = HeldRows(moving.rows, param, view.adam)
         if parts.displacement:  # Adam moves a buffer, whose state is the parameter's
+            parts.check_options(self.call_name, group)
             moving.buffer = torch.zeros_like(param, requires_grad=False)
             moving.buffer.grad = fed
             step.overrides.extra_item(self.state, moving.buffer, view.adam)

@@ -166,3 +166,17 @@ def test_the_loss_jumps_by_1e12_without_a_switch() -> None:
         x.grad = 1e12 * torch.randn(8, 3, generator=draw)
         optimizer.step()
     assert float((x.detach() - 1).abs().max()) < 50 * 0.01 * 3
+
+
+@pytest.mark.parametrize(
+    "first",
+    [[], [0.3, 0.3 - 1e-6, 0.25], [0.25, 0.2501, 0.3], [0.3, 0.2999, 0.25], [9.0, 9.0, 0.2]],
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_the_first_energies_do_not_own_the_multiplier(first: list[float], seed: int) -> None:
+    """The slope of an energy whose deviation is not known yet has no bound."""
+    draw = torch.Generator().manual_seed(seed)
+    later = 0.2 + 0.02 * torch.randn(400, generator=draw, dtype=torch.float64)
+    histogram = EnergyHistogram()
+    nu = [float(histogram.observe(energy)) for energy in [*first, *later.tolist()]]
+    assert abs(sum(nu[250:400]) / 150 - 1) < 0.15

@@ -145,6 +145,8 @@ class MovingHistogram:
         read = kernel * self.q
         slope = ((centers - z) * read).sum() / 0.16 / (read.sum() + 0.05 / self.m)
         slope *= 0.5 * 1.32  # 1 + 2 * 0.4^2: two Gaussians of 0.4 widen the density
+        if self.k <= 4:  # it has no bound there
+            slope = 0.0
         nu = 1 + slope - self.mean_slope
         if self.clamp is not None:
             nu = min(max(nu, self.clamp[0]), self.clamp[1])

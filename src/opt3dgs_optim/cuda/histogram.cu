@@ -58,7 +58,9 @@ extern "C" __global__ void __launch_bounds__(128)
   }
   // Smoothing by k twice widens a Gaussian's variance to 1 + 2 h^2.
   const Real widened = spread.scale + Real(1);
-  const Real slope = widened * (kq_slope / total) / (kq / total + even / Real(count));
+  // Of the unlimited energies it has no bound, and would own its mean for long.
+  const Real slope =
+      taken > unlimited ? widened * (kq_slope / total) / (kq / total + even / Real(count)) : Real(0);
   const Real multiplier = taken > warmup ? clamped(slope - state[2] + Real(1), low, high) : Real(1);
   *nu = multiplier;
   if (taken > warmup) {
