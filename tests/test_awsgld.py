@@ -394,3 +394,23 @@ def test_an_energy_that_is_not_finite_drops_one_step() -> None:
         optimizer.step()
         moved.append(not torch.equal(x, before))
     assert moved == [True, False, True, True, True]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_plain_drift_forgets_a_large_gradient(dtype: torch.dtype) -> None:
+    """And none is so large that it makes a NaN."""
+    x = torch.nn.Parameter(torch.zeros(2, dtype=dtype))
+    walk = AWSGLD([x], lr=1e-3, preconditioner="none")
+    for large in (1e16, 1e21, 1e27):
+        x.grad = torch.tensor([large, 1.0], dtype=dtype)
+        walk.step()
+        before = x.detach().clone()
+        x.grad = torch.ones_like(x)
+        walk.step()
+        assert x.isfinite().all()
+        moved = (before - x.detach())[1].item()
+        assert moved == pytest.approx(1e-3, rel=1e-3 if dtype == torch.float32 else 1e-12)
+    x.data.zero_()
+    x.grad = torch.full_like(x, 1e12)
+    walk.step()
+    assert x[0].item() == pytest.approx(-1e9, rel=2e-3)
