@@ -52,9 +52,13 @@ ACCUMULATED = {  # lines above the loop, the end of a turn, the condition that i
     "gap in the other arm": (
         "",
         f"if 2 <= iteration < 5:\n    pass\nelse:\n{indent(STEP, ' ' * 4)}",
-        "2 <= iteration < 5",
+        "not 2 <= iteration < 5",
     ),
-    "gap in an or": ("", "2 <= iteration < 5 or gaussians.optimizer.step()", "2 <= iteration < 5"),
+    "gap in an or": (
+        "",
+        "2 <= iteration < 5 or gaussians.optimizer.step()",
+        "not 2 <= iteration < 5",
+    ),
     "gap in a chain": ("", when("not 2 <= iteration < 5"), "not 2 <= iteration < 5"),
     "all but one": ("", when("iteration != 3"), "iteration != 3"),
     "by a helper": (

@@ -173,3 +173,65 @@ def test_an_item_of_what_is_upgraded_is_not_left_alone(tmp_path: Path) -> None:
     )
     assert not [note for note in diff(path).notes if "left alone" in note]
     assert "self.optimizers = phases.upgrade(self.optimizers)" in added(diff(path).diff)
+
+
+@pytest.mark.parametrize(
+    ("groups", "refused"),
+    [
+        ('[{"params": [self._obj], "name": "obj_dc"}]', True),
+        ("list(self.net.parameters())", True),
+        ('[{"params": [self._xyz], "name": "xyz"}]', False),
+        ("[{'params': p, 'name': n} for n, p in self.all()]", False),
+        ("self.groups()", False),
+    ],
+)
+@pytest.mark.parametrize("method", ["training_setup", "training_seg_only_setup"])
+def test_the_method_that_is_called_makes_the_groups(
+    tmp_path: Path, method: str, groups: str, refused: bool
+) -> None:
+    """Gaga and SegAnyGAussians train features of frozen Gaussians, by a method of the model."""
+    made = f"self.optimizer = torch.optim.Adam({groups}, lr=0.1)"
+    own = f"    def {method}(self, opt):\n        {made}\n"
+    other = "training_setup" if "seg" in method else "another"
+    text = f"class GaussianModel:\n{own}\n"
+    made = "[dict(params=[self._xyz], name='xyz')]" if refused else "[self.pose]"
+    text += f"    def {other}(self, opt):\n        self.optimizer = torch.optim.Adam({made})\n"
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "gaussian_model.py").write_text(text)
+    script = stepped("gaussians.optimizer.step()").replace(".training_setup(", f".{method}(")
+    if refused:
+        assert "no group of gaussians.optimizer has the name" in refusal_of(tmp_path, script)
+    else:
+        assert UPGRADED in lines_of(tmp_path, script)
+
+
+NET = """\
+import torch
+
+
+class Net:
+    def __init__(self, net, iters):
+        self.net, self.iters = net, iters
+        self.optimizer = torch.optim.Adam({groups}, lr=1e-3)
+
+    def train(self, data):
+        for i in range(self.iters):
+            loss = (self.net(data) ** 2).mean()
+            loss.backward()
+            self.optimizer.step()
+"""
+
+
+def test_an_optimizer_of_the_files_own_class(tmp_path: Path) -> None:
+    text = NET.format(groups='[{"params": net.parameters()}]')
+    assert "no group of self.optimizer has the name" in refusal_of(tmp_path, text)
+    text = NET.format(groups='[{"params": net.xyz, "name": "xyz"}]')
+    assert "self.optimizer = phases.upgrade(self.optimizer)" in lines_of(tmp_path, text)
+
+
+def test_a_class_that_is_called_otherwise_is_no_adam(tmp_path: Path) -> None:
+    text = stepped("gaussians.optimizer.step()")
+    model(tmp_path, made="Lion(groups)")
+    assert "gaussians.optimizer is Lion(...), but" in refusal_of(tmp_path, text)
+    model(tmp_path, made="make_optimizer(groups)")
+    assert UPGRADED in lines_of(tmp_path, text)

@@ -103,6 +103,8 @@ def find_optimizers(
             f"(stepped in the loop: {lines or 'nothing'})",
         )
     _check_adam([tree, *models], found[0])
+    if found[0].endswith(".optimizer"):
+        _check_set_up(tree, own, models, found[0].removesuffix(".optimizer"), steps)
     setups = find_remade([tree, *models], own, loop, found[0])
     if others := [text for text in stepped if text not in found and not _is_of(own, text, found)]:
         notes.append(f"left alone: {', '.join(others)}")
@@ -135,18 +137,58 @@ def _check_adam(trees: list[ast.Module], optimizer: str) -> None:
         match node:
             case ast.Assign([ast.Name(known) | ast.Attribute(_, known)], ast.Call() as call):
                 made += [call] if known == name else []
-    if made and all(NO_ADAM.search(ast.unparse(call.func)) for call in made):
+    if made and all(_is_no_adam(ast.unparse(call.func)) for call in made):
         raise NothingToAddError(
             f"line {made[0].lineno}: {optimizer} is {ast.unparse(made[0].func)}(...), but "
             "torch.optim.Adam is needed; other optimizers get no parts"
         )
 
 
-def _check_names(own: list[Spot], optimizer: str, steps: list[Step]) -> None:
+def _is_no_adam(called: str) -> bool:
+    """Whether what is called is a class, and no Adam."""
+    is_class = called.rsplit(".", maxsplit=1)[-1][:1].isupper()
+    return NO_ADAM.search(called) is not None or (is_class and ADAM.search(called) is None)
+
+
+def _check_set_up(
+    tree: ast.Module, own: list[Spot], models: list[ast.Module], owner: str, steps: list[Step]
+) -> None:
+    """ValueError where the methods that make a model's optimizer make no group of Gaussians.
+
+    As far as they are known: of `self`, all in the file, else those that are called on the model.
+    """
+    called = set[str]()
+    for spot in own:
+        match spot.node:
+            case ast.Call(ast.Attribute(holder, name)) if ast.unparse(holder) == owner:
+                called.add(name)
+    trees = [tree] if owner == "self" else [tree, *models]
+    setters = [
+        inside
+        for each in trees
+        for function in ast.walk(each)
+        if isinstance(function, FUNCTIONS) and (owner == "self" or function.name in called)
+        if any(values(inside := [*spots(function)], "self.optimizer"))
+    ]
+    refusals = list[ValueError]()
+    for inside in setters:
+        try:
+            _check_names(inside, "self.optimizer", steps, f"{owner}.optimizer")
+        except ValueError as error:
+            refusals.append(error)
+    if setters and len(refusals) == len(setters):
+        raise refusals[0]
+
+
+def _check_names(
+    own: list[Spot], optimizer: str, steps: list[Step], shown_as: str | None = None
+) -> None:
     """ValueError where none of an Adam's groups has a Gaussian parameter's name: poses, say.
 
-    Names that are no constants, as the keys of a dict of parameters, may be any.
+    Names that are no constants, as the keys of a dict of parameters, may be any. `shown_as` is how
+    the step has the optimizer.
     """
+    step = shown_as or optimizer
     given: list[ast.expr | None] = []
     for spot in own:
         match spot.node:
@@ -159,19 +201,21 @@ def _check_names(own: list[Spot], optimizer: str, steps: list[Step]) -> None:
         match value:
             case ast.Dict(keys):
                 given += keys
-            case ast.Call(_, [ast.List()]):
+            case ast.Call(_, [ast.List(), *_]):
                 continue
-            case ast.Call(_, [ast.Name(name)]) if _are_lists(own, name):
+            case ast.Call(_, [ast.Call(ast.Name("list")), *_]):  # of a network's parameters
+                continue
+            case ast.Call(_, [ast.Name(name), *_]) if _are_lists(own, name):
                 continue
             case _:
                 given.append(None)  # made elsewhere
     names = [_constant_of(each) for each in given]
     if None not in names and not any(map(canonical_name, names)):
         shown = ", ".join(sorted({str(name) for name in names})) or "none"
-        line = next(step.spot.line for step in steps if step.optimizer == optimizer)
+        line = next(each.spot.line for each in steps if each.optimizer == step)
         raise refusal(
             line,
-            f"no group of {optimizer} has the name of a Gaussian parameter (its names: {shown}): "
+            f"no group of {step} has the name of a Gaussian parameter (its names: {shown}): "
             "it is not clear that it is the Gaussians' optimizer",
         )
 

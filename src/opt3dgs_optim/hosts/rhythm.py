@@ -166,10 +166,11 @@ def _check_conditions(
             around_all = together and all(test in conditions(spot, loop) for spot in backwards)
             negated = _is_where_false(step.spot, test)
             if not (always or around_all or _is_steady(test, facts, negated=negated)):
+                shown = ast.unparse(ast.UnaryOp(ast.Not(), test) if negated else test)
                 raise refusal(
                     step.spot.line,
-                    f"{step.optimizer} steps only where {ast.unparse(test)}: one step may have "
-                    "several losses; observe their mean once, above the step",
+                    f"{step.optimizer} steps only where {shown}: one step may have several losses; "
+                    "observe their mean once, above the step",
                 )
 
 
