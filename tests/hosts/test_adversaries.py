@@ -831,7 +831,7 @@ def test_methods_of_the_models_file_that_make_optimizers(tmp_path: Path) -> None
     (tmp_path / "scene").mkdir()
     (tmp_path / "scene" / "gaussian_model.py").write_text(
         "class GaussianModel:\n"
-        "    def rebuild(self):\n        self.optimizer = Adam([])\n"
+        "    def rebuild(self):\n        self.optimizer = Adam(self.groups())\n"
         "    def grow(self):\n        self.rebuild()\n"
         "    def forget(self):\n        self.optimizer = None\n"
     )
