@@ -58,9 +58,13 @@ class Training:
     def log(self) -> Path:
         return self.folder / "log.jsonl"
 
+    @property
+    def view(self) -> Path:
+        return self.folder / "view.npy"
+
     def finished(self) -> Run | None:
-        """Its log if it has run to the end."""
-        run = read_run(self.log) if self.log.exists() else None
+        """Its log if it has run to the end, and has left its picture."""
+        run = read_run(self.log) if self.log.exists() and self.view.exists() else None
         done = run is not None and any(event["event"] == "finished" for event in run.events)
         return run if done else None
 
@@ -123,7 +127,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _train_all(trainings, args, recorded_command("error_vs_time.py", parser, args))
     runs = [run for training in trainings if (run := training.finished())]
     written = write_report(runs, out, baseline=reference(runs))
-    fitted = {t.arm.name: t.folder / "view.npy" for t in trainings if t.seed == 0}
+    fitted = {t.arm.name: t.view for t in trainings if t.seed == 0}
     draw_gallery(scene.test[0], fitted, out / "renders.png")
     print(summary(runs))
     print(*written, out / "renders.png", sep="\n")

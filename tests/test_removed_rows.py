@@ -428,6 +428,17 @@ def test_clone_split_and_prune_of_gsplat(
     assert set(phases.switched_off) == {"Fading"}
 
 
+def test_the_log_is_closed_before_the_last_checkpoint(tmp_path: Path) -> None:
+    """The optimizers' state is saved all the same, though it is the first to see the removal."""
+    with RunLog(tmp_path / "run.jsonl") as log:
+        phases = PhaseScheduler(TOTAL, log=log)
+        trainer = gsplat_trainer("default", phases)
+        trainer.run(0, FIRST_EDIT + 1)
+    state = trainer.optimizers["means"].state_dict()
+    assert set(phases.switched_off) == {"Fading"}
+    assert state["param_groups"][0]["opt3dgs"]["switched_off"].keys() == {"Fading"}
+
+
 def test_relocation_of_gsplat_is_none(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO", "opt3dgs_optim")
     phases = PhaseScheduler(TOTAL)

@@ -14,7 +14,7 @@ from torch.nn import Parameter
 from tqdm import tqdm
 
 from opt3dgs_optim import Phase, PhaseScheduler, PositionNoise
-from opt3dgs_optim.runs import RunLog
+from opt3dgs_optim.runs import RunLog, read_run
 from splatting.arms import NOISE_LR, Arm
 from splatting.density import MCMCDensityControl, Optimizers, regularisers
 from splatting.gaussians import (
@@ -282,11 +282,12 @@ def run(
     checkpoint, path, total = folder / "checkpoint.pt", folder / "log.jsonl", fit.options.iterations
     if checkpoint.exists():
         fit.load(checkpoint)
-    if fit.iteration == total:
-        return fit.evaluate()
-    fit.compile_kernels()
     about = {"arm": fit.arm.name, "scene": fit.scene.name, **asdict(fit.options)}
     about |= metadata or {}
+    if fit.iteration == total:
+        _say_finished(fit, path)
+        return fit.evaluate()
+    fit.compile_kernels()
     # Lines past the checkpoint, or of a run without one, are superseded.
     if path.exists():
         log = RunLog.resume(path, iteration=fit.iteration, metadata=about, clock=time.process_time)
@@ -316,6 +317,14 @@ def run(
                 raise KeyboardInterrupt
         log.event("finished", fit.iteration, mean_nu=fit.mean_nu)
     return metrics
+
+
+def _say_finished(fit: Fit, path: Path) -> None:
+    """Of a run that was stopped after its last checkpoint, and before its log said so."""
+    if not any(event["event"] == "finished" for event in read_run(path).events):
+        with RunLog.resume(path, iteration=fit.iteration, clock=time.process_time) as log:
+            _evaluate(fit, log)
+            log.event("finished", fit.iteration, mean_nu=fit.mean_nu)
 
 
 def _evaluate(fit: Fit, log: RunLog) -> dict[str, float]:

@@ -86,7 +86,7 @@ def load_scene(
     images = folder / size
     if not images.is_dir():
         raise FileNotFoundError(f"{images}: missing, expected the photos of size={size!r}")
-    views = {posed.name: _load_view(images, posed) for posed in model.images}
+    views = {posed.name: _load_view(images, posed, background) for posed in model.images}
     train = [views[name] for name in train_names]
     return Scene(
         folder.resolve().name,
@@ -153,13 +153,17 @@ def _read_split(path: Path, names: list[str]) -> tuple[list[str], list[str]]:
     return sorted(train), sorted(test)
 
 
-def _load_view(folder: Path, posed: PosedImage) -> View:
+def _load_view(folder: Path, posed: PosedImage, background: Background) -> View:
     path = folder / posed.name
     if not path.is_file():
         raise FileNotFoundError(f"{path}: missing, but the scene's model lists it")
     try:
         with Image.open(path) as file:
-            pixels = np.array(file.convert("RGB"))
+            photo: Image.Image = file
+            if file.has_transparency_data:  # as NeRF-synthetic's photos have it
+                photo = file.convert("RGBA")
+                photo = Image.alpha_composite(Image.new("RGBA", photo.size, background), photo)
+            pixels = np.array(photo.convert("RGB"))
     except (UnidentifiedImageError, OSError) as error:
         raise ValueError(f"{path}: expected an image: {error}") from None
     height, width = pixels.shape[:2]

@@ -23,7 +23,10 @@ def command(name: str) -> Callable[[Main], Callable[..., int]]:
                 print(f"{name}: {error}", file=sys.stderr)
                 return 2
             except KeyboardInterrupt:
-                print("interrupted: the same command goes on from the checkpoints", file=sys.stderr)
+                print(
+                    "interrupted: the same command goes on from the checkpoints, if it writes any",
+                    file=sys.stderr,
+                )
                 return 130
 
         return ended

@@ -468,7 +468,8 @@ class PhaseScheduler(Course):
                 f"opt3dgs_optim: iteration {self.current}: {name} is switched off, since "
                 f"{REMOVAL}; parts that are given to PhaseScheduler stay on"
             )
-            if self.log is not None:
+            # A log may be closed before the last checkpoint is saved.
+            if self.log is not None and not getattr(self.log, "closed", False):
                 self.log.event("switched_off", self.current, part=name, reason=REMOVAL)
 
     def state_dict(self) -> dict[str, Any]:

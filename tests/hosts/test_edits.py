@@ -349,6 +349,27 @@ def test_a_file_that_cannot_be_written_is_left_alone(
     write(path)
 
 
+def test_a_backup_for_which_there_is_no_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file itself is not touched, not even by what would put it back."""
+    path, written = saved(tmp_path, INRIA), list[Path]()
+
+    def half(self: Path, data: bytes) -> int:
+        written.append(self)
+        with self.open("wb") as file:
+            file.write(data[: len(data) // 2])
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", half)
+        with pytest.raises(ValueError, match="cannot be written"):
+            write(path)
+    assert [each.name for each in written] == ["train.py.orig"]
+    assert path.read_text() == INRIA
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_as_a_module_it_prints_the_lines(tmp_path: Path) -> None:
     path = saved(tmp_path, INRIA)
     command = [sys.executable, "-m", "opt3dgs_optim", "hosts", "diff", str(path)]

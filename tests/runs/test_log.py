@@ -694,3 +694,53 @@ def test_a_resume_that_is_refused_has_not_opened_the_log(tmp_path: Path, iterati
     assert path.read_text() == before
     RunLog.resume(path, iteration=1).close()  # while the error's traceback is held
     assert held.value is not None
+
+
+class Full:
+    """A file on a disk that has room for so many bytes more."""
+
+    def __init__(self, file, room):
+        self._file, self.room = file, room
+
+    def __getattr__(self, name):
+        return getattr(self._file, name)
+
+    def write(self, data):
+        written = self._file.write(data[: self.room])
+        self.room -= written
+        if not written:
+            raise OSError(28, "No space left on device")
+        return written
+
+
+@pytest.mark.parametrize("room", [0, 1, 15])
+def test_a_line_for_which_there_is_no_room_is_not_begun(tmp_path, room):
+    """The error names the file; what is written when there is room again is read."""
+    path = tmp_path / "run.jsonl"
+    with RunLog(path) as log:
+        log.step(0, loss=1.0)
+        log._file._file = full = Full(log._file._file, room)
+        with pytest.raises(
+            OSError, match=r"RunLog: a line cannot be written: No space.*run\.jsonl"
+        ):
+            log.step(1, loss=2.0)
+        full.room = 10_000
+        log.step(2, loss=3.0)
+    assert read_run(path).steps["iteration"].tolist()[0] == 0
+    assert read_run(path).steps["iteration"].tolist()[-1] == 2
+    with RunLog.resume(path, iteration=2) as log:
+        log.step(3, loss=4.0)
+    assert read_run(path).steps["iteration"].tolist()[-1] == 3
+
+
+@pytest.mark.parametrize("content", ['{"psnr": 27.1}', "x", '{"kind":"step","iter'])
+def test_a_file_of_one_line_without_an_end_is_no_log(tmp_path, content):
+    path = tmp_path / "results.json"
+    path.write_text(content)
+    for call in (RunLog, read_run):
+        with pytest.raises(ValueError, match="line 1: no line of a run log"):
+            call(path)
+    assert path.read_text() == content
+    path.write_text('{"kind":"sta')  # killed in its first line
+    RunLog(path).close()
+    assert len(read_run(path).metadata) == 0

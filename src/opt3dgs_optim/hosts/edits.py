@@ -179,15 +179,17 @@ def write(path: Path) -> Path:
     if backup.exists():
         raise ValueError(f"its backup {backup} exists already; remove it or move it away")
     new, old = diff(path).new, path.read_bytes()
+    touched = False
     try:
         with path.open("r+b") as file:  # before there is a backup: can it be written at all?
             backup.write_bytes(old)
+            touched = True
             file.truncate()
             file.write(new)
     except OSError as error:
-        if backup.exists():
+        if touched:  # if that fails, too, the backup stays
             path.write_bytes(old)
-            backup.unlink()
+        backup.unlink(missing_ok=True)
         raise ValueError(f"it cannot be written: {error}") from None
     return backup
 

@@ -52,13 +52,20 @@ class LineFile:
         return self._file.closed
 
     def append(self, line: Mapping[str, Any]) -> None:
-        """Write one line in one system call (more only if the kernel cuts it short)."""
+        """Write one line in one system call (more only if the kernel cuts it short), or nothing."""
         data = encoded(line).encode() + b"\n"
         if data.startswith(START) and self.path.read_bytes()[-1:] not in (b"", b"\n"):
             data = b"\n" + data  # the last session was killed within a line
-        rest = memoryview(data)
-        while rest:
-            rest = rest[self._file.write(rest) or 0 :]
+        rest, size = memoryview(data), os.fstat(self._file.fileno()).st_size
+        try:
+            while rest:
+                rest = rest[self._file.write(rest) or 0 :]
+        except OSError as error:  # a full disk: half a line would make the file no run log
+            with contextlib.suppress(OSError):
+                self._file.truncate(size)
+            raise OSError(
+                error.errno, f"RunLog: a line cannot be written: {error.strerror}", str(self.path)
+            ) from None
 
     def close(self) -> None:
         """Release the file; a data loader that was forked meanwhile shares the lock."""
@@ -181,6 +188,8 @@ def read_run(path: str | os.PathLike[str]) -> Run:
 def _lines(path: Path) -> list[dict[str, Any]]:
     *whole, torn = path.read_bytes().split(b"\n")
     lines = []
+    if torn and not whole and not (torn.startswith(START) or START.startswith(torn)):
+        raise ValueError(f"{path}, line 1: no line of a run log: {torn[:60]!r}")
     for i, raw in enumerate(whole):
         try:
             lines.append(_parse(raw))

@@ -170,7 +170,7 @@ class RunLog(AbstractContextManager["RunLog"]):
     @property
     def seconds(self) -> float:
         """Run seconds so far by the log's clock, without pauses, of all sessions of this run."""
-        # A wall clock may be set back; then the run's stands still.
+        # A clock may be set back to before the session began.
         passed = 0.0 if self._since is None else max(self._clock() - self._since, 0.0)
         return self._base + passed
 
@@ -185,8 +185,8 @@ class RunLog(AbstractContextManager["RunLog"]):
         """Log one optimization step: `log.step(iteration, loss=loss, lr=1e-3)`.
 
         `columns` are numbers of Python or numpy, or tensors of one element on any device, by a name
-        of your own. Not every step needs the same ones. The report marks where `phase` changes, and
-        shows the means over the run of the columns whose name says no loss.
+        of your own. Not every step needs the same ones. The report shows the means over the run of
+        the columns whose name says no loss.
 
         Raises:
             ValueError: a negative iteration, a reserved name, a tensor of several elements, or an

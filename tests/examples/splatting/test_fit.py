@@ -105,6 +105,26 @@ def test_run_logs_what_the_report_needs(scene: Scene, tmp_path: Path) -> None:
     assert len(read_run(tmp_path / "log.jsonl").records) == len(log.records)  # not run again
 
 
+def test_a_run_that_was_stopped_at_its_end_is_finished_by_the_next_start(
+    scene: Scene, tmp_path: Path
+) -> None:
+    run(Fit(scene, ARMS["mcmc"], OPTIONS), tmp_path)
+    path = tmp_path / "log.jsonl"
+    *lines, last = path.read_text().splitlines(keepends=True)
+    assert '"finished"' in last
+    while '"evaluation"' in lines[-1]:  # stopped in the last one
+        lines.pop()
+    path.write_text("".join(lines))
+    metrics = run(Fit(scene, ARMS["mcmc"], OPTIONS), tmp_path)
+    log = read_run(path)
+    assert log.events[-1]["event"] == "finished"
+    assert log.evaluations["psnr"][-1] == pytest.approx(metrics["psnr"])
+    assert log.evaluations["iteration"][-1] == OPTIONS.iterations
+    before = path.read_bytes()
+    run(Fit(scene, ARMS["mcmc"], OPTIONS), tmp_path)
+    assert path.read_bytes() == before
+
+
 @pytest.mark.processes
 def test_ctrl_c_leaves_a_checkpoint_and_a_readable_log(tmp_path: Path) -> None:
     """A real signal to a real process; the second start ends like a run without it."""

@@ -31,6 +31,23 @@ _SHARED = Path(__file__).resolve().parents[4] / "shared" / "scenes"
 _REAL = ("banana", "brighton_beach", "lund_door", "plush")
 
 
+@pytest.mark.parametrize("background", ["black", "white"])
+def test_what_a_photo_shows_through_is_the_background(tmp_path, background):
+    """NeRF-synthetic's photos are transparent around the object."""
+    folder = write_scene(tmp_path / "toy", "json")
+    for path in (folder / "images").glob("*.png"):
+        pixels = np.array(Image.open(path).convert("RGBA"))
+        pixels[:, : WIDTH // 2, 3], pixels[0, 0, 3] = 0, 128
+        Image.fromarray(pixels).save(path)
+    scene = load_scene(folder, "images", background=background)
+    for view in (*scene.train, *scene.test):
+        behind = scene.background.expand_as(view.image[:, : WIDTH // 2])
+        assert torch.equal(view.image[1:, : WIDTH // 2], behind[1:])
+        assert not torch.equal(
+            view.image[:, WIDTH // 2 :], torch.zeros(()).expand(HEIGHT, WIDTH - WIDTH // 2, 3)
+        )
+
+
 @pytest.mark.parametrize("layout", ["bin", "json"])
 @pytest.mark.parametrize(("size", "scale"), [("images_4", 0.25), ("images", 1.0)])
 def test_every_layout_gives_the_scene_that_was_written(tmp_path, layout, size, scale):
