@@ -125,3 +125,16 @@ def test_complex_parameters_are_refused() -> None:
     x.grad = torch.ones_like(x)
     with pytest.raises(ValueError, match="complex"):
         LQNAdam([x]).step()
+
+
+def test_half_precision_that_a_direction_would_leave() -> None:
+    """Grafting puts the length of a whole gradient into one coordinate."""
+    stiff, goal = torch.tensor([1.0, 100.0, 100.0]), torch.tensor([[3.0, 1.0, -1.0]])
+    x = torch.nn.Parameter(torch.zeros(1, 3).half())
+    optimizer = LQNAdam([x], lr=0.1, eps=1e-4)
+    for i in range(12):
+        grad = (x.detach().float() - goal) * stiff
+        x.grad = (grad if i < 11 else torch.tensor([[-6e4, 6e4, 6e4]])).half()
+        optimizer.step()
+    assert x.isfinite().all()
+    assert optimizer.state[x]["exp_avg"].isfinite().all()

@@ -158,7 +158,11 @@ def lqn_direction(
         head = header(part, history_size)
         taken = take_pairs(part, head, history_size, x, g, visible, min_cosine)
         accepted[rows], candidates[rows] = taken
-        put(fed[rows], direction(g, size, part, head, history_size, graft))
+        found = direction(g, size, part, head, history_size, graft)
+        if found.dtype != fed.dtype:  # half precision ends where a grafted coordinate may lie
+            most = torch.finfo(fed.dtype).max
+            found.clamp_(-most, most)
+        put(fed[rows], found)
     return fed, accepted, candidates
 
 

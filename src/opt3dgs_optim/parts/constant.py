@@ -17,7 +17,8 @@ class ConstantMultiplier(Part):
 
     Args:
         value: the multiplier, any finite number.
-        warmup: number of energies during which it is 1, as in `EnergyHistogram`.
+        warmup: number of energies during which it is 1, as in `EnergyHistogram`, but for those that
+            are not finite, which count here.
 
     Raises:
         ValueError: an option is outside what is allowed.
