@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -221,6 +222,7 @@ class Fit:
             "arm": self.arm.name,
             "scene": self.scene.name,
             "options": asdict(self.options),
+            "photos": self._photos(),
             "iteration": self.iteration,
             "relocated": self.relocated,
             "density": {} if self.density is None else self.density.state,
@@ -238,18 +240,29 @@ class Fit:
         torch.save(state, partial)
         os.replace(partial, path)
 
+    def _photos(self) -> list[float]:
+        """Height and width of the first, and the background: what a checkpoint must agree in."""
+        return [*self.scene.train[0].image.shape[:2], *self.scene.background.tolist()]
+
     def load(self, path: Path, trunk: str | None = None) -> None:
-        """Go on from a checkpoint; ValueError if it is of another scene, arm or options.
+        """Go on from a checkpoint; ValueError if it is none, or of another scene, arm or options.
 
         Args:
             path: the file.
             trunk: the arm that it is of, where this run branches off another arm's.
         """
-        state = torch.load(path, weights_only=True)
+        state = _loaded(path)
         arm = trunk or self.arm.name
         mine = (self.scene.name, arm, asdict(self.options), CHECKPOINT_FORMAT)
         options = asdict(FitOptions()) | state["options"]  # older files lack newer options
         its = (state["scene"], state["arm"], options, state["format"])
+        shown = self._photos()
+        if state.get("photos", shown) != shown:
+            raise ValueError(
+                f"{path}: a checkpoint of photos of other sizes or on another background (height, "
+                f"width, background: {state['photos']}), but those of this run are {shown}; choose "
+                "another folder"
+            )
         if mine != its:
             raise ValueError(
                 f"{path}: a checkpoint of {its}, but this run is {mine}; choose another folder"
@@ -317,6 +330,17 @@ def run(
                 raise KeyboardInterrupt
         log.event("finished", fit.iteration, mean_nu=fit.mean_nu)
     return metrics
+
+
+def _loaded(path: Path) -> dict[str, Any]:
+    """What `Fit.save` has written; ValueError where a file is something else."""
+    try:
+        state = torch.load(path, weights_only=True)
+    except (EOFError, KeyError, OSError, RuntimeError, ValueError, pickle.UnpicklingError) as error:
+        raise ValueError(f"{path}: no checkpoint can be read from it: {error!r:.200}") from None
+    if not isinstance(state, dict) or not {"scene", "arm", "options", "format"} <= state.keys():
+        raise ValueError(f"{path}: no checkpoint of this trainer")
+    return state
 
 
 def _say_finished(fit: Fit, path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -74,7 +74,8 @@ def load_scene(
     if str(source) == "embedded":
         from splatting.embedded import embedded_scene  # it imports Scene from here
 
-        return embedded_scene(size, held_out=held_out)
+        made = embedded_scene(size, held_out=held_out)
+        return replace(made, background=torch.full((3,), float(background == "white")))
     folder = Path(source)
     if not folder.is_dir():
         raise FileNotFoundError(f"load_scene: {folder} is no folder; expected one, or 'embedded'")
@@ -132,9 +133,10 @@ def _split(folder: Path, names: list[str], held_out: int | None) -> tuple[list[s
     else:
         test = names[held_out or 0 :: _TEST_EVERY]
         train = [name for name in names if name not in test]
-    if len(train) < 2:
+    if len(train) < 2 or not test:
         raise ValueError(
-            f"{folder}: needs at least 2 train views, got {len(train)} of {len(names)} views"
+            f"{folder}: needs at least 2 train views and a test view, got {len(train)} and "
+            f"{len(test)} of {len(names)} views"
         )
     return train, test
 

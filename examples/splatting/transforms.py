@@ -12,7 +12,8 @@ from plyfile import PlyData, PlyParseError
 from splatting.colmap import UNDISTORT, PosedImage, SparseModel
 
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2", "is_fisheye")
+_CAMERAS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")  # the last with the distortion above
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # y up, looking along -z: y down, along +z
 
 
@@ -56,7 +57,13 @@ def _posed_image(path: Path, index: int, table: dict[str, Any], frame: Any) -> P
         name = frame["file_path"].removeprefix("./").removeprefix("images/")
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{where}: {error!r}") from None
+    if not np.isfinite([cx, cy, width, height]).all():
+        raise ValueError(f"{where}: impossible camera: cx={cx}, cy={cy}, w={width}, h={height}")
+    model = merged.get("camera_model", "OPENCV")
+    if model not in _CAMERAS:
+        raise ValueError(f"{where}: camera_model={model!r}, allowed are {_CAMERAS}; {UNDISTORT}")
     distortion = {key: merged[key] for key in _DISTORTION if merged.get(key)}
+    distortion |= {"distortion_params": p for p in [merged.get("distortion_params")] if p}
     if distortion:
         raise ValueError(f"{where}: lens distortion {distortion}; {UNDISTORT}")
     rotation = pose[:3, :3]

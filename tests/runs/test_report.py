@@ -547,3 +547,18 @@ def test_an_arm_that_is_none_goes_by_the_files_name(tmp_path):
             log.evaluation(1, psnr=20.0)
     (found,) = compare([read_run(tmp_path / f"{name}.jsonl") for name in ("first", "second")])
     assert {arm.name for arm in found.arms} == {"first", "second"}
+
+
+def test_logs_of_one_name_go_by_their_folders(tmp_path, capsys):
+    """`A/stock/log.jsonl` and `A/ours/log.jsonl` are no two seeds of one arm."""
+    for folder, psnr in (("stock", 19.0), ("ours", 26.0)):
+        with RunLog(tmp_path / "runs" / folder / "log.jsonl") as log:
+            log.evaluation(1, psnr=psnr)
+    assert report.main([str(tmp_path / "runs"), "-o", str(tmp_path / "report")]) == 0
+    table = (tmp_path / "report" / "report.md").read_text()
+    assert "| ours |" in table
+    assert "| stock |" in table
+    assert "| log |" not in table
+    alone = tmp_path / "runs" / "stock"
+    assert report.main([str(alone), "-o", str(tmp_path / "report")]) == 0
+    assert "| log |" in (tmp_path / "report" / "report.md").read_text()

@@ -10,6 +10,7 @@ import re
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -194,6 +195,20 @@ def origin(runs: Sequence[Run]) -> str:
     return "; ".join(text for text in said if text)
 
 
+def _named(logs: Sequence[tuple[Path, Run]]) -> list[Run]:
+    """Runs of one file name in several folders by the folders, where nothing else says the arm."""
+    unnamed = {path: run for path, run in logs if "arm" not in run.metadata}
+    folders: dict[str, set[Path]] = {}
+    for path, run in unnamed.items():
+        folders.setdefault(run.name, set()).add(path.resolve().parent)
+    return [
+        replace(run, name=path.resolve().parent.name)
+        if path in unnamed and len(folders[run.name]) > 1
+        else run
+        for path, run in logs
+    ]
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line: 0, or 2 after one line that says what is wrong."""
     parser = argparse.ArgumentParser(
@@ -210,7 +225,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         logs = find_logs(options.runs)
         Path(options.out).mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=options.out).close()  # before any work is done
-        runs = [read_run(path) for path in logs]
+        runs = _named([(path, read_run(path)) for path in logs])
         better = None if options.better is None else options.better == "higher"
         written = write_report(
             runs,

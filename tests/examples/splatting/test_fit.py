@@ -233,3 +233,28 @@ def test_bad_options(make, message: str) -> None:
 def test_constant_arm_without_its_source_says_so(scene: Scene) -> None:
     with pytest.raises(ValueError, match="needs the mean nu"):
         Fit(scene, ARMS[CONSTANT_ARM], OPTIONS)
+
+
+@pytest.mark.parametrize("content", [b"", b"no checkpoint", None])
+def test_a_file_that_is_no_checkpoint_is_named(
+    scene: Scene, tmp_path: Path, content: bytes | None
+) -> None:
+    path = tmp_path / "checkpoint.pt"
+    if content is None:
+        torch.save({"weights": torch.ones(2)}, path)
+    else:
+        path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"checkpoint\.pt: no checkpoint"):
+        Fit(scene, ARMS["mcmc"], OPTIONS).load(path)
+
+
+def test_a_checkpoint_of_other_photos_is_refused(scene: Scene, tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.pt"
+    Fit(scene, ARMS["mcmc"], OPTIONS).save(path)
+    on_white = replace(scene, background=torch.ones(3))
+    first = scene.train[0]
+    smaller = replace(first, image=first.image[::2])
+    for other in (on_white, replace(scene, train=[smaller, *scene.train[1:]])):
+        with pytest.raises(ValueError, match="other sizes or on another background"):
+            Fit(other, ARMS["mcmc"], OPTIONS).load(path)
+    Fit(scene, ARMS["mcmc"], OPTIONS).load(path)

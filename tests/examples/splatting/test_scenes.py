@@ -104,7 +104,8 @@ def test_split_json_decides(tmp_path):
         ({"train": image_names(3)}, "expected lists of image names under 'train' and 'test'"),
         ({"train": image_names(3), "test": ["x.png"]}, r"names \['x.png'\], which"),
         ({"train": image_names(3), "test": image_names(1)}, "more than once, or in both"),
-        ({"train": image_names(1), "test": []}, "at least 2 train views, got 1 of 10"),
+        ({"train": image_names(1), "test": image_names(2)[1:]}, "got 1 and 1 of 10 views"),
+        ({"train": image_names(3), "test": []}, "2 train views and a test view, got 3 and 0 of"),
     ],
 )
 def test_bad_splits_are_named(tmp_path, split, message):
@@ -132,7 +133,7 @@ def test_bad_images_are_named(tmp_path):
 
 
 def test_too_few_views_and_cameras_at_one_place(tmp_path):
-    with pytest.raises(ValueError, match="at least 2 train views, got 1 of 2 views"):
+    with pytest.raises(ValueError, match="got 1 and 1 of 2 views"):
         load_scene(write_scene(tmp_path / "two", "bin", count=2))
     folder = write_scene(tmp_path / "still", "json", count=4)
     path = folder / "transforms.json"
