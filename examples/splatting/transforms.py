@@ -13,6 +13,7 @@ from splatting.colmap import UNDISTORT, PosedImage, SparseModel
 
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2", "is_fisheye")
+_DISTORTION += ("distortion_params",)
 _CAMERAS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")  # the last with the distortion above
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # y up, looking along -z: y down, along +z
 
@@ -62,8 +63,7 @@ def _posed_image(path: Path, index: int, table: dict[str, Any], frame: Any) -> P
     model = merged.get("camera_model", "OPENCV")
     if model not in _CAMERAS:
         raise ValueError(f"{where}: camera_model={model!r}, allowed are {_CAMERAS}; {UNDISTORT}")
-    distortion = {key: merged[key] for key in _DISTORTION if merged.get(key)}
-    distortion |= {"distortion_params": p for p in [merged.get("distortion_params")] if p}
+    distortion = {key: merged[key] for key in _DISTORTION if np.any(merged.get(key) or 0.0)}
     if distortion:
         raise ValueError(f"{where}: lens distortion {distortion}; {UNDISTORT}")
     rotation = pose[:3, :3]
