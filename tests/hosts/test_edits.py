@@ -582,3 +582,18 @@ def test_a_link_is_followed(tmp_path: Path) -> None:
     assert link.is_symlink()
     assert OURS[0] in path.read_text()
     assert backup.read_text() == INRIA
+
+
+def test_a_file_that_cannot_be_read_is_said_in_a_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    path = saved(tmp_path, INRIA)
+
+    def refuse(self: Path) -> bytes:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    assert main(["diff", str(path)]) == 1
+    said = capsys.readouterr().err
+    assert "Permission denied" in said
+    assert "Traceback" not in said

@@ -719,7 +719,7 @@ def test_a_line_for_which_there_is_no_room_is_not_begun(tmp_path, room):
     path = tmp_path / "run.jsonl"
     with RunLog(path) as log:
         log.step(0, loss=1.0)
-        log._file._file = full = Full(log._file._file, room)
+        log._file._file = full = Full(log._file._file, room)  # type: ignore[assignment]
         with pytest.raises(
             OSError, match=r"RunLog: a line cannot be written: No space.*run\.jsonl"
         ):

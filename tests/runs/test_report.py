@@ -562,3 +562,13 @@ def test_logs_of_one_name_go_by_their_folders(tmp_path, capsys):
     alone = tmp_path / "runs" / "stock"
     assert report.main([str(alone), "-o", str(tmp_path / "report")]) == 0
     assert "| log |" in (tmp_path / "report" / "report.md").read_text()
+
+
+def test_runs_without_a_scene_have_a_heading_beside_others(tmp_path):
+    for name, about in (("a", {"scene": "garden"}), ("b", {}), ("c", {"scene": "attic"})):
+        with RunLog(tmp_path / f"{name}.jsonl", metadata=about) as log:
+            log.evaluation(1, psnr=20.0)
+    assert report.main([str(tmp_path), "-o", str(tmp_path / "report")]) == 0
+    text = (tmp_path / "report" / "report.md").read_text()
+    headings = [line for line in text.splitlines() if line.startswith("## ")]
+    assert headings == ["## garden", "## Runs without a scene in their metadata", "## attic"]

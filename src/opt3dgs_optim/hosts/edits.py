@@ -10,6 +10,7 @@ import ast
 import builtins
 import difflib
 import io
+import os
 import re
 import sys
 import tokenize
@@ -52,7 +53,10 @@ LINES_BY_HAND = (
 )
 IMPORTS = {  # where it is refused, and why
     "opt3dgs_optim": "it imports opt3dgs_optim already; to begin anew, take the trainer's own file",
-    "nerfstudio": "nerfstudio needs no change: ns-train splatfacto-opt3dgs",
+    "nerfstudio": (
+        "it imports nerfstudio, whose own trainer needs no change: ns-train splatfacto-opt3dgs; a "
+        "trainer of another model needs the lines by hand"
+    ),
 }
 # Modules of trainers that need other lines than these, or none, and the page of docs/hosts that has
 # what they need.
@@ -87,7 +91,7 @@ def diff(path: Path) -> Edited:
             "no Python: the optimizers of LichtFeld Studio (C++) and Brush (Rust) are not "
             "torch.optim's, and there is nothing here for them"
         )
-    if path.is_dir():
+    if os.path.isdir(path):  # of a folder that may not be entered nothing is known
         names = ", ".join(str(p.relative_to(path)) for p in sorted(path.rglob("*train*.py"))[:10])
         raise ValueError(f"it is a folder; name the training script ({names or 'no *train*.py'})")
     source = _read(path)
@@ -121,7 +125,7 @@ def _read(path: Path) -> bytes:
     Raises:
         ValueError: it is no regular file, or is not written in UTF-8.
     """
-    if path.exists() and not path.is_file():
+    if os.path.exists(path) and not os.path.isfile(path):
         raise ValueError("it is no regular file")
     try:
         source = path.read_bytes()
@@ -157,10 +161,10 @@ def _help_by_hand(path: Path) -> list[str]:
     """What to do with a script that is refused."""
     try:
         tree = ast.parse(path.read_bytes())
-    except (SyntaxError, ValueError, RecursionError):
+    except (OSError, SyntaxError, ValueError, RecursionError):
         tree = ast.Module([], [])
     pages = [page for module, page in PAGES.items() if _imports(tree, module)]
-    if any((folder / LIGHTNING).is_file() for folder in path.resolve().parents):
+    if any(os.path.isfile(folder / LIGHTNING) for folder in path.resolve().parents):
         pages.append("lightning")
     if pages:
         return [f"docs/hosts/{pages[0]}.md says what this trainer needs."]

@@ -128,6 +128,8 @@ def as_markdown(
     for i, comparison in enumerate(comparisons):
         if comparison.scene is not None:
             parts.append(f"## {escaped(comparison.scene)}")
+        elif len(comparisons) > 1:
+            parts.append("## Runs without a scene in their metadata")
         parts.append(_table(comparison))
         if pictures:
             metric = escaped(comparison.metric)
