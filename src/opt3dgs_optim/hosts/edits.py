@@ -55,7 +55,7 @@ IMPORTS = {  # where it is refused, and why
     "opt3dgs_optim": "it imports opt3dgs_optim already; to begin anew, take the trainer's own file",
     "nerfstudio": (
         "it imports nerfstudio, whose own trainer needs no change: ns-train splatfacto-opt3dgs; a "
-        "trainer of another model needs the lines by hand"
+        "trainer of another model is none that is known"
     ),
 }
 # Modules of trainers that need other lines than these, or none, and the page of docs/hosts that has
