@@ -201,7 +201,9 @@ def page(rows: list[Script], trials: dict[str, Any]) -> str:
     saved = sum(row["checkpoint"] == "yes" for row in trials["rows"])
     said: dict[str, list[str]] = {}
     for row in rows:
-        what = row.said or "nothing" if row.edited else f"**refused**: {row.said}"
+        # A line of a script, which is quoted there, has no meaning in Markdown.
+        words = re.sub(r"([\[\]*_`])", r"\\\1", row.said)
+        what = words or "nothing" if row.edited else f"**refused**: {words}"
         script = f"`{row.trainer}/{row.path}@{row.commit.split()[0]}`"
         said.setdefault(GROUPS.sub("", what), []).append(script)
     diffs = [_row(" ".join(scripts), what) for what, scripts in said.items()]
