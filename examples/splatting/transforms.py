@@ -12,8 +12,7 @@ from plyfile import PlyData, PlyParseError
 from splatting.colmap import UNDISTORT, PosedImage, SparseModel
 
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2", "is_fisheye")
-_DISTORTION += ("distortion_params",)
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2", "distortion_params", "is_fisheye")
 _CAMERAS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")  # the last with the distortion above
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # y up, looking along -z: y down, along +z
 

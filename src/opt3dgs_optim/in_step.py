@@ -220,14 +220,6 @@ def _laid_out_as(like: Tensor, found: Tensor) -> Tensor:
     return torch.empty_like(like).copy_(found.detach())
 
 
-def in_range_of(like: Tensor, fed: Tensor) -> Tensor:
-    """The same numbers in a gradient's dtype; those that it has no place for become its largest."""
-    if fed.dtype == like.dtype:
-        return fed
-    most = torch.finfo(like.dtype).max
-    return fed.clamp(-most, most).to(like.dtype)
-
-
 def _check_returned(name: str, hook: str, found: Any, like: Tensor) -> None:
     """ValueError unless what a part's hook has returned is a tensor of the shape of `like`."""
     if not isinstance(found, Tensor):

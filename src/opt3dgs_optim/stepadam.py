@@ -29,8 +29,8 @@ from opt3dgs_optim.in_step import (
     NamedPart,
     StepInProgress,
     check_mask_fits,
-    in_range_of,
 )
+from opt3dgs_optim.lbfgs.pairs import in_range_of
 from opt3dgs_optim.names import (
     MOMENTS,
     NamedGroup,
@@ -440,7 +440,8 @@ class StepAdam(Adam):
             fed = fed.add(param.detach(), alpha=group["weight_decay"])
         fed = parts.feed(group, param, fed, view, course)
         if unit is not None:
-            fed = in_range_of(cast(Tensor, param.grad), fed * unit)
+            dtype = cast(Tensor, param.grad).dtype
+            fed = in_range_of(dtype, fed * unit).to(dtype)
         if moving.rows is not None and self._base is Adam:
             if moving.rows.is_cpu and not (group["fused"] or parts.displacement):
                 moving.masked = PickedRows(moving.rows, param, fed, view.adam)

@@ -84,6 +84,14 @@ def columns(points: Tensor, dtype: torch.dtype, out: Tensor | None = None) -> Te
     return found
 
 
+def in_range_of(dtype: torch.dtype, numbers: Tensor) -> Tensor:
+    """Numbers of another dtype, to be cast: those that this one cannot hold become its largest."""
+    if numbers.dtype == dtype:
+        return numbers
+    most = torch.finfo(dtype).max
+    return numbers.clamp(-most, most)
+
+
 def put(points: Tensor, found: Iterable[Tensor]) -> None:
     """Into `points` [N, D] what was found as [D, N] or its rows: as fast as `columns`."""
     for column, row in zip(points.unbind(1), found, strict=True):

@@ -7,7 +7,15 @@ from opt3dgs_optim import cuda
 from opt3dgs_optim.backend import BACKENDS, Backend, obstacle
 from opt3dgs_optim.checks import check_choice, check_count
 from opt3dgs_optim.lbfgs.history import Header, check_history, header, stored_pairs, take_pairs
-from opt3dgs_optim.lbfgs.pairs import columns, dot, largest, length, put, row_chunks
+from opt3dgs_optim.lbfgs.pairs import (
+    columns,
+    dot,
+    in_range_of,
+    largest,
+    length,
+    put,
+    row_chunks,
+)
 
 
 @torch.no_grad()
@@ -159,10 +167,8 @@ def lqn_direction(
         taken = take_pairs(part, head, history_size, x, g, visible, min_cosine)
         accepted[rows], candidates[rows] = taken
         found = direction(g, size, part, head, history_size, graft)
-        if found.dtype != fed.dtype:  # half precision ends where a grafted coordinate may lie
-            most = torch.finfo(fed.dtype).max
-            found.clamp_(-most, most)
-        put(fed[rows], found)
+        # Half precision ends where a grafted coordinate may lie.
+        put(fed[rows], in_range_of(fed.dtype, found))
     return fed, accepted, candidates
 
 
