@@ -17,7 +17,6 @@ WIDTH = 8
 _FLOAT = ir.FloatType()
 _LANES = ir.VectorType(_FLOAT, WIDTH)
 _BITS = ir.VectorType(ir.IntType(32), WIDTH)
-_TRUTHS = ir.VectorType(ir.IntType(1), WIDTH)
 
 
 class LanesType(types.Type):
@@ -106,10 +105,6 @@ def _minimum(builder, a, b):
     return builder.select(builder.fcmp_ordered("<", a, b), a, b)
 
 
-def _maximum(builder, a, b):
-    return builder.select(builder.fcmp_ordered(">", a, b), a, b)
-
-
 def _compare(sign):
     return lambda builder, a, b: builder.sext(builder.fcmp_ordered(sign, a, b), _BITS)
 
@@ -118,11 +113,10 @@ def _is_true(builder, mask):
     return builder.icmp_signed("<", mask, ir.Constant(_BITS, [0] * WIDTH))
 
 
-def _power_of_two(builder, whole):
-    """2 to whole numbers above -127, written into the exponent's bits."""
-    bits = builder.fptosi(whole, _BITS)
-    biased = builder.add(bits, ir.Constant(_BITS, [127] * WIDTH))
-    return builder.bitcast(builder.shl(biased, ir.Constant(_BITS, [23] * WIDTH)), _LANES)
+def _raised(builder, lanes, exponents):
+    """Add the last bits of `exponents` to those of the exponent."""
+    whole = builder.shl(builder.bitcast(exponents, _BITS), ir.Constant(_BITS, [23] * WIDTH))
+    return builder.bitcast(builder.add(builder.bitcast(lanes, _BITS), whole), _LANES)
 
 
 _add = _intrinsic_of_lanes(2, lambda builder, a, b: builder.fadd(a, b))
@@ -137,10 +131,9 @@ _at_least = _intrinsic_of_lanes(2, _compare(">="), mask_type)
 # a b + c, with one rounding where that is fast
 multiply_add = _intrinsic_of_lanes(3, _call("llvm.fmuladd", 3))
 minimum = _intrinsic_of_lanes(2, _minimum)
-maximum = _intrinsic_of_lanes(2, _maximum)
-floor = _intrinsic_of_lanes(1, _call("llvm.floor", 1))
 absolute = _intrinsic_of_lanes(1, _call("llvm.fabs", 1))
-power_of_two = _intrinsic_of_lanes(1, _power_of_two)
+# Lanes times 2 to the power that the last bits of other lanes hold
+raised = _intrinsic_of_lanes(2, _raised)
 
 
 def _overload_operator(operation, function):
@@ -195,9 +188,8 @@ def _totals(builder, *lanes):
     )
 
 
-# Mask and mask; mask a where b is not; lanes of a where the mask is true, of b elsewhere
+# Mask and mask; lanes of a where the mask is true, of b elsewhere
 both = _intrinsic_of_lanes(2, lambda builder, a, b: builder.and_(a, b), mask_type)
-but_not = _intrinsic_of_lanes(2, lambda builder, a, b: builder.and_(a, builder.not_(b)), mask_type)
 choose = _intrinsic_of_lanes(
     3, lambda builder, mask, a, b: builder.select(_is_true(builder, mask), a, b)
 )
@@ -243,8 +235,9 @@ def from_bits(typing_context, bits):
     """The mask whose lane i is bit i of an integer."""
 
     def codegen(context, builder, signature, values):
-        truth = builder.bitcast(builder.trunc(values[0], ir.IntType(WIDTH)), _TRUTHS)
-        return builder.sext(truth, _BITS)
+        own = ir.Constant(_BITS, [1 << lane for lane in range(WIDTH)])
+        every = _splat(builder, builder.trunc(values[0], ir.IntType(32)), _BITS)
+        return builder.sext(builder.icmp_signed("==", builder.and_(every, own), own), _BITS)
 
     return mask_type(bits), codegen
 

@@ -65,12 +65,12 @@ class Rasterize(torch.autograd.Function):
         order = depth_order(geometry[:, 6].copy())
         lists = list_points(order, splats, geometry, camera.width, camera.height)
         behind = _array(background).astype(np.float64)
-        image, alpha, transmittance, finished, stops = composite_forward(
+        image, alpha, transmittance, blended, stops = composite_forward(
             *lists, splats, behind, camera.width, camera.height
         )
         ctx.camera_arrays = viewmat, viewpoint, lens, degree
         ctx.points = index, geometry, points, colors, splats, len(means)
-        ctx.pixels = behind, transmittance, finished, stops, lists
+        ctx.pixels = behind, transmittance, blended, stops, lists
         found = torch.from_numpy(visible), torch.from_numpy(geometry[:, :6])
         ctx.mark_non_differentiable(*found)
         return torch.from_numpy(image), torch.from_numpy(alpha), *found
@@ -81,13 +81,13 @@ class Rasterize(torch.autograd.Function):
         viewmat, viewpoint, lens, degree = ctx.camera_arrays
         index, geometry, points, colors, splats, count = ctx.points
         means, quats, scales, _, shN = points
-        background, transmittance, finished, stops, (starts, entries) = ctx.pixels
+        background, transmittance, blended, stops, (starts, entries) = ctx.pixels
         sums, by_background = composite_backward(
             _array(grad_image),
             _array(grad_alpha),
             background,
             transmittance,
-            finished,
+            blended,
             starts,
             stops,
             entries,

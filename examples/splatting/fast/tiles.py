@@ -25,17 +25,14 @@ from splatting.fast.lanes import (
     WIDTH,
     absolute,
     both,
-    but_not,
     choose,
     count_up,
-    floor,
     from_bits,
     load,
-    maximum,
     minimum,
     multiply_add,
-    power_of_two,
     prefetch,
+    raised,
     repeat,
     store,
     total,
@@ -48,11 +45,10 @@ HEIGHT = 8  # rows of a tile
 AREA = HEIGHT * WIDTH
 SUMS = 16  # columns of the backward pass's sums, of which 9 are used: a cache line a point
 SLACK = 1e-3  # pixels; a list may hold a point that reaches no pixel, the passes test each
-NEVER = np.float32(2.0**24)  # the entry that finishes a pixel which none finishes
 LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 MARGIN = 1e-5  # of log2 alpha: this near to the threshold, float64 decides
 HALF_LOG2_E = 0.5 / math.log(2)
-LEAST = -30.0  # of log2 alpha where a point does not reach: a normal number, selected away
+SHIFT = 1.5 * 2.0**23  # a float32 below 2^22 plus this is its nearest whole number in the last bits
 AHEAD = 6  # entries whose points are fetched into the cache before they are used
 CENTRE = (WIDTH - 1) / 2  # lanes are counted from the middle, where rounding is least
 
@@ -173,24 +169,63 @@ def list_points(order, splats, geometry, width, height):
     return starts, entries
 
 
-@kernel
-def _power(x):
-    """2 to the x, for -126 < x < 127, within 2e-7 of itself: Taylor's series around 1/2 steps."""
-    whole = floor(x + 0.5)
-    f = x - whole
-    # ln(2)^n / n!, for |f| <= 1/2
-    series = multiply_add(f, 1.5403530393381608e-4, 1.3333558146428443e-3)
-    series = multiply_add(series, f, 9.618129107628477e-3)
-    series = multiply_add(series, f, 5.550410866482158e-2)
-    series = multiply_add(series, f, 2.402265069591007e-1)
-    series = multiply_add(series, f, 6.931471805599453e-1)
-    series = multiply_add(series, f, 1.0)
-    return series * power_of_two(whole)
+# The numbers that the passes compute with, each repeated over a register: an instruction reads such
+# an operand from memory for nothing, while a constant in the code is spread over a register first.
+# ln(2)^n / n! are the coefficients of 2 to the f.
+NUMBERS = (
+    *(1.0, 6.931471805599453e-1, 2.402265069591007e-1, 5.550410866482158e-2),
+    *(9.618129107628477e-3, 1.3333558146428443e-3, 1.5403530393381608e-4),
+    *(SHIFT, ALPHA_MAX, TRANSMITTANCE_MIN, LOG2_ALPHA_MIN, MARGIN),
+)
+ONE, F1, F2, F3, F4, F5, F6, SHIFTED, MOST, FULL, LEAST, NEAR = range(0, 12 * WIDTH, WIDTH)
 
 
 @kernel
-def _exact_mask(slope, at_centre, level):
-    """Which lanes reach the threshold, in float64."""
+def _repeated_numbers():
+    numbers = np.empty(len(NUMBERS) * WIDTH, np.float32)
+    for i in range(numbers.shape[0]):
+        numbers[i] = NUMBERS[i // WIDTH]
+    return numbers
+
+
+@kernel
+def _power(x, numbers):
+    """2 to the x, for -126 < x < 127, within 2e-7 of itself: Taylor's series around 1/2 steps.
+
+    Of a number outside it is anything, NaN too.
+    """
+    shifted = x + load(numbers, SHIFTED)
+    f = x - (shifted - load(numbers, SHIFTED))
+    square = f * f
+    low = multiply_add(f, load(numbers, F1), load(numbers, ONE))
+    middle = multiply_add(f, load(numbers, F3), load(numbers, F2))
+    high = multiply_add(f, load(numbers, F5), load(numbers, F4))
+    high = multiply_add(square, load(numbers, F6), high)
+    series = multiply_add(square, multiply_add(square, high, middle), low)
+    return raised(series, shifted)
+
+
+@kernel
+def _prepare_rows(splats, point, x, top, offsets, centres, levels):
+    """What the rows of a tile need of a point: dy, v in the middle of the row, and the level there.
+
+    All at once, since a row that had to wait for its own would take longer.
+    """
+    slope, y = splats[point, SLOPE], splats[point, MEAN_Y]
+    along = slope * (x - splats[point, MEAN_X])
+    for row in range(HEIGHT):
+        dy = top + row + 0.5 - y
+        offsets[row] = dy
+        centres[row] = along - splats[point, SHEAR] * dy
+        levels[row] = splats[point, LOG_OPACITY] - splats[point, FALL] * dy * dy
+
+
+@kernel
+def _exact_mask(splats, point, x, y):
+    """Which lanes of the row at y reach the threshold, in float64."""
+    slope, dy = splats[point, SLOPE], y - splats[point, MEAN_Y]
+    at_centre = slope * (x - splats[point, MEAN_X]) - splats[point, SHEAR] * dy
+    level = splats[point, LOG_OPACITY] - splats[point, FALL] * dy * dy
     bits = 0
     for lane in range(WIDTH):
         v = slope * (lane - CENTRE) + at_centre
@@ -203,18 +238,20 @@ def _exact_mask(slope, at_centre, level):
 def composite_forward(starts, entries, splats, background, width, height):  # noqa: PLR0915
     """Blend the points of each tile.
 
-    Returns image [H, W, 3], alpha [H, W], and for the backward pass, tile after tile,
-    transmittance and finished [T * AREA] (the entry at which each pixel was full, counted from
-    the tile's first; -1 beside the image) and stops [T], the entry where a tile was left.
+    Returns image [H, W, 3], alpha [H, W], and for the backward pass the transmittance
+    [T * AREA], tile after tile, the pixels that each entry was blended into (bit 8 row + column,
+    [entries]; only of those before the stop) and stops [T], the entry where a tile was left.
     """
     across = -(-width // WIDTH)
     tiles = starts.shape[0] - 1
     image = np.empty((height, width, 3), np.float32)
     alpha_image = np.empty((height, width), np.float32)
     transmittance = np.empty(tiles * AREA, np.float32)
-    finished = np.empty(tiles * AREA, np.float32)
+    blended = np.empty(entries.shape[0], np.int64)
     stops = starts[1:].copy()
     colour = np.empty(3 * AREA, np.float32)
+    offsets, centres, levels = np.empty((3, HEIGHT), np.float32)
+    numbers = _repeated_numbers()
     places = count_up() - CENTRE
     for tile in range(tiles):
         left, top = tile % across * WIDTH, tile // across * HEIGHT
@@ -224,54 +261,54 @@ def composite_forward(starts, entries, splats, background, width, height):  # no
             inside = i % WIDTH < columns and i // WIDTH < rows
             # A pixel that takes no more points has its transmittance negated.
             transmittance[planes + i] = 1.0 if inside else -1.0
-            finished[planes + i] = NEVER if inside else -1.0
         colour[:] = 0
         open_pixels = rows * columns
         x = left + 0.5 + CENTRE
         for entry in range(starts[tile], starts[tile + 1]):
             prefetch(splats, entries[min(entry + AHEAD, starts[tile + 1] - 1)])
             point = entries[entry]
-            slope, shear, fall = splats[point, SLOPE], splats[point, SHEAR], splats[point, FALL]
-            log_opacity = splats[point, LOG_OPACITY]
-            slopes = repeat(slope)
-            along, y = slope * (x - splats[point, MEAN_X]), splats[point, MEAN_Y]
+            _prepare_rows(splats, point, x, top, offsets, centres, levels)
+            slopes = repeat(splats[point, SLOPE])
             red, green = repeat(splats[point, RED]), repeat(splats[point, GREEN])
             blue = repeat(splats[point, BLUE])
             first = max(int(splats[point, FIRST_ROW]) - top, 0)
+            pixels = 0
             for row in range(first, min(int(splats[point, END_ROW]) - top, HEIGHT)):
-                dy = top + row + 0.5 - y
-                at_centre, level = along - shear * dy, log_opacity - fall * dy * dy
-                v = multiply_add(slopes, places, at_centre)
-                power = level - v * v
-                reached = power >= LOG2_ALPHA_MIN
-                if truths(absolute(power - LOG2_ALPHA_MIN) < MARGIN):
-                    reached = from_bits(_exact_mask(slope, at_centre, level))
-                before = load(transmittance, planes + row * WIDTH)
-                reached = both(reached, before > 0.0)
-                if truths(reached) == 0:
+                v = multiply_add(slopes, places, centres[row])
+                power = levels[row] - v * v
+                judged = power
+                if truths(absolute(power - load(numbers, LEAST)) < load(numbers, NEAR)):
+                    exact = from_bits(_exact_mask(splats, point, x, top + row + 0.5))
+                    judged = choose(exact, 0.0, 2 * LOG2_ALPHA_MIN)
+                at = planes + row * WIDTH
+                before = load(transmittance, at)
+                reached = both(judged >= load(numbers, LEAST), before > 0.0)
+                bits = truths(reached)
+                if bits == 0:
                     continue
-                alpha = minimum(_power(maximum(power, LEAST)), ALPHA_MAX)
-                after = before * (1.0 - alpha)
-                full = both(reached, after <= TRANSMITTANCE_MIN)
-                blended = but_not(reached, full)
-                weight = choose(blended, alpha * before, 0.0)
+                alpha = minimum(_power(power, numbers), load(numbers, MOST))
+                alpha = choose(reached, alpha, 0.0)
+                after = before * (load(numbers, ONE) - alpha)
+                weight = alpha * before
+                # Those that were full before are negative, and not as small.
+                full = absolute(after) <= load(numbers, FULL)
+                filled = truths(full)
+                if filled:
+                    weight = choose(full, 0.0, weight)
+                    after = choose(full, 0.0 - before, after)
+                    bits &= ~filled
+                    while filled:
+                        filled &= filled - 1
+                        open_pixels -= 1
+                store(transmittance, at, after)
+                pixels |= bits << (row * WIDTH)
                 at = row * WIDTH
                 store(colour, at, multiply_add(weight, red, load(colour, at)))
                 at += AREA
                 store(colour, at, multiply_add(weight, green, load(colour, at)))
                 at += AREA
                 store(colour, at, multiply_add(weight, blue, load(colour, at)))
-                at = planes + row * WIDTH
-                after = choose(blended, after, before)
-                if truths(full):
-                    after = choose(full, 0.0 - before, after)
-                    filled = load(finished, at)
-                    store(finished, at, choose(full, float(entry - starts[tile]), filled))
-                    bits = truths(full)
-                    while bits:
-                        bits &= bits - 1
-                        open_pixels -= 1
-                store(transmittance, at, after)
+            blended[entry] = pixels
             if open_pixels == 0:
                 stops[tile] = entry + 1
                 break
@@ -284,12 +321,12 @@ def composite_forward(starts, entries, splats, background, width, height):  # no
                     image[top + row, left + column, channel] = (
                         colour[channel * AREA + i] + left_over * background[channel]
                     )
-    return image, alpha_image, transmittance, finished, stops
+    return image, alpha_image, transmittance, blended, stops
 
 
 @kernel
 def composite_backward(  # noqa: PLR0915
-    grad_image, grad_alpha, background, transmittance, finished, starts, stops, entries, splats
+    grad_image, grad_alpha, background, transmittance, blended, starts, stops, entries, splats
 ):
     """Gradients of the entries, summed per point.
 
@@ -304,6 +341,8 @@ def composite_backward(  # noqa: PLR0915
     grad_background = np.zeros(3)
     grads = np.empty(3 * AREA, np.float32)
     in_front, behind = np.empty(AREA, np.float32), np.empty(AREA, np.float32)
+    offsets, centres, levels = np.empty((3, HEIGHT), np.float32)
+    numbers = _repeated_numbers()
     places = count_up() - CENTRE
     for tile in range(starts.shape[0] - 1):
         left, top = tile % across * WIDTH, tile // across * HEIGHT
@@ -329,39 +368,33 @@ def composite_backward(  # noqa: PLR0915
             coming = entries[max(entry - AHEAD, starts[tile])]
             prefetch(splats, coming)
             prefetch(sums, coming)
+            pixels = blended[entry]
+            if pixels == 0:
+                continue
             point = entries[entry]
-            slope, shear, fall = splats[point, SLOPE], splats[point, SHEAR], splats[point, FALL]
-            log_opacity = splats[point, LOG_OPACITY]
-            slopes = repeat(slope)
-            along, y = slope * (x - splats[point, MEAN_X]), splats[point, MEAN_Y]
+            _prepare_rows(splats, point, x, top, offsets, centres, levels)
+            slopes = repeat(splats[point, SLOPE])
             red, green = repeat(splats[point, RED]), repeat(splats[point, GREEN])
             blue = repeat(splats[point, BLUE])
-            number = repeat(float(entry - starts[tile]))
             sum_0, sum_v, sum_vv = repeat(0.0), repeat(0.0), repeat(0.0)
             sum_y, sum_vy, sum_yy = repeat(0.0), repeat(0.0), repeat(0.0)
             sum_red, sum_green, sum_blue = repeat(0.0), repeat(0.0), repeat(0.0)
-            touched = False
             first = max(int(splats[point, FIRST_ROW]) - top, 0)
             for row in range(first, min(int(splats[point, END_ROW]) - top, HEIGHT)):
-                dy = top + row + 0.5 - y
-                at_centre, level = along - shear * dy, log_opacity - fall * dy * dy
-                v = multiply_add(slopes, places, at_centre)
-                power = level - v * v
-                reached = power >= LOG2_ALPHA_MIN
-                if truths(absolute(power - LOG2_ALPHA_MIN) < MARGIN):
-                    reached = from_bits(_exact_mask(slope, at_centre, level))
                 at = row * WIDTH
-                reached = both(reached, load(finished, planes + at) > number)
-                if truths(reached) == 0:
+                bits = pixels >> at & 255
+                if bits == 0:
                     continue
-                touched = True
-                unclamped = _power(maximum(power, LEAST))
-                alpha = minimum(unclamped, ALPHA_MAX)
-                inverse = 1.0 / (1.0 - alpha)
+                v = multiply_add(slopes, places, centres[row])
+                unclamped = _power(levels[row] - v * v, numbers)
+                # 0 beside the pixels: nothing below changes, and nothing is added there.
+                alpha = minimum(unclamped, load(numbers, MOST))
+                alpha = choose(from_bits(bits), alpha, 0.0)
+                inverse = load(numbers, ONE) / (load(numbers, ONE) - alpha)
                 before = load(in_front, at)
-                before = choose(reached, before * inverse, before)
+                before = before * inverse
                 store(in_front, at, before)
-                weight = choose(reached, alpha * before, 0.0)
+                weight = alpha * before
                 grad_red, grad_green = load(grads, at), load(grads, AREA + at)
                 grad_blue = load(grads, 2 * AREA + at)
                 sum_red = multiply_add(weight, grad_red, sum_red)
@@ -373,8 +406,8 @@ def composite_backward(  # noqa: PLR0915
                 # -alpha d(loss)/d(alpha), where alpha is not clamped
                 by_exponent = alpha * (rest * inverse - before * by_weight)
                 store(behind, at, multiply_add(weight, by_weight, rest))
-                smooth = both(reached, unclamped <= ALPHA_MAX)
-                g = choose(smooth, by_exponent, 0.0)
+                g = choose(unclamped <= load(numbers, MOST), by_exponent, 0.0)
+                dy = offsets[row]
                 gv, gy = g * v, g * dy
                 sum_0 = sum_0 + g
                 sum_v = sum_v + gv
@@ -382,11 +415,10 @@ def composite_backward(  # noqa: PLR0915
                 sum_y = sum_y + gy
                 sum_vy = multiply_add(gv, dy, sum_vy)
                 sum_yy = multiply_add(gy, dy, sum_yy)
-            if touched:
-                at = point * SUMS
-                more = totals(sum_0, sum_v, sum_y, sum_vv, sum_vy, sum_yy, sum_red, sum_green)
-                store(flat_sums, at, load(flat_sums, at) + more)
-                sums[point, 8] += total(sum_blue)
+            at = point * SUMS
+            more = totals(sum_0, sum_v, sum_y, sum_vv, sum_vy, sum_yy, sum_red, sum_green)
+            store(flat_sums, at, load(flat_sums, at) + more)
+            sums[point, 8] += total(sum_blue)
     return sums, grad_background
 
 
