@@ -36,7 +36,7 @@ PIECES = {"OutOfView": 9}
 
 # On before anything could be trained at full size.
 ON_BEFORE = ("Fading", "Averaging", "OutOfView")
-CONFIRMING = 30_000  # iterations
+CONFIRMING = (15_000, 30_000)  # iterations; of the trainings of a scene the longest count
 MIN_FULL_SCENES = 2  # at full size, where one training takes hours and seeds are few
 
 
@@ -48,7 +48,7 @@ class Decision:
     control: str
     iterations: int | None  # None: not measured on enough scenes
     found: Difference | None
-    full: Difference  # at full size and length
+    full: Difference  # at full size
     size: str = QUARTER  # of the photos
     new: bool = False  # was not on before there were trainings at full size
 
@@ -119,7 +119,12 @@ def decide(study: Study) -> dict[str, Decision]:
     behind at full size; those that were on before need not be trained there.
     """
     made = {}
-    every = every_scene(study, CONFIRMING) + every_scene(study, CONFIRMING, sh_degree=3)
+    every = [
+        setting
+        for iterations in CONFIRMING
+        for degree in (0, 3)
+        for setting in every_scene(study, iterations, sh_degree=degree)
+    ]
     whole = [setting for setting in every if setting.size == FULL]
     for part, (arm, control) in COMPARISONS.items():
         full, new = difference(study, whole, arm, control), part not in ON_BEFORE

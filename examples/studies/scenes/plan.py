@@ -107,16 +107,20 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
                 scenes, [*ADAPTIVE_ARMS, f"adc+{OWN_FRAME}{AVERAGED}"], 1, share=share
             )
         ],
-        # 800x532 and 800x800, two core-hours each.
-        "whole": rotated(
-            ("bonsai", "lego"),
-            (OWN_FRAME_ARM, DEFAULTS, BASELINE),
-            1,
-            30_000,
-            20,
-            size="images",
-            sh_degree=3,
-        ),
+        # 640x480, 800x532 and 800x800, some two core-hours each: half as long as the others.
+        "whole": [
+            spec
+            for scenes, share in ((("plush",), 50), (("bonsai", "lego"), 20))
+            for spec in rotated(
+                scenes,
+                (OWN_FRAME_ARM, DEFAULTS, BASELINE),
+                1,
+                15_000,
+                share,
+                size="images",
+                sh_degree=3,
+            )
+        ],
         # One size of a training after the other.
         "crowded": [  # 40,000 Gaussians on images of a quarter of their size
             *rotated(("bonsai",), TODAY, 1, 7_500, 4),

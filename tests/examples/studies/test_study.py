@@ -276,6 +276,7 @@ def test_half_size_decides_where_it_was_trained_with_two_seeds(seeds: int) -> No
 
 
 UNCONFIRMED, REFUTED = "pays, not confirmed at full size", "pays, but not at full size"
+FULL_SIZE: dict[str, Any] = {"size": "images", "points": 200_000, "sh_degree": 3}
 
 
 @pytest.mark.parametrize(
@@ -291,8 +292,9 @@ UNCONFIRMED, REFUTED = "pays, not confirmed at full size", "pays, but not at ful
         (({"psnr": 21.0, "lpips": 0.2001}, {"psnr": 21.0, "lpips": 0.2002}), REFUTED, REFUTED),
     ],
 )
+@pytest.mark.parametrize("iterations", [15_000, 30_000])
 def test_full_size_has_the_last_word(
-    full: tuple[dict[str, float], ...], of_a_new_part: str, of_an_old_one: str
+    iterations: int, full: tuple[dict[str, float], ...], of_a_new_part: str, of_an_old_one: str
 ) -> None:
     for part, verdict in (("OwnFrame", of_a_new_part), ("Fading", of_an_old_one)):
         arm, control = COMPARISONS[part]
@@ -302,7 +304,7 @@ def test_full_size_has_the_last_word(
             for seed in (0, 1)
             for name in (arm, control)
         ]
-        others = {"size": "images", "points": 200_000, "sh_degree": 3, "iterations": 30_000}
+        others = {**FULL_SIZE, "iterations": iterations}
         for scene, better in zip(MANY_VIEWS_SCENES, full, strict=False):
             for name, metrics in ((arm, better), (control, {})):
                 made = rotated_record(name, scene, 0, **metrics)
@@ -310,6 +312,19 @@ def test_full_size_has_the_last_word(
         decision = decide(Study(records))[part]
         assert decision.verdict == verdict
         assert decision.on == (verdict == "pays")
+
+
+@pytest.mark.parametrize(("brief", "long"), [(19.0, 21.0), (21.0, 19.0)])
+def test_at_full_size_the_longest_training_of_a_scene_counts(brief: float, long: float) -> None:
+    arm, control = COMPARISONS["OwnFrame"]
+    records = []
+    for iterations, psnr in ((30_000, long), (15_000, brief), (7_500, 0.0)):
+        setting = {**FULL_SIZE, "iterations": iterations}
+        for name, found in ((arm, psnr), (control, 20.0)):
+            made = rotated_record(name, "lego", 0, psnr=found)
+            records.append(replace(made, setting=replace(made.setting, **setting)))
+    gain, _ = decide(Study(records))["OwnFrame"].full.of("psnr")
+    assert gain == long - 20.0
 
 
 def test_every_scene_and_size_has_its_line() -> None:
