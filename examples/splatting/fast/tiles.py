@@ -190,7 +190,7 @@ def _repeated_numbers():
 
 @kernel
 def _power(x, numbers):
-    """2 to the x, for -126 < x < 127, within 2e-7 of itself: Taylor's series around 1/2 steps.
+    """2 to the x, for -126 < x < 127, within 3e-7 of itself: Taylor's series around 1/2 steps.
 
     Of a number outside it is anything, NaN too.
     """

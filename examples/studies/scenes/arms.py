@@ -116,6 +116,7 @@ LIST = (
     ),
     adaptive(f"adc+{OWN_FRAME}", "own frame, as without clone and split", of(OWN)),
 )
+ADAPTIVE_OWN_FRAME = f"adc+{OWN_FRAME}{AVERAGED}"
 ADAPTIVE_DEFAULTS = f"adc+annealed+faded-but-scales{AVERAGED}"  # what `DEFAULTS_ADC` is
 TRAINED = {arm.name: arm for arm in LIST}
 

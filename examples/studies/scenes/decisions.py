@@ -14,6 +14,7 @@ LADDER = ((HALF, 30_000), (QUARTER, 30_000), (QUARTER, 7_500))
 POINTS, HALF_POINTS = 4_000, 50_000
 NUM_POINTS = {"embedded": 2_000, "bonsai": 10_000, MISPOSED: 10_000, "lego": 10_000}
 MANY_VIEWS_SCENES = ("bonsai", "lego", "plush")  # forty training views or more
+FEW_VIEWS_SCENES = ("embedded", "banana", "lund_door", "brighton_beach")
 MIN_SCENES, MIN_SEEDS = 3, 2
 # part -> (the arm with it, the arm without it)
 COMPARISONS = {

@@ -11,6 +11,7 @@ from typing import Any
 from studies.scenes.arms import (
     ADAPTIVE,
     ADAPTIVE_DEFAULTS,
+    ADAPTIVE_OWN_FRAME,
     AVERAGED,
     BASELINE,
     DEFAULTS,
@@ -19,15 +20,14 @@ from studies.scenes.arms import (
     OWN_FRAME_ARM,
     find_study_arm,
 )
-from studies.scenes.decisions import MANY_VIEWS_SCENES, points_of
+from studies.scenes.decisions import FEW_VIEWS_SCENES, MANY_VIEWS_SCENES, points_of
 from studies.scenes.training import Spec
 
-FEW_VIEWS_SCENES = ("embedded", "banana", "lund_door", "brighton_beach")
 STOCK = (BASELINE, f"{BASELINE}{AVERAGED}")
 TODAY = (*STOCK, "faded", DEFAULTS)
 FRAMES = (OWN_FRAME_ARM, f"{OWN_FRAME}{AVERAGED}")
 RATES = tuple(arm.name for arm in LIST if arm.name.startswith(("rates-", "positions-")))
-ADAPTIVE_ARMS = (ADAPTIVE, ADAPTIVE_DEFAULTS)
+ADAPTIVE_ARMS = (ADAPTIVE, ADAPTIVE_DEFAULTS, ADAPTIVE_OWN_FRAME)
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,10 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
             for scenes, share in half_sizes
             for spec in at_half(scenes, [arm], seeds, share=share)
         ],
-        "own-frame-quarter": rotated(MANY_VIEWS_SCENES, FRAMES, seeds, 30_000),
+        "own-frame-quarter": [
+            *rotated(MANY_VIEWS_SCENES, FRAMES, seeds, 30_000),
+            *rotated(FEW_VIEWS_SCENES, [OWN_FRAME_ARM], seeds, 30_000),
+        ],
         # Stock with other constant rates: what a longer step is to be compared with.
         "rates-tuned": [
             *rotated(MANY_VIEWS_SCENES, ["rates-x2"], seeds, 30_000),
@@ -103,9 +106,7 @@ def stages(seeds: int = 3) -> dict[str, list[Spec]]:
         "half-adaptive": [
             spec
             for scenes, share in half_sizes
-            for spec in at_half(
-                scenes, [*ADAPTIVE_ARMS, f"adc+{OWN_FRAME}{AVERAGED}"], 1, share=share
-            )
+            for spec in at_half(scenes, ADAPTIVE_ARMS, 1, share=share)
         ],
         # 640x480, 800x532 and 800x800, some two core-hours each: half as long as the others.
         "whole": [

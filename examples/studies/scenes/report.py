@@ -24,6 +24,7 @@ from studies.scenes.analysis import Study
 from studies.scenes.arms import (
     ADAPTIVE,
     ADAPTIVE_DEFAULTS,
+    ADAPTIVE_OWN_FRAME,
     BASELINE,
     DEFAULTS,
     OWN_FRAME,
@@ -31,6 +32,7 @@ from studies.scenes.arms import (
     arm_of,
 )
 from studies.scenes.decisions import (
+    FEW_VIEWS_SCENES,
     HALF,
     MANY_VIEWS_SCENES,
     PIECES,
@@ -79,7 +81,7 @@ FALLS = FOLDER.parent / "histogram" / "collapse.json"
 MARK = "<!-- study:{} -->"
 LONG, BRIEF = 30_000, 7_500
 SHORTER = (BRIEF, 10_000)  # lengths that may do instead of the baseline's
-ADAPTIVE_ARMS = (ADAPTIVE, "adc+annealed+faded", ADAPTIVE_DEFAULTS)
+ADAPTIVE_ARMS = (ADAPTIVE, "adc+annealed+faded", ADAPTIVE_DEFAULTS, ADAPTIVE_OWN_FRAME)
 PLUSH = Setting("plush", 4_000, BRIEF, "sfm", rotated=True)  # where other rates were tried, too
 LARGEST = Setting("lego", 50_000, LONG, "sfm", rotated=True, size="images_2")  # the README's
 FULL_ARMS = (BASELINE, "faded", DEFAULTS, OWN_FRAME_ARM)
@@ -108,6 +110,7 @@ def conclusions(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
     long, every = settings_of(study, LONG), every_scene(study, LONG)
     quarter = [setting for setting in every if setting.size == QUARTER]
     degrees = [*every, *every_scene(study, LONG, sh_degree=3)]
+    few = [setting for setting in quarter if setting.scene in FEW_VIEWS_SCENES]
     half = settings_of(study, LONG, size=HALF)
     full = [s for s in study.settings() if s.rotated and s.size == "images" and not s.views]
     # Quarter, half and full size. Bonsai has its right poses here, as far as it was trained.
@@ -129,6 +132,7 @@ def conclusions(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
         ),
         "own-frame": scenes_gain_table(study, sizes[1], OWN_FRAME_ARM, BASELINE),
         "own-frame-or-not": scenes_gain_table(study, sizes[1], OWN_FRAME_ARM, DEFAULTS),
+        "own-frame-few": metrics_table(study, few, (BASELINE, DEFAULTS, OWN_FRAME_ARM), plain=True),
         "headline": headline_table(study, sizes[::-1]),
         "each-size": sizes_table(study, sizes, ("rates-x2", DEFAULTS, OWN_FRAME_ARM)),
         "reach": reach_table(study, sizes[0], DEFAULTS, SHORTER),

@@ -12,6 +12,7 @@ from studies.scenes.analysis import METRICS, Difference, Study, difference
 from studies.scenes.arms import (
     ADAPTIVE,
     ADAPTIVE_DEFAULTS,
+    ADAPTIVE_OWN_FRAME,
     BASELINE,
     DEFAULTS,
     OWN_FRAME_ARM,
@@ -40,6 +41,7 @@ LABELS = {
     ADAPTIVE: "gsplat's `DefaultStrategy`",
     "adc+annealed+faded": "with `Annealing` and `Fading`",
     ADAPTIVE_DEFAULTS: "with `DEFAULTS_ADC`",
+    ADAPTIVE_OWN_FRAME: "with `OwnFrame` and `Averaging`",
 }
 CONSTANT = "a constant multiplier of equal mean"
 PAPER = (  # what the pages say of the paper's parts: the part, what without it, and their arms

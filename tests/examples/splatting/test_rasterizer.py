@@ -12,7 +12,9 @@ import torch
 from raster_scene import synthetic_scene
 from splatting.camera import Camera
 from splatting.compositing import composite
+from splatting.fast import tiles
 from splatting.fast.kernel import kernel
+from splatting.fast.lanes import WIDTH, load, store
 from splatting.fast.tiles import depth_order
 from splatting.projection import project, rotation_matrices
 from splatting.rasterizer import Backend, render
@@ -515,6 +517,21 @@ def test_fast_survives_broken_numbers(name: str, value: float):
     broken[::3] = True
     if math.isnan(value) and name != "quats" and name[:2] != "sh":
         assert not (result["visible"] & broken).any()
+
+
+def test_the_power_of_two_of_the_pixels():
+    power, repeated_numbers = tiles._power, tiles._repeated_numbers
+
+    @numba.njit
+    def powers(x):
+        numbers, found = repeated_numbers(), np.empty_like(x)
+        for i in range(0, x.shape[0], WIDTH):
+            # numba passes intrinsics their typing context itself
+            store(found, i, power(load(x, i), numbers))  # pyright: ignore[reportCallIssue]
+        return found
+
+    x = np.linspace(-125.9, 126.9, 100_000 * WIDTH).astype(np.float32)
+    np.testing.assert_allclose(powers(x), np.exp2(x.astype(np.float64)), rtol=3e-7)
 
 
 def test_depth_order_is_a_stable_sort():
