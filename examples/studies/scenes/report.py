@@ -132,7 +132,7 @@ def conclusions(study: Study, rotated: Sequence[Setting]) -> dict[str, str]:
         ),
         "own-frame": scenes_gain_table(study, sizes[1], OWN_FRAME_ARM, BASELINE),
         "own-frame-or-not": scenes_gain_table(study, sizes[1], OWN_FRAME_ARM, DEFAULTS),
-        "own-frame-few": metrics_table(study, few, (BASELINE, DEFAULTS, OWN_FRAME_ARM), plain=True),
+        "own-frame-few": scenes_gain_table(study, few, OWN_FRAME_ARM, DEFAULTS),
         "headline": headline_table(study, sizes[::-1]),
         "each-size": sizes_table(study, sizes, ("rates-x2", DEFAULTS, OWN_FRAME_ARM)),
         "reach": reach_table(study, sizes[0], DEFAULTS, SHORTER),

@@ -57,6 +57,10 @@ class OwnFrame(Part):
 
     `Fading` leaves positions alone while this part steps them.
 
+    It gains most where photos are many and the density control is 3DGS-MCMC's. Where photos are
+    few, or Gaussians are cloned and split, it may fit the training photos better, and photos that
+    were held out worse (docs/evidence.md).
+
     A row whose moments begin anew in the middle of a run, as those of Gaussians that are relocated
     or added, takes steps of up to six full ones at first, since Adam corrects its moments for the
     parameter's age and not for the row's. So do all rows at the start of a training whose optimizer
