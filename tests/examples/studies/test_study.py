@@ -486,7 +486,14 @@ def test_tables_that_a_reader_meets_first_have_plain_names() -> None:
         assert not re.search(r"\bstock\b|\barms?\b|less |likewise|\bx\d\.", text), name
         if name != "decisions":  # whose second column names the variants that were compared
             names = set(re.findall(r"`([^`]+)`", text))
-            known = {"Fading", "Annealing", "OwnFrame", "DefaultStrategy", "DEFAULTS_ADC"}
+            known = {
+                "Annealing",
+                "Averaging",
+                "DEFAULTS_ADC",
+                "DefaultStrategy",
+                "Fading",
+                "OwnFrame",
+            }
             assert names <= known, name
 
 
