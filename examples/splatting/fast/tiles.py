@@ -206,26 +206,31 @@ def _power(x, numbers):
 
 
 @kernel
+def _row(splats, point, x, dy):
+    """v in the middle of a row, and the level there."""
+    along = splats[point, SLOPE] * (x - splats[point, MEAN_X])
+    level = splats[point, LOG_OPACITY] - splats[point, FALL] * dy * dy
+    return along - splats[point, SHEAR] * dy, level
+
+
+@kernel
 def _prepare_rows(splats, point, x, top, offsets, centres, levels):
-    """What the rows of a tile need of a point: dy, v in the middle of the row, and the level there.
+    """What the rows of a tile need of a point: dy, and what `_row` says.
 
     All at once, since a row that had to wait for its own would take longer.
     """
-    slope, y = splats[point, SLOPE], splats[point, MEAN_Y]
-    along = slope * (x - splats[point, MEAN_X])
+    y = splats[point, MEAN_Y]
     for row in range(HEIGHT):
         dy = top + row + 0.5 - y
         offsets[row] = dy
-        centres[row] = along - splats[point, SHEAR] * dy
-        levels[row] = splats[point, LOG_OPACITY] - splats[point, FALL] * dy * dy
+        centres[row], levels[row] = _row(splats, point, x, dy)
 
 
 @kernel
 def _exact_mask(splats, point, x, y):
     """Which lanes of the row at y reach the threshold, in float64."""
-    slope, dy = splats[point, SLOPE], y - splats[point, MEAN_Y]
-    at_centre = slope * (x - splats[point, MEAN_X]) - splats[point, SHEAR] * dy
-    level = splats[point, LOG_OPACITY] - splats[point, FALL] * dy * dy
+    slope = splats[point, SLOPE]
+    at_centre, level = _row(splats, point, x, y - splats[point, MEAN_Y])
     bits = 0
     for lane in range(WIDTH):
         v = slope * (lane - CENTRE) + at_centre
