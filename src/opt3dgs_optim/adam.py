@@ -115,7 +115,6 @@ class StepAdam(Adam):
         """Have the parts of `course` from now on; slots are, by group, set and name."""
         self.course, self._slots, self._lanes = course, slots, []
         self._masked = own_step(self._base) is not None
-        self._patch_step_function()  # torch's step hooks, for a class that was given afterwards
         self._step_supports_amp_scaling = False  # a GradScaler unscales, and leaves steps out
         self._use_host_steps()
 
@@ -152,6 +151,8 @@ class StepAdam(Adam):
                 INRIA's SparseGaussianAdam get their mask, and what goes with it, unchanged.
         """
         self._opt_called = True  # what learning-rate schedulers would note by wrapping this method
+        for hook in self._optimizer_step_pre_hooks.values():
+            hook(self, (closure, *masked), masks)
         loss, course = None, self.course
         if callable(closure):
             with torch.enable_grad():
@@ -174,10 +175,14 @@ class StepAdam(Adam):
                 for lane in self._present_lanes():
                     if lane.param.grad is not None:
                         self._step_lane(lane, iteration)
+        for hook in self._optimizer_step_post_hooks.values():
+            hook(self, (closure, *masked), masks)
         return loss
 
     # Learning-rate schedulers, which would wrap `step` on the instance, need not: `step` tells.
     step._wrapped_by_lr_sched = True  # pyright: ignore[reportFunctionMemberAccess]
+    # torch's own wrapper, for hooks and profiles, takes longer than all else that Python does here.
+    step.hooked = True  # pyright: ignore[reportFunctionMemberAccess]
 
     def _present_lanes(self) -> list[Lane]:
         """The lanes of all parameters; looked up again when groups or Parameters are new."""
