@@ -235,7 +235,7 @@ class PhaseScheduler(Course):
         if self.log is not None:
             numbers = self.numbers()
             if self._loss is not None:
-                numbers["loss"] = self._loss
+                numbers["loss"], self._loss = self._loss, None
             self.log.step(self.iteration, phase=self.phase.value, **numbers)
         assert self.total_steps is not None
         if self.iteration > self.total_steps:  # trainers that count from 1 end at total_steps
