@@ -46,7 +46,7 @@ class Lane:
         self.set, self.name = slot
         self.last = -1
         self.framed: bool | None = None
-        self.same_object = False  # whether the Parameter is the one of the last step
+        self.same_object = False  # whether the Parameter is still that of the last step
         self.keeps = False  # whether parts keep something for its rows
         self.left: dict[str, tuple[Tensor, int]] = {}
         self.plans: dict[Phase, list[Part]] = {}
@@ -90,6 +90,7 @@ class Lane:
 
     def leave(self, state: dict[str, Any]) -> None:
         """Note what the step has left, by which edits of rows show at the next one."""
+        self.same_object = True
         self.left = {key: (state[key], state[key]._version) for key in KEPT if key in state}
 
 
@@ -159,15 +160,15 @@ class StepAdam(Adam):
                 loss = closure()
             if loss is not None and course.observers:
                 course.observe(loss)  # pyright: ignore[reportAttributeAccessIssue]
-        iteration = course.begin(self)
-        if self._masked:
-            given = () if closure is None and not masked else (closure, *masked)
-            self._step_around(iteration, given, masks)
-        elif masked or masks or isinstance(closure, Tensor):
+        if not self._masked and (masked or masks or isinstance(closure, Tensor)):
             raise TypeError(
                 f"{type(self).__name__}.step: a mask was given, but torch's Adam steps all rows; "
                 "use gsplat's SelectiveAdam or INRIA's SparseGaussianAdam for masked steps"
             )
+        iteration = course.begin(self)
+        if self._masked:
+            given = () if closure is None and not masked else (closure, *masked)
+            self._step_around(iteration, given, masks)
         elif not course.parts:
             _unhooked(self._base)(self)
         else:
@@ -191,7 +192,6 @@ class StepAdam(Adam):
             for param in group["params"]:
                 if i == len(lanes) or lanes[i].param is not param or lanes[i].group is not group:
                     return self._new_lanes()
-                lanes[i].same_object = True
                 i += 1
         return lanes
 
@@ -216,7 +216,7 @@ class StepAdam(Adam):
                         lane.framed = self.in_own_frame and lane.name == "means"
                 else:
                     lane.last, lane.framed, lane.left = before.last, before.framed, before.left
-                    lane.same_object = before.param is param
+                    lane.same_object = before.same_object and before.param is param
                     self._tell_fewer_rows(before.param, lane)
                 self._check_rows(lane)
                 self._lanes.append(lane)
