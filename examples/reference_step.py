@@ -75,7 +75,7 @@ def default_step(
 
     parts: by part, the tensors that it acts on.
     """
-    num_points, progress = len(params["means"]), iteration / total
+    num_points, progress = len(params["means"]), min(iteration / total, 1.0)
     for name, param in params.items():
         state.setdefault(name, {**new_moments(param), "last": iteration - 1})
     out_of_view, share = views(grads.get("means"), state, iteration)

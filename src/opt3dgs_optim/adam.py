@@ -47,7 +47,6 @@ class Lane:
         self.set, self.name = slot
         self.last = -1
         self.framed: bool | None = None
-        self.same_object = False  # whether the Parameter is still that of the last step
         self.keeps = False  # whether parts keep something for its rows
         self.left: dict[str, tuple[Tensor, int]] = {}
         self.plans: dict[Phase, list[Part]] = {}
@@ -70,9 +69,7 @@ class Lane:
     def rows(self, state: dict[str, Any], key: str, shape: tuple[int, ...]) -> tuple[Tensor, bool]:
         """What is kept for the rows under a name, and whether rows may be new since the last step.
 
-        A row of zeros is one for which nothing is kept. Trainers that edit rows edit every tensor
-        of the state so (gsplat's family), or none but Adam's moments (INRIA's): then all rows of a
-        new Parameter are others, and what was kept for them is dropped.
+        A row of zeros is one for which nothing is kept.
         """
         tensor, was, self.keeps = state.get(key), self.left.get(key), True
         if tensor is None or tensor.shape != shape:
@@ -84,14 +81,21 @@ class Lane:
             return tensor, True
         if tensor is not was[0] or tensor._version != was[1]:
             return tensor, True
-        if not self.same_object:
-            tensor.zero_()
-            return tensor, True
         return tensor, False
+
+    def drop_if_moved(self, state: dict[str, Any], rows: int) -> None:
+        """Of a Parameter that is new, drop what is kept for rows that are others now.
+
+        Trainers that edit rows edit every tensor of the state so (gsplat's family), or none but
+        Adam's moments (INRIA's): what they have left as it was belongs to other rows.
+        """
+        for key, (tensor, version) in self.left.items():
+            now = state.get(key)
+            if now is not None and (len(now) != rows or (now is tensor and now._version == version)):
+                del state[key]
 
     def leave(self, state: dict[str, Any]) -> None:
         """Note what the step has left, by which edits of rows show at the next one."""
-        self.same_object = True
         self.left = {key: (state[key], state[key]._version) for key in KEPT if key in state}
 
 
@@ -218,7 +222,8 @@ class StepAdam(Adam):
                         lane.framed = self.in_own_frame and lane.name == "means"
                 else:
                     lane.last, lane.framed, lane.left = before.last, before.framed, before.left
-                    lane.same_object = before.same_object and before.param is param
+                    if before.param is not param:
+                        before.drop_if_moved(self.state.get(param, {}), len(param))
                     self._tell_fewer_rows(before.param, lane)
                 self._check_rows(lane)
                 self._lanes.append(lane)
