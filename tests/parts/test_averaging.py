@@ -1,0 +1,135 @@
+"""Averaging: a training ends at the mean of its last thirtieth, of the rows that stayed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import row_edits
+import torch
+from gaussians import adam_of, adams_of, parameters, steps
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.nn import Parameter
+
+from opt3dgs_optim import Averaging, PhaseScheduler
+
+TOTAL, ROWS = 300, 6
+
+
+@given(total=st.integers(1, 100_000))
+def test_where_the_mean_begins_and_where_it_is_put(total: int) -> None:
+    start, put = Averaging.start(total), Averaging.put_from(total)
+    assert total - start == int(1 / 30 * total)
+    assert total - put == max(2, int((total - start) / 10))
+
+
+@settings(max_examples=20)
+@given(total=st.integers(90, 700))
+def test_the_end_is_the_mean_of_the_last_iterates(total: int) -> None:
+    """Of those before the mean is put; after it, Adam still moves by its momentum."""
+    params = parameters(ROWS, "sh0")
+    phases = PhaseScheduler(total, parts=[Averaging()])
+    optimizers = phases.upgrade(adams_of(params))
+    put, last = Averaging.put_from(total), []
+    for iteration in range(put):
+        steps(optimizers, params, 1, seed=iteration)
+        if iteration >= Averaging.start(total):
+            last.append(params["sh0"].detach().double())
+    if last:
+        phases.finish()
+        assert torch.allclose(params["sh0"].double(), torch.stack(last).mean(0), atol=1e-5)
+
+
+def test_until_the_mean_is_put_nothing_is_changed() -> None:
+    ends = []
+    for parts in ([Averaging()], []):
+        params = parameters(ROWS, "sh0")
+        optimizers = PhaseScheduler(TOTAL, parts=parts).upgrade(adams_of(params))
+        steps(optimizers, params, Averaging.put_from(TOTAL))
+        ends.append(params["sh0"].detach().clone())
+    assert torch.equal(*ends)
+
+
+@pytest.mark.parametrize("inria", [False, True])
+def test_an_edit_of_rows_in_the_last_thirtieth(inria: bool) -> None:
+    """gsplat's family edits every tensor: other rows are spared. INRIA's: all begin anew."""
+    params = parameters(ROWS, "sh0")
+
+    def edit(optimizer: Any) -> None:
+        gone = row_edits.removed(torch.tensor([1]))
+        row_edits.apply(gone, params, [optimizer], ["sh0"], inria)
+
+    optimizer = PhaseScheduler(TOTAL, parts=[Averaging()]).upgrade(adam_of(params))
+    for iteration in range(296):
+        if iteration == 295:
+            edit(optimizer)
+        steps({"all": optimizer}, params, 1, seed=iteration)
+    began = optimizer.state[params["sh0"]]["averaging.began"]
+    assert began.tolist() == [6.0 if inria else 1.0] * (ROWS - 1)
+
+
+@pytest.mark.parametrize("between", [0, 1, 3])
+def test_new_rows_begin_with_their_first_iterate(between: int) -> None:
+    """Also where the iterations after the edit have no gradient."""
+    params = parameters(ROWS, "sh0")
+    optimizer = PhaseScheduler(TOTAL, parts=[Averaging()]).upgrade(adam_of(params))
+    steps({"all": optimizer}, params, 293)
+    row_edits.apply(row_edits.added(torch.tensor([0, 3])), params, [optimizer], ["sh0"], False)
+    for _ in range(between):
+        optimizer.step()
+    steps({"all": optimizer}, params, 1)
+    state = optimizer.state[params["sh0"]]
+    assert state["averaging.began"].tolist() == [1.0] * ROWS + [4.0 + between] * 2
+    assert torch.equal(state["averaging.mean"][ROWS:], params["sh0"][ROWS:])
+
+
+def test_rows_moved_in_place_end_where_they_were_put() -> None:
+    params = {"means": Parameter(torch.zeros(4, 3))}
+    goal = torch.zeros(4, 3)
+    optimizer = PhaseScheduler(TOTAL, parts=[Averaging()]).upgrade(adam_of(params))
+    for iteration in range(TOTAL):
+        if iteration == 295:
+            params["means"].data[0] = goal[0] = torch.full((3,), 10.0)
+            optimizer.reset_rows(params["means"], torch.tensor([0]))
+        params["means"].grad = params["means"].detach() - goal
+        optimizer.step()
+    assert torch.allclose(params["means"], goal, atol=0.05)
+
+
+@pytest.mark.parametrize("when", [291, 294, 297])
+def test_iterates_that_are_not_finite_stay_out_of_the_mean(when: int) -> None:
+    """A position becomes NaN in the last thirtieth, and the trainer repairs it."""
+    params = {"means": Parameter(torch.full((4, 3), 5.0))}
+    optimizer = PhaseScheduler(TOTAL, parts=[Averaging()]).upgrade(adam_of(params))
+    optimizer.param_groups[0]["lr"] = 1e-4
+    for iteration in range(TOTAL):
+        if iteration == when:
+            params["means"].data[0, 1] = torch.nan
+        if iteration == when + 2:
+            params["means"].data[0, 1] = 5.0
+        params["means"].grad = torch.ones(4, 3)
+        optimizer.step()
+    assert bool(((params["means"] - 5.0).abs() < 0.05).all())
+
+
+def test_it_costs_nothing_before_the_last_thirtieth() -> None:
+    params = parameters(ROWS, "sh0")
+    optimizers = PhaseScheduler(TOTAL, parts=[Averaging()]).upgrade(adams_of(params))
+    steps(optimizers, params, 290)
+    assert set(optimizers["sh0"].state[params["sh0"]]) == {"step", "exp_avg", "exp_avg_sq"}
+    steps(optimizers, params, 1)
+    assert optimizers["sh0"].state[params["sh0"]]["averaging.began"].shape == (ROWS,)
+
+
+def test_finish_takes_the_mean_early_and_averages_no_more() -> None:
+    params = parameters(ROWS, "sh0")
+    phases = PhaseScheduler(TOTAL, parts=[Averaging()])
+    optimizers = phases.upgrade(adams_of(params))
+    steps(optimizers, params, 294)
+    mean = optimizers["sh0"].state[params["sh0"]]["averaging.mean"].clone()
+    assert not torch.equal(params["sh0"], mean)
+    phases.finish()
+    assert torch.equal(params["sh0"], mean)
+    steps(optimizers, params, 6)
+    assert not torch.equal(params["sh0"], optimizers["sh0"].state[params["sh0"]]["averaging.mean"])

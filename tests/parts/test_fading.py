@@ -1,0 +1,117 @@
+"""Fading: which points an event fades, when there are events, and how long the steps become."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from gaussians import adams_of, parameters, steps
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.nn import Parameter
+from torch.optim import Adam
+
+from opt3dgs_optim import Fading, PhaseScheduler
+
+CPU = torch.device("cpu")
+
+
+@given(
+    event=st.integers(0, 2**20), seed=st.integers(0, 2**31), share=st.sampled_from([0.05, 0.2, 0.7])
+)
+def test_a_share_of_the_points_is_chosen(event: int, seed: int, share: float) -> None:
+    """By a hash: within five deviations of the share; other events and seeds choose others."""
+    count = 20_000
+    part = Fading(share=share, seed=seed)
+    chosen = part.chosen(event, count, CPU)
+    assert abs(int(chosen.sum()) - share * count) < 5 * (count * share * (1 - share)) ** 0.5
+    for other in (part.chosen(event + 1, count, CPU), Fading(share, seed=seed + 1).chosen(event, count, CPU)):
+        both = float((chosen & other).sum()) / count
+        assert abs(both - share**2) < 0.03
+
+
+@given(event=st.integers(0, 10_000), few=st.integers(0, 500), more=st.integers(0, 500))
+def test_a_points_fate_does_not_depend_on_how_many_there_are(event: int, few: int, more: int) -> None:
+    part = Fading()
+    assert torch.equal(part.chosen(event, few, CPU), part.chosen(event, few + more, CPU)[:few])
+
+
+@given(
+    total=st.integers(1, 50_000),
+    events=st.integers(1, 5_000),
+    start=st.floats(0, 0.9),
+    length=st.floats(0.01, 1.0),
+)
+def test_events_are_in_their_stretch_and_four_iterations_apart(
+    total: int, events: int, start: float, length: float
+) -> None:
+    stop = min(start + length, 1.0)
+    part = Fading(events=events, start=start, stop=stop)
+    assert part.events_before(int(start * total), total) == 0
+    whole = part.events_before(total, total)
+    assert whole <= min(events, (stop - start) * total / 4 + 1)
+    assert whole == part.events_before(int(stop * total) + 1, total)
+    middle = int((start + stop) / 2 * total)
+    counts = [part.events_before(i, total) for i in range(middle, middle + 40)]
+    assert all(b - a in (0, 1) for a, b in zip(counts, counts[1:], strict=False))
+    assert all(b - a <= 1 for a, b in zip(counts, counts[3:], strict=False))
+
+
+@given(count=st.integers(1, 2_000_000))
+def test_of_more_than_ten_thousand_points_some_events_happen(count: int) -> None:
+    happened = sum(Fading().happens(event, count) for event in range(300))
+    assert happened == int(300 * min(1.0, 10_000 / count) ** (2 / 3))
+
+
+def test_a_faded_step_is_as_long_as_before_then_up_to_five_times() -> None:
+    """exp_avg^2 = exp_avg_sq of the factors; a constant gradient shows it."""
+    param = Parameter(torch.zeros(1000, 1))
+    part = Fading(events=1, start=0.5, stop=0.505, names=("scales",))
+    optimizer = PhaseScheduler(1000, parts=[part]).upgrade(
+        Adam([{"params": [param], "name": "scales"}], lr=1.0, eps=0.0)
+    )
+    lengths = []
+    for _ in range(600):
+        before = param.detach().clone()
+        param.grad = torch.ones(1000, 1)
+        optimizer.step()
+        lengths.append((before - param.detach()).abs())
+    at = next(i for i, each in enumerate(lengths) if each.amax() > each.amin() * 1.01)
+    faded = (lengths[at + 5] > 2 * lengths[at - 1]).flatten()
+    assert torch.equal(faded, part.chosen(0, 1000, CPU))
+    assert max(float(each.amax()) for each in lengths) <= 5.0
+    assert max(float(each.amax()) for each in lengths) > 3.0
+
+
+def test_all_parameters_fade_the_same_points() -> None:
+    params = parameters(500)
+    part = Fading()
+    optimizers = PhaseScheduler(100, parts=[part]).upgrade(adams_of(params))
+    steps(optimizers, params, next(i for i in range(100) if part.events_before(i + 1, 100)))
+    before = {n: optimizers[n].state[p]["exp_avg_sq"].clone() for n, p in params.items()}
+    for param in params.values():
+        param.grad = torch.zeros_like(param)
+    rows = set()
+    for optimizer in optimizers.values():
+        optimizer.step()
+    for name, param in params.items():
+        now = optimizers[name].state[param]["exp_avg_sq"]
+        rows.add(tuple((now < 0.5 * before[name]).reshape(500, -1).all(1).tolist()))
+    assert rows == {tuple(part.chosen(0, 500, CPU).tolist())}
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"share": 0.0}, r"share=0.0.*\(0.0, 1.0\]"),
+        ({"exp_avg": 1.5}, "exp_avg=1.5"),
+        ({"exp_avg_sq": -1}, "exp_avg_sq=-1"),
+        ({"events": 0}, "events=0.*at least 1"),
+        ({"start": 0.6}, "stop=0.5"),
+        ({"seed": -1}, "seed=-1"),
+        ({"names": ("mean",)}, "names=.'mean',.*means, scales"),
+        ({"names": ()}, "names=.*a tuple of Gaussian parameters' names"),
+    ],
+)
+def test_options_that_are_refused(options: dict, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        Fading(**options)

@@ -1,0 +1,176 @@
+"""OwnFrame: positions are stepped along each Gaussian's axes, in its standard deviations."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from gaussians import adam_of, adams_of, make_gaussians, parameters, steps
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.nn import Parameter
+
+from opt3dgs_optim import OwnFrame, PhaseScheduler
+from opt3dgs_optim.step import Frame, axes_of, into_frame, out_of_frame
+
+ROWS, TOTAL = 12, 300
+NAMES = ("means", "scales", "quats")
+SEEDS = st.integers(0, 2**20)
+
+
+def draw(seed: int, *shape: int) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def dense_axes(quats: Tensor, scales: Tensor, least: float) -> Tensor:
+    """B = R diag(s) [N, 3, 3], by the textbook's matrix of a quaternion, in float64."""
+    w, x, y, z = torch.nn.functional.normalize(quats.double(), dim=1).unbind(1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    rotation = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    s = scales.double().exp()
+    return rotation * torch.maximum(s, least * s.amax(1, keepdim=True))[:, None, :]
+
+
+@given(seed=SEEDS, least=st.sampled_from([0.0, 0.1, 1.0]), size=st.sampled_from([1e-3, 1.0, 1e3]))
+def test_the_frame_is_that_of_the_covariance(seed: int, least: float, size: float) -> None:
+    quats, scales, v = draw(seed, ROWS, 4) * size, draw(seed + 1, ROWS, 3), draw(seed + 2, ROWS, 3)
+    axes, dense = axes_of(Frame(1.0, least, quats, scales)), dense_axes(quats, scales, least)
+    assert torch.allclose(into_frame(axes, v).double(), torch.einsum("nij,ni->nj", dense, v.double()), rtol=1e-4, atol=1e-5)  # fmt: skip
+    assert torch.allclose(out_of_frame(axes, v).double(), torch.einsum("nij,nj->ni", dense, v.double()), rtol=1e-4, atol=1e-5)  # fmt: skip
+
+
+def stepped(params: dict[str, Any], grad: Tensor, part: OwnFrame, count: int = 1) -> Tensor:
+    """The displacement of the positions by so many equal gradients."""
+    before = params["means"].detach().clone()
+    optimizers = PhaseScheduler(TOTAL, parts=[part]).upgrade(adams_of(params))
+    for _ in range(count):
+        params["means"].grad = grad.clone()
+        optimizers["means"].step()
+    return params["means"].detach() - before
+
+
+@given(seed=SEEDS, rate=st.sampled_from([0.01, 0.1, 1.0]))
+def test_a_full_step_is_rate_standard_deviations_along_each_axis(seed: int, rate: float) -> None:
+    params = parameters(ROWS, *NAMES, seed=seed)
+    moved = stepped(params, draw(seed, ROWS, 3), OwnFrame(rate=rate, min_aspect=0.0))
+    dense = dense_axes(params["quats"].detach(), params["scales"].detach(), 0.0)
+    along = torch.linalg.solve(dense, moved.double())
+    assert torch.allclose(along.abs(), torch.full_like(along, rate), rtol=0.02)
+
+
+@settings(max_examples=20)
+@given(seed=SEEDS, unit=st.sampled_from([0.01, 100.0]), turn=SEEDS)
+def test_it_knows_no_unit_and_no_axes_of_the_world(seed: int, unit: float, turn: int) -> None:
+    """A scene in other units, turned: every step is turned and scaled with it."""
+    params = parameters(ROWS, *NAMES, seed=seed)
+    q = torch.nn.functional.normalize(draw(turn, 4), dim=0)
+    rotation = dense_axes(q[None], torch.zeros(1, 3), 0.0)[0].float()
+    other = {name: Parameter(each.detach().clone()) for name, each in params.items()}
+    other["scales"].data += math.log(unit)
+    other["quats"].data = product(q, params["quats"].detach())
+    grad = draw(seed + 1, ROWS, 3)
+    moved = stepped(params, grad, OwnFrame(), 5)
+    theirs = stepped(other, grad @ rotation.T / unit, OwnFrame(), 5)
+    assert torch.allclose(theirs, unit * moved @ rotation.T, rtol=1e-2, atol=1e-4 * unit)
+
+
+def product(q: Tensor, others: Tensor) -> Tensor:
+    """Quaternions of a rotation after others."""
+    w, u = q[0], q[1:]
+    real = w * others[:, 0] - others[:, 1:] @ u
+    imaginary = w * others[:, 1:] + others[:, :1] * u + torch.linalg.cross(u.expand(len(others), 3), others[:, 1:])  # fmt: skip
+    return torch.cat([real[:, None], imaginary], 1)
+
+
+def test_the_rate_decays_and_a_learning_rate_of_zero_holds() -> None:
+    part = OwnFrame(rate=0.2, final=0.01)
+    assert [part.at(t) for t in (0.0, 0.5, 1.0, 2.0)] == pytest.approx([0.2, 0.02, 0.002, 0.002])
+    params = parameters(ROWS, *NAMES)
+    optimizers = PhaseScheduler(TOTAL, parts=[part]).upgrade(adams_of(params))
+    start = params["means"].detach().clone()
+    optimizers["means"].param_groups[0]["lr"] = 0.0
+    steps(optimizers, params, 5)
+    assert torch.equal(params["means"], start)
+    ends = []
+    for rate in (1e-6, 10.0):  # another learning rate is no other step
+        params = parameters(ROWS, *NAMES)
+        optimizers = PhaseScheduler(TOTAL, parts=[part]).upgrade(adams_of(params))
+        optimizers["means"].param_groups[0]["lr"] = rate
+        steps({"means": optimizers["means"]}, params, 5)
+        ends.append(params["means"].detach().clone())
+    assert torch.equal(*ends)
+
+
+def test_thin_axes_count_as_a_tenth_of_the_longest() -> None:
+    """A disk: steps across its own surface are a tenth of those along it, not a millionth."""
+    params = parameters(ROWS, *NAMES)
+    params["quats"].data[:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    params["scales"].data[:] = torch.tensor([0.0, 0.0, -14.0])
+    moved = stepped(params, torch.ones(ROWS, 3), OwnFrame()).abs()
+    assert torch.allclose(moved, torch.tensor([0.1, 0.1, 0.01]).expand(ROWS, 3), rtol=1e-3)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 200.0])
+@pytest.mark.parametrize("name", ["scales", "quats"])
+def test_a_gaussian_whose_axes_are_not_finite_is_not_moved(name: str, value: float) -> None:
+    """exp(200) is no float32; a quaternion of 200 is one as good as another."""
+    params = parameters(ROWS, *NAMES)
+    params[name].data[3] = value
+    moved = stepped(params, torch.ones(ROWS, 3), OwnFrame(), 3)
+    assert bool(torch.isfinite(moved).all())
+    still = not (name == "quats" and value == 200.0)
+    assert bool((moved[3] == 0).all()) == still
+    assert bool((moved[4:] != 0).all())
+
+
+def test_moments_of_another_frame_begin_anew(caplog: pytest.LogCaptureFixture) -> None:
+    """A training that begins with it in the middle, from a checkpoint of the stock trainer."""
+    params = parameters(ROWS, *NAMES)
+    stock = adam_of(params)
+    steps({"all": stock}, params, 20)
+    with caplog.at_level("INFO", "opt3dgs_optim"):
+        optimizer = PhaseScheduler(TOTAL, parts=[OwnFrame()]).upgrade(stock)
+        steps({"all": optimizer}, params, 2)
+    assert caplog.text.count("moments of the positions begin anew, in the own frame's units") == 1
+    assert optimizer.state[params["means"]]["step"] == 2
+    assert optimizer.state[params["scales"]]["step"] == 22
+
+
+@pytest.mark.parametrize("missing", ["scales", "quats"])
+def test_without_scales_or_quats_adam_steps_and_it_is_said_once(missing: str) -> None:
+    names = [name for name in NAMES if name != missing]
+    params, plain = parameters(ROWS, *names), parameters(ROWS, *names)
+    optimizers = PhaseScheduler(TOTAL, parts=[OwnFrame()]).upgrade(adams_of(params))
+    with pytest.warns(UserWarning, match=f"OwnFrame: .*which hold .*'{missing}': None.*; Adam steps") as said:
+        steps(optimizers, params, 5)
+    steps(adams_of(plain), plain, 5)
+    assert len(said) == 1
+    assert torch.equal(params["means"], plain["means"])
+
+
+def test_two_sets_of_gaussians_in_one_adam() -> None:
+    """drivestudio's names: each set has frames of its own."""
+    sets = {f"{which}#{n}": p for which in "ab" for n, p in parameters(ROWS, *NAMES).items()}
+    sets["b#scales"].data += 1.0
+    groups = [{"params": [param], "name": name} for name, param in sets.items()]
+    optimizer = PhaseScheduler(TOTAL, parts=[OwnFrame(min_aspect=0.0)]).upgrade(torch.optim.Adam(groups))
+    start = make_gaussians(ROWS)["means"]
+    for name, param in sets.items():
+        param.grad = torch.ones_like(param) if name.endswith("means") else None
+    optimizer.step()
+    ratio = (sets["b#means"] - start) / (sets["a#means"] - start)
+    assert torch.allclose(ratio, torch.full_like(ratio, math.e), rtol=1e-2)
+
+
+@pytest.mark.parametrize("option", [{"rate": 0.0}, {"final": -1.0}, {"min_aspect": 1.5}, {"rate": math.nan}])
+def test_options_that_are_refused(option: dict) -> None:
+    (name, value), *_ = option.items()
+    with pytest.raises(ValueError, match=f"OwnFrame: {name}={value}, but a finite number in"):
+        OwnFrame(**option)

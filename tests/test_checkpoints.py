@@ -1,0 +1,254 @@
+"""Checkpoints: what is damaged is refused, and nothing has changed; the rest goes on from there."""
+
+from __future__ import annotations
+
+import copy
+import io
+import math
+from typing import Any
+
+import pytest
+import torch
+from gaussians import adam_of, adams_of, parameters, same_tensors, steps
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from opt3dgs_optim import Averaging, EnergyHistogram, Fading, OutOfView, PhaseScheduler
+
+TOTAL, ROWS = 60, 4
+NAMES = ("means", "scales")
+
+
+def trained(count: int = 59) -> tuple[PhaseScheduler, Any, dict[str, Any]]:
+    """One Adam of two groups, in the mean, with a part that learns and one with notes."""
+    params = parameters(ROWS, *NAMES)
+    parts = [Fading(), OutOfView(), Averaging(), EnergyHistogram(warmup=5)]
+    phases = PhaseScheduler(TOTAL, parts=parts)
+    optimizer = phases.upgrade(adam_of(params))
+    for iteration in range(count):
+        phases.observe(0.1 + 0.01 * (iteration % 7))
+        steps({"all": optimizer}, params, 1, seed=iteration)
+    return phases, optimizer, params
+
+
+def through_a_file(saved: Any) -> Any:
+    buffer = io.BytesIO()
+    torch.save(saved, buffer)
+    buffer.seek(0)
+    return torch.load(buffer, weights_only=True)
+
+
+SAVED = through_a_file(trained()[1].state_dict())
+PATHS: list[tuple[Any, ...]] = []  # of everything in it
+
+
+def list_paths(value: Any, path: tuple[Any, ...] = ()) -> None:
+    PATHS.append(path)
+    items = value.items() if isinstance(value, dict) else ()
+    if isinstance(value, (list, tuple)):
+        items = list(enumerate(value))[:3]  # of the histogram's weights a few are enough
+    for key, each in items:
+        list_paths(each, (*path, key))
+
+
+list_paths(SAVED)
+IGNORED = {"name", "gaussian", "foreach", "fused", "decoupled_weight_decay"}  # torch's: any value
+WRONG = ("gone", "renamed", None, "text", [], {}, -1, math.nan, True, 10**9, "shape", "complex")
+
+
+def at(value: Any, path: tuple[Any, ...]) -> Any:
+    for key in path:
+        value = value[key]
+    return value
+
+
+def damaged(path: tuple[Any, ...], wrong: Any) -> Any:
+    """The checkpoint with one thing in it spoiled; None where that would be no damage."""
+    if not path:
+        return None if wrong in ("gone", "renamed", "shape", "complex") else wrong
+    result = copy.deepcopy(SAVED)
+    holder, key = at(result, path[:-1]), path[-1]
+    if isinstance(holder, tuple):
+        return None
+    value = holder[key]
+    if wrong == "gone":
+        del holder[key]
+    elif wrong == "renamed":
+        if not isinstance(holder, dict):
+            return None
+        holder["renamed"] = holder.pop(key)
+    elif wrong in ("shape", "complex"):
+        if not isinstance(value, Tensor):
+            return None
+        holder[key] = value[None, None] if wrong == "shape" else value.to(torch.complex64)
+        if wrong == "shape" and value.numel() == 1:
+            return None  # a count of steps
+    else:
+        holder[key] = wrong
+    return result
+
+
+def snapshot(phases: PhaseScheduler, optimizer: Any, params: dict[str, Any]) -> Any:
+    numbers = (phases.iteration, repr(phases), repr(phases.part(EnergyHistogram)))
+    return numbers, copy.deepcopy(optimizer.state_dict()), {k: v.clone() for k, v in params.items()}
+
+
+def equal(a: Any, b: Any) -> bool:
+    if isinstance(a, Tensor):
+        return isinstance(b, Tensor) and torch.equal(a, b)
+    if isinstance(a, dict):
+        return set(a) == set(b) and all(equal(a[key], b[key]) for key in a)
+    if isinstance(a, (list, tuple)):
+        return len(a) == len(b) and all(map(equal, a, b))
+    return a == b or (a != a and b != b)  # NaN is NaN
+
+
+@settings(max_examples=150, deadline=None)
+@given(path=st.sampled_from(PATHS), wrong=st.sampled_from(WRONG), upgraded=st.booleans())
+def test_what_is_damaged_is_refused_and_nothing_has_changed(
+    path: tuple[Any, ...], wrong: Any, upgraded: bool
+) -> None:
+    """Or it is no damage, and the training steps on. Both in the upgraded Adam and in INRIA's order."""
+    state = damaged(path, wrong)
+    if state is None or (path and path[-1] in IGNORED):
+        return
+    phases, optimizer, params = trained(3)
+    if not upgraded:
+        optimizer = adam_of(params)
+    before = snapshot(phases, optimizer, params)
+    try:
+        if upgraded:
+            optimizer.load_state_dict(through_a_file(state))
+        else:
+            if "opt3dgs" not in path:
+                return  # stock loads what it loads
+            optimizer.load_state_dict(through_a_file(state))
+            before = snapshot(phases, optimizer, params)
+            phases.upgrade(optimizer)
+    except ValueError as error:
+        assert "load_state_dict: " in str(error) or "upgrade: " in str(error), error
+        assert len(str(error)) < 1_000_000
+        assert equal(before, snapshot(phases, optimizer, params))
+        assert isinstance(optimizer, type(adam_of(params)))
+    else:
+        phases.observe(0.1)
+        steps({"all": optimizer}, params, 1)
+        assert all(bool(torch.isfinite(param).all()) for param in params.values())
+
+
+@pytest.mark.parametrize("wrong", ["gone", None, "text", [], {}, -1, math.nan])
+@pytest.mark.parametrize(
+    "path",
+    [
+        ("state",),
+        ("state", 0),
+        ("state", 0, "exp_avg"),
+        ("state", 1, "step"),
+        ("param_groups",),
+        ("param_groups", 0),
+        ("param_groups", 0, "params"),
+        ("param_groups", 0, "lr"),
+        ("param_groups", 0, "betas"),
+        ("param_groups", 0, "opt3dgs", "format"),
+        ("param_groups", 0, "opt3dgs", "iteration"),
+        ("param_groups", 0, "opt3dgs", "notes"),
+        ("param_groups", 0, "opt3dgs", "parts"),
+        ("param_groups", 0, "opt3dgs", "last"),
+    ],
+    ids=lambda path: path[-1] if isinstance(path, tuple) else None,
+)
+def test_the_usual_damage_is_refused(path: tuple[Any, ...], wrong: Any) -> None:
+    fine = [  # an empty state is Adam's before its first step
+        (("state",), {}), (("state", 0), {}), (("state", 0), "gone"), (("param_groups", 0, "opt3dgs", "last"), []),
+        (("param_groups", 0, "opt3dgs", "notes"), {}), (("param_groups", 0, "opt3dgs", "parts"), {}),
+    ]  # fmt: skip
+    phases, optimizer, params = trained(3)
+    before = snapshot(phases, optimizer, params)
+    if (path, wrong) in fine:
+        optimizer.load_state_dict(damaged(path, wrong))
+        return
+    with pytest.raises(ValueError, match=r"Adam.load_state_dict: "):
+        optimizer.load_state_dict(damaged(path, wrong))
+    assert equal(before, snapshot(phases, optimizer, params))
+
+
+@pytest.mark.parametrize("option", ["amsgrad", "maximize", "differentiable", "capturable"])
+def test_options_that_are_refused_do_not_come_with_a_checkpoint(option: str) -> None:
+    _, optimizer, params = trained(3)
+    stock = adam_of(params)
+    stock.param_groups[1][option] = True
+    with pytest.raises(ValueError, match=f"group 1 has {option}=True"):
+        optimizer.load_state_dict(stock.state_dict())
+
+
+def test_the_state_is_plain_and_of_the_moment() -> None:
+    """Tensors with rows first, float32; the rest survives weights_only=True. None is left behind."""
+    _, optimizer, _ = trained()
+    saved = optimizer.state_dict()
+    for state in saved["state"].values():
+        assert set(state) == {"step", "exp_avg", "exp_avg_sq", "averaging.mean", "averaging.began"}
+        assert all(v.dtype == torch.float32 for v in state.values())
+        assert all(len(v) == ROWS for k, v in state.items() if k != "step")
+    assert saved["param_groups"][0]["opt3dgs"]["iteration"] == 59
+    assert "opt3dgs" not in optimizer.param_groups[0]
+    assert equal(saved, through_a_file(saved))
+
+
+@pytest.mark.parametrize("upgraded_first", [True, False])
+@pytest.mark.parametrize("single", [True, False])
+def test_what_parts_have_learnt_is_restored(upgraded_first: bool, single: bool) -> None:
+    """gsplat's and nerfstudio's order, and INRIA's: a new Adam, load_state_dict, upgrade."""
+
+    def make(params: Any) -> Any:
+        return adam_of(params) if single else adams_of(params)
+
+    def run(phases: PhaseScheduler, given: Any, params: Any, first: int, last: int) -> None:
+        for iteration in range(first, last):
+            phases.observe(0.1 + 0.01 * (iteration % 7))
+            steps({"all": given} if single else given, params, 1, seed=iteration)
+
+    def start() -> PhaseScheduler:
+        return PhaseScheduler(90, 80, [OutOfView(), EnergyHistogram(warmup=5), Averaging()])
+
+    params, phases = parameters(ROWS, *NAMES), start()
+    whole = phases.upgrade(make(params))
+    run(phases, whole, params, 0, 45)
+    listed = [whole] if single else list(whole.values())
+    saved = through_a_file([each.state_dict() for each in listed])
+    rows = {name: param.detach().clone() for name, param in params.items()}
+    run(phases, whole, params, 45, 90)
+    again = {name: torch.nn.Parameter(each) for name, each in rows.items()}
+    phases, resumed = start(), make(again)
+    if upgraded_first:
+        phases.upgrade(resumed)
+    for optimizer, state in zip([resumed] if single else resumed.values(), saved, strict=True):
+        optimizer.load_state_dict(state)
+    if not upgraded_first:
+        phases.upgrade(resumed)
+    run(phases, resumed, again, 45, 90)
+    assert same_tensors(params, again)
+
+
+def test_a_longer_run_knows_nothing_of_the_first_ones_end() -> None:
+    """Trained to 60, and on to 180: the mean is of the last thirtieth of the second run."""
+    _, optimizer, params = trained(60)
+    phases = PhaseScheduler(180, parts=[Averaging()])
+    fresh = phases.upgrade(adam_of(params))
+    fresh.load_state_dict(optimizer.state_dict())
+    assert phases.iteration == 59
+    assert not any("averaging.mean" in state for state in fresh.state.values())
+    last: list[Tensor] = []
+    for iteration in range(60, 180):
+        steps({"all": fresh}, params, 1, seed=iteration)
+        if iteration >= 174:
+            last.append(params["scales"].detach().clone())
+    assert fresh.state[params["scales"]]["averaging.began"].tolist() == [1.0] * ROWS
+
+
+def test_a_stock_adam_loads_ours_and_goes_on() -> None:
+    _, optimizer, params = trained()
+    stock = adam_of(params)
+    stock.load_state_dict(through_a_file(optimizer.state_dict()))
+    steps({"all": stock}, params, 3)
+    assert all(int(state["step"]) == 62 for state in stock.state.values())

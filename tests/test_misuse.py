@@ -1,0 +1,331 @@
+"""What is outside of the contract is refused, or told once: with the value, and what to do."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from gaussians import adam_of, adams_of, parameters, steps
+from torch.nn import Parameter
+from torch.optim import Adam
+
+from opt3dgs_optim import (
+    DEFAULTS,
+    DEFAULTS_ADC,
+    Averaging,
+    Curvature,
+    EnergyHistogram,
+    Fading,
+    OwnFrame,
+    Part,
+    PhaseScheduler,
+)
+from opt3dgs_optim import phases as module
+
+ROWS = 4
+
+
+def one(value: Any = None, name: str = "means", **options: Any) -> Adam:
+    """A stock Adam of one tensor."""
+    param = Parameter(torch.ones(ROWS, 3) if value is None else value)
+    return Adam([{"params": [param], "name": name}], **{"lr": 0.01, **options})
+
+
+class Foreign(Adam):
+    """An Adam with a step that is not torch's."""
+
+    def step(self, closure: Any = None) -> None: ...
+
+
+def two_tensors() -> Adam:
+    return Adam([{"params": [Parameter(torch.ones(ROWS, 3)) for _ in "ab"], "name": "xyz"}])
+
+
+OPTIMIZERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
+    "another optimizer": (
+        lambda: torch.optim.SGD([Parameter(torch.ones(ROWS, 3))], lr=0.1),
+        TypeError,
+        "SGD has a step of its own; have the trainer make a torch.optim.Adam",
+    ),
+    "a foreign step": (lambda: Foreign(one().param_groups), TypeError, "Foreign has a step of its"),
+    "no optimizer": (lambda: torch.ones(3), TypeError, "Tensor is no optimizer; pass the trainer"),
+    "sparse gradients": (
+        lambda: torch.optim.SparseAdam([Parameter(torch.ones(ROWS, 3))]),
+        TypeError,
+        "SparseAdam has a step of its own",
+    ),
+    "complex": (
+        lambda: one(torch.ones(ROWS, 3, dtype=torch.complex64)),
+        ValueError,
+        "means is torch.complex64.*dense float32 is needed",
+    ),
+    "half precision": (
+        lambda: one(torch.ones(ROWS, 3, dtype=torch.bfloat16)),
+        ValueError,
+        "means is torch.bfloat16.*dense float32 is needed",
+    ),
+    "several devices": (
+        lambda: Adam(
+            [
+                {"params": [Parameter(torch.ones(ROWS, 3))], "name": "xyz"},
+                {"params": [Parameter(torch.ones(ROWS, 3, device="meta"))], "name": "scaling"},
+            ]
+        ),
+        ValueError,
+        "parameters lie on .'cpu', 'meta'.; one device is needed",
+    ),
+    "a tensor as lr": (lambda: one(lr=torch.tensor(0.1)), ValueError, "a tensor as lr; give a flo"),
+    "two tensors in a group": (two_tensors, ValueError, "xyz holds 2 tensors; give each Gaussian"),
+    "positions of another shape": (
+        lambda: one(torch.ones(ROWS, 4, 3)),
+        ValueError,
+        r"means is \(4, 4, 3\); positions are \[N, 3\]",
+    ),
+    "no Gaussians": (
+        lambda: one(name="mlp"),
+        ValueError,
+        "no Gaussians among the groups .'mlp'.; name the groups, or the keys of a dict",
+    ),
+    "names twice": (
+        lambda: [one(name="xyz"), one(name="means")],
+        ValueError,
+        "'means' is held twice; for two sets of Gaussians name the groups",
+    ),
+    **{
+        option: (
+            lambda option=option: one(**{option: True}),
+            ValueError,
+            f"means has {option}=True; make the Adam without it",
+        )
+        for option in ("amsgrad", "maximize", "differentiable", "capturable")
+    },
+}
+
+
+@pytest.mark.parametrize("what", OPTIMIZERS)
+def test_optimizers_that_are_refused(what: str) -> None:
+    make, kind, said = OPTIMIZERS[what]
+    given = make()
+    classes = [type(each) for each in (given if isinstance(given, list) else [given])]
+    with pytest.raises(kind, match=said):
+        PhaseScheduler(100).upgrade(given)
+    assert classes == [type(each) for each in (given if isinstance(given, list) else [given])]
+
+
+def test_a_group_that_comes_later_is_refused_too() -> None:
+    optimizer = PhaseScheduler(100).upgrade(one())
+    with pytest.raises(ValueError, match="scales has amsgrad=True; make the Adam without it"):
+        optimizer.add_param_group(
+            {"params": [Parameter(torch.ones(ROWS, 3))], "name": "scales", "amsgrad": True}
+        )
+    assert len(optimizer.param_groups) == 1
+    optimizer.add_param_group({"params": [Parameter(torch.ones(ROWS, 3))], "name": "scales"})
+    assert optimizer.param_groups[1]["gaussian"] == "scales"
+
+
+SCHEDULERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
+    "no length": (lambda: PhaseScheduler(0), ValueError, "total_steps=0, but an integer at least"),
+    "a float": (lambda: PhaseScheduler(3e4), ValueError, "total_steps=30000.0, but an integer"),  # pyright: ignore
+    "a switch beyond": (lambda: PhaseScheduler(100, 101), ValueError, "switch=101.*0..100"),
+    "a share beyond": (lambda: PhaseScheduler(100, 1.5), ValueError, "switch=1.5.*is needed"),
+    "parts second": (
+        lambda: PhaseScheduler(100, [Averaging()]),  # pyright: ignore
+        TypeError,
+        "parts in the second place, where `switch` is; write parts=",
+    ),
+    "a class": (
+        lambda: PhaseScheduler(100, parts=[Averaging]),  # pyright: ignore
+        TypeError,
+        r"write parts=\[Averaging\(\)\]",
+    ),
+    "one part": (
+        lambda: PhaseScheduler(100, parts=Averaging()),  # pyright: ignore
+        TypeError,
+        r"a list of parts is needed, parts=\[Averaging\(\)\]",
+    ),
+    "a part twice": (
+        lambda: PhaseScheduler(100, parts=[Averaging(), Averaging()]),
+        ValueError,
+        "Averaging is there twice in parts; give one part of each class",
+    ),
+    "own frame and curvature": (
+        lambda: PhaseScheduler(100, parts=[OwnFrame(), Curvature()]),
+        ValueError,
+        "leave one of the two out",
+    ),
+    "more than a preset": (
+        lambda: DEFAULTS + [Fading()],
+        TypeError,
+        r"write parts=\[\*DEFAULTS, YourPart\(\)\]",
+    ),
+    "no log": (lambda: PhaseScheduler(9, log="run.jsonl"), TypeError, "a RunLog or None is needed"),  # pyright: ignore
+}
+
+
+@pytest.mark.parametrize("what", SCHEDULERS)
+def test_schedulers_that_are_refused(what: str) -> None:
+    make, kind, said = SCHEDULERS[what]
+    with pytest.raises(kind, match=said):
+        make()
+
+
+def test_a_part_that_learns_serves_one_training() -> None:
+    parts: list[Part] = [EnergyHistogram()]
+    PhaseScheduler(100, parts=parts)
+    with pytest.raises(ValueError, match="EnergyHistogram serves another training already"):
+        PhaseScheduler(100, parts=parts)
+    PhaseScheduler(100, parts=DEFAULTS)
+    PhaseScheduler(100, parts=DEFAULTS)
+
+
+@pytest.mark.parametrize(
+    ("iteration", "said"),
+    [
+        (6, "iteration=6, but the clock stands at 7 of total_steps=100 and goes forward, to 200"),
+        (201, "iteration=201, but the clock stands at 7 of total_steps=100"),
+        (-1, "iteration=-1, but an integer at least 0"),
+        (8.5, "iteration=8.5, but an integer"),
+    ],
+)
+def test_the_clock_goes_forward_within_the_run(iteration: Any, said: str) -> None:
+    phases = PhaseScheduler(100)
+    phases.observe(iteration=7)
+    with pytest.raises(ValueError, match=said):
+        phases.observe(iteration=iteration)
+    assert phases.iteration == 7
+
+
+@pytest.mark.parametrize("loss", [torch.ones(2), "0.1", [1.0, 2.0], 1j, torch.ones((), dtype=torch.cfloat)])
+def test_a_loss_is_one_real_number(loss: Any) -> None:
+    with pytest.raises(ValueError, match="observe: loss=.*one real number is needed"):
+        PhaseScheduler(100).observe(loss)
+
+
+def test_images_of_two_shapes() -> None:
+    with pytest.raises(ValueError, match=r"render has shape \(2, 3\) and target \(3, 2\)"):
+        PhaseScheduler(100).pixel_loss(torch.ones(2, 3), torch.ones(3, 2))
+
+
+def test_a_part_that_gets_no_loss_says_so_once() -> None:
+    optimizer = PhaseScheduler(100, parts=[EnergyHistogram()]).upgrade(one())
+    params = {"means": optimizer.param_groups[0]["params"][0]}
+    with pytest.warns(UserWarning, match=r"no energy has come; call phases.observe\(loss\)") as said:
+        steps({"means": optimizer}, params, 40)
+    assert len(said) == 1
+
+
+@pytest.mark.parametrize("grouped", [False, True])
+def test_several_ranks_without_a_process_group(
+    monkeypatch: pytest.MonkeyPatch, grouped: bool, recwarn: pytest.WarningsRecorder
+) -> None:
+    monkeypatch.setattr(module, "_num_ranks", lambda: 2)
+    params = parameters(ROWS, "means")
+    phases = PhaseScheduler(100, parts=[Averaging()], process_group="all" if grouped else None)
+    steps(phases.upgrade(adams_of(params)), params, 3)
+    found = [str(each.message) for each in recwarn]
+    told = "2 ranks train, but process_group=None.*give process_group=torch.distributed"
+    assert len(found) == (0 if grouped else 1)
+    assert grouped or __import__("re").search(told, found[0])
+
+
+@pytest.mark.parametrize("chosen", [None, DEFAULTS_ADC])
+def test_rows_removed_under_the_default_parts(
+    chosen: Any, recwarn: pytest.WarningsRecorder
+) -> None:
+    """Once; a user who has chosen parts knows what density control there is."""
+    params: dict[str, Any] = parameters(9)
+    optimizers = PhaseScheduler(100, parts=chosen).upgrade(adams_of(params))
+    for rows in (9, 8, 7):
+        for name, optimizer in optimizers.items():
+            old = params[name]
+            params[name] = new = Parameter(old.detach()[:rows])
+            optimizer.param_groups[0]["params"] = [new]
+            state = optimizer.state.pop(old, None)
+            if state is not None:
+                optimizer.state[new] = {
+                    k: v if k == "step" else v[:rows] for k, v in state.items()
+                }
+        steps(optimizers, params, 1)
+    found = [str(each.message) for each in recwarn]
+    assert len(found) == (chosen is None)
+    assert chosen is not None or "1 Gaussians were removed at iteration 1" in found[0]
+    assert chosen is not None or "give parts=DEFAULTS_ADC" in found[0]
+
+
+def test_a_run_that_is_longer_than_it_was_said(recwarn: pytest.WarningsRecorder) -> None:
+    params = parameters(ROWS, "means")
+    steps(PhaseScheduler(10, parts=[Fading()]).upgrade(adams_of(params)), params, 14)
+    found = [str(each.message) for each in recwarn]
+    assert len(found) == 1
+    assert "iteration 11 of total_steps=10" in found[0]
+    assert "pass the training's number of iterations" in found[0]
+
+
+def test_moments_of_other_rows_are_named() -> None:
+    """Those of 20 Gaussians, loaded for 30."""
+    few, many = parameters(20, "means"), parameters(30, "means")
+    first = PhaseScheduler(60).upgrade(adams_of(few, weight_decay=0.0))
+    with pytest.warns(UserWarning, match="OwnFrame: positions .20, 3. need scales"):
+        steps(first, few, 3)
+    second = PhaseScheduler(60).upgrade(adams_of(many))
+    second["means"].load_state_dict(first["means"].state_dict())
+    with pytest.raises(ValueError, match="means is .30, 3., but its exp_avg.* 20 rows for 30"):
+        steps(second, many, 1)
+
+
+def test_numbers_that_are_not_finite_are_told_once(recwarn: pytest.WarningsRecorder) -> None:
+    params = parameters(ROWS, "means")
+    optimizers = PhaseScheduler(500, parts=[Averaging()]).upgrade(adams_of(params))
+    for _ in range(250):
+        params["means"].grad = torch.full((ROWS, 3), torch.nan)
+        optimizers["means"].step()
+    found = [str(each.message) for each in recwarn]
+    assert len(found) == 1
+    assert "iteration 100: 1200 numbers of gradients have not been finite" in found[0]
+    assert "look for the first NaN of the loss" in found[0]
+
+
+@pytest.mark.parametrize(
+    ("done", "finished", "said"),
+    [(0, False, False), (5, False, True), (585, False, True), (599, False, False), (585, True, False)],
+)
+def test_a_training_that_ends_early(done: int, finished: bool, said: bool) -> None:
+    params = parameters(ROWS, "means")
+    phases = PhaseScheduler(600, parts=[Averaging()])
+    steps(phases.upgrade(adams_of(params)), params, done)
+    if finished:
+        phases.finish()
+    line = phases.end_line()
+    assert (line is not None) == said
+    assert line is None or (f"iteration {done} of 600" in line and "phases.finish()" in line)
+
+
+def test_finish_before_there_is_a_mean(caplog: pytest.LogCaptureFixture) -> None:
+    params = parameters(ROWS, "means")
+    phases = PhaseScheduler(600)
+    phases.upgrade(adam_of(params))
+    with caplog.at_level(logging.WARNING, "opt3dgs_optim"):
+        phases.finish()
+    assert "averaging begins at 580, and the parameters stay the last iterate" in caplog.text
+
+
+@pytest.mark.processes
+def test_the_early_end_is_said_at_exit() -> None:
+    code = """
+import torch
+from opt3dgs_optim import PhaseScheduler
+p = torch.nn.Parameter(torch.zeros(5, 3))
+phases = PhaseScheduler(600, parts=None)
+adam = phases.upgrade({"opacities": torch.optim.Adam([p])})["opacities"]
+for _ in range(585):
+    p.grad = torch.ones(5, 3)
+    adam.step()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "the training ended at iteration 585 of 600" in done.stderr
+    assert done.stdout == ""
