@@ -269,6 +269,7 @@ def paper_step(
         grad = grad.nan_to_num(0.0, 0.0, 0.0)
         adam_(param, grad, own, rates[name] * multiplier)  # eq. 15 and 17; the trainer adds noise
 
+
 def paper_pixel_loss(error: Tensor, iteration: int, total: int) -> Tensor:
     """The photometric term: L1, and L2 after the switch."""
     exploiting = iteration >= round(total * 29_000 / 30_000)

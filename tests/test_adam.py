@@ -25,12 +25,18 @@ KINDS = [SelectiveAdam, SparseGaussianAdam]
 @pytest.mark.parametrize("parts", [[], IDLE], ids=["no parts", "idle"])
 @pytest.mark.parametrize(
     "options",
-    [{}, {"weight_decay": 0.1}, {"betas": (0.5, 0.9), "eps": 1e-8}, {"fused": True}, {"foreach": True}],
+    [
+        {},
+        {"weight_decay": 0.1},
+        {"betas": (0.5, 0.9), "eps": 1e-8},
+        {"fused": True},
+        {"foreach": True},
+    ],
     ids=str,
 )
 @pytest.mark.parametrize("kind", [Adam, AdamW])
 def test_without_parts_it_is_the_trainers_adam(kind: Any, options: dict, parts: list[Part]) -> None:
-    """Bit for bit, but that torch's fused loop rounds otherwise, and steps on where parts are []."""
+    """Bit for bit; where there are parts, of the loop that torch has without `fused`."""
     same_loop = parts == [] or not options.get("fused")
     ours, theirs = parameters(ROWS), parameters(ROWS)
     upgraded = PhaseScheduler(1000, parts=parts).upgrade(adams_of(ours, kind, **options))
@@ -44,16 +50,18 @@ def test_other_groups_are_stepped_by_plain_adam() -> None:
     ends = []
     for upgrade in (True, False):
         torch.manual_seed(0)
-        params: dict[str, Any] = {
-            **parameters(ROWS), "mlp": Parameter(torch.randn(3, 5)), "scalar": Parameter(torch.ones(()))
-        }  # fmt: skip
+        more = {"mlp": Parameter(torch.randn(3, 5)), "scalar": Parameter(torch.ones(()))}
+        params: dict[str, Any] = {**parameters(ROWS), **more}
         adam = adam_of(params)
         adam.add_param_group({"params": [Parameter(torch.ones(2)) for _ in range(3)], "lr": 0.1})
         if upgrade:
             adam = PhaseScheduler(30, parts=DEFAULTS).upgrade(adam)
         several = dict(enumerate(adam.param_groups[-1]["params"]))
         steps({"all": adam}, params | several, 30)
-        ends.append({str(n): params[n].detach() for n in ("mlp", "scalar")} | {str(n): p for n, p in several.items()})
+        ends.append(
+            {str(n): params[n].detach() for n in ("mlp", "scalar")}
+            | {str(n): p for n, p in several.items()}
+        )
     assert same_tensors(*ends)
 
 
@@ -77,7 +85,8 @@ def test_the_class_stays_the_trainers() -> None:
 @pytest.mark.parametrize("given", ["dict", "list", "tuple", "one"])
 def test_upgrade_returns_what_was_given(given: str) -> None:
     adams = adams_of(parameters(ROWS))
-    made: Any = {"dict": adams, "list": list(adams.values()), "tuple": tuple(adams.values()), "one": adams["means"]}[given]  # fmt: skip
+    lists = {"dict": dict, "list": lambda d: list(d.values()), "tuple": lambda d: tuple(d.values())}
+    made: Any = lists.get(given, lambda d: d["means"])(adams)
     assert PhaseScheduler(TOTAL).upgrade(made) is made
 
 
@@ -270,7 +279,9 @@ def test_a_masked_step_in_the_own_frame_is_theirs_in_standard_deviations() -> No
     params["scales"].data.fill_(2.0)
     params["quats"].data[:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
     start = params["means"].detach().clone()
-    optimizer = PhaseScheduler(60, parts=[OwnFrame(rate=0.1)]).upgrade(adam_of(params, SelectiveAdam))
+    optimizer = PhaseScheduler(60, parts=[OwnFrame(rate=0.1)]).upgrade(
+        adam_of(params, SelectiveAdam)
+    )
     params["means"].grad = torch.ones(ROWS, 3)
     optimizer.step(torch.ones(ROWS, dtype=torch.bool))
     full = 0.1 * 0.1 / 0.001**0.5  # without bias correction, of the first step
@@ -312,7 +323,9 @@ def test_a_strangers_part_has_hooks_and_notes() -> None:
     assert bool((params["scales"].abs() <= 1).all())
     moment = optimizers["scales"].state[params["scales"]]["exp_avg"]
     assert torch.allclose(moment.abs(), torch.tensor(0.1))
-    assert torch.allclose((params["means"] - start).abs(), torch.tensor(RATES["means"] / 2), rtol=1e-3)
+    assert torch.allclose(
+        (params["means"] - start).abs(), torch.tensor(RATES["means"] / 2), rtol=1e-3
+    )
     again = PhaseScheduler(TOTAL, parts=[Counts()])
     fresh = again.upgrade(adams_of(params))
     fresh["means"].load_state_dict(optimizers["means"].state_dict())
@@ -327,5 +340,7 @@ def test_a_gradient_of_another_shape_is_refused(found: Any) -> None:
 
     params = parameters(ROWS, "sh0")
     optimizers = PhaseScheduler(TOTAL, parts=[Wrong()]).upgrade(adams_of(params))
-    with pytest.raises(ValueError, match=r"Wrong.before: returned .*a tensor of \(8, 1, 3\) is needed"):
+    with pytest.raises(
+        ValueError, match=r"Wrong.before: returned .*a tensor of \(8, 1, 3\) is needed"
+    ):
         steps(optimizers, params, 1)

@@ -101,7 +101,7 @@ def equal(a: Any, b: Any) -> bool:
         return set(a) == set(b) and all(equal(a[key], b[key]) for key in a)
     if isinstance(a, (list, tuple)):
         return len(a) == len(b) and all(map(equal, a, b))
-    return a == b or (a != a and b != b)  # NaN is NaN
+    return a == b or (isinstance(a, float) and math.isnan(a) and math.isnan(b))
 
 
 @settings(max_examples=150, deadline=None)
@@ -109,28 +109,26 @@ def equal(a: Any, b: Any) -> bool:
 def test_what_is_damaged_is_refused_and_nothing_has_changed(
     path: tuple[Any, ...], wrong: Any, upgraded: bool
 ) -> None:
-    """Or it is no damage, and the training steps on. Both in the upgraded Adam and in INRIA's order."""
+    """Or it is no damage, and the training steps on. In both orders of `upgrade` and load."""
     state = damaged(path, wrong)
     if state is None or (path and path[-1] in IGNORED):
         return
     phases, optimizer, params = trained(3)
     if not upgraded:
         optimizer = adam_of(params)
-    before = snapshot(phases, optimizer, params)
+    if not upgraded and "opt3dgs" not in path:
+        return  # a stock Adam takes it as it likes
+    refused, before = "", snapshot(phases, optimizer, params)
     try:
-        if upgraded:
-            optimizer.load_state_dict(through_a_file(state))
-        else:
-            if "opt3dgs" not in path:
-                return  # stock loads what it loads
-            optimizer.load_state_dict(through_a_file(state))
+        optimizer.load_state_dict(through_a_file(state))
+        if not upgraded:
             before = snapshot(phases, optimizer, params)
             phases.upgrade(optimizer)
     except ValueError as error:
-        assert "load_state_dict: " in str(error) or "upgrade: " in str(error), error
-        assert len(str(error)) < 1_000_000
+        refused = str(error)
+    if refused:
+        assert "load_state_dict: " in refused or "upgrade: " in refused
         assert equal(before, snapshot(phases, optimizer, params))
-        assert isinstance(optimizer, type(adam_of(params)))
     else:
         phases.observe(0.1)
         steps({"all": optimizer}, params, 1)
@@ -159,10 +157,11 @@ def test_what_is_damaged_is_refused_and_nothing_has_changed(
     ids=lambda path: path[-1] if isinstance(path, tuple) else None,
 )
 def test_the_usual_damage_is_refused(path: tuple[Any, ...], wrong: Any) -> None:
+    ours = ("param_groups", 0, "opt3dgs")
     fine = [  # an empty state is Adam's before its first step
-        (("state",), {}), (("state", 0), {}), (("state", 0), "gone"), (("param_groups", 0, "opt3dgs", "last"), []),
-        (("param_groups", 0, "opt3dgs", "notes"), {}), (("param_groups", 0, "opt3dgs", "parts"), {}),
-    ]  # fmt: skip
+        *[(("state",), {}), (("state", 0), {}), (("state", 0), "gone")],
+        *[((*ours, "last"), []), ((*ours, "notes"), {}), ((*ours, "parts"), {})],
+    ]
     phases, optimizer, params = trained(3)
     before = snapshot(phases, optimizer, params)
     if (path, wrong) in fine:
@@ -183,7 +182,7 @@ def test_options_that_are_refused_do_not_come_with_a_checkpoint(option: str) -> 
 
 
 def test_the_state_is_plain_and_of_the_moment() -> None:
-    """Tensors with rows first, float32; the rest survives weights_only=True. None is left behind."""
+    """Tensors with rows first, float32; the rest survives weights_only=True."""
     _, optimizer, _ = trained()
     saved = optimizer.state_dict()
     for state in saved["state"].values():

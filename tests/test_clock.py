@@ -77,7 +77,9 @@ def test_an_optimizer_that_steps_now_and_then() -> None:
     """taming-3dgs has f_rest in an optimizer of its own, which steps in every sixteenth."""
     phases, part = clocked()
     params = parameters(5, "means", "shN")
-    main, other = phases.upgrade([adam_of({"means": params["means"]}), adam_of({"shN": params["shN"]})])
+    main, other = phases.upgrade(
+        [adam_of({"means": params["means"]}), adam_of({"shN": params["shN"]})]
+    )
     for iteration in range(50):
         steps({"means": main}, params, 1)
         if iteration % 16 == 15:
@@ -178,9 +180,8 @@ def test_phase_progress_and_what_is_shown() -> None:
         phases.observe(iteration=iteration)
         shown.append((phases.iteration, phases.phase, phases.progress))
     explore, exploit = Phase.EXPLORATION, Phase.EXPLOITATION
-    assert shown == [
-        (-1, explore, 0.0), (0, explore, 0.0), (89, explore, 0.89), (90, exploit, 0.9), (99, exploit, 0.99),
-    ]  # fmt: skip
+    first = [(-1, explore, 0.0), (0, explore, 0.0), (89, explore, 0.89)]
+    assert shown == [*first, (90, exploit, 0.9), (99, exploit, 0.99)]
     assert "iteration 99 of 100, exploitation" in repr(phases)
     assert phases.part(Averaging) is DEFAULTS[3]
     assert phases.numbers()["own_frame_rate"] == pytest.approx(0.1 * 0.01**0.99)

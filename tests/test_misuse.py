@@ -159,7 +159,7 @@ SCHEDULERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         "leave one of the two out",
     ),
     "more than a preset": (
-        lambda: DEFAULTS + [Fading()],
+        lambda: DEFAULTS + [Fading()],  # noqa: RUF005
         TypeError,
         r"write parts=\[\*DEFAULTS, YourPart\(\)\]",
     ),
@@ -200,9 +200,11 @@ def test_the_clock_goes_forward_within_the_run(iteration: Any, said: str) -> Non
     assert phases.iteration == 7
 
 
-@pytest.mark.parametrize("loss", [torch.ones(2), "0.1", [1.0, 2.0], 1j, torch.ones((), dtype=torch.cfloat)])
+@pytest.mark.parametrize(
+    "loss", [torch.ones(2), "0.1", [1.0, 2.0], 1j, torch.ones((), dtype=torch.cfloat)]
+)
 def test_a_loss_is_one_real_number(loss: Any) -> None:
-    with pytest.raises(ValueError, match="observe: loss=.*one real number is needed"):
+    with pytest.raises(ValueError, match=r"observe: loss=.*one real number is needed"):
         PhaseScheduler(100).observe(loss)
 
 
@@ -214,7 +216,9 @@ def test_images_of_two_shapes() -> None:
 def test_a_part_that_gets_no_loss_says_so_once() -> None:
     optimizer = PhaseScheduler(100, parts=[EnergyHistogram()]).upgrade(one())
     params = {"means": optimizer.param_groups[0]["params"][0]}
-    with pytest.warns(UserWarning, match=r"no energy has come; call phases.observe\(loss\)") as said:
+    with pytest.warns(
+        UserWarning, match=r"no energy has come; call phases.observe\(loss\)"
+    ) as said:
         steps({"means": optimizer}, params, 40)
     assert len(said) == 1
 
@@ -228,9 +232,9 @@ def test_several_ranks_without_a_process_group(
     phases = PhaseScheduler(100, parts=[Averaging()], process_group="all" if grouped else None)
     steps(phases.upgrade(adams_of(params)), params, 3)
     found = [str(each.message) for each in recwarn]
-    told = "2 ranks train, but process_group=None.*give process_group=torch.distributed"
+    told = "2 ranks train, but process_group=None"
     assert len(found) == (0 if grouped else 1)
-    assert grouped or __import__("re").search(told, found[0])
+    assert grouped or (told in found[0] and "give process_group=torch.distributed" in found[0])
 
 
 @pytest.mark.parametrize("chosen", [None, DEFAULTS_ADC])
@@ -247,9 +251,7 @@ def test_rows_removed_under_the_default_parts(
             optimizer.param_groups[0]["params"] = [new]
             state = optimizer.state.pop(old, None)
             if state is not None:
-                optimizer.state[new] = {
-                    k: v if k == "step" else v[:rows] for k, v in state.items()
-                }
+                optimizer.state[new] = {k: v if k == "step" else v[:rows] for k, v in state.items()}
         steps(optimizers, params, 1)
     found = [str(each.message) for each in recwarn]
     assert len(found) == (chosen is None)
@@ -274,7 +276,7 @@ def test_moments_of_other_rows_are_named() -> None:
         steps(first, few, 3)
     second = PhaseScheduler(60).upgrade(adams_of(many))
     second["means"].load_state_dict(first["means"].state_dict())
-    with pytest.raises(ValueError, match="means is .30, 3., but its exp_avg.* 20 rows for 30"):
+    with pytest.raises(ValueError, match=r"means is .30, 3., but its exp_avg.* 20 rows for 30"):
         steps(second, many, 1)
 
 
@@ -292,7 +294,13 @@ def test_numbers_that_are_not_finite_are_told_once(recwarn: pytest.WarningsRecor
 
 @pytest.mark.parametrize(
     ("done", "finished", "said"),
-    [(0, False, False), (5, False, True), (585, False, True), (599, False, False), (585, True, False)],
+    [
+        (0, False, False),
+        (5, False, True),
+        (585, False, True),
+        (599, False, False),
+        (585, True, False),
+    ],
 )
 def test_a_training_that_ends_early(done: int, finished: bool, said: bool) -> None:
     params = parameters(ROWS, "means")

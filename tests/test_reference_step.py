@@ -93,7 +93,9 @@ def train(
     step: Callable[[Gaussians, int, Tensor], None],
 ) -> list[Gaussians]:
     """The parameters after every iteration."""
-    params = {name: each.requires_grad_() for name, each in make_gaussians(scene.num_points).items()}
+    params = {
+        name: each.requires_grad_() for name, each in make_gaussians(scene.num_points).items()
+    }
     history = []
     for iteration in range(total):
         for param in params.values():

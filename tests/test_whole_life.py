@@ -300,7 +300,9 @@ class WholeLife(RuleBasedStateMachine):
 
 def same(a: Tensor, b: Tensor) -> bool:
     """Equal bit for bit; one NaN is as good as another."""
-    return a.shape == b.shape and torch.equal(a.nan_to_num(7.0, 8.0, 9.0), b.nan_to_num(7.0, 8.0, 9.0))
+    return a.shape == b.shape and torch.equal(
+        a.nan_to_num(7.0, 8.0, 9.0), b.nan_to_num(7.0, 8.0, 9.0)
+    )
 
 
 def zeroed(tensor: Tensor, rows: Tensor) -> Tensor:

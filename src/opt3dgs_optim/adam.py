@@ -91,7 +91,9 @@ class Lane:
         """
         for key, (tensor, version) in self.left.items():
             now = state.get(key)
-            if now is not None and (len(now) != rows or (now is tensor and now._version == version)):
+            if now is not None and (
+                len(now) != rows or (now is tensor and now._version == version)
+            ):
                 del state[key]
 
     def leave(self, state: dict[str, Any]) -> None:

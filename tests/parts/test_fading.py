@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 import torch
 from gaussians import adams_of, parameters, steps
@@ -24,13 +26,18 @@ def test_a_share_of_the_points_is_chosen(event: int, seed: int, share: float) ->
     part = Fading(share=share, seed=seed)
     chosen = part.chosen(event, count, CPU)
     assert abs(int(chosen.sum()) - share * count) < 5 * (count * share * (1 - share)) ** 0.5
-    for other in (part.chosen(event + 1, count, CPU), Fading(share, seed=seed + 1).chosen(event, count, CPU)):
+    for other in (
+        part.chosen(event + 1, count, CPU),
+        Fading(share, seed=seed + 1).chosen(event, count, CPU),
+    ):
         both = float((chosen & other).sum()) / count
         assert abs(both - share**2) < 0.03
 
 
 @given(event=st.integers(0, 10_000), few=st.integers(0, 500), more=st.integers(0, 500))
-def test_a_points_fate_does_not_depend_on_how_many_there_are(event: int, few: int, more: int) -> None:
+def test_a_points_fate_does_not_depend_on_how_many_there_are(
+    event: int, few: int, more: int
+) -> None:
     part = Fading()
     assert torch.equal(part.chosen(event, few, CPU), part.chosen(event, few + more, CPU)[:few])
 
@@ -52,7 +59,7 @@ def test_events_are_in_their_stretch_and_four_iterations_apart(
     assert whole == part.events_before(int(stop * total) + 1, total)
     middle = int((start + stop) / 2 * total)
     counts = [part.events_before(i, total) for i in range(middle, middle + 40)]
-    assert all(b - a in (0, 1) for a, b in zip(counts, counts[1:], strict=False))
+    assert all(b - a in (0, 1) for a, b in itertools.pairwise(counts))
     assert all(b - a <= 1 for a, b in zip(counts, counts[3:], strict=False))
 
 

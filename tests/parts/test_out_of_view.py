@@ -1,4 +1,4 @@
-"""OutOfView: where views see little of a scene, regularisers make no full steps of what they miss."""
+"""OutOfView: where views see little of a scene, regularisers make no full steps elsewhere."""
 
 from __future__ import annotations
 

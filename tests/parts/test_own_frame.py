@@ -42,8 +42,10 @@ def dense_axes(quats: Tensor, scales: Tensor, least: float) -> Tensor:
 def test_the_frame_is_that_of_the_covariance(seed: int, least: float, size: float) -> None:
     quats, scales, v = draw(seed, ROWS, 4) * size, draw(seed + 1, ROWS, 3), draw(seed + 2, ROWS, 3)
     axes, dense = axes_of(Frame(1.0, least, quats, scales)), dense_axes(quats, scales, least)
-    assert torch.allclose(into_frame(axes, v).double(), torch.einsum("nij,ni->nj", dense, v.double()), rtol=1e-4, atol=1e-5)  # fmt: skip
-    assert torch.allclose(out_of_frame(axes, v).double(), torch.einsum("nij,nj->ni", dense, v.double()), rtol=1e-4, atol=1e-5)  # fmt: skip
+    into = torch.einsum("nij,ni->nj", dense, v.double())
+    out = torch.einsum("nij,nj->ni", dense, v.double())
+    assert torch.allclose(into_frame(axes, v).double(), into, rtol=1e-4, atol=1e-5)
+    assert torch.allclose(out_of_frame(axes, v).double(), out, rtol=1e-4, atol=1e-5)
 
 
 def stepped(params: dict[str, Any], grad: Tensor, part: OwnFrame, count: int = 1) -> Tensor:
@@ -85,7 +87,8 @@ def product(q: Tensor, others: Tensor) -> Tensor:
     """Quaternions of a rotation after others."""
     w, u = q[0], q[1:]
     real = w * others[:, 0] - others[:, 1:] @ u
-    imaginary = w * others[:, 1:] + others[:, :1] * u + torch.linalg.cross(u.expand(len(others), 3), others[:, 1:])  # fmt: skip
+    across = torch.linalg.cross(u.expand(len(others), 3), others[:, 1:])
+    imaginary = w * others[:, 1:] + others[:, :1] * u + across
     return torch.cat([real[:, None], imaginary], 1)
 
 
@@ -148,7 +151,9 @@ def test_without_scales_or_quats_adam_steps_and_it_is_said_once(missing: str) ->
     names = [name for name in NAMES if name != missing]
     params, plain = parameters(ROWS, *names), parameters(ROWS, *names)
     optimizers = PhaseScheduler(TOTAL, parts=[OwnFrame()]).upgrade(adams_of(params))
-    with pytest.warns(UserWarning, match=f"OwnFrame: .*which hold .*'{missing}': None.*; Adam steps") as said:
+    with pytest.warns(
+        UserWarning, match=f"OwnFrame: .*which hold .*'{missing}': None.*; Adam steps"
+    ) as said:
         steps(optimizers, params, 5)
     steps(adams_of(plain), plain, 5)
     assert len(said) == 1
@@ -160,7 +165,9 @@ def test_two_sets_of_gaussians_in_one_adam() -> None:
     sets = {f"{which}#{n}": p for which in "ab" for n, p in parameters(ROWS, *NAMES).items()}
     sets["b#scales"].data += 1.0
     groups = [{"params": [param], "name": name} for name, param in sets.items()]
-    optimizer = PhaseScheduler(TOTAL, parts=[OwnFrame(min_aspect=0.0)]).upgrade(torch.optim.Adam(groups))
+    optimizer = PhaseScheduler(TOTAL, parts=[OwnFrame(min_aspect=0.0)]).upgrade(
+        torch.optim.Adam(groups)
+    )
     start = make_gaussians(ROWS)["means"]
     for name, param in sets.items():
         param.grad = torch.ones_like(param) if name.endswith("means") else None
@@ -169,7 +176,9 @@ def test_two_sets_of_gaussians_in_one_adam() -> None:
     assert torch.allclose(ratio, torch.full_like(ratio, math.e), rtol=1e-2)
 
 
-@pytest.mark.parametrize("option", [{"rate": 0.0}, {"final": -1.0}, {"min_aspect": 1.5}, {"rate": math.nan}])
+@pytest.mark.parametrize(
+    "option", [{"rate": 0.0}, {"final": -1.0}, {"min_aspect": 1.5}, {"rate": math.nan}]
+)
 def test_options_that_are_refused(option: dict) -> None:
     (name, value), *_ = option.items()
     with pytest.raises(ValueError, match=f"OwnFrame: {name}={value}, but a finite number in"):

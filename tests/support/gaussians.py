@@ -54,9 +54,7 @@ def adams_of(
     }
 
 
-def adam_of(
-    params: Mapping[str, Tensor], make: Callable[..., Any] = Adam, **options: Any
-) -> Any:
+def adam_of(params: Mapping[str, Tensor], make: Callable[..., Any] = Adam, **options: Any) -> Any:
     """One optimizer of all, as INRIA's trainer makes it."""
     groups = [
         {"params": [param], "lr": RATES.get(name, 0.01), "name": INRIA.get(name, name)}

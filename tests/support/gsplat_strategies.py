@@ -39,7 +39,9 @@ class Training:
         strategy.check_sanity(params, optimizers)
         self.mcmc = hasattr(strategy, "cap_max")
         self.state = strategy.initialize_state(**({} if self.mcmc else {"scene_scale": 1.0}))
-        self.decay = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], 0.01 ** (1 / total))
+        self.decay = torch.optim.lr_scheduler.ExponentialLR(
+            optimizers["means"], 0.01 ** (1 / total)
+        )
         self.sizes: set[int] = set()
 
     def run(self, first: int, last: int) -> None:

@@ -1,4 +1,4 @@
-"""Adams that step some rows only, as gsplat's and INRIA's do: no bias correction, their own mask."""
+"""Adams that step some rows only, without bias correction, as gsplat's and INRIA's do."""
 
 from __future__ import annotations
 
