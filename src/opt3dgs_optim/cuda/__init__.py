@@ -103,7 +103,7 @@ def launch(kernel: str, like: Tensor, *arguments: Any, history_size: int) -> Non
     It is the kernel for the dtype of `like`. `arguments` are contiguous tensors, passed as their
     addresses, ints, passed in 8 bytes, and numpy numbers of C's size.
     """
-    threads, device = len(like), like.get_device()
+    threads, device = like.shape[0], like.get_device()
     if threads == 0:
         return
     if device != torch.cuda.current_device():
@@ -126,7 +126,7 @@ def lqn_direction(
     graft: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`lbfgs.lqn_direction` on the GPU, for points of three coordinates. Never synchronises."""
-    rows = len(grad)
+    rows = grad.shape[0]
     fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
     accepted = torch.empty(rows, dtype=torch.bool, device=grad.device)
     candidates = torch.empty_like(accepted)
@@ -143,7 +143,7 @@ def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
     """`lbfgs.two_loop` on the GPU, for points of three coordinates. Never synchronises."""
     result = torch.empty_like(grad, memory_format=torch.contiguous_format)
     tensors = (_contiguous(grad), _aligned(history), result)
-    launch("two_loop", grad, *tensors, len(grad), history_size=history_size)
+    launch("two_loop", grad, *tensors, grad.shape[0], history_size=history_size)
     return result
 
 

@@ -68,19 +68,19 @@ def check_points(call: str, name: str, points: Any, dims: int) -> None:
         )
 
 
-def check_alike(call: str, name: str, given: Any, like: Tensor, shape: tuple, why: str) -> None:
+def check_alike(
+    call: str, name: str, given: Any, like: Tensor, shape: tuple[int, ...], size: int | None = None
+) -> None:
     """ValueError unless `given` is a tensor of `shape`, of the dtype and on the device of `like`.
 
-    The kernel reads memory by them.
+    The kernel reads memory by them. `size` is the history size, if that made the shape.
     """
-    if not isinstance(given, Tensor) or (given.shape, given.dtype, given.device) != (
-        shape,
-        like.dtype,
-        like.device,
-    ):
+    needed = shape, like.dtype, like.device
+    if not isinstance(given, Tensor) or (given.shape, given.dtype, given.device) != needed:
+        why = "" if size is None else f" for history_size={size}"
         raise ValueError(
             f"{call}: {name} is {described(given)}, but {tuple(shape)} {like.dtype} on "
-            f"{like.device} is needed, {why}"
+            f"{like.device} is needed{why}"
         )
 
 
@@ -88,8 +88,7 @@ def check_history(call: str, grad: Any, history: Any, history_size: int) -> int:
     """The history size K; TypeError or ValueError unless all three fit together."""
     history_size = check_count(call, "history_size", history_size, 1)
     check_points(call, "grad", grad, 2)
-    needed = history_shape(grad, history_size)
-    check_alike(call, "history", history, grad, needed, f"as history_size={history_size}")
+    check_alike(call, "history", history, grad, history_shape(grad, history_size), history_size)
     return history_size
 
 
@@ -224,7 +223,7 @@ def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:
     """
     call = "history_from_pairs"
     check_points(call, "s", s, 3)
-    check_alike(call, "y", y, s, s.shape, "as s is")
+    check_alike(call, "y", y, s, s.shape)
     s, y, size = s.detach(), y.detach(), s.shape[0]
     kernel = s.is_cuda and obstacle("auto", s.device, s.dtype, s.shape[2], size) is None
     history = new_history(s[0], size)

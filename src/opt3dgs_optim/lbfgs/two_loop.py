@@ -153,7 +153,7 @@ def lqn_direction(
     """
     call = "lqn_direction"
     history_size = check_history(call, grad, history, history_size)
-    check_alike(call, "position", position, grad, grad.shape, "as the gradient is")
+    check_alike(call, "position", position, grad, grad.shape)
     if by_kernel(call, grad, history_size, backend, grad.is_cuda):
         return cuda.lqn_direction(position, grad, history, history_size, min_cosine, graft)
     fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
