@@ -17,7 +17,7 @@ from kernel_host import compiler, host_kernels
 from line_search import minimise
 from oracles import dense_bfgs
 from placed_training import some_of
-from points_first import newest_gamma
+from points_first import header, newest_gamma
 from problems import (
     MUELLER_BROWN_OTHERS,
     MULTIMODAL,
@@ -33,7 +33,6 @@ from problems import (
 from torch import Tensor
 
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history
-from opt3dgs_optim.lbfgs.history import header
 
 ROWS, SIZE = 10_000, 5
 CONDITIONS = (1.0, 1e3, 1e6, 1e12)
