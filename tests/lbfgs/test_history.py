@@ -241,7 +241,7 @@ def test_pairs_and_header_lie_where_the_docstring_says(size: int, dim: int) -> N
     assert torch.equal(cells.last, torch.stack([position.T, gradient.T]))
     for kind, vectors in enumerate((cells.s, cells.y)):
         assert torch.equal(torch.stack(vectors).mT, found[kind])
-        rows = [torch.stack(list(cells.coordinates(j)[kind]), 1) for j in range(size)]
+        rows = [torch.stack(each, 1) for each in (cells.s_rows, cells.y_rows)[kind]]
         assert torch.equal(torch.stack(rows), found[kind])
 
 
@@ -275,6 +275,6 @@ def test_rows_are_overwritten_bit_for_bit(dtype: torch.dtype) -> None:
     mask = torch.arange(len(old)) % 3 == 0
     found = torch.stack([old, old])
     bits = BITS[dtype]
-    overwrite(found.view(bits), torch.stack([new, old]).view(bits), bits_of(mask, dtype))
+    overwrite(found.view(bits), torch.stack([new, old]).view(bits), bits_of(mask, bits))
     assert torch.equal(found[0].view(bits), torch.where(mask, new.view(bits), old.view(bits)))
     assert torch.equal(found[1].view(bits), old.view(bits))

@@ -15,7 +15,6 @@ A new pair moves the older ones down: readers of a ring would have to gather. A 
 computes on has the strides of [slots, lanes, N], its cells; one of the CUDA kernel is contiguous.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -106,9 +105,9 @@ class Cells:
 
     Attributes:
         dim, history_size: D and K.
-        rows: the N numbers of every lane of every slot.
-        lanes: of every lane, those of the K pairs, [K, N].
+        lanes: of every lane, the numbers of the K pairs, [K, N].
         s, y: of every pair, the vector [D, N], newest first.
+        s_rows, y_rows: of every pair, the D coordinates [N] of that vector.
         pairs: all of them, [K, 2, D, N].
         last: position and gradient of the last visible step, [2, D, N].
         counter: [N], 0: never visible; c: holds c - 1 pairs.
@@ -118,7 +117,7 @@ class Cells:
         slots, lanes, _ = cells.shape
         dim = self.dim = lanes // 2 - 1
         self.history_size = history_size
-        self.rows = cells.flatten(0, 1).unbind()
+        rows = cells.flatten(0, 1).unbind()
         halves = cells.unflatten(1, (2, dim + 1))
         kept = cells if slots == history_size else cells[:history_size]
         self.lanes = kept.unbind(1)
@@ -126,17 +125,15 @@ class Cells:
         if history_size > dim:
             self.pairs = pairs
             self.last = halves[:dim, :, dim].transpose(0, 1)
-            self.counter = self.rows[dim * lanes + dim]
+            self.counter = rows[dim * lanes + dim]
         else:
             self.pairs, self.last = pairs[:history_size], pairs[history_size]
-            self.counter = self.rows[history_size * lanes + dim]
+            self.counter = rows[history_size * lanes + dim]
         vectors = self.pairs.flatten(0, 1).unbind()
         self.s, self.y = vectors[::2], vectors[1::2]
-
-    def coordinates(self, which: int) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
-        """Of the pair `which`, the newest being 0, the rows of s and of y, D each."""
-        dim, first = self.dim, which * 2 * (self.dim + 1)
-        return self.rows[first : first + dim], self.rows[first + dim + 1 : first + 2 * dim + 1]
+        first = range(0, history_size * lanes, lanes)
+        self.s_rows = [rows[i : i + dim] for i in first]
+        self.y_rows = [rows[i + dim + 1 : i + 2 * dim + 1] for i in first]
 
     def curvatures(self) -> Tensor:
         """s.y of every pair, [K, N]; 0 where there is none."""
@@ -151,8 +148,8 @@ def cells_of(history: Tensor, rows: slice = slice(None)) -> Tensor:
 
 def push(cells: Cells, vectors: Tensor, accepted: Tensor) -> None:
     """Put a pair [2, D, N] in front of the others where `accepted` (bool) says, in place."""
-    stored, new = (each.view(BITS[each.dtype]) for each in (cells.pairs, vectors))
-    chosen = bits_of(accepted, vectors.dtype)
+    bits = BITS[vectors.dtype]
+    stored, new, chosen = cells.pairs.view(bits), vectors.view(bits), bits_of(accepted, bits)
     if cells.history_size > 1:
         overwrite(stored[1:], stored[:-1], chosen)
     overwrite(stored[0], new, chosen)
@@ -176,8 +173,8 @@ def take_pairs(
     # False where the pair is not finite.
     torch.gt(pair.cosine, min_cosine, out=accepted).bitwise_and_(candidates)
     push(cells, pair.vectors, accepted)
-    last, now = (each.view(BITS[each.dtype]) for each in (cells.last, seen))
-    overwrite(last, now, bits_of(visible, seen.dtype))
+    bits = BITS[seen.dtype]
+    overwrite(cells.last.view(bits), seen.view(bits), bits_of(visible, bits))
     torch.maximum(cells.counter, visible, out=cells.counter)
     cells.counter.add_(accepted).clamp_(max=cells.history_size + 1)
 

@@ -32,9 +32,9 @@ def dot(a: Iterable[Tensor], b: Iterable[Tensor]) -> Tensor:
     return total
 
 
-def bits_of(mask: Tensor, dtype: torch.dtype) -> Tensor:
-    """All bits of a chosen point's numbers of `dtype`: what `overwrite` takes of `mask` (bool)."""
-    return mask.to(BITS[dtype]).neg_()
+def bits_of(mask: Tensor, bits: torch.dtype) -> Tensor:
+    """All bits of a chosen point's numbers: what `overwrite` takes of `mask` (bool)."""
+    return mask.to(bits).neg_()
 
 
 def overwrite(old: Tensor, new: Tensor, chosen: Tensor) -> None:

@@ -104,20 +104,19 @@ def recursion(grad: Tensor, cells: Cells) -> Tensor:
     # |y| = 1, hence gamma = s.y / y.y = s.y. No pair: gamma = 1, and r stays the gradient.
     gamma = torch.threshold(sy[0], 0.0, 1.0)
     inverses = torch.threshold_(sy, 0.0, torch.inf).reciprocal_().unbind()  # no pair: 0
-    coordinates = [cells.coordinates(j) for j in range(cells.history_size)]
     r, alphas = grad, []
     rows = r.unbind()
-    for j, (s_j, _) in enumerate(coordinates):  # newest to oldest
-        alpha = dot(s_j, rows).mul_(inverses[j])
-        if j == 0:
+    for j in range(cells.history_size):  # newest to oldest
+        alpha = dot(cells.s_rows[j], rows).mul_(inverses[j])
+        if j == 0:  # the gradient stays as it is
             r = torch.addcmul(grad, alpha, cells.y[0], value=-1)
             rows = r.unbind()
         else:
             r.addcmul_(alpha, cells.y[j], value=-1)
         alphas.append(alpha)
     r.mul_(gamma)
-    for j, (_, y_j) in reversed([*enumerate(coordinates)]):
-        beta = dot(y_j, rows).mul_(inverses[j])
+    for j in reversed(range(cells.history_size)):
+        beta = dot(cells.y_rows[j], rows).mul_(inverses[j])
         r.addcmul_(alphas[j].sub_(beta), cells.s[j])
     return r
 
