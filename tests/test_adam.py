@@ -152,9 +152,9 @@ def test_hooks_and_closures() -> None:
         calls.append("closure")
         return loss
 
-    loss = float(optimizer.step(closure))
+    loss = optimizer.step(closure).item()
     assert calls == ["before", "closure", "after"]
-    assert float(params["means"].square().sum()) < loss
+    assert params["means"].square().sum().item() < loss
 
 
 def test_a_grad_scaler_unscales_and_leaves_steps_out() -> None:
@@ -195,12 +195,7 @@ def test_another_default_dtype_is_not_followed() -> None:
     torch.set_default_dtype(torch.float64)
     try:
         optimizers = PhaseScheduler(TOTAL).upgrade(adams_of(params))
-        generator = torch.Generator().manual_seed(0)
-        for _ in range(TOTAL):
-            for param in params.values():
-                param.grad = torch.randn(param.shape, generator=generator, dtype=torch.float32)
-            for optimizer in optimizers.values():
-                optimizer.step()
+        steps(optimizers, params, TOTAL)
     finally:
         torch.set_default_dtype(torch.float32)
     other = parameters(ROWS)

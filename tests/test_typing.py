@@ -23,14 +23,15 @@ from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 
 from opt3dgs_optim import (
-    AWSGLD, DEFAULTS, Annealing, Averaging, ConstantMultiplier, Curvature, EnergyHistogram, Fading,
-    FreshMoments, IsotropicNoise, LQNAdam, Part, Phase, PhaseScheduler,
+    AWSGLD, DEFAULTS, DEFAULTS_ADC, Annealing, Averaging, Course, Curvature, EnergyHistogram,
+    Fading, FreshMoments, IsotropicNoise, LQNAdam, OwnFrame, Part, Phase, PhaseScheduler,
     PositionNoise, SquaredLoss, backend_info, two_loop,
 )
+from opt3dgs_optim.step import Step
 
 
 class Trainer:
-    """gsplat's, with the README's four lines."""
+    """gsplat's, with the README's three lines."""
 
     def __init__(self, optimizers: dict[str, Optimizer], max_steps: int) -> None:
         self.optimizers = optimizers
@@ -60,16 +61,23 @@ upgraded: dict[str, Adam] = PhaseScheduler(10).upgrade(adams)
 
 class SignAgreement(Part):
     during: ClassVar[Phase | None] = Phase.EXPLOITATION
-    keys: ClassVar[tuple[str, ...]] = ("seen",)
 
-    def before(self, group: dict[str, Any], param: Tensor, grad: Tensor, state: dict[str, Any],
-               course: Any) -> Tensor:
-        return torch.where(grad * state["exp_avg"] < 0, 0.0, grad)
+    def plan(self, step: Step, course: Course) -> None:
+        step.factor = step.factor * 0.5
+
+    def before(self, step: Step, course: Course) -> Tensor:
+        return torch.where(step.grad * step.state["exp_avg"] < 0, 0.0, step.grad)
 
 
-parts: list[Part] = [*DEFAULTS, Averaging(), SignAgreement(), ConstantMultiplier(1.5)]
-phases = PhaseScheduler(30_000, 0.9, parts, adaptive=True)
-phases = PhaseScheduler(30_000, 29_000, [Annealing(4.0, names=("means",)), Fading(seed=3)])
+parts: list[Part] = [*DEFAULTS, Averaging(), SignAgreement(), OwnFrame(rate=0.1)]
+phases = PhaseScheduler(30_000, 0.9, parts)
+phases = PhaseScheduler(30_000, parts=DEFAULTS_ADC)
+phases.observe(iteration=3)
+phases.observe(torch.ones(()))
+phases.finish()
+numbers: dict[str, float | Tensor] = phases.numbers()
+averaging: Averaging | None = phases.part(Averaging)
+phases = PhaseScheduler(30_000, 29_000, [Annealing(4.0), Fading(seed=3)])
 phases = PhaseScheduler(300, parts=[FreshMoments(), SquaredLoss(), Curvature(history_size=3)])
 phases = PhaseScheduler.paper(total_steps=3_000)
 phase: Phase = phases.phase

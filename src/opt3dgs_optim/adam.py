@@ -130,8 +130,11 @@ class StepAdam(Adam):
     def _use_host_steps(self) -> None:
         """Name the groups; keep Adam's count of steps on the host, which reads it in every step."""
         for group, (_, name) in zip(self.param_groups, self._slots, strict=True):
-            group["fused"], group["foreach"] = False, False
             group["gaussian"] = name  # gsplat's name of what it holds, or None
+        if not self.course.parts:
+            return
+        for group in self.param_groups:
+            group["fused"], group["foreach"] = False, False
         for state in self.state.values():
             if isinstance(state.get("step"), Tensor):
                 state["step"] = state["step"].to("cpu", torch.float32)
@@ -352,7 +355,7 @@ class StepAdam(Adam):
         if step.fade is not None:
             chosen = like_rows(chosen_rows(step.fade, len(param), param.device), param)
             for key, factor in zip(MOMENTS, step.fade[2:], strict=True):
-                state[key].mul_(torch.where(chosen, factor, 1.0))
+                state[key].copy_(torch.where(chosen, state[key] * factor, state[key]))
         framed = None
         if step.frame is not None:
             axes = axes_of(step.frame)

@@ -75,7 +75,8 @@ def steps(
     generator = torch.Generator().manual_seed(seed)
     for _ in range(count):
         for param in params.values():
-            param.grad = torch.randn(param.shape, generator=generator)
+            grad = torch.randn(param.shape, generator=generator, dtype=torch.float32)
+            param.grad = grad.to(param.dtype)
         for optimizer in optimizers.values():
             optimizer.step()
 
