@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import os
 import shutil
 import subprocess
 import sys
@@ -83,11 +81,10 @@ phases = PhaseScheduler.paper(total_steps=3_000)
 phase: Phase = phases.phase
 points = Parameter(torch.ones(4, 3))
 phases = PhaseScheduler(30, parts=[PositionNoise({"scales": points}, scale=5e5)])
-a = AWSGLD([points], lr=0.1, histogram=EnergyHistogram(), noise=IsotropicNoise(std=0.1), fused=True)
-b = LQNAdam([points], lr=0.1, betas=(0.9, 0.99), history_size=5, decoupled_weight_decay=True)
+a = AWSGLD([points], lr=0.1, histogram=EnergyHistogram(), noise=IsotropicNoise(std=0.1))
+b = LQNAdam([points], lr=0.1, betas=(0.9, 0.99), history_size=5)
 b.step()
 a.step(lambda: torch.ones(()))
-a.step(visible=torch.ones(4))
 direction: Tensor = two_loop(torch.ones(4, 3), torch.zeros(4, 5, 8), 5)
 print(backend_info("cpu"), phase)
 '''
@@ -109,23 +106,14 @@ def test_pyright_takes_the_documented_lines_and_refuses_wrong_ones(tmp_path: Pat
     check([pyright, "--pythonpath", sys.executable], tmp_path)
 
 
-def test_mypy_takes_the_documented_lines_and_refuses_wrong_ones(tmp_path: Path) -> None:
-    if importlib.util.find_spec("mypy") is None:
-        pytest.skip("mypy is not installed")
-    options = ["--follow-imports=silent", "--cache-dir", str(tmp_path / "cache")]
-    check([sys.executable, "-m", "mypy", *options], tmp_path)
-
-
 def check(command: list[str], folder: Path) -> None:
     """The lines are fine; with the wrong ones there is an error at each of these."""
     good, bad = folder / "good.py", folder / "bad.py"
     good.write_text(LINES)
     bad.write_text(LINES + "\n".join(WRONG) + "\n")
-    env = {**os.environ, "MYPYPATH": str(ROOT / "src")}
     run = subprocess.run(
         [*command, str(good), str(bad)],
         cwd=folder,
-        env=env,
         capture_output=True,
         text=True,
         check=False,  # it exits with 1: there are errors

@@ -235,8 +235,8 @@ class WholeLife(RuleBasedStateMachine):
         self.drop(*OF_THE_END)
 
     @precondition(lambda self: self.preset != "paper" and self.state)
-    @rule(upgraded_first=st.booleans())
-    def load_a_stock_checkpoint(self, upgraded_first: bool) -> None:
+    @rule(upgraded_first=st.booleans(), seed=SEEDS)
+    def load_a_stock_checkpoint(self, upgraded_first: bool, seed: int) -> None:
         """Adam's own state alone: its steps are the clock, and its moments are in world units."""
         states = self.saved()
         for each in states:
@@ -254,6 +254,7 @@ class WholeLife(RuleBasedStateMachine):
             own["last"] = self.iteration - 1
             if self.preset == "relocation" and name == "means":
                 own |= new_moments(self.theirs[name])
+        self.train(1, seed, 1.0)
 
     def drop(self, *keys: str) -> None:
         for name in NAMES:

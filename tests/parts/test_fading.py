@@ -7,7 +7,7 @@ import itertools
 import pytest
 import torch
 from gaussians import adams_of, parameters, steps
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import Parameter
 from torch.optim import Adam
@@ -63,6 +63,7 @@ def test_events_are_in_their_stretch_and_four_iterations_apart(
     assert all(b - a <= 1 for a, b in zip(counts, counts[3:], strict=False))
 
 
+@settings(max_examples=20)
 @given(count=st.integers(1, 2_000_000))
 def test_of_more_than_ten_thousand_points_some_events_happen(count: int) -> None:
     happened = sum(Fading().happens(event, count) for event in range(300))

@@ -48,7 +48,7 @@ def train(
     return params, phases
 
 
-@settings(max_examples=8)
+@settings(max_examples=4)
 @given(share=st.floats(0.45, 1.0))
 def test_where_views_see_more_than_a_third_nothing_is_changed(share: float) -> None:
     ours, phases = train(True, share, 200)
@@ -69,7 +69,7 @@ def test_steps_of_a_point_out_of_view_are_about_three_shares_of_a_full_one(name:
     """After relocation has emptied its second moment; plain Adam makes full steps."""
     ends = [train(on, 0.05, 401, emptied_at=399)[0] for on in (True, False)]
     before = [train(on, 0.05, 400)[0] for on in (True, False)]
-    moved = [float((b[name] - a[name]).abs().median()) for a, b in zip(before, ends, strict=True)]
+    moved = [(b[name] - a[name]).detach().abs().median() for a, b in zip(before, ends, strict=True)]
     assert moved[0] < 0.5 * moved[1]
 
 
