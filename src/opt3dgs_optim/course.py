@@ -158,7 +158,7 @@ class Course:
             part.settle(self)
         return {
             "format": FORMAT,
-            "iteration": optimizer.next_iteration,
+            "iteration": max(optimizer.next_iteration, self.iteration),  # it may have been put on
             "total_steps": self.total_steps,
             "own_frame": optimizer.in_own_frame,
             "last": list(optimizer.last_steps()),
