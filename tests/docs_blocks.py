@@ -62,6 +62,14 @@ def unfenced(text: str) -> str:
     return re.sub(r"`[^`\n]*`", "", text)
 
 
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub and mkdocs make them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    headings = re.findall(r"^#{1,6} +(.+?) *$", text, re.M)
+    slugs = (re.sub(r"[^\w\s-]", "", heading.lower()) for heading in headings)
+    return {re.sub(r"[\s]+", "-", slug.strip()) for slug in slugs}
+
+
 def adams(names: dict[str, int]) -> dict[str, torch.optim.Adam]:
     """One Adam per parameter, of that many columns."""
     return {
@@ -109,6 +117,7 @@ def trainer_names() -> dict[str, Any]:
         "conf": SimpleNamespace(n_iterations=100, strategy=strategy),
         "opt_args": SimpleNamespace(iterations=100),
         "total_steps": 100,
+        "optimizers": dict_of_adams,
         "global_step": 1,
         "PATH": Path(tempfile.mkdtemp()) / "training.pt",
         "device": "cpu",

@@ -102,7 +102,7 @@ def check_command(words: list[str]) -> None:
         assert rest[0] in methods, words
     elif program in ("ruff", "pyright", "mkdocs"):
         extras = PROJECT["optional-dependencies"]
-        assert any(r.startswith(program) for r in extras["test"] + extras["docs"]), words
+        assert any(r.startswith(program) for r in extras["test"] + extras["dev"]), words
     else:
         path = ROOT / words[0]
         assert path.is_file() and os.access(path, os.X_OK), f"{words}: no such program"  # noqa: PT018
