@@ -53,5 +53,7 @@ def test_constraints_name_what_the_project_names() -> None:
         assert pin, line
         assert pin[1] in (*re.findall(r'"([\w-]+)', project), "mkdocs"), line
     for name in {line.split("==")[0] for line in lines}:
-        own = sorted(line.partition("; python_version ")[2] for line in lines if f"{name}==" in line)
+        own = sorted(
+            line.partition("; python_version ")[2] for line in lines if line.startswith(f"{name}==")
+        )
         assert own in ([""], ['< "3.11"', '>= "3.11"']), name
