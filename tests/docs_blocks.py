@@ -33,9 +33,13 @@ class Block:
 
 def pages() -> list[Path]:
     """The READMEs, CONTRIBUTING and the pages of docs/ that people write (not tables of runs)."""
-    written = [p for p in DOCS.rglob("*.md") if not {"results", "benchmarks"} & set(p.parts)]
-    others = ("README.md", "CONTRIBUTING.md", "examples/hosts/README.md")
-    return [*(ROOT / page for page in others), *sorted(written)]
+    written = [p for p in DOCS.rglob("*.md") if "results" not in p.parts]
+    readmes = [
+        ROOT / "README.md",
+        ROOT / "CONTRIBUTING.md",
+        *(ROOT / "examples").rglob("README.md"),
+    ]
+    return [*readmes, *sorted(written)]
 
 
 def name(page: Path) -> str:
