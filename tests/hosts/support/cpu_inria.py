@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hosts.cpu_host.gsplat_modules import fused_ssim, masked_adam
-from hosts.cpu_host.rendering import Drawn, draw, view_colors
+from cpu_gsplat import fused_ssim, masked_adam, relocation
+from cpu_rendering import Drawn, draw, view_colors
 from splatting.camera import Camera
 from splatting.gaussians import neighbour_distance
-from splatting.relocation import relocated_values
 from torch import Tensor
 
 
@@ -76,6 +75,8 @@ class GaussianRasterizer(torch.nn.Module):
             colors = view_colors(means3D, coefficients, settings.sh_degree, view)
         half = torch.tensor([view.width / 2, view.height / 2])
         offset = means2D[:, :2] * half if means2D.requires_grad else None
+        if scales.shape[1] == 2:  # a disc
+            scales = torch.cat([scales, torch.full_like(scales[:, :1], 1e-6)], 1)
         scales = scales * settings.scale_modifier
         geometry = (means3D, rotations, scales, opacities.reshape(-1))
         drawn = draw(*geometry, colors, view, settings.bg, offset)
@@ -85,6 +86,8 @@ class GaussianRasterizer(torch.nn.Module):
         if self.extra == "weights":
             weights = self._weights(geometry, view)
             return image, radii, weights, *self._areas(drawn, weights)
+        if self.extra == "surfels":  # 2DGS: depth, alpha, normal and distortion, without gradients
+            return image, radii, torch.ones(7, view.height, view.width)
         if settings.pixel_weights != "none":
             return image, radii, *self._taming(drawn, self._weights(geometry, view))
         if settings.antialiasing is not None:
@@ -129,6 +132,12 @@ class ImportanceRasterizer(GaussianRasterizer):
     extra = "weights"
 
 
+class SurfelRasterizer(GaussianRasterizer):
+    """2DGS's: thin Gaussians in the place of discs, and no depths or normals."""
+
+    extra = "surfels"
+
+
 class UsedRasterizer(GaussianRasterizer):
     """3dgs-mcmc's, which returns who was used too."""
 
@@ -160,14 +169,6 @@ class SparseGaussianAdam(torch.optim.Adam):
             masked_adam(param, param.grad, first, second, *rest)
 
 
-def compute_relocation(
-    opacity_old: Tensor, scale_old: Tensor, N: Tensor, binoms: Tensor, n_max: int
-) -> tuple[Tensor, Tensor]:
-    """3dgs-mcmc's relocation."""
-    opacities, scales = relocated_values(opacity_old.flatten(), scale_old, N.flatten())
-    return opacities.reshape(opacity_old.shape), scales
-
-
 def distCUDA2(points: Tensor) -> Tensor:  # noqa: N802 (its name)
     """[P] mean squared distance to the three nearest other points."""
     return neighbour_distance(points).square()
@@ -180,12 +181,13 @@ def install(folder: Path) -> None:
         "GaussianRasterizationSettings": GaussianRasterizationSettings,
         "GaussianRasterizer": UsedRasterizer if mcmc else GaussianRasterizer,
         "SparseGaussianAdam": SparseGaussianAdam,
-        "compute_relocation": compute_relocation,
+        "compute_relocation": relocation,
     }
     _module("diff_gaussian_rasterization", **usual)
     _module(
         "diff_gaussian_rasterization_ms", **usual | {"GaussianRasterizer": ImportanceRasterizer}
     )
+    _module("diff_surfel_rasterization", **usual | {"GaussianRasterizer": SurfelRasterizer})
     _module("simple_knn")
     _module("simple_knn._C", distCUDA2=distCUDA2)
     _module("fused_ssim", fused_ssim=fused_ssim)

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-VIEWERS = "viser nerfview splines wandb icecream open3d lpips websockets tensorly mmcv dearpygui"
+VIEWERS = "viser nerfview splines wandb icecream open3d lpips websockets mediapy trimesh addict"
 OTHERS = "tensorboard torchvision imageio_ffmpeg exif fused_bilagrid"
 ABSENT = {*VIEWERS.split(), *OTHERS.split()}
 
