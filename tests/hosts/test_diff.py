@@ -37,7 +37,7 @@ def example(trainer: Trainer) -> str:
         text = sign if isinstance(sign, str) else sign[0]
         if text not in "\n".join(lines):
             lines += statement(text)
-    for said, number in trainer.counts.items():
+    for said, number in sorted(trainer.counts.items(), key=lambda each: -len(each[0])):
         least = number if isinstance(number, int) else min(number)
         lines += [repr(said)] * (least - sum(said in line for line in lines))
     return "\n".join([*lines, ""])
@@ -85,8 +85,8 @@ def test_the_lines_go_to_their_places(name: str) -> None:
 def test_a_file_that_differs_is_left_alone(name: str) -> None:
     """A line missing, commented out, elsewhere or twice; a word once more."""
     for text in changes(TRAINERS[name]):
-        if text == example(TRAINERS[name]):
-            continue
+        if name == "mini-splatting-d" and not diff.misses(TRAINERS["mini-splatting"], text):
+            continue  # one more new optimizer: that is the other script's form
         with pytest.raises(ValueError, match="PhaseScheduler") as refused:
             diff.edited(text)
         assert "upgrade(" in str(refused.value)  # the lines to write by hand

@@ -219,7 +219,7 @@ _TRAINERS_OF_INRIA = {
         "graphdeco-inria/gaussian-splatting",
         ("54c035f (2024-10-30)", "472689c (2024-04-05)"),
         step=(_INRIA_STEP, _STEP),
-        counts={"gaussians.optimizer.step(": (1, 2), "total_loss": 0},
+        counts={"gaussians.optimizer.step(": (1, 2), "total_loss.backward()": 0},
         notes={"Options": f"Exposures stay plain Adam. `--optimizer_type sparse_adam`: {_MASKED}"},
     ),
     "3dgs-mcmc": _inria(

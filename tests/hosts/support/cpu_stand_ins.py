@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-VIEWERS = "viser nerfview splines wandb icecream open3d lpips websockets mediapy trimesh addict"
+VIEWERS = "viser nerfview splines wandb icecream open3d lpips websockets mediapy trimesh tensorly mmcv"
 OTHERS = "tensorboard torchvision imageio_ffmpeg exif fused_bilagrid"
 ABSENT = {*VIEWERS.split(), *OTHERS.split()}
 
@@ -91,14 +91,9 @@ class NoMetric(torch.nn.Module):
 def install() -> None:
     """Make the modules importable."""
     sys.meta_path.append(Finder())
-    tensorboard: Any = Empty("torch.utils.tensorboard")
-    try:
-        import tensorboard as _  # noqa: F401  # pyright: ignore
-
-        if isinstance(sys.modules["tensorboard"], Empty):
-            sys.modules["torch.utils.tensorboard"] = tensorboard
-    except ImportError:
-        sys.modules["torch.utils.tensorboard"] = tensorboard
+    if isinstance(importlib.import_module("tensorboard"), Empty):
+        for name in ("torch.utils.tensorboard", "torch.utils.tensorboard.writer"):
+            sys.modules[name] = Empty(name)
     metrics = types.ModuleType("torchmetrics.image.lpip")
     metrics.LearnedPerceptualImagePatchSimilarity = NoMetric  # type: ignore[attr-defined]
     sys.modules["torchmetrics.image.lpip"] = metrics

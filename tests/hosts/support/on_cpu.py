@@ -14,10 +14,15 @@ importances of mini-splatting and taming-3dgs are estimates; LPIPS is NaN; one p
 
 from __future__ import annotations
 
+import atexit
+import importlib
+import logging
 import os
+import random
 import runpy
 import sys
 from pathlib import Path
+from typing import Any
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 
@@ -41,9 +46,61 @@ def prepare(script: Path) -> None:
     cpu_stand_ins.install()
     cpu_inria.install(folder)
     cpu_cuda.install()
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("opt3dgs_optim").setLevel(logging.INFO)
+    for root in (package, package.parent):  # mini-splatting's scripts have folders
+        if (root / "scene" / "gaussian_model.py").is_file():
+            seed_each_iteration(root)
+    keep_ends()
     text = script.read_text(errors="ignore")
     if "gsplat" in text or "nerfstudio" in text:
         cpu_gsplat.install()
+
+
+def seed_each_iteration(package: Path) -> None:
+    """Random numbers follow from the iteration, so that a resumed run can be compared.
+
+    INRIA's trainers call `update_learning_rate(iteration)` where an iteration begins.
+    """
+    import torch
+
+    sys.path.insert(0, str(package))
+    model: Any = importlib.import_module("scene.gaussian_model").GaussianModel
+    stock = model.update_learning_rate
+
+    def seeded(self: Any, iteration: int) -> Any:
+        random.seed(iteration)
+        torch.manual_seed(iteration)
+        return stock(self, iteration)
+
+    model.update_learning_rate = seeded
+
+
+def keep_ends() -> None:
+    """Write what a training ended with to OPT3DGS_END: by name, the parameter and its mean."""
+    if "OPT3DGS_END" not in os.environ:
+        return
+    import torch
+
+    from opt3dgs_optim import PhaseScheduler
+
+    begun: list[Any] = []
+    init: Any = PhaseScheduler.__init__
+
+    def kept(self: Any, *args: Any, **options: Any) -> None:
+        init(self, *args, **options)
+        begun.append(self)
+
+    def write() -> None:
+        ends = {}
+        for phases in begun:
+            for key in phases.members:
+                state = phases.state_of_param(*key) or {}
+                ends[key[1]] = phases.param_of(*key).detach(), state.get("averaging.mean")
+        torch.save(ends, os.environ["OPT3DGS_END"])
+
+    PhaseScheduler.__init__ = kept  # type: ignore[method-assign]
+    atexit.register(write)
 
 
 def main() -> None:

@@ -1,25 +1,24 @@
 """Optimizers, density control and checkpoints of trainers whose renderers need CUDA, on a CPU.
 
-    python examples/hosts/without_renderer.py 3dgrut TRAINERS/3dgrut
-    python examples/hosts/without_renderer.py fvdb TRAINERS/fvdb-reality-capture
+    python tests/hosts/support/without_renderer.py 3dgrut TRAINERS/3dgrut
+    python tests/hosts/support/without_renderer.py fvdb TRAINERS/fvdb-0.6.0
 
-The folder of fVDB may also be the one where `pip install --no-deps fvdb-reality-capture==0.6.0` has
-put the package, whose form is that of 2026. Both need scipy, 3DGRUT hydra-core.
+The folder of fVDB is one into which `pip install --no-deps fvdb-reality-capture==0.6.0` has put the
+package. 3DGRUT needs hydra-core.
 
-3DGRUT and fVDB reality capture render with kernels of their own, so that `on_cpu.py` cannot run
-their scripts. What touches an optimizer is Python, and runs here from their sources: how they make
-it, move, add and remove Gaussians in it, save it and load it. In place of a render stands a loss
-with known minima. Printed is what holds, as JSON: that with no parts the steps are the trainer's
-own, bit for bit; that with the default parts it trains on through every edit; and that a training
-resumed from the trainer's own checkpoint ends bit for bit as the uninterrupted one does. Besides,
-which parts the scheduler has switched off, since the trainer removes Gaussians.
+3DGRUT and fVDB reality capture render with kernels of their own. What touches an optimizer is
+Python, and runs here from their sources: how they make it, move, add and remove Gaussians in it,
+save it and load it. In place of a render stands a loss with known minima. Printed is what holds, as
+JSON: that with no parts the steps are the trainer's own, bit for bit; that with the parts of its
+lines it trains on through every edit and ends at the mean; that a training resumed from the
+trainer's own checkpoint ends bit for bit as the uninterrupted one does; and that `finish()` puts
+the mean where it is called.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib
-import importlib.machinery
 import json
 import sys
 import types
@@ -27,16 +26,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "examples"))
 
+import cpu_cuda
+import cpu_stand_ins
 import torch
-from hosts.cpu_host import cuda, stand_ins
-from hosts.cpu_host.gsplat_modules import masked_adam
+from cpu_gsplat import masked_adam
 from splatting.relocation import relocated_values
 from torch import Tensor
 from torch.nn import Parameter
 
-from opt3dgs_optim import PhaseScheduler
+from opt3dgs_optim import DEFAULTS_ADC, PhaseScheduler
 
 ITERATIONS = 60
 POINTS = 40
@@ -46,12 +46,14 @@ BEFORE = "what holds:\n"  # the figures, below what the trainers print
 class Host(Protocol):
     """A trainer without its renderer."""
 
+    relocates: bool
+
     def parameters(self) -> dict[str, Tensor]:
         """The Gaussians, by the names of their groups."""
         ...
 
-    def upgrade(self, phases: PhaseScheduler) -> None:
-        """The line of the trainer's page."""
+    def optimizer(self) -> Any:
+        """What the last of the trainer's lines upgrades."""
         ...
 
     def step(self) -> None:
@@ -107,14 +109,14 @@ class Threedgrut:
             strategies._mcmc_plugin = types.SimpleNamespace(compute_relocation_tensor=_relocate)
         self.strategy = getattr(strategies, kind)(config, self.model)
         self.strategy.init_densification_buffer()
-        self.clones = source == "gs"
+        self.relocates = source == "mcmc"
         self.selective = config.optimizer.type == "selective_adam"
 
     def parameters(self) -> dict[str, Tensor]:
         return {g["name"]: g["params"][0] for g in self.model.optimizer.param_groups}
 
-    def upgrade(self, phases: PhaseScheduler) -> None:
-        self.model.optimizer = phases.upgrade(self.model.optimizer)
+    def optimizer(self) -> Any:
+        return self.model.optimizer
 
     def step(self) -> None:
         optimizer = self.model.optimizer
@@ -126,7 +128,7 @@ class Threedgrut:
         self.model.scheduler_step(0)
 
     def control(self, iteration: int) -> None:
-        if not self.clones:
+        if self.relocates:
             if iteration % 10 == 5:
                 with torch.no_grad():
                     self.model.density[:4] = -8.0  # dead, so that they are relocated
@@ -162,7 +164,7 @@ def threedgrut(sources: Path, app: str, *changes: str) -> Callable[..., Host]:
     from hydra import compose, initialize_config_dir  # pyright: ignore
 
     for name in ("threedgrt_tracer", "threedgut_tracer"):
-        sys.modules[name] = stand_ins.Empty(name)
+        sys.modules[name] = cpu_stand_ins.Empty(name)
     sys.path.insert(0, str(sources))
     bare_package("threedgrut.datasets", sources)
     torch.cuda.nvtx.range_push = torch.cuda.nvtx.range_pop = lambda *_: 0
@@ -240,26 +242,34 @@ class SplatModel:
 
 
 class Fvdb:
-    """`GaussianSplatOptimizer` over a model without a renderer."""
+    """`GaussianSplatOptimizer` of version 0.6, over a model without a renderer."""
+
+    kind = ""  # "_mcmc" for MCMC
+    relocates = False
 
     def __init__(self, saved: dict[str, Any] | None = None) -> None:
-        module = importlib.import_module("fvdb_reality_capture.training.gaussian_splat_optimizer")
-        kind = module.GaussianSplatOptimizer
-        if saved is None:
-            values = start_values(FVDB)
-            values["logit_opacities"] = values["logit_opacities"].reshape(-1)
-            self.model = SplatModel(values)
-            config = module.GaussianSplatOptimizerConfig()
-            self.trainer = kind.from_model_and_config(self.model, config, batch_size=1)
-        else:
+        name = f"fvdb_reality_capture.radiance_fields.gaussian_splat_optimizer{self.kind}"
+        module = importlib.import_module(name)
+        kind = f"GaussianSplatOptimizer{self.kind[1:].upper()}"
+        optimizer, config = getattr(module, kind), getattr(module, f"{kind}Config")
+        if saved is not None:
             self.model = SplatModel({k: v.clone() for k, v in saved["model"].items()})
-            self.trainer = kind.from_state_dict(self.model, saved["optimizer"])
+            self.trainer = optimizer.from_state_dict(self.model, saved["optimizer"])
+            return
+        values = start_values(FVDB)
+        values["logit_opacities"] = values["logit_opacities"].reshape(-1)
+        for name in ("sh0", "shN"):
+            values[name] = values[name].reshape(POINTS, -1, 3)
+        self.model = SplatModel(values)
+        scene = types.SimpleNamespace(spatial_scale=lambda mode: 1.0)
+        self.trainer = optimizer.from_model_and_scene(self.model, scene, config())
+        self.trainer.reset_learning_rates_and_decay(1, ITERATIONS)
 
     def parameters(self) -> dict[str, Tensor]:
         return {name: getattr(self.model, name) for name in FVDB}
 
-    def upgrade(self, phases: PhaseScheduler) -> None:
-        phases.upgrade(self.trainer._optimizers)
+    def optimizer(self) -> Any:
+        return self.trainer._optimizer
 
     def step(self) -> None:
         self.trainer.step()
@@ -267,72 +277,36 @@ class Fvdb:
 
     def control(self, iteration: int) -> None:
         if iteration % 20 == 5:
-            self.trainer.refine_gaussians()
-        if iteration == 30:
-            self.trainer.reset_opacities()
+            with torch.no_grad():
+                self.model.logit_opacities[:4] = -8.0  # pyright: ignore  # dead
+            self.trainer.refine()
 
     def checkpoint(self) -> dict[str, Any]:
         model = {name: getattr(self.model, name).detach() for name in FVDB}
         return {"model": model, "optimizer": self.trainer.state_dict()}
 
 
-class Fvdb2026(Fvdb):
-    """`GaussianSplatOptimizer` of version 0.6, over a model without a renderer."""
-
-    kind = ""  # "_mcmc" for MCMC
-
-    def __init__(self, saved: dict[str, Any] | None = None) -> None:
-        name = f"fvdb_reality_capture.radiance_fields.gaussian_splat_optimizer{self.kind}"
-        module = importlib.import_module(name)
-        kind = f"GaussianSplatOptimizer{self.kind[1:].upper()}"
-        optimizer, config = getattr(module, kind), getattr(module, f"{kind}Config")
-        if saved is None:
-            values = start_values(FVDB)
-            values["logit_opacities"] = values["logit_opacities"].reshape(-1)
-            for name in ("sh0", "shN"):
-                values[name] = values[name].reshape(POINTS, -1, 3)
-            self.model = SplatModel(values)
-            scene = types.SimpleNamespace(spatial_scale=lambda mode: 1.0)
-            self.trainer = optimizer.from_model_and_scene(self.model, scene, config())
-            self.trainer.reset_learning_rates_and_decay(1, ITERATIONS)
-        else:
-            self.model = SplatModel({k: v.clone() for k, v in saved["model"].items()})
-            self.trainer = optimizer.from_state_dict(self.model, saved["optimizer"])
-
-    def upgrade(self, phases: PhaseScheduler) -> None:
-        phases.upgrade(self.trainer._optimizer)
-
-    def control(self, iteration: int) -> None:
-        if iteration % 20 == 5:
-            with torch.no_grad():
-                self.model.logit_opacities[:4] = -8.0  # pyright: ignore  # dead
-            self.trainer.refine()
-
-
-class Fvdb2026Mcmc(Fvdb2026):
+class FvdbMcmc(Fvdb):
     """With `GaussianSplatOptimizerMCMC`."""
 
     kind = "_mcmc"
+    relocates = True
 
 
 def fvdb(sources: Path) -> dict[str, Callable[..., Host]]:
     """Makers of fVDB's optimizers."""
     sys.path.insert(0, str(sources))
-    sys.modules["fvdb"] = stand_ins.Empty("fvdb")
-    today = (sources / "fvdb_reality_capture" / "radiance_fields").is_dir()
-    folder = "radiance_fields" if today else "training"
-    for name in ("fvdb_reality_capture", f"fvdb_reality_capture.{folder}"):
+    sys.modules["fvdb"] = cpu_stand_ins.Empty("fvdb")
+    for name in ("fvdb_reality_capture", "fvdb_reality_capture.radiance_fields"):
         bare_package(name, sources)
-    if not today:
-        return {"GaussianSplatOptimizer": Fvdb}
     sys.modules["fvdb"].morton = _morton  # pyright: ignore
-    scene: Any = stand_ins.Empty("fvdb_reality_capture.sfm_scene")
+    scene: Any = cpu_stand_ins.Empty("fvdb_reality_capture.sfm_scene")
     scene.SpatialScaleMode = types.SimpleNamespace(MEDIAN_CAMERA_DEPTH=0)
     for name in (scene.__name__, f"{scene.__name__}.sfm_scene"):
         sys.modules[name] = scene
     model = "fvdb_reality_capture.radiance_fields.gaussian_splatting"
-    sys.modules[model] = stand_ins.Empty(model)
-    return {"GaussianSplatOptimizer": Fvdb2026, "GaussianSplatOptimizerMCMC": Fvdb2026Mcmc}
+    sys.modules[model] = cpu_stand_ins.Empty(model)
+    return {"GaussianSplatOptimizer": Fvdb, "GaussianSplatOptimizerMCMC": FvdbMcmc}
 
 
 def _morton(cells: Tensor) -> Tensor:
@@ -347,8 +321,8 @@ def _morton(cells: Tensor) -> Tensor:
 # -- what is tried ---------------------------------------------------------------------------------
 
 
-def train(host: Host, phases: PhaseScheduler | None, first: int, last: int) -> None:
-    """Iterations of the trainer's order: backward, observe, step, density control."""
+def train(host: Host, first: int, last: int) -> None:
+    """Iterations of the trainer's order: backward, step, density control."""
     for iteration in range(first, last):
         torch.manual_seed(iteration)
         terms = []
@@ -356,40 +330,54 @@ def train(host: Host, phases: PhaseScheduler | None, first: int, last: int) -> N
             visible = torch.rand(len(value)) < 0.7
             goal = torch.randn(1) * 0.1 - 1.0
             terms.append(((value - goal)[visible]).square().sum() / POINTS)
-        loss = torch.stack(terms).sum()
-        loss.backward()
-        if phases is not None:
-            phases.observe(loss, iteration=iteration)
+        torch.stack(terms).sum().backward()
         host.step()
         host.control(iteration)
 
 
+def begun(make: Callable[..., Host], *saved: Any, parts: Any = None) -> tuple[Host, PhaseScheduler]:
+    """The trainer with its lines."""
+    host = make(*saved)
+    if parts is None and not host.relocates:
+        parts = DEFAULTS_ADC
+    phases = PhaseScheduler(ITERATIONS, parts=parts)
+    phases.upgrade(host.optimizer())
+    return host, phases
+
+
+def at_the_mean(host: Host, phases: PhaseScheduler) -> bool:
+    """Whether the parameters are the running means; noise may have come after them."""
+    pairs = [
+        (phases.param_of(*key), (phases.state_of_param(*key) or {})["averaging.mean"])
+        for key in phases.members
+        if not (host.relocates and key[1] == "means")
+    ]
+    return all(torch.equal(a, b) for a, b in pairs if a is not None)
+
+
 def try_out(make: Callable[..., Host]) -> dict[str, Any]:
     """What holds of a trainer."""
-    stock, plain, whole, half = (make() for _ in range(4))
-    train(stock, None, 0, ITERATIONS)
-    without = PhaseScheduler(ITERATIONS, parts=[])
-    plain.upgrade(without)
-    train(plain, without, 0, ITERATIONS)
-    phases = PhaseScheduler(ITERATIONS)
-    whole.upgrade(phases)
-    train(whole, phases, 0, ITERATIONS)
-    before = PhaseScheduler(ITERATIONS)
-    half.upgrade(before)
-    train(half, before, 0, ITERATIONS // 2)
-    again = PhaseScheduler(ITERATIONS)
-    resumed = make(half.checkpoint())
-    resumed.upgrade(again)
-    begun = again.iteration
-    train(resumed, again, begun, ITERATIONS)
+    stock, (plain, _), (whole, phases) = make(), begun(make, parts=[]), begun(make)
+    for group in stock.optimizer().param_groups:
+        group["fused"] = False  # an upgraded one is not, and torch's differ in the last bit
+    half, early = begun(make)[0], begun(make)
+    for each in (stock, plain, whole):
+        train(each, 0, ITERATIONS)
+    train(half, 0, ITERATIONS // 2)
+    resumed, again = begun(make, half.checkpoint())
+    at = again.iteration + 1
+    train(resumed, at, ITERATIONS)
+    train(early[0], 0, ITERATIONS - 1)
+    early[1].finish()
     finite = all(bool(value.isfinite().all()) for value in whole.parameters().values())
     return {
         "names": list(stock.parameters()),
         "points": [POINTS, len(next(iter(whole.parameters().values())))],
         "without parts the trainer's own": _same(stock, plain),
-        "with the default parts finite and another": finite and not _same(stock, whole),
-        "switched off": list(phases.switched_off),
-        "resumed at": begun,
+        "with the parts finite and another": finite and not _same(stock, whole),
+        "ends at the mean": at_the_mean(whole, phases),
+        "finish() ends at the mean": at_the_mean(*early),
+        "resumed at": at,
         "resumed as uninterrupted": _same(whole, resumed),
     }
 
@@ -405,8 +393,8 @@ def main() -> None:
     parser.add_argument("trainer", choices=("3dgrut", "fvdb"))
     parser.add_argument("sources", type=Path, help="the folder of its repository")
     options = parser.parse_args()
-    stand_ins.install()
-    cuda.install()
+    cpu_stand_ins.install()
+    cpu_cuda.install()
     if options.trainer == "fvdb":
         found = {name: try_out(make) for name, make in fvdb(options.sources).items()}
     else:

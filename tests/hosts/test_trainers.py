@@ -1,0 +1,114 @@
+"""The real scripts of real trainers, stock and with the lines, on a CPU.
+
+`python -m pytest -m hosts tests/hosts` with OPT3DGS_TRAINERS: a folder with the sources of each
+trainer (examples/hosts/README.md names them), and OPT3DGS_SCENE: a scene in COLMAP's layout with
+photos in `images` and `images_4`. Some forty trainings of half a minute on a core.
+"""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData
+from trials import HALF, LENGTH, TRAINERS, TRIALS, Done, Trial, missing
+
+from opt3dgs_optim.hosts import diff
+from opt3dgs_optim.hosts.trainers import TRAINERS as TABLE
+
+WORSE = 2.0  # dB that 84 iterations with the lines may end below stock's; they are no result
+PLACES = {  # the folder of each trainer's sources; the others' is their name
+    "gsplat": "gsplat-main", "gsplat-2dgs": "gsplat-main", "inria": "gaussian-splatting",
+    "2dgs": "2d-gaussian-splatting", "mini-splatting-d": "mini-splatting",
+    "grendel-gs": "Grendel-GS", "fvdb": "fvdb-0.6.0", "citygaussian": "CityGaussian",
+}  # fmt: skip
+OLDER = [("gsplat", "gsplat-1.5.3"), ("gsplat", "gsplat-1.4.0"), ("gsplat-2dgs", "gsplat-1.5.3"),
+         ("gsplat-2dgs", "gsplat-1.4.0"), ("inria", "gaussian-splatting-2024-04")]  # fmt: skip
+EACH = [(name, PLACES.get(name, name)) for name, each in TABLE.items() if each.inserted]
+
+pytestmark = pytest.mark.hosts
+
+
+@pytest.mark.parametrize(("name", "folder"), [*EACH, *OLDER])
+def test_the_real_file_gets_its_lines(name: str, folder: str, tmp_path: Path) -> None:
+    """And no linter finds a name in it that is not defined."""
+    path = TRAINERS / folder / TABLE[name].file
+    if not path.is_file():
+        pytest.skip(f"no {path}: put its sources there, set OPT3DGS_TRAINERS")
+    found, new = diff.edited(path.read_bytes().decode())
+    assert found is TABLE[name]
+    (tmp_path / "new.py").write_text(new, encoding="utf-8")
+    command = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F821"]
+    said = subprocess.run([*command, str(tmp_path)], capture_output=True, text=True, check=False)
+    assert not [word for word in ("phases", "DEFAULTS_ADC", "Scheduler") if word in said.stdout]
+
+
+@pytest.mark.parametrize("trial", TRIALS, ids=lambda trial: trial.name)
+def test_trains_saves_the_mean_and_resumes(trial: Trial, scene: Path, tmp_path: Path) -> None:
+    """Both evaluate; the lines' run ends at the mean, and goes on from its own checkpoint."""
+    if (why := missing(trial)) is not None:
+        pytest.skip(why)
+    stock = trial.train(scene, tmp_path, "stock", ours=False)
+    ours = trial.train(scene, tmp_path, "ours", ours=True)
+    for done in (stock, ours):
+        assert done.code == 0, done.output[-3000:]
+    steps = LENGTH if trial.gsplat else LENGTH - 1
+    assert f"opt3dgs_optim: {steps} iterations" in ours.output
+    assert "no mean" not in ours.output  # said of a training that ends before its end
+    if ours.psnr is not None:  # mini-splatting prints none
+        assert stock.psnr is not None
+        assert math.isfinite(ours.psnr)
+        assert ours.psnr > stock.psnr - WORSE
+    ends_at_the_mean(trial, ours)
+    if trial.gsplat:
+        return
+    resumed = trial.train(
+        *(scene, tmp_path, "resumed", "--start_checkpoint", str(ours.out / f"chkpnt{HALF}.pth")),
+        ours=True,
+    )
+    assert resumed.code == 0, resumed.output[-3000:]
+    assert resumed.saved().read_bytes() == ours.saved().read_bytes()
+
+
+def test_ends_early_with_finish(scene: Path, tmp_path: Path) -> None:
+    """The mean of two iterates is saved where `finish()` is called; no line at exit."""
+    trial = next(each for each in TRIALS if each.trainer == "3dgs-mcmc")
+    if (why := missing(trial)) is not None:
+        pytest.skip(why)
+    end = LENGTH - 1  # the iteration before the last, which the trainer counts from 1
+    done = trial.train(scene, tmp_path, "early", ours=True, end=end)
+    assert done.code == 0, done.output[-3000:]
+    assert "no mean" not in done.output
+    is_the_mean(done, done.out / f"point_cloud/iteration_{end}/point_cloud.ply")
+
+
+def ends_at_the_mean(trial: Trial, done: Done) -> None:
+    """The parameters are the mean at the end, and what is saved is a mean, too."""
+    if not trial.gsplat:
+        is_the_mean(done, done.saved())
+        return
+    ends = torch.load(done.out / "end.pt")
+    saved: Any = torch.load(done.saved(), weights_only=False)["splats"]
+    for name, (param, mean) in ends.items():
+        if name == "means" and "mcmc" in trial.options:
+            continue  # its noise comes after the last step
+        assert torch.equal(param, mean), name
+        assert saved[name].shape == mean.shape  # gsplat saves before its last step
+
+
+def is_the_mean(done: Done, path: Path) -> None:
+    """INRIA's .ply has the means."""
+    ends, vertices = torch.load(done.out / "end.pt"), PlyData.read(str(path))["vertex"]
+    names = {"means": "x y z", "opacities": "opacity", "quats": "rot_0 rot_1 rot_2 rot_3"}
+    for name, columns in names.items():
+        saved = np.stack([vertices[column] for column in columns.split()], 1)
+        assert ends[name][1] is not None, name
+        if name == "means" and "mcmc" in str(path) and "early" not in str(path):
+            continue  # its noise comes after the step
+        assert np.array_equal(saved, ends[name][1].numpy().reshape(saved.shape)), name
