@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from cpu_gsplat import fused_ssim, masked_adam, relocation
 from cpu_rendering import Drawn, draw, view_colors
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from splatting.camera import Camera
 from splatting.gaussians import neighbour_distance
 from torch import Tensor
@@ -191,6 +193,8 @@ def install(folder: Path) -> None:
     _module("simple_knn")
     _module("simple_knn._C", distCUDA2=distCUDA2)
     _module("fused_ssim", fused_ssim=fused_ssim)
+    canvas: Any = FigureCanvasAgg  # 2DGS calls what matplotlib 3.10 has no more
+    canvas.tostring_rgb = lambda self: np.asarray(self.buffer_rgba())[..., :3].tobytes()
 
 
 def _module(name: str, **names: Any) -> None:

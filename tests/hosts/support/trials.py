@@ -91,7 +91,8 @@ class Done:
         return path
 
 
-_OFTEN_TAMING = "--cams 2 --percent_dense 0.03 --mode final_count --budget 6000"
+_TAMING = "--cams 2 --percent_dense 0.03 --mode final_count --budget 6000"
+_TAMING += " --opacity_reset_interval 1000"  # afterwards no gradient is large enough to split
 TRIALS = (
     *(
         Trial(f"gsplat-{version}", options, "examples/simple_trainer.py")
@@ -102,9 +103,9 @@ TRIALS = (
     Trial("gaussian-splatting", "--optimizer_type sparse_adam --disable_viewer"),
     Trial("3dgs-mcmc", "--cap_max 2500 --init_type sfm"),
     Trial("2d-gaussian-splatting"),
-    Trial("taming-3dgs", _OFTEN_TAMING),
-    Trial("mini-splatting", "--simp_iteration1 20 --simp_iteration2 30 --imp_metric indoor",
-          script="ms/train.py"),
+    Trial("taming-3dgs", _TAMING),
+    Trial("mini-splatting", "--simp_iteration1 20 --densify_until_iter 20 --simp_iteration2 30 "
+          "--imp_metric indoor", script="ms/train.py"),
 )  # fmt: skip
 GSPLAT_NEEDS = "torchmetrics tyro cv2 sklearn yaml imageio"
 

@@ -1,20 +1,15 @@
-"""The INRIA family's GaussianModel: its real class where present, and a simulator of its edits.
+"""A simulator of the INRIA family's GaussianModel, and of its row edits.
 
-The simulator keeps the contract of the originals (HOSTS.md): one Adam with six named groups of one
-parameter, `exp_avg` and `exp_avg_sq` edited and nothing else, a new Parameter after every edit.
+It keeps the contract of the originals: one Adam with six named groups of one parameter, `exp_avg`
+and `exp_avg_sq` edited and nothing else, a new Parameter after every edit.
 """
 
 from __future__ import annotations
 
-import sys
-import types
 from argparse import Namespace
-from pathlib import Path
 from typing import Any
 
-import pytest
 import torch
-from gsplat_host import HOSTS
 from splatting.relocation import relocated_values
 from torch import Tensor
 from torch.nn import Parameter
@@ -29,11 +24,6 @@ OPTIONS = Namespace(
     opacity_lr=5e-2,
     scaling_lr=5e-3,
     rotation_lr=1e-3,
-    exposure_lr_init=1e-2,
-    exposure_lr_final=1e-3,
-    exposure_lr_delay_steps=0,
-    exposure_lr_delay_mult=0.0,
-    iterations=60,
 )
 ATTRIBUTES = {
     "xyz": "_xyz",
@@ -188,60 +178,13 @@ class SimulatedModel:
             self._exchange(group, getattr(self, ATTRIBUTES[group["name"]]), zero)
 
 
-def fill(model: Any, splats: dict[str, Parameter]) -> Any:
-    """Put raw Gaussians into a model, in the family's shapes."""
+def made_model(splats: Any) -> SimulatedModel:
+    """A model of raw Gaussians under gsplat's names, with its optimizer."""
     names = {"means": "_xyz", "sh0": "_features_dc", "shN": "_features_rest"}
     names |= {"scales": "_scaling", "quats": "_rotation"}
+    model = SimulatedModel()
     for name, attribute in names.items():
         setattr(model, attribute, Parameter(splats[name].detach().clone()))
     model._opacity = Parameter(splats["opacities"].detach().clone()[:, None])
-    model.max_radii2D = torch.zeros(len(splats["means"]))
-    model.spatial_lr_scale = 1.0
-    return model
-
-
-def made_model(kind: str, splats: dict[str, Parameter]) -> Any:
-    """A model of these Gaussians with its optimizer: "simulated", or that of a project."""
-    model = fill(SimulatedModel() if kind == "simulated" else real_model(kind), splats)
     model.training_setup(OPTIONS)
     return model
-
-
-def real_model(project: str) -> Any:
-    """The GaussianModel of ../hosts/<project>, on a CPU; skips with the reason."""
-    folder = HOSTS / project
-    path = folder / "scene/gaussian_model.py"
-    if not path.is_file():
-        pytest.skip(f"no {path}: clone the project there, or set OPT3DGS_HOSTS")
-    stubs: dict[str, Any] = {
-        "simple_knn": types.ModuleType("simple_knn"),
-        "simple_knn._C": types.ModuleType("simple_knn._C"),
-        "utils.reloc_utils": types.ModuleType("utils.reloc_utils"),
-    }
-    stubs["simple_knn._C"].distCUDA2 = None
-    stubs["utils.reloc_utils"].compute_relocation_cuda = _relocation
-    held = {name: sys.modules.pop(name) for name in list(sys.modules) if _is_utils(name)}
-    sys.modules.update(stubs)
-    sys.path.insert(0, str(folder))
-    try:
-        return _run(path)["GaussianModel"](3)
-    finally:
-        sys.path.remove(str(folder))
-        for name in [n for n in sys.modules if _is_utils(n) or n in stubs]:
-            del sys.modules[name]
-        sys.modules.update(held)
-
-
-def _is_utils(name: str) -> bool:
-    return name == "utils" or name.startswith("utils.")
-
-
-def _run(path: Path) -> dict[str, Any]:
-    namespace: dict[str, Any] = {"__name__": "host_gaussian_model"}
-    source = path.read_text().replace('"cuda"', '"cpu"').replace(".cuda()", "")
-    exec(compile(source, str(path), "exec"), namespace)
-    return namespace
-
-
-def _relocation(opacity_old: Tensor, scale_old: Tensor, N: Tensor) -> tuple[Tensor, Tensor]:
-    return relocated_values(opacity_old, scale_old, N.clamp(1, 51))
