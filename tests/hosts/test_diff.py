@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from opt3dgs_optim.hosts import diff
-from opt3dgs_optim.hosts.trainers import ANY, TRAINERS, Trainer
+from opt3dgs_optim.hosts.places import Trainer
+from opt3dgs_optim.hosts.trainers import ANY, TRAINERS
 
 EDITED = [name for name, trainer in TRAINERS.items() if trainer.inserted]
 

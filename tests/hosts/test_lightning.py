@@ -53,7 +53,10 @@ def trainer(
     torch.manual_seed(0)
     optimizers = [
         Adam(
-            [{"params": [Parameter(torch.ones(6, WIDTHS[n]))], "lr": 1e-2, "name": n} for n in names],
+            [
+                {"params": [Parameter(torch.ones(6, WIDTHS[n]))], "lr": 1e-2, "name": n}
+                for n in names
+            ],
             lr=0.0,
             eps=1e-15,
         )

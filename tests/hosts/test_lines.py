@@ -31,9 +31,7 @@ def test_the_list_has_every_name(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_trainers_page_has_what_is_printed(
-    name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_trainers_page_has_what_is_printed(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Its lines stand in one block of a page, and each of its notes in that page's text."""
     assert lines.main([name]) == 0
     printed = capsys.readouterr().out
@@ -91,11 +89,7 @@ def test_a_patch_adds_the_lines(patch: Path) -> None:
     text = patch.read_text(encoding="utf-8")
     changed = [line for line in text.splitlines() if re.match(r"[+-](?!\+\+|--)", line)]
     added = [line[1:].strip() for line in changed if line.startswith("+")]
-    expected = [
-        line
-        for place in trainer.places
-        for line in trainer.lines_at(place) * place.times
-    ]
+    expected = [line for place in trainer.places for line in trainer.lines_at(place) * place.times]
     assert added == expected
     assert len(added) == len(changed)  # nothing is taken away
     assert trainer.read[0].split(" (")[0].split()[-1] in text  # the commit

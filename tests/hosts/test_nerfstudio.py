@@ -176,7 +176,9 @@ def test_without_nerfstudio_the_import_says_so(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.hosts
-@pytest.mark.parametrize(("folder", "left_only"), [("nerfstudio", True), ("nerfstudio-1.1.5", False)])
+@pytest.mark.parametrize(
+    ("folder", "left_only"), [("nerfstudio", True), ("nerfstudio-1.1.5", False)]
+)
 def test_the_real_trainers_count_so(folder: str, left_only: bool) -> None:
     """What `end_of` looks for is in the real `train`."""
     path = Path(os.environ.get("OPT3DGS_TRAINERS", "/no/trainers")) / folder

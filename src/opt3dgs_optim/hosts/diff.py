@@ -16,7 +16,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from opt3dgs_optim.hosts.lines import block
-from opt3dgs_optim.hosts.trainers import ANY, TRAINERS, Trainer
+from opt3dgs_optim.hosts.places import Trainer
+from opt3dgs_optim.hosts.trainers import ANY, TRAINERS
 
 USAGE = """opt3dgs hosts diff FILE           the lines that FILE would get, as a diff
 opt3dgs hosts diff FILE --write   writes them, and keeps the old file as FILE.orig

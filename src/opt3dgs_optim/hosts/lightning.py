@@ -1,8 +1,8 @@
 """The plugin `Opt3DGS` of gaussian-splatting-lightning (yzslab), named in a configuration:
 
-    model:
-      plugins:
-        - class_path: opt3dgs_optim.hosts.lightning.Opt3DGS
+model:
+  plugins:
+    - class_path: opt3dgs_optim.hosts.lightning.Opt3DGS
 """
 
 from __future__ import annotations

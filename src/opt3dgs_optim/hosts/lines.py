@@ -7,7 +7,8 @@ import sys
 import textwrap
 from collections.abc import Sequence
 
-from opt3dgs_optim.hosts.trainers import ANY, TRAINERS, Place, Trainer
+from opt3dgs_optim.hosts.places import Place, Trainer
+from opt3dgs_optim.hosts.trainers import ANY, TRAINERS
 
 USAGE = """opt3dgs lines             the trainers that are known
 opt3dgs lines TRAINER     its lines, where they go, and what to know

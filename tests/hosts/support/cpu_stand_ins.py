@@ -19,7 +19,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-VIEWERS = "viser nerfview splines wandb icecream open3d lpips websockets mediapy trimesh tensorly mmcv"
+VIEWERS = (
+    "viser nerfview splines wandb icecream open3d lpips websockets mediapy trimesh tensorly mmcv"
+)
 OTHERS = "tensorboard torchvision imageio_ffmpeg exif fused_bilagrid"
 ABSENT = {*VIEWERS.split(), *OTHERS.split()}
 

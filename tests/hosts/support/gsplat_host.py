@@ -63,7 +63,9 @@ def strategy(version: str, kind: str) -> Any:
     if kind == "mcmc":
         return package.MCMCStrategy(cap_max=70, noise_lr=1.0, **often)
     sizes = {"grow_scale3d": 0.6, "prune_scale3d": 1e9}
-    return package.DefaultStrategy(grow_grad2d=0.1, prune_opa=0.3, reset_every=1000, **sizes, **often)
+    return package.DefaultStrategy(
+        grow_grad2d=0.1, prune_opa=0.3, reset_every=1000, **sizes, **often
+    )
 
 
 def _strategies_of_main() -> Any:
