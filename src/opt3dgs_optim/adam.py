@@ -83,17 +83,19 @@ class Lane:
             return tensor, True
         return tensor, False
 
-    def drop_if_moved(self, state: dict[str, Any], rows: int) -> None:
-        """Of a Parameter that is new, drop what is kept for rows that are others now.
+    def drop_moved(self, state: dict[str, Any], new: bool) -> None:
+        """Drop what is kept for rows that are others now, if the Parameter is new.
 
         Trainers that edit rows edit every tensor of the state so (gsplat's family), or none but
         Adam's moments (INRIA's): what they have left as it was belongs to other rows.
         """
-        for key, (tensor, version) in self.left.items():
-            now = state.get(key)
-            if now is not None and (
-                len(now) != rows or (now is tensor and now._version == version)
-            ):
+        rows = len(self.param) if self.param.dim() else 1
+        for key in KEPT:
+            now, was = state.get(key), self.left.get(key)
+            if now is None:
+                continue
+            as_it_was = was is not None and now is was[0] and now._version == was[1]
+            if len(now) != rows or (new and as_it_was):
                 del state[key]
 
     def leave(self, state: dict[str, Any]) -> None:
@@ -227,9 +229,9 @@ class StepAdam(Adam):
                         lane.framed = self.in_own_frame and lane.name == "means"
                 else:
                     lane.last, lane.framed, lane.left = before.last, before.framed, before.left
-                    if before.param is not param:
-                        before.drop_if_moved(self.state.get(param, {}), len(param))
                     self._tell_fewer_rows(before.param, lane)
+                new = before is not None and before.param is not param
+                lane.drop_moved(self.state.get(param, {}), new)
                 self._check_rows(lane)
                 self._lanes.append(lane)
         return self._lanes
@@ -563,7 +565,7 @@ def check_moments(call: str, state: Any) -> None:
     check_count(call, "step", whole(state["step"]), 0)
     shapes: dict[str, tuple[int, ...]] = {}
     for key in (*MOMENTS, *KEPT):
-        value = state.get(key)
+        value: Any = state.get(key)
         if value is None and key in KEPT:
             continue
         if not isinstance(value, Tensor) or not value.is_floating_point():

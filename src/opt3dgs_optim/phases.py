@@ -186,7 +186,7 @@ class PhaseScheduler(Course):
                     f"{2 * self.total_steps} at most; make a new PhaseScheduler for another run"
                 )
             if iteration > self.iteration:
-                self.iteration = iteration
+                self.iteration, self._resumed = iteration, False
                 self._advance()
         if loss is None:
             return
