@@ -1,13 +1,152 @@
-"""The step of a parameter as one Triton launch on a GPU."""
+"""The step of a parameter as one Triton launch on a GPU.
 
+Triton comes with torch's CUDA and ROCm builds for Linux. It is imported with the first step of a
+tensor on a GPU. Where it is missing, or cannot compile, `opt3dgs_optim.step.take_step` runs.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.util
+import os
+import subprocess
+import sys
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.step import Hyper, Step
+
+ROWS_BLOCK, FRAME_BLOCK = 1024, 128  # numbers, or Gaussians, of a program
+LONG = 2**31 - ROWS_BLOCK  # above it a number's place needs 64 bits
+CHECK = "opt3dgs_optim.triton.check"  # run as a program, with Triton's interpreter
+
+
+@functools.cache
+def missing() -> str | None:
+    """Why no kernel runs on this machine's GPU, in a sentence; None: they run.
+
+    The first call makes a launch, by which it shows whether Triton can compile here.
+    """
+    try:
+        _kernels()
+    except Exception as error:  # of a Triton for another machine, anything
+        return f"Triton cannot be imported ({error}), so that a step on a GPU is many launches."
+    if not torch.cuda.is_available():
+        return "torch sees no GPU, so that a step is plain torch."
+    try:
+        p, g, m, v = torch.zeros(4, 1, device="cuda")
+        hyper = Hyper(0.0, 0.9, 0.999, 1.0, 1.0, 1.0, m, v)
+        launch(Step(p, g, None, "", {}, {}, 0, -1), hyper)
+    except Exception as error:  # no C compiler, a GPU that is too old, a folder that is read-only
+        return (
+            f"Triton cannot launch a kernel ({type(error).__name__}: {error}), so that a step on "
+            "a GPU is many launches; it needs a C compiler (apt install gcc) and a writable home."
+        )
+    return None
+
+
+@functools.cache
+def _runs() -> bool:
+    reason = missing()
+    if reason is not None:
+        LOGGER.warning("opt3dgs_optim: %s", reason)
+    return reason is None
+
+
+@functools.cache
+def _kernels() -> Any:
+    return importlib.import_module("opt3dgs_optim.triton.kernels")
 
 
 def takes(step: Step) -> bool:
-    """Whether the kernels make this step."""
-    return False
+    """Whether the kernels make this step: float32 without gaps, on a GPU with Triton."""
+    return step.param.is_cuda and _runs() and fits(step)
+
+
+def fits(step: Step) -> bool:
+    state, frame = step.state, step.frame
+    if not all(map(_plain, (step.param, step.grad, state["exp_avg"], state["exp_avg_sq"]))):
+        return False
+    if frame is None:
+        return not step.plain or (step.fade is None and step.hold is None)
+    if step.plain or step.fade is not None or step.hold is not None:
+        return False  # none of our parts says so of positions in their own frames
+    return _plain(frame.quats) and _plain(frame.scales) and 4 * len(step.param) < LONG
+
+
+def _plain(tensor: Tensor) -> bool:
+    return tensor.dtype is torch.float32 and tensor.is_contiguous()
 
 
 def take_step(step: Step, hyper: Hyper) -> None:
-    """Make the step in one launch."""
-    raise NotImplementedError
+    """Make the step in one launch: what `opt3dgs_optim.step.take_step` means.
+
+    Numbers that are not finite are added to `hyper.nonfinite` [1] int32. Nothing waits for the
+    device, and nothing is allocated there.
+    """
+    param = step.param
+    index = param.get_device()
+    if index == torch.cuda.current_device():
+        launch(step, hyper)
+    else:
+        with torch.cuda.device(index):
+            launch(step, hyper)
+    # Autograd is to see that a parameter has changed, as after an operator of torch's.
+    torch.autograd.graph.increment_version(param)
+
+
+def launch(step: Step, hyper: Hyper) -> None:
+    numbers = step.param.numel()
+    if not numbers:
+        return
+    frame, fade, hold, how, factor = step.frame, step.fade, step.hold, step.mean, step.factor
+    on_device = factor if isinstance(factor, Tensor) else None
+    rate = hyper.lr if frame is None else frame.rate
+    size = rate if on_device is not None else rate * factor
+    if not step.plain:
+        size /= hyper.correction1
+    number, put = (0.0, 0.0) if how is None else (float(how.number), float(how.put))
+    mean, began = (None, None) if how is None else (hyper.mean, hyper.began)
+    if frame is not None:
+        rows = len(step.param)
+        _kernels().step_in_own_frame[(-(-rows // FRAME_BLOCK),)](
+            step.param, step.grad, hyper.exp_avg, hyper.exp_avg_sq, frame.quats, frame.scales,
+            mean, began, on_device, hyper.nonfinite, rows, frame.min_aspect, size, hyper.beta2,
+            1 - hyper.beta1, 1 - hyper.beta2, hyper.eps, hyper.root2, hyper.shrink, hyper.decay,
+            number, put, BLOCK=FRAME_BLOCK, enable_fp_fusion=False,
+        )  # fmt: skip
+        return
+    key, share, fade_m, fade_v = (0, 0.0, 1.0, 1.0) if fade is None else fade
+    held, weight = (None, 0.0) if hold is None else (hold.rows.view(torch.uint8), hold.weight)
+    _kernels().step_rows[(-(-numbers // ROWS_BLOCK),)](
+        step.param, step.grad, hyper.exp_avg, hyper.exp_avg_sq, mean, began, held, on_device,
+        hyper.nonfinite, numbers, numbers // len(step.param) if step.param.dim() else 1, size,
+        hyper.beta2, 1 - hyper.beta1, 1 - hyper.beta2, hyper.eps, hyper.root2, hyper.shrink,
+        hyper.decay, key if key < 2**31 else key - 2**32, share, fade_m, fade_v, weight, number,
+        put, PLAIN=step.plain, LONG=numbers > LONG, BLOCK=ROWS_BLOCK, enable_fp_fusion=False,
+    )  # fmt: skip
+
+
+def interpreted_difference(timeout: float = 120.0) -> float | None:
+    """How far the kernels, run on this CPU by Triton's interpreter, are from plain torch.
+
+    The largest difference of a parameter, a moment or a mean after thirty steps with all that a
+    step can have, as a share of its size (of 1 for smaller ones). It takes some seconds, in a
+    process of its own. None: Triton is not installed.
+
+    Raises:
+        RuntimeError: the kernels fail, with what they said.
+    """
+    if importlib.util.find_spec("triton") is None:
+        return None
+    done = subprocess.run(
+        [sys.executable, "-m", CHECK], env={**os.environ, "TRITON_INTERPRET": "1"},
+        capture_output=True, text=True, timeout=timeout, check=False,
+    )  # fmt: skip
+    if done.returncode:
+        raise RuntimeError(f"Triton's interpreter has failed on the kernels: {done.stderr[-500:]}")
+    return float(done.stdout.split()[-1])
