@@ -22,10 +22,10 @@ TENSORS |= {"held": "*u8", "nonfinite": "*i32"}
 INTEGERS = {"numbers": "i32", "width": "i32", "key": "i32", "rows": "i32"}
 
 
-def compiled(kernel: Any, absent: tuple[str, ...], numbers: str = "i32", **constants: Any) -> Any:
+def compiled(kernel: Any, absent: tuple[str, ...], numbers: str = "i32") -> Any:
     """A kernel for sm_90 where the arguments `absent` are None; pointers are multiples of 16."""
     names = kernel.arg_names
-    constants |= dict.fromkeys(absent)
+    constants = dict.fromkeys(absent)
     signature, attributes = {}, {}
     for i, name in enumerate(names):
         kind = {**TENSORS, **INTEGERS, "numbers": numbers}.get(name, "fp32")
@@ -40,22 +40,21 @@ def compiled(kernel: Any, absent: tuple[str, ...], numbers: str = "i32", **const
 
 NOTHING = ("mean", "began", "held", "factor")
 CASES = {
-    "rows": (NOTHING, {}),
-    "rows, held": (("mean", "began", "factor"), {}),
-    "rows, mean": (("held", "factor"), {}),
-    "rows, all": ((), {}),
-    "rows, plain": (NOTHING, {"PLAIN": True}),
-    "rows, long": ((), {"LONG": True, "numbers": "i64"}),
+    "rows": NOTHING,
+    "rows, held": ("mean", "began", "factor"),
+    "rows, mean": ("held", "factor"),
+    "rows, all": (),
+    "rows, plain": (*NOTHING, "m", "v"),
+    "rows, long": (),
 }
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_rows_compile_and_read_four_numbers_at_a_time(name: str) -> None:
-    absent, options = CASES[name]
-    options = {"PLAIN": False, "LONG": False, **options}
-    made = compiled(kernels.step_rows, absent, BLOCK=ROWS_BLOCK, **options)
+    absent = CASES[name]
+    made = compiled(kernels.step_rows, absent, "i64" if "long" in name else "i32")
     ptx = made.asm["ptx"]
-    moments = 0 if options["PLAIN"] else 2
+    moments = 2 * int("m" not in absent)
     means = int("mean" not in absent)
     programs = ROWS_BLOCK // (4 * 128)  # times four numbers, of 128 threads
     assert ptx.count("ld.global.v4") == programs * (2 + moments + means)
@@ -63,6 +62,11 @@ def test_rows_compile_and_read_four_numbers_at_a_time(name: str) -> None:
     assert ".local" not in ptx  # all in registers
 
 
+def test_the_sizes_of_programs() -> None:
+    assert kernels.ROWS_BLOCK.value == ROWS_BLOCK
+    assert kernels.FRAME_BLOCK.value == FRAME_BLOCK
+
+
 @pytest.mark.parametrize("absent", [("mean", "began", "factor"), ()], ids=["step", "all"])
 def test_own_frames_compile(absent: tuple[str, ...]) -> None:
-    assert ".local" not in compiled(kernels.step_in_own_frame, absent, BLOCK=FRAME_BLOCK).asm["ptx"]
+    assert ".local" not in compiled(kernels.step_in_own_frame, absent).asm["ptx"]

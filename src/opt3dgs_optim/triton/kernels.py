@@ -5,7 +5,8 @@ Every number is read once and written once; nothing lies between. One thread has
 that compiles nothing anew; what is not there is None, and compiles to nothing.
 What a load gives outside of its mask is never stored.
 
-Neither reductions nor anything else of Triton's standard library is used, so that Triton's
+No argument is a constexpr, so that a compiled kernel takes the same arguments in every version of
+Triton. Neither reductions nor anything else of Triton's standard library is used, so that Triton's
 interpreter can run this file beside a Triton that compiles.
 """
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportOperatorIssue=false
@@ -16,6 +17,8 @@ import triton.language as tl
 
 INFINITY = tl.constexpr(float("inf"))
 LARGEST = tl.constexpr(9.223371761976868e18)  # float32's in `step.LARGEST`: its square is finite
+ROWS_BLOCK = tl.constexpr(1024)  # numbers of a program
+FRAME_BLOCK = tl.constexpr(128)  # Gaussians of a program
 # Numbers of Python that a step changes; with an unknown size Triton compiles one kernel for all.
 PLAIN_INTS = ["numbers", "width", "key", "rows"]
 
@@ -65,7 +68,7 @@ def into_mean(value, mean, began, row, at, inside, number, put):
 @triton.jit
 def _step_rows(
     p, g, m, v, mean, began, held, factor, nonfinite, at, inside, width, size, beta2, ones1, ones2,
-    eps, root2, shrink, decay, key, share, fade_m, fade_v, weight, number, put, PLAIN: tl.constexpr,
+    eps, root2, shrink, decay, key, share, fade_m, fade_v, weight, number, put,
 ):  # fmt: skip
     grad = finite(tl.load(g + at, inside), nonfinite, inside)
     value = tl.load(p + at, inside) * shrink
@@ -73,7 +76,7 @@ def _step_rows(
         grad = grad + value * decay
     if factor is not None:
         size = size * tl.load(factor)
-    if PLAIN:
+    if m is None:
         value = value - grad * size
     else:
         exp_avg = tl.load(m + at, inside)
@@ -100,12 +103,12 @@ def _step_rows(
 def step_rows(
     p, g, m, v, mean, began, held, factor, nonfinite, numbers, width, size, beta2, ones1, ones2,
     eps, root2, shrink, decay, key, share, fade_m, fade_v, weight, number, put,
-    PLAIN: tl.constexpr, LONG: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Step a parameter [rows, width], BLOCK of its numbers in a program.
+    """Step a parameter [rows, width], ROWS_BLOCK of its numbers in a program.
 
     Args:
-        p, g, m, v, mean: numbers float32: parameter, gradient, moments, mean (or None).
+        p, g, m, v, mean: numbers float32: parameter, gradient, moments (None: the step is the
+            gradient times the rate), mean (or None).
         began: [rows] float32, the number with which a row's mean began; None without a mean.
         held: [rows] uint8, not 0: raise the second moment to (weight * gradient)^2; or None.
         factor: one float32 on the device, on the size; or None.
@@ -115,25 +118,22 @@ def step_rows(
         shrink, decay: of weight decay, decoupled and the other kind; 1.0 and 0.0: none.
         key, share, fade_m, fade_v: of fading; a share of 0.0: none.
         number, put: of the mean; put > 0: it takes the parameter's place.
-        PLAIN: no moments. LONG: more than 2^31 numbers.
+        numbers: 64 bits, where there are more than 2^31.
     """
-    first = tl.program_id(0)
-    if LONG:
-        first = first.to(tl.int64)
-    first = first * BLOCK
-    at = first + tl.arange(0, BLOCK)
+    first = tl.program_id(0).to(numbers.dtype) * ROWS_BLOCK
+    at = first + tl.arange(0, ROWS_BLOCK)
     # Without a mask four numbers are read at a time.
-    if first + BLOCK <= numbers:
+    if first + ROWS_BLOCK <= numbers:
         _step_rows(
             p, g, m, v, mean, began, held, factor, nonfinite, at, None, width, size,
             beta2, ones1, ones2, eps, root2, shrink, decay, key, share, fade_m, fade_v, weight,
-            number, put, PLAIN,
+            number, put,
         )  # fmt: skip
     else:
         _step_rows(
             p, g, m, v, mean, began, held, factor, nonfinite, at, at < numbers, width, size,
             beta2, ones1, ones2, eps, root2, shrink, decay, key, share, fade_m, fade_v, weight,
-            number, put, PLAIN,
+            number, put,
         )  # fmt: skip
 
 
@@ -159,9 +159,9 @@ def adam(grad, m, v, at, inside, size, beta2, ones1, ones2, eps, root2):
 @triton.jit(do_not_specialize=PLAIN_INTS)
 def step_in_own_frame(
     p, g, m, v, quats, scales, mean, began, factor, nonfinite, rows, min_aspect, size, beta2,
-    ones1, ones2, eps, root2, shrink, decay, number, put, BLOCK: tl.constexpr,
+    ones1, ones2, eps, root2, shrink, decay, number, put,
 ):  # fmt: skip
-    """Step positions along each Gaussian's axes, mu <- mu - B Adam(B^T g), BLOCK of them a program.
+    """Step positions along each Gaussian's axes, mu <- mu - B Adam(B^T g), FRAME_BLOCK a program.
 
     Args:
         p, g, m, v, scales, mean: [rows, 3] float32; scales are logarithms.
@@ -170,7 +170,7 @@ def step_in_own_frame(
         min_aspect: share of the longest axis that a shorter one counts as, at least.
         the others: as of `step_rows`.
     """
-    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    row = tl.program_id(0) * FRAME_BLOCK + tl.arange(0, FRAME_BLOCK)
     inside = row < rows
     i, j, k, q = 3 * row, 3 * row + 1, 3 * row + 2, 4 * row
     gx = finite(tl.load(g + i, inside), nonfinite, inside)
