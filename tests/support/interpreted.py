@@ -12,21 +12,29 @@ import pytest
 from opt3dgs_optim import triton as package
 
 
-def interpreted_kernels(patch: pytest.MonkeyPatch) -> ModuleType:
-    """The kernels' module once more, for the interpreter; it takes the place of the one in use.
+def fresh_kernels(environment: dict[str, str]) -> ModuleType:
+    """The kernels' module once more, by itself.
 
-    The variable is read while functions are decorated; the kernels use none of Triton's own.
+    The environment is read while functions are decorated; the kernels use none of Triton's own.
     """
     pytest.importorskip("triton.language", reason="Triton is not installed")
     spec = importlib.util.find_spec("opt3dgs_optim.triton.kernels")
     assert spec is not None
     assert spec.loader is not None
     made = importlib.util.module_from_spec(spec)
-    with pytest.MonkeyPatch.context() as environment:
-        environment.setenv("TRITON_INTERPRET", "1")
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in environment.items():
+            patch.setenv(name, value)
         spec.loader.exec_module(made)
+    return made
+
+
+def interpreted_kernels(patch: pytest.MonkeyPatch) -> ModuleType:
+    """The kernels for the interpreter, which take the place of those in use."""
+    made = fresh_kernels({"TRITON_INTERPRET": "1"})
     quiet = Quiet(made)
     patch.setattr(package, "_kernels", lambda: quiet)
+    patch.setattr(package, "_COMPILED", {})
     return made
 
 
