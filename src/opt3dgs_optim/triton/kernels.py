@@ -191,9 +191,8 @@ def step_in_own_frame(
     sx = tl.exp(tl.load(scales + i, inside))
     sy = tl.exp(tl.load(scales + j, inside))
     sz = tl.exp(tl.load(scales + k, inside))
-    if min_aspect > 0.0:
-        least = larger(larger(sx, sy), sz) * min_aspect
-        sx, sy, sz = larger(sx, least), larger(sy, least), larger(sz, least)
+    least = larger(larger(sx, sy), sz) * min_aspect
+    sx, sy, sz = larger(sx, least), larger(sy, least), larger(sz, least)
 
     gx, gy, gz = turned(w, -x, -y, -z, gx, gy, gz)
     gx, gy, gz = gx * sx, gy * sy, gz * sz
