@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import pytest
@@ -148,7 +149,7 @@ def test_a_triton_that_cannot_compile_is_said_with_the_cure(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(triton, "launch", fails)
     monkeypatch.setattr(torch, "zeros", lambda *size, **_: zeros(*size))
-    said = triton.missing.__wrapped__()
+    said = inspect.unwrap(triton.missing)()
     assert said is not None
     assert "Failed to find C compiler" in said
     assert "apt install gcc" in said

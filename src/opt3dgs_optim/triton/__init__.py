@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import importlib
-import importlib.util
 import os
 import subprocess
 import sys
@@ -107,9 +106,12 @@ def launch(step: Step, hyper: Hyper) -> None:
     if not numbers:
         return
     frame, fade, hold, how, factor = step.frame, step.fade, step.hold, step.mean, step.factor
-    on_device = factor if isinstance(factor, Tensor) else None
-    rate = hyper.lr if frame is None else frame.rate
-    size = rate if on_device is not None else rate * factor
+    size = hyper.lr if frame is None else frame.rate
+    on_device = None
+    if isinstance(factor, Tensor):
+        on_device = factor
+    else:
+        size *= factor
     if not step.plain:
         size /= hyper.correction1
     number, put = (0.0, 0.0) if how is None else (float(how.number), float(how.put))
@@ -177,7 +179,9 @@ def interpreted_difference(timeout: float = 120.0) -> float | None:
     Raises:
         RuntimeError: the kernels fail, with what they said.
     """
-    if importlib.util.find_spec("triton") is None:
+    try:
+        importlib.import_module("triton.language")
+    except ImportError:
         return None
     done = subprocess.run(
         [sys.executable, "-m", CHECK], env={**os.environ, "TRITON_INTERPRET": "1"},

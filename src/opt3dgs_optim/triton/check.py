@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim import triton
-from opt3dgs_optim.step import Fade, Frame, Hold, Hyper, Mean, Step, take_step
+from opt3dgs_optim.step import Fade, Frame, Hold, Hyper, Mean, Step, like_rows, take_step
 
 SHAPES = ((257, 3), (31, 4), (1000,), (19, 15, 3))
 
@@ -64,8 +64,8 @@ def case(
     if mean:
         step.mean = Mean(steps, put)
         began = torch.randint(1, steps + 1, (rows,), generator=generator).to(torch.float32)
-        hyper.mean, hyper.began = param + 0.1 * draw(*shape), began
-        hyper.mean[began == steps] = 0.0
+        hyper.mean, hyper.began = (param + 0.1 * draw(*shape)), began
+        hyper.mean.mul_(like_rows(began < steps, param))  # those that begin with this step
     return step, hyper
 
 
@@ -118,7 +118,9 @@ def difference(options: dict[str, Any], shape: tuple[int, ...], seed: int = 0) -
 
 def combinations() -> Iterator[tuple[dict[str, Any], tuple[int, ...]]]:
     """Steps with everything that can meet in one."""
-    for shape, fade, hold, mean in itertools.product(SHAPES, *[(False, True)] * 3):
+    for shape, (fade, hold, mean) in itertools.product(
+        SHAPES, itertools.product((False, True), repeat=3)
+    ):
         yield {"fade": fade, "hold": hold, "mean": mean, "bad": 5, "shrink": 0.999}, shape
     for mean, decay in itertools.product((False, True), (0.0, 0.01)):
         options = {"mean": mean, "put": mean, "decay": decay, "bad": 2}
