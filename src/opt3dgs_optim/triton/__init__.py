@@ -6,6 +6,7 @@ tensor on a GPU. Where it is missing, or cannot compile, `opt3dgs_optim.step.tak
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import os
@@ -19,9 +20,10 @@ from torch import Tensor
 from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.step import Hyper, Step
 
-ROWS_BLOCK, FRAME_BLOCK = 1024, 128  # as in `kernels`
+ROWS_BLOCK, FRAME_BLOCK, LOOK_BLOCK = 1024, 128, 1024  # as in `kernels`
 LONG = 2**31 - ROWS_BLOCK  # above it a number's place needs 64 bits
 NO_FADE = (0, 0.0, 1.0, 1.0)
+_HERE = contextlib.nullcontext()
 _COMPILED: dict[Any, Any] = {}  # what Triton has compiled, by what it depends on
 CHECK = "opt3dgs_optim.triton.check"  # run as a program, with Triton's interpreter
 
@@ -89,15 +91,41 @@ def take_step(step: Step, hyper: Hyper) -> None:
     Numbers that are not finite are added to `hyper.nonfinite` [1] int32. Nothing waits for the
     device, and nothing is allocated there.
     """
-    param = step.param
-    index = param.get_device()
-    if index == torch.cuda.current_device():
+    with _device_of(step.param):
         launch(step, hyper)
-    else:
-        with torch.cuda.device(index):
-            launch(step, hyper)
     # Autograd is to see that a parameter has changed, as after an operator of torch's.
-    torch.autograd.graph.increment_version(param)
+    torch.autograd.graph.increment_version(step.param)
+
+
+def looks(grad: Tensor) -> bool:
+    """Whether `look` takes the positions' gradient."""
+    return grad.is_cuda and _runs() and _plain(grad) and 3 * len(grad) < LONG
+
+
+def look(
+    grad: Tensor, exp_avg_sq: Tensor | None, out_of_view: Tensor | None, counter: Tensor | None
+) -> None:
+    """See in one launch which positions have no gradient.
+
+    Args:
+        grad: [N, 3] of the positions; `looks(grad)`. N above 0.
+        exp_avg_sq: [N, 3] their second moments, or None before their first step.
+        out_of_view: [N] bool to write into, or None.
+        counter: [1] int64, to which 2^32 is added for each position with a gradient, and 1 for each
+            that has or had one; or None.
+    """
+    mask = None if out_of_view is None else out_of_view.view(torch.uint8)
+    with _device_of(grad):
+        _run(
+            "look_at_positions", -(-len(grad) // LOOK_BLOCK), (grad, exp_avg_sq, mask, counter),
+            (len(grad),),
+        )  # fmt: skip
+
+
+def _device_of(tensor: Tensor) -> Any:
+    """A context in which kernels are launched where a tensor lies."""
+    index = tensor.get_device()
+    return _HERE if index in (-1, torch.cuda.current_device()) else torch.cuda.device(index)
 
 
 def launch(step: Step, hyper: Hyper) -> None:

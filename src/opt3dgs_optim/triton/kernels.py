@@ -6,8 +6,8 @@ that compiles nothing anew; what is not there is None, and compiles to nothing.
 What a load gives outside of its mask is never stored.
 
 No argument is a constexpr, so that a compiled kernel takes the same arguments in every version of
-Triton. Neither reductions nor anything else of Triton's standard library is used, so that Triton's
-interpreter can run this file beside a Triton that compiles.
+Triton. Nothing of Triton's standard library is used, so that Triton's interpreter can run this file
+beside a Triton that compiles.
 """
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportOperatorIssue=false
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
@@ -19,6 +19,7 @@ INFINITY = tl.constexpr(float("inf"))
 LARGEST = tl.constexpr(9.223371761976868e18)  # float32's in `step.LARGEST`: its square is finite
 ROWS_BLOCK = tl.constexpr(1024)  # numbers of a program
 FRAME_BLOCK = tl.constexpr(128)  # Gaussians of a program
+LOOK_BLOCK = tl.constexpr(1024)  # Gaussians of a program that looks at them
 # Numbers of Python that a step changes; with an unknown size Triton compiles one kernel for all.
 PLAIN_INTS = ["numbers", "width", "key", "rows"]
 
@@ -215,3 +216,36 @@ def step_in_own_frame(
     tl.store(p + i, px, inside)
     tl.store(p + j, py, inside)
     tl.store(p + k, pz, inside)
+
+
+@triton.jit
+def added(a, b):
+    """The sum of two."""
+    return a + b
+
+
+@triton.jit(do_not_specialize=PLAIN_INTS)
+def look_at_positions(g, v, out_of_view, counter, rows):
+    """See which positions have no gradient.
+
+    Args:
+        g: [rows, 3] float32, the gradient. v: [rows, 3] the second moments, not 0 where a position
+            has had one before; or None.
+        out_of_view: [rows] uint8, 1 where there is none; or None.
+        counter: [1] int64, to which 2^32 is added for each row in view, and 1 for each that is or
+            has been; or None.
+    """
+    row = tl.program_id(0) * LOOK_BLOCK + tl.arange(0, LOOK_BLOCK)
+    inside = row < rows
+    i = 3 * row
+    x, y, z = tl.load(g + i, inside), tl.load(g + i + 1, inside), tl.load(g + i + 2, inside)
+    seen = ((x != 0.0) | (y != 0.0) | (z != 0.0)) & inside
+    if out_of_view is not None:
+        tl.store(out_of_view + row, tl.where(seen, 0, 1).to(tl.uint8), inside)
+    if counter is not None:
+        known = seen
+        if v is not None:
+            x, y, z = tl.load(v + i, inside), tl.load(v + i + 1, inside), tl.load(v + i + 2, inside)
+            known = seen | (((x != 0.0) | (y != 0.0) | (z != 0.0)) & inside)
+        counts = tl.where(seen, 1 << 32, 0).to(tl.int64) + tl.where(known, 1, 0).to(tl.int64)
+        tl.atomic_add(counter, tl.reduce(counts, 0, added), sem="relaxed")
