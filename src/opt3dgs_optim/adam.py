@@ -303,10 +303,8 @@ class StepAdam(Adam):
         """The running mean, and with which count the mean of each row began."""
         param, state = step.param, step.state
         assert step.mean is not None
-        began, touched = lane.rows(state, BEGAN, (len(param),))
-        mean, other = lane.rows(state, MEAN, tuple(param.shape))
-        if touched or other:  # rows that are new have a mean of zeros, and begin with this step
-            began.copy_(torch.where(began == 0, float(step.mean.number), began))
+        began, _ = lane.rows(state, BEGAN, (len(param),))
+        mean, _ = lane.rows(state, MEAN, tuple(param.shape))
         return mean, began
 
     # -- optimizers that have a step of their own --------------------------------------------------

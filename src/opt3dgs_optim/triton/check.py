@@ -63,16 +63,18 @@ def case(
     )  # fmt: skip
     if mean:
         step.mean = Mean(steps, put)
-        began = torch.randint(1, steps + 1, (rows,), generator=generator).to(torch.float32)
+        began = torch.randint(0, steps, (rows,), generator=generator).to(torch.float32)
         hyper.mean, hyper.began = (param + 0.1 * draw(*shape)), began
-        hyper.mean.mul_(like_rows(began < steps, param))  # those that begin with this step
+        hyper.mean.mul_(like_rows(began > 0, param))  # others begin with this step
     return step, hyper
 
 
 def tensors(step: Step, hyper: Hyper) -> list[Tensor]:
     """What a step changes."""
     found = [step.param, hyper.exp_avg, hyper.exp_avg_sq]
-    return found if hyper.mean is None else [*found, hyper.mean]
+    if hyper.mean is None or hyper.began is None:
+        return found
+    return [*found, hyper.mean, hyper.began]
 
 
 def both(options: dict[str, Any], shape: tuple[int, ...], seed: int = 0) -> tuple[Any, Any]:
@@ -110,7 +112,7 @@ def difference(options: dict[str, Any], shape: tuple[int, ...], seed: int = 0) -
         if not torch.equal(known, torch.isfinite(theirs)):
             return float("inf")
         size = torch.where(known, ours, 0.0).abs()
-        size = size.amax(1, keepdim=True) if step.frame is not None else size
+        size = size.amax(1, keepdim=True) if step.frame is not None and ours.dim() > 1 else size
         away = (ours - theirs).abs() / size.clamp(min=1.0)
         worst = max(worst, float(away[known].max()) if known.any() else 0.0)
     return worst

@@ -53,9 +53,20 @@ def chosen_rows(row, key, share):
 
 
 @triton.jit
+def new_row(began, inside):
+    """Whether a row's mean begins with this step."""
+    first = began == 0.0
+    if inside is not None:
+        first = first & inside
+    return first
+
+
+@triton.jit
 def into_mean(value, mean, began, row, at, inside, number, put):
     """`step.take_into_mean` of one number; what the parameter is afterwards."""
-    weight = 1.0 / (number + 1.0 - tl.load(began + row, inside))
+    first = tl.load(began + row, inside)
+    tl.store(began + row, number, new_row(first, inside))  # by each number of a row: the same
+    weight = 1.0 / (number + 1.0 - tl.where(first == 0.0, number, first))
     old = tl.load(mean + at, inside)
     known = tl.abs(value) < INFINITY
     start = tl.where(tl.abs(old) < INFINITY, old, value)
@@ -110,7 +121,7 @@ def step_rows(
     Args:
         p, g, m, v, mean: numbers float32: parameter, gradient, moments (None: the step is the
             gradient times the rate), mean (or None).
-        began: [rows] float32, the number with which a row's mean began; None without a mean.
+        began: [rows] float32, the number with which a row's mean began, 0: it begins now; or None.
         held: [rows] uint8, not 0: raise the second moment to (weight * gradient)^2; or None.
         factor: one float32 on the device, on the size; or None.
         nonfinite: one int32 to which numbers that are not finite are added; or None.
