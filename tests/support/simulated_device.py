@@ -99,6 +99,7 @@ class SimulatedDevice(TorchFunctionMode):
 
         def launch(name: str, grid: Any, args: Any, kwargs: Any) -> None:
             self.launches[name] += 1
+            Event.launched += 1
             with torch._C.DisableTorchFunction():
                 run(name, grid, [on_host(a) if isinstance(a, Tensor) else a for a in args], kwargs)
 
@@ -134,7 +135,7 @@ class SimulatedDevice(TorchFunctionMode):
             raise RuntimeError(f"Expected all tensors to be on the same device ({name})")
         if here and name in WAITS:
             self._wait(name)
-        if here and name in ("__getitem__", "__setitem__") and any(map(_is_mask, args[1:])):
+        if here and name in ("__getitem__", "__setitem__") and any(t.dtype == torch.bool for t in _tensors(args[1:])):
             self._wait("boolean index")
         if name == "copy_" and len(here) == 1:
             return self._copied(args[0], args[1], kwargs.get("non_blocking", False))
@@ -177,23 +178,21 @@ class SimulatedDevice(TorchFunctionMode):
 
 
 class Event:
-    """torch.cuda.Event: done when it is asked for the second time."""
+    """torch.cuda.Event: done when a whole iteration's kernels have been launched after it."""
 
     pending: list[tuple[Tensor, Tensor]] = []  # noqa: RUF012
-
-    def __init__(self, *_: Any) -> None:
-        self.asked, self.copies = 0, []
+    launched = 0
 
     def record(self) -> None:
         """What was begun before belongs to it."""
-        self.copies, Event.pending = Event.pending, []
+        self.since, self.copies, Event.pending = Event.launched, Event.pending, []
 
     def query(self) -> bool:
         """Whether it is done."""
-        self.asked += 1
-        if self.asked > 1:
+        done = Event.launched >= self.since + 6
+        if done:
             _finish(self.copies)
-        return self.asked > 1
+        return done
 
     @classmethod
     def finish_all(cls) -> None:
@@ -216,10 +215,6 @@ def _line() -> str:
             return f"{path.name}:{frame.f_lineno}"
         frame = frame.f_back
     return ""
-
-
-def _is_mask(value: Any) -> bool:
-    return isinstance(value, Tensor) and value.dtype == torch.bool
 
 
 def _tensors(values: Any) -> Any:
