@@ -272,8 +272,9 @@ class StepAdam(Adam):
     def _step_lane(self, lane: Lane, iteration: int) -> None:
         step, course = self._plan(lane, iteration), self.course
         group, state = lane.group, step.state
-        state["step"] += 1
-        t, (beta1, beta2) = state["step"].item(), group["betas"]
+        count = state["step"].numpy()  # torch's own addition takes as long as a launch
+        count[()] += 1
+        t, (beta1, beta2) = count.item(), group["betas"]
         lr, decay = group["lr"], group["weight_decay"]
         hyper = Hyper(
             lr, beta1, beta2, group["eps"], 1 - beta1**t, (1 - beta2**t) ** 0.5,

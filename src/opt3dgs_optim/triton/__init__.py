@@ -71,14 +71,18 @@ def takes(step: Step) -> bool:
 
 
 def fits(step: Step) -> bool:
+    """`takes`, wherever the tensors lie."""
     state, frame = step.state, step.frame
-    if not all(map(_plain, (step.param, step.grad, state["exp_avg"], state["exp_avg_sq"]))):
+    if not (
+        _plain(step.param) and _plain(step.grad)
+        and _plain(state["exp_avg"]) and _plain(state["exp_avg_sq"])
+    ):  # fmt: skip
         return False
     if frame is None:
         return not step.plain or (step.fade is None and step.hold is None)
     if step.plain or step.fade is not None or step.hold is not None:
         return False  # none of our parts says so of positions in their own frames
-    return _plain(frame.quats) and _plain(frame.scales) and 4 * len(step.param) < LONG
+    return _plain(frame.quats) and _plain(frame.scales) and 4 * step.param.shape[0] < LONG
 
 
 def _plain(tensor: Tensor) -> bool:
@@ -150,10 +154,10 @@ def launch(step: Step, hyper: Hyper) -> None:
     )  # fmt: skip
     if frame is not None:
         _run(
-            "step_in_own_frame", -(-len(param) // FRAME_BLOCK),
+            "step_in_own_frame", -(-param.shape[0] // FRAME_BLOCK),
             (param, step.grad, hyper.exp_avg, hyper.exp_avg_sq, frame.quats, frame.scales, mean,
              began, on_device, hyper.nonfinite),
-            (len(param), frame.min_aspect, size, *adam, number, put),
+            (param.shape[0], frame.min_aspect, size, *adam, number, put),
         )  # fmt: skip
         return
     key, share, fade_m, fade_v = NO_FADE if fade is None else fade
@@ -162,7 +166,7 @@ def launch(step: Step, hyper: Hyper) -> None:
     _run(
         "step_rows", -(-numbers // ROWS_BLOCK),
         (param, step.grad, m, v, mean, began, held, on_device, hyper.nonfinite),
-        (numbers, numbers // len(param) if param.dim() else 1, size, *adam,
+        (numbers, numbers // param.shape[0] if param.dim() else 1, size, *adam,
          key if key < 2**31 else key - 2**32, share, fade_m, fade_v, weight, number, put),
     )  # fmt: skip
 
@@ -176,13 +180,13 @@ def _run(
     where the same tensors are there, all begin at a multiple of 16 bytes, and are on one device.
     """
     pointers = [None if tensor is None else tensor.data_ptr() for tensor in tensors]
-    every, absent = 0, 0
+    every, absent, bit = 0, 0, 1
     for pointer in pointers:
-        absent *= 2
         if pointer is None:
-            absent += 1
+            absent |= bit
         else:
             every |= pointer
+        bit *= 2
     first = tensors[0]
     assert first is not None
     key = name, absent, first.get_device(), numbers[0] > LONG
