@@ -135,7 +135,11 @@ class SimulatedDevice(TorchFunctionMode):
             raise RuntimeError(f"Expected all tensors to be on the same device ({name})")
         if here and name in WAITS:
             self._wait(name)
-        if here and name in ("__getitem__", "__setitem__") and any(t.dtype == torch.bool for t in _tensors(args[1:])):
+        if (
+            here
+            and name in ("__getitem__", "__setitem__")
+            and any(t.dtype == torch.bool for t in _tensors(args[1:]))
+        ):
             self._wait("boolean index")
         if name == "copy_" and len(here) == 1:
             return self._copied(args[0], args[1], kwargs.get("non_blocking", False))

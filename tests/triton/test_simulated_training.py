@@ -107,7 +107,12 @@ def train(parts: Sequence[Part], gpu: SimulatedDevice | None, seen: float) -> Tr
         pytest.param(DEFAULTS, 0.6, marks=pytest.mark.thorough),
         pytest.param(DEFAULTS_ADC, 0.1, marks=pytest.mark.thorough),
     ],
-    ids=["relocation", "clone and split", "relocation, all in view", "clone and split, few in view"],
+    ids=[
+        "relocation",
+        "clone and split",
+        "relocation, all in view",
+        "clone and split, few in view",
+    ],
 )
 def test_a_training_ends_as_on_a_cpu(parts: Sequence[Part], seen: float) -> None:
     ours = train(parts, None, seen)
