@@ -286,8 +286,9 @@ class StepAdam(Adam):
     def _step_lane(self, lane: Lane, iteration: int) -> None:
         step, course = self._plan(lane, iteration), self.course
         group, state = lane.group, step.state
-        state["step"] += 1
-        t, (beta1, beta2) = state["step"].item(), group["betas"]
+        count = state["step"].numpy()  # torch's own addition takes as long as a launch
+        count[()] += 1
+        t, (beta1, beta2) = count.item(), group["betas"]
         lr, decay = group["lr"], group["weight_decay"]
         hyper = Hyper(
             lr, beta1, beta2, group["eps"], 1 - beta1**t, (1 - beta2**t) ** 0.5,
@@ -317,10 +318,8 @@ class StepAdam(Adam):
         """The running mean, and with which count the mean of each row began."""
         param, state = step.param, step.state
         assert step.mean is not None
-        began, touched = lane.rows(state, BEGAN, (len(param),))
-        mean, other = lane.rows(state, MEAN, tuple(param.shape))
-        if touched or other:  # rows that are new have a mean of zeros, and begin with this step
-            began.copy_(torch.where(began == 0, float(step.mean.number), began))
+        began, _ = lane.rows(state, BEGAN, (len(param),))
+        mean, _ = lane.rows(state, MEAN, tuple(param.shape))
         return mean, began
 
     # -- optimizers that have a step of their own --------------------------------------------------
