@@ -53,11 +53,9 @@ class Lane:
         self.before: list[Part] = []
         self.after: list[Part] = []
 
-    def ask(self, parts: tuple[Part, ...], any_group: bool) -> Lane:
+    def ask(self, parts: tuple[Part, ...]) -> Lane:
         """Take the parts that act on this parameter."""
-        mine = [
-            p for p in parts if any_group or p.names is None or (self.name and self.name in p.names)
-        ]
+        mine = [p for p in parts if p.names is None or (self.name and self.name in p.names)]
         for phase in Phase:
             self.plans[phase] = [
                 p for p in mine if overrides(p, "plan") and p.during in (None, phase)
@@ -114,7 +112,6 @@ class StepAdam(Adam):
     """
 
     course: Course
-    any_group = False  # whether the parts act on groups that are no Gaussian parameter's, too
     next_iteration = 0
     in_own_frame = False  # whether its moments of the positions are those of the own frame
     _base: type[Adam] = Adam  # the class whose optimizer it was
@@ -221,7 +218,7 @@ class StepAdam(Adam):
                 course.members[(slot[0], slot[1])] = self, at
             for param in group["params"]:
                 i = len(self._lanes)
-                lane = Lane(group, param, slot).ask(course.parts, self.any_group)
+                lane = Lane(group, param, slot).ask(course.parts)
                 before = old[i] if i < len(old) else None
                 if before is None:
                     lane.last = self._last[i] if i < len(self._last) else self.next_iteration - 2
@@ -256,6 +253,11 @@ class StepAdam(Adam):
         """What the lane's step has, as its parts say."""
         param, group, course = lane.param, lane.group, self.course
         grad = cast(Tensor, param.grad)
+        if grad.layout != torch.strided:
+            raise ValueError(
+                f"{type(self).__name__}.step: the gradient of {lane.name or 'a parameter'} is "
+                f"{grad.layout}; have the trainer make dense gradients (gsplat: no sparse_grad)"
+            )
         state = self.state[param]
         if not state:
             state["step"] = torch.zeros((), dtype=torch.float32, device="cpu")
