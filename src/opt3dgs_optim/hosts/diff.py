@@ -59,18 +59,18 @@ def edited(text: str) -> tuple[Trainer, str]:
     if len(fit) != 1:
         raise ValueError(_by_hand(plain))
     trainer, lines = fit[0], text.split("\n")
-    inserted: dict[int, list[str]] = {}  # above the line of that number, from 0
+    inserted: dict[int, list[str]] = {}  # above that line, from 0
     for place in trainer.places:
-        indent = place.anchor[: len(place.anchor) - len(place.anchor.lstrip())]
         for at in _starts(place.anchor, plain):
             end = "\r" if lines[at].endswith("\r") else ""
-            new = [f"{indent}{line}{end}" for line in trainer.lines_at(place)]
-            inserted[at if place.above else at + 1] = new
+            new = [f"{place.indent}{line}{end}" for line in trainer.lines_at(place)]
+            inserted.setdefault(at if place.above else at + 1, []).extend(new)
     whole: list[str] = []
     ours: set[int] = set()  # numbers of our lines, from 1
     for at, line in enumerate([*lines, ""]):
-        ours.update(range(len(whole) + 1, len(whole) + 1 + len(inserted.get(at, ()))))
-        whole += [*inserted.get(at, ()), line]
+        new = inserted.get(at, [])
+        ours.update(range(len(whole) + 1, len(whole) + 1 + len(new)))
+        whole += [*new, line]
     new_text = "\n".join(whole[:-1])
     if not _only_inserted(text, new_text, ours):
         raise ValueError(f"the lines would not be statements of their own\n\n{_by_hand(plain)}")
@@ -146,6 +146,6 @@ def main(arguments: Sequence[str]) -> int:
         return 1
     pair = (old.replace("\r", "").split("\n"), new.replace("\r", "").split("\n"))
     print("\n".join(difflib.unified_diff(*pair, str(path), str(path), lineterm="")))
-    done = f"written; {kept} is the old file" if "--write" in arguments else "not written: --write"
-    print(f"\n{trainer.title}; {done}", file=sys.stderr)
+    done = f"written; {kept} is the old file" if "--write" in arguments else "not written"
+    print(f"\n{trainer.title}: {done}", file=sys.stderr)
     return 0

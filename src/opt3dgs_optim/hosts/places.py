@@ -17,6 +17,11 @@ class Place:
     above: bool = False
     times: int = 1
 
+    @property
+    def indent(self) -> str:
+        """The spaces before the anchor, and before the lines."""
+        return self.anchor[: len(self.anchor) - len(self.anchor.lstrip())]
+
 
 @dataclass(frozen=True)
 class Trainer:
