@@ -15,7 +15,7 @@ pytestmark = pytest.mark.processes
 
 ROOT = Path(__file__).resolve().parents[1]
 LINES = '''
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -23,24 +23,20 @@ from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 
 from opt3dgs_optim import (
-    AWSGLD, DEFAULTS, Annealing, Averaging, ConstantMultiplier, Curvature, EnergyHistogram, Fading,
-    FreshMoments, IsotropicNoise, LQNAdam, Part, Phase, PhaseScheduler,
+    AWSGLD, DEFAULTS, DEFAULTS_ADC, Annealing, Averaging, Course, Curvature, EnergyHistogram,
+    Fading, FreshMoments, IsotropicNoise, LQNAdam, Part, Phase, PhaseScheduler,
     PositionNoise, SquaredLoss, backend_info, two_loop,
 )
+from opt3dgs_optim.step import Step
 
 
 class Trainer:
-    """gsplat's, with the README's four lines."""
+    """gsplat's, with the three lines."""
 
     def __init__(self, optimizers: dict[str, Optimizer], max_steps: int) -> None:
         self.optimizers = optimizers
-        self.phases = PhaseScheduler(total_steps=max_steps)
-        self.optimizers = self.phases.upgrade(self.optimizers)
-
-    def train(self, colors: Tensor, pixels: Tensor) -> Tensor:
-        l1loss: Tensor = self.phases.pixel_loss(colors, pixels)
-        self.phases.observe(l1loss)
-        return l1loss
+        self.phases = PhaseScheduler(max_steps)
+        self.phases.upgrade(self.optimizers)
 
 
 class Gaussians:
@@ -50,8 +46,10 @@ class Gaussians:
 
     def __init__(self, iterations: int) -> None:
         self.optimizer = Adam([{"params": [Parameter(torch.ones(3))], "name": "xyz"}])
-        phases = PhaseScheduler(total_steps=iterations)
+        phases = PhaseScheduler(iterations, parts=DEFAULTS_ADC)
         self.optimizer = phases.upgrade(self.optimizer)
+        phases.observe(iteration=0)
+        phases.finish()
 
 
 adams: dict[str, Adam] = {}
@@ -60,26 +58,28 @@ upgraded: dict[str, Adam] = PhaseScheduler(10).upgrade(adams)
 
 class SignAgreement(Part):
     during: ClassVar[Phase | None] = Phase.EXPLOITATION
-    keys: ClassVar[tuple[str, ...]] = ("seen",)
 
-    def before(self, group: dict[str, Any], param: Tensor, grad: Tensor, state: dict[str, Any],
-               course: Any) -> Tensor:
-        return torch.where(grad * state["exp_avg"] < 0, 0.0, grad)
+    def plan(self, step: Step, course: Course) -> None:
+        step.factor *= 2.0
+
+    def before(self, step: Step, course: Course) -> Tensor:
+        return torch.where(step.grad * step.state["exp_avg"] < 0, 0.0, step.grad)
 
 
-parts: list[Part] = [*DEFAULTS, Averaging(), SignAgreement(), ConstantMultiplier(1.5)]
-phases = PhaseScheduler(30_000, 0.9, parts, adaptive=True)
+parts: list[Part] = [*DEFAULTS, SignAgreement()]
+phases = PhaseScheduler(30_000, 0.9, parts)
 phases = PhaseScheduler(30_000, 29_000, [Annealing(4.0, names=("means",)), Fading(seed=3)])
 phases = PhaseScheduler(300, parts=[FreshMoments(), SquaredLoss(), Curvature(history_size=3)])
 phases = PhaseScheduler.paper(total_steps=3_000)
 phase: Phase = phases.phase
+loss: Tensor = phases.pixel_loss(torch.ones(3), torch.ones(3))
+phases.observe(loss)
 points = Parameter(torch.ones(4, 3))
-phases = PhaseScheduler(30, parts=[PositionNoise({"scales": points}, scale=5e5)])
-a = AWSGLD([points], lr=0.1, histogram=EnergyHistogram(), noise=IsotropicNoise(std=0.1), fused=True)
-b = LQNAdam([points], lr=0.1, betas=(0.9, 0.99), history_size=5, decoupled_weight_decay=True)
+phases = PhaseScheduler(30, parts=[PositionNoise({"scales": points}, scale=5e5), Averaging()])
+a = AWSGLD([points], lr=0.1, histogram=EnergyHistogram(), noise=IsotropicNoise(std=0.1))
+b = LQNAdam([points], lr=0.1, betas=(0.9, 0.99), history_size=5)
 b.step()
 a.step(lambda: torch.ones(()))
-a.step(visible=torch.ones(4))
 direction: Tensor = two_loop(torch.ones(4, 3), torch.zeros(4, 5, 8), 5)
 print(backend_info("cpu"), phase)
 '''
