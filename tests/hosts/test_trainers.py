@@ -110,8 +110,8 @@ def test_nerfstudio_trains_and_saves_the_mean(
     sources = TRAINERS / folder / "nerfstudio"
     if not sources.is_dir():
         pytest.skip(f"no {sources}: put its sources there, set OPT3DGS_TRAINERS")
-    names = "nerfacc pytorch_msssim tyro appdirs pathos fpsample mediapy rawpy torchmetrics".split()
-    lacking = [name for name in names if not importlib.util.find_spec(name)]
+    needs = "nerfacc pytorch_msssim tyro appdirs pathos fpsample mediapy rawpy torchmetrics"
+    lacking = [name for name in needs.split() if not importlib.util.find_spec(name)]
     if lacking or not entry_points(group="nerfstudio.method_configs"):
         pytest.skip(f"install opt3dgs_optim beside what nerfstudio needs, as {lacking}")
     end = str(LENGTH)
