@@ -138,7 +138,8 @@ def test_a_second_optimizer_stepped_less_often() -> None:
         for optimizer, state in zip(made, () if saved is None else saved[1], strict=False):
             optimizer.load_state_dict(state)
         phases = PhaseScheduler(TOTAL, parts=DEFAULTS_ADC)
-        phases.upgrade(made)
+        optimizers: Any = made
+        phases.upgrade(optimizers)
         return values, made, phases
 
     def go_on(values: Any, made: list[Adam], first: int, last: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 
@@ -49,7 +50,7 @@ class Trainer:
     relocates: bool | str
     places: tuple[Place, ...]
     signs: tuple[str | tuple[str, ...], ...] = ()
-    counts: dict[str, int | tuple[int, ...]] = field(default_factory=dict)
+    counts: Mapping[str, int | tuple[int, ...]] = field(default_factory=dict)
     notes: dict[str, str] = field(default_factory=dict)
     inserted: bool = True
     variants: dict[str, bool] = field(default_factory=dict)
