@@ -49,6 +49,7 @@ def command_of(line: Line) -> str:
     words += [f"--sh-degree {line['sh_degree']}"] * (line["sh_degree"] > 0)
     words += [f"--rates {line['rates']:g}"] * ("rates" in line)
     words += [f"--views {line['views']}"] * ("views" in line)
+    words += ["--background white"] * (line["scene"] == "lego")
     return " ".join(["python examples/benchmarks/train.py", *words, f"--seed {line['seed']}"])
 
 

@@ -1,0 +1,301 @@
+"""Make the tables and pictures of docs/evidence.md anew: python examples/benchmarks/report.py
+
+All of it comes from docs/results/evidence.jsonl, and the cost of a step from docs/results/steps.json.
+In the page a table stands between `<!-- evidence:NAME -->` and `<!-- end -->`, where NAME is a
+function of `TABLES`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import statistics
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks import evidence, steps
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "evidence.md"
+PICTURE = evidence.FILE.with_name("iterations.png")
+MAIN = ("bonsai", "lego", "plush")
+FEW = ("banana", "brighton_beach", "embedded", "lund_door")
+HALF: dict[str, Any] = {"size": "images_2", "points": 50_000, "sh_degree": 0}
+QUARTER: dict[str, Any] = {"size": "images_4", "sh_degree": 0}
+METRICS = ("psnr", "ssim", "lpips")
+FORMS = {"psnr": "{:.2f}", "ssim": "{:.4f}", "lpips": "{:.4f}"}
+GAINS = {"psnr": "{:+.2f}", "ssim": "{:+.4f}", "lpips": "{:+.4f}"}
+Line = dict[str, Any]
+
+
+class Evidence:
+    """All lines, to choose from."""
+
+    def __init__(self, path: Path = evidence.FILE) -> None:
+        self.lines = evidence.read(path)
+
+    def of(self, arm: str, scene: str, **those: Any) -> list[Line]:
+        """The lines of an arm; what is not said is as usual, on a CPU. One a seed, in order."""
+        wanted = evidence.USUAL | those | {"arm": arm, "scene": scene}
+        found = [x for x in self.lines if all(x.get(k) == v for k, v in wanted.items())]
+        found = [x for x in found if "NVIDIA" not in x["device"]]
+        return sorted(found, key=lambda x: str(x["seed"]))
+
+
+def seeds_of(lines: Iterable[Line]) -> list[int]:
+    """All seeds of the lines."""
+    return sorted(s for x in lines for s in (x["seed"] if isinstance(x["seed"], list) else [x["seed"]]))
+
+
+def mean(lines: Sequence[Line], metric: str) -> float:
+    """Over the seeds."""
+    weights = [len(seeds_of([x])) for x in lines]
+    return sum(w * x[metric] for w, x in zip(weights, lines, strict=True)) / sum(weights)
+
+
+def shown(lines: Sequence[Line]) -> str:
+    """PSNR / SSIM / LPIPS and the number of seeds."""
+    if not lines:
+        return "not trained"
+    values = (FORMS[m].format(mean(lines, m)) for m in METRICS if lines[0][m] is not None)
+    count = len(seeds_of(lines))
+    return f"{' / '.join(values)} ({count} seed{'s' * (count > 1)})"
+
+
+def gain(lines: Sequence[Line], control: Sequence[Line]) -> dict[str, float] | None:
+    """Mean difference over the seeds that both have; None where there is none."""
+    common = set(seeds_of(lines)) & set(seeds_of(control))
+    if not common or any(isinstance(x["seed"], list) for x in (*lines, *control)):
+        same = lines and control and seeds_of(lines) == seeds_of(control)
+        return {m: mean(lines, m) - mean(control, m) for m in METRICS} if same else None
+    ours, theirs = ([x for x in each if x["seed"] in common] for each in (lines, control))
+    return {m: mean(ours, m) - mean(theirs, m) for m in METRICS if ours[0][m] is not None}
+
+
+def gained(lines: Sequence[Line], control: Sequence[Line]) -> str:
+    """The gain, and over how many seeds."""
+    found = gain(lines, control)
+    if found is None:
+        return "not trained" if not lines else "-"
+    count = len(set(seeds_of(lines)) & set(seeds_of(control)))
+    values = " / ".join(GAINS[m].format(v) for m, v in found.items())
+    return f"{values} ({count} seed{'s' * (count > 1)})"
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Markdown."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+# -- the tables -------------------------------------------------------------------------------------
+
+
+def iterations(all_: Evidence) -> str:
+    """Shorter trainings against stock's 30,000 iterations, seed by seed."""
+    rows = []
+    for scene in MAIN:
+        stock = all_.of("mcmc", scene, iterations=30_000, **HALF)
+        rows.append((scene, "stock, 30,000", shown(stock), ""))
+        for arm, count in (
+            *(("own", n) for n in (15_000, 10_000, 7_500)),
+            *((arm, 10_000) for arm in ("mcmc", "x2", "x3", "averaged", "x2-averaged", "learn2splat")),
+        ):
+            lines = all_.of(arm, scene, iterations=count, **HALF)
+            if lines or arm in ("own", "mcmc"):
+                name = NAMES.get(arm, arm)
+                rows.append(("", f"{name}, {count:,}", shown(lines), gained(lines, stock)))
+    heads = ("scene", "training", "PSNR / SSIM / LPIPS", "less stock at 30,000, same seeds")
+    return table(heads, rows)
+
+
+def kept_aside(all_: Evidence) -> str:
+    """A scene that nobody tuned to."""
+    rows = []
+    for arm in ("mcmc", "x2", "defaults", "own"):
+        found = [x for x in all_.lines if x["scene"] == "kept-aside" and x["arm"] == arm]
+        cells = {x["iterations"]: shown([x]).removesuffix(" (1 seed)") for x in found}
+        rows.append((NAMES[arm], *(cells.get(n, "-") for n in (1_875, 2_500, 3_750, 7_500))))
+    return table(("training", "1,875", "2,500", "3,750", "7,500 iterations"), rows)
+
+
+def gpu(all_: Evidence) -> str:
+    """What was read on a GPU."""
+    rows = []
+    found = [x for x in all_.lines if "NVIDIA" in x["device"]]
+    keys = sorted({(x["scene"], x["points"], x["iterations"]) for x in found})
+    for scene, points, planned in keys:
+        those = {x["arm"]: x for x in found if (x["scene"], x["points"], x["iterations"]) == (scene, points, planned)}
+        reached = min(x["curve"]["iteration"][-1] for x in those.values())
+        marks = [n for n in those["mcmc"]["curve"]["iteration"] if n <= reached]
+        at = sorted({marks[len(marks) // 3], marks[-1]})
+        for arm, line in those.items():
+            curve = dict(zip(line["curve"]["iteration"], line["curve"]["psnr"], strict=True))
+            cells = [f"{curve[n]:.2f} at {n:,}" for n in at]
+            rows.append((f"{scene}, {points:,} of {planned:,}", NAMES[arm], *cells))
+    return table(("scene, Gaussians, planned iterations", "training", "PSNR early", "PSNR at the last that all reached"), rows)
+
+
+def equal(all_: Evidence) -> str:
+    """All of 30,000 iterations."""
+    rows = []
+    for size, setting in (("half", HALF), ("quarter", QUARTER)):
+        for scene in MAIN:
+            stock = all_.of("mcmc", scene, iterations=30_000, **setting)
+            lines = (all_.of(a, scene, iterations=30_000, **setting) for a in ("own", "defaults", "x2"))
+            rows.append((scene, size, shown(stock), *(gained(x, stock) for x in lines)))
+    heads = ("scene", "size", "stock", "own frame", "fading (the defaults before)", "rates times 2")
+    return table(heads, rows)
+
+
+def cost(_: Evidence) -> str:
+    """What a step costs on a CPU."""
+    made = json.loads(steps.OUT.read_text(encoding="utf-8"))
+    found = {int(points): rows for points, rows in made["results"].items()}
+    return f"{steps.table(found)}\n\n{made['machine']}, {made['date']}, medians of {made['rounds']} rounds."
+
+
+def few(all_: Evidence) -> str:
+    """Scenes with 10 to 24 photos."""
+    rows = []
+    for scene in FEW:
+        stock, former, own = (
+            all_.of(a, scene, iterations=30_000, **QUARTER) for a in ("mcmc", "defaults", "own")
+        )
+        rows.append((scene, shown(stock), gained(former, stock), gained(own, stock)))
+    heads = ("scene", "stock", "fading (the defaults before)", "own frame")
+    return table(heads, rows)
+
+
+def adaptive(all_: Evidence) -> str:
+    """Clone, split, prune and reset."""
+    rows = []
+    arms = ("adc", "adc-own", "adc-annealed-faded-averaged")
+    for scene in ("lego", "plush"):
+        stock = all_.of("adc", scene, iterations=30_000, **QUARTER)
+        for arm in arms:
+            lines = all_.of(arm, scene, iterations=30_000, **QUARTER)
+            count = f"{mean(lines, 'gaussians'):,.0f}" if lines else "-"
+            rows.append((scene if arm == "adc" else "", NAMES[arm], shown(lines), gained(lines, stock), count))
+    heads = ("scene", "training", "PSNR / SSIM / LPIPS", "less stock", "Gaussians")
+    return table(heads, rows)
+
+
+def capture(all_: Evidence) -> str:
+    """A large capture, where views see little."""
+    rows = []
+    for arm in ("mcmc", "out-of-view", "defaults-without", "defaults"):
+        lines = all_.of(arm, "capture")
+        rows.append((lines[0]["note"].split(";")[0], shown(lines)))
+    return table(("training", "PSNR / SSIM"), rows)
+
+
+PAPER = (
+    ("AW-SGLD, this package's form", "awsgld-stable", "awsgld-stable-constant"),
+    ("AW-SGLD, the paper's settings", "awsgld", "constant"),
+    ("L2 loss in the last thirtieth", "l2@1/30", "mcmc"),
+    ("fresh moments in the last thirtieth", "l1+reset@1/30", "mcmc"),
+    ("L-BFGS directions in the last thirtieth", "l2+reset+lqn@1/30", "l2+reset@1/30"),
+    ("all of it, the paper's preset", "paper", "mcmc"),
+)
+
+
+def paper(all_: Evidence) -> str:
+    """The paper's parts, each beside the same training without it."""
+    rows = []
+    for what, arm, control in PAPER:
+        gains = []
+        for scene in ("bonsai-misposed", "lego", "plush", *FEW):
+            found = gain(
+                *(all_.of(a, scene, iterations=30_000, **QUARTER) for a in (arm, control))
+            )
+            gains += [found] if found else []
+        beside = "a constant multiplier of its mean" if "constant" in control else "the training without it"
+        cells = [spread([g[m] for g in gains], GAINS[m]) for m in METRICS]
+        rows.append((what, beside, f"{len(gains)}", *cells))
+    return table(("part", "compared with", "scenes", "PSNR", "SSIM", "LPIPS"), rows)
+
+
+def spread(values: Sequence[float], form: str) -> str:
+    """Mean and standard error over the scenes."""
+    error = statistics.stdev(values) / len(values) ** 0.5 if len(values) > 1 else 0.0
+    return f"{form.format(statistics.mean(values))} ± {form.format(error)[1:]}"
+
+
+NAMES = {
+    "mcmc": "stock",
+    "own": "own frame",
+    "defaults": "fading (the defaults before)",
+    "x2": "rates times 2",
+    "x3": "rates times 3",
+    "averaged": "stock, averaged",
+    "x2-averaged": "rates times 2, averaged",
+    "learn2splat": "Learn2Splat's tuned Adam",
+    "adc": "stock",
+    "adc-own": "`OwnFrame` and `Averaging`",
+    "adc-annealed-faded-averaged": "`Annealing` and `Fading`, not of the scales",
+}
+TABLES: dict[str, Callable[[Evidence], str]] = {
+    f.__name__: f
+    for f in (iterations, kept_aside, gpu, equal, cost, few, adaptive, capture, paper)
+}
+
+
+def draw(all_: Evidence, path: Path) -> None:
+    """Quality over iterations at half size, with the end of stock's training as a line."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 3.9), dpi=130, layout="constrained")
+    axes = figure.subplots(1, len(MAIN))
+    for axis, scene in zip(axes, MAIN, strict=True):
+        stock = all_.of("mcmc", scene, iterations=30_000, **HALF)
+        end = mean(stock, "psnr")
+        axis.axhline(end, color="#555555", lw=1, ls="--")
+        said = f"stock after 30,000: {end:.2f} dB"
+        axis.text(0.98, end, said, transform=axis.get_yaxis_transform(), ha="right", va="bottom")
+        drawn = [("mcmc", 30_000, "#555555"), ("own", 30_000, "#9ecae1"), ("own", 15_000, "#4292c6"), ("own", 10_000, "#d55e00"), ("own", 7_500, "#009e73")]
+        for arm, count, colour in drawn:
+            lines = [x for x in all_.of(arm, scene, iterations=count, **HALF) if x.get("curve")]
+            if not lines:
+                continue
+            at = lines[0]["curve"]["iteration"]
+            curves = [[dict(zip(x["curve"]["iteration"], x["curve"]["psnr"], strict=True)).get(n) for n in at] for x in lines]
+            curve = [statistics.mean(v) if None not in v else float("nan") for v in zip(*curves, strict=True)]
+            label = f"{NAMES[arm]}, planned for {count:,}" if arm == "own" else "stock"
+            axis.plot([n / 1000 for n in at], curve, color=colour, lw=2, label=label)
+            axis.plot(at[-1] / 1000, curve[-1], "o", color=colour, ms=5)
+        axis.set(title=scene, xlabel="thousand iterations", xlim=(0, 31), ylim=(end - 5, end + 1.6))
+        axis.grid(color="#e4e4e4", lw=0.8)
+    axes[0].set_ylabel("PSNR of held-out views, dB")
+    entries = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(entries.values(), entries, loc="outside lower center", ncols=len(entries), frameon=False)
+    figure.savefig(path)
+
+
+def filled(page: str, all_: Evidence) -> str:
+    """The page with its tables made anew; ValueError where it names one that there is not."""
+
+    def made(found: re.Match[str]) -> str:
+        if found[1] not in TABLES:
+            raise ValueError(f"{PAGE.name}: evidence:{found[1]}, but there are {', '.join(TABLES)}")
+        return f"<!-- evidence:{found[1]} -->\n{TABLES[found[1]](all_)}\n<!-- end -->"
+
+    return re.sub(r"<!-- evidence:(\w+) -->.*?<!-- end -->", made, page, flags=re.DOTALL)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line."""
+    argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0]).parse_args(arguments)
+    all_ = Evidence()
+    PAGE.write_text(filled(PAGE.read_text(encoding="utf-8"), all_), encoding="utf-8")
+    draw(all_, PICTURE)
+    print(PAGE, PICTURE, sep="\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
