@@ -8,15 +8,15 @@ What is on by default is this package's own, and not the paper's: fading of Adam
 on points out of view, and the average of the last iterates.
 """
 
+from opt3dgs_optim.adam import StepAdam
 from opt3dgs_optim.awsgld import AWSGLD
 from opt3dgs_optim.backend import backend_info
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.lbfgs import history_from_pairs, two_loop
 from opt3dgs_optim.lqnadam import LQNAdam
-from opt3dgs_optim.part import Kept, Part, Phase
+from opt3dgs_optim.part import Part, Phase
 from opt3dgs_optim.parts.annealing import Annealing
 from opt3dgs_optim.parts.averaging import Averaging
-from opt3dgs_optim.parts.constant import ConstantMultiplier
 from opt3dgs_optim.parts.curvature import Curvature
 from opt3dgs_optim.parts.fading import Fading
 from opt3dgs_optim.parts.histogram import EnergyHistogram
@@ -27,7 +27,6 @@ from opt3dgs_optim.parts.own_frame import OwnFrame
 from opt3dgs_optim.phases import PhaseScheduler
 from opt3dgs_optim.presets import DEFAULTS, DEFAULTS_ADC, paper_parts
 from opt3dgs_optim.runs import RunLog
-from opt3dgs_optim.stepadam import StepAdam
 from opt3dgs_optim.version import __version__
 
 __all__ = [
@@ -36,14 +35,12 @@ __all__ = [
     "DEFAULTS_ADC",
     "Annealing",
     "Averaging",
-    "ConstantMultiplier",
     "Course",
     "Curvature",
     "EnergyHistogram",
     "Fading",
     "FreshMoments",
     "IsotropicNoise",
-    "Kept",
     "LQNAdam",
     "OutOfView",
     "OwnFrame",

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from torch import Tensor
 
+from opt3dgs_optim.adam import StepAdam
 from opt3dgs_optim.backend import Backend
 from opt3dgs_optim.checks import warn_user
+from opt3dgs_optim.contract import check_supported
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.overrides import AdamOptions
+from opt3dgs_optim.names import split_name
 from opt3dgs_optim.parts.curvature import Curvature
-from opt3dgs_optim.stepadam import StepAdam
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 
 class LQNAdam(StepAdam):
@@ -43,10 +41,8 @@ class LQNAdam(StepAdam):
     Memory: Adam's, and for each row of three coordinates 160 bytes with five pairs.
 
     Args:
-        params, lr, betas, eps, weight_decay, amsgrad: as in `torch.optim.Adam`.
+        params, lr, betas, eps, weight_decay: as in `torch.optim.Adam`.
         history_size, min_cosine, graft, backend: as in `Curvature`.
-        adam: `foreach, maximize, capturable, fused, decoupled_weight_decay`, as in
-            `torch.optim.Adam`.
 
     Examples:
         Fifty starts in Rosenbrock's valley, each optimizer with the best of its rates there:
@@ -70,7 +66,6 @@ class LQNAdam(StepAdam):
 
     Raises:
         ValueError, RuntimeError: as `Curvature`.
-        TypeError: `params` is a tensor, or an option is none of Adam's.
     """
 
     any_group = True
@@ -78,28 +73,23 @@ class LQNAdam(StepAdam):
     def __init__(
         self,
         params: Any,
-        lr: float | Tensor = 1e-3,
+        lr: float = 1e-3,
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-8,
         weight_decay: float = 0.0,
-        amsgrad: bool = False,
         *,
         history_size: int = 5,
         min_cosine: float = 1e-6,
         graft: bool = True,
         backend: Backend = "auto",
-        **adam: Unpack[AdamOptions],
     ) -> None:
-        if adam.get("differentiable"):
-            raise ValueError(
-                "LQNAdam: differentiable=True, but curvature pairs are kept between steps and "
-                "have no gradient; False is needed"
-            )
         curvature = Curvature(
             history_size, min_cosine=min_cosine, graft=graft, names=None, backend=backend
         )
-        super().__init__(params, lr, betas, eps, weight_decay, amsgrad, **adam)
-        self.follow(Course([curvature]))
+        super().__init__(params, lr, betas, eps, weight_decay)
+        slots = [split_name(group.get("name")) for group in self.param_groups]
+        check_supported(self, slots)
+        self.follow(Course([curvature], switch_step=0), slots)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Add a group as in `torch.optim.Adam`; parameters of one dimension get a warning."""

@@ -16,9 +16,6 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from opt3dgs_optim import cuda
-from opt3dgs_optim.backend import obstacle
-
 RELATIVE_ROUNDING = 1e-5  # of a saved range; more than that of float32
 FLOOR = 1e-8  # smallest weight of a fixed range before renormalisation; log theta never sees 0
 # Of the moving partitions; lengths are in deviations of the energy.
@@ -267,12 +264,7 @@ class MovingPartitions(Partitions):
         self._up, self._below, self._base = self._sums.unbind()
 
     def take_on_device(self, energy: Tensor, valid: Tensor | Literal[True], tally: Tally) -> None:
-        """As in `Partitions`; one launch where the CUDA kernels run."""
-        if obstacle("auto", self._state.device, self._state.dtype) is None:
-            counts, limit = (tally.warmup, MEMORY, UNLIMITED), LIMIT / MEAN_ABS
-            learnt = (self._state, self.nu, tally.count, tally.sums)
-            cuda.take_energy(energy, valid, *learnt, counts, limit, *self.clamp, *self._constants)
-            return
+        """As in `Partitions`."""
         if energy.dtype != self.nu.dtype:
             energy = energy.to(self.nu.dtype)
             valid = valid & torch.isfinite(energy)  # a large number of float64 is not, in float32

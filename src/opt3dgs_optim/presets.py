@@ -1,4 +1,8 @@
-"""What is on: the parts that paid, and those of the paper."""
+"""What is on: the parts that paid, for each kind of density control, and those of the paper."""
+
+from __future__ import annotations
+
+from typing import Any
 
 from opt3dgs_optim.checks import check_count
 from opt3dgs_optim.part import Part
@@ -9,19 +13,39 @@ from opt3dgs_optim.parts.fading import Fading
 from opt3dgs_optim.parts.histogram import EnergyHistogram
 from opt3dgs_optim.parts.last_phase import FreshMoments, SquaredLoss
 from opt3dgs_optim.parts.out_of_view import OutOfView
+from opt3dgs_optim.parts.own_frame import OwnFrame
 
 PAPER_STEPS = 30_000
 PAPER_SWITCH = 29_000 / PAPER_STEPS
 PAPER_WARMUP = 2_500 / PAPER_STEPS
-DEFAULTS: tuple[Part, ...] = (Fading(), OutOfView(), Averaging())  # what paid: docs/evidence.md
-# What is switched off where a trainer removes Gaussians and nobody has chosen the parts.
-LEFT_OUT_WITH_REMOVAL: tuple[type[Part], ...] = (Fading,)
+
+
+class Preset(tuple[Part, ...]):
+    """Parts that are put together; none of them learns, so that trainings may share them."""
+
+    def __add__(self, other: Any) -> Any:  # pyright: ignore
+        raise TypeError(
+            "a preset cannot be added to; write parts=[*DEFAULTS, YourPart()], which says the order"
+        )
+
+
+# For 3DGS-MCMC's relocation (docs/evidence.md).
+DEFAULTS = Preset(
+    [
+        OwnFrame(),
+        Fading(names=("scales", "quats", "opacities", "sh0", "shN")),
+        OutOfView(),
+        Averaging(),
+    ]
+)
 # For clone, split and prune: longer steps let scales grow until they are pruned as too big.
-DEFAULTS_ADC: tuple[Part, ...] = (
-    Annealing(names=("quats", "opacities", "sh0", "shN")),
-    Fading(names=("means", "quats", "opacities", "sh0", "shN")),
-    OutOfView(),
-    Averaging(),
+DEFAULTS_ADC = Preset(
+    [
+        Annealing(names=("quats", "opacities", "sh0", "shN")),
+        Fading(names=("means", "quats", "opacities", "sh0", "shN")),
+        OutOfView(),
+        Averaging(),
+    ]
 )
 
 

@@ -1,12 +1,15 @@
 """Annealing: learning rates start above the trainer's own and end below them."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from opt3dgs_optim.checks import check_number, set_options
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.names import GAUSSIAN, SLOT, canonical_name, check_names
-from opt3dgs_optim.part import Group, Part
+from opt3dgs_optim.names import GAUSSIAN, canonical_name, check_names
+from opt3dgs_optim.part import Part
+from opt3dgs_optim.step import Step
 
 CALL = "Annealing"
 ANNEALED = tuple(name for name in GAUSSIAN if name != "means")
@@ -63,8 +66,9 @@ class Annealing(Part):
         t = min(max(progress, 0.0), 1.0)
         return peak ** (1.0 - t) * self.final**t
 
-    def factor(self, group: Group, course: Course) -> float:
-        return self.at(group.get(SLOT), course.progress)
+    def plan(self, step: Step, course: Course) -> None:
+        """Scale the rate."""
+        step.factor = step.factor * self.at(step.name, course.progress)
 
     def numbers(self, course: Course) -> Mapping[str, float]:
         """`annealing`: the factor on the steps of the first of its parameters."""

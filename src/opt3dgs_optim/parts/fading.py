@@ -1,5 +1,7 @@
 """Fading: Adam's moments of random points are shrunk, so that their next steps are longer."""
 
+from __future__ import annotations
+
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,11 +12,10 @@ from torch import Tensor
 from opt3dgs_optim.checks import check_count, check_number, set_options
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import GAUSSIAN, check_names
-from opt3dgs_optim.part import Group, Part, State
-from opt3dgs_optim.state import broadcast_rows
+from opt3dgs_optim.part import Part
+from opt3dgs_optim.step import Fade, Step, chosen_rows, mixed
 
 CALL = "Fading"
-MAX_CATCH_UP_EVENTS = 32  # made up for at once, where a trainer's iteration count jumps
 MAX_POINTS_OF_ALL_EVENTS = 10_000  # of more points, fewer of the events happen
 # In 600 iterations, events 1 apart lose half of what events 4 apart gain.
 MIN_ITERATIONS_BETWEEN_EVENTS = 4
@@ -29,9 +30,9 @@ class Fading(Part):
     recovered, which takes about a thousand iterations.
 
     The same points are faded in all these parameters. Which ones depends on `seed`, on the event
-    and on the number of points alone, so that a resumed run repeats them. It costs no memory.
-    Positions that `OwnFrame` steps are left alone: a faded step of them would be half a standard
-    deviation long.
+    and on the point's index alone: a resumed run repeats them, and every device chooses the same.
+    It costs no memory. Positions that `OwnFrame` steps are left alone: a faded step of them would
+    be half a standard deviation long.
 
     Args:
         share: of the points in each event, chance per point in (0, 1].
@@ -57,8 +58,6 @@ class Fading(Part):
     seed: int = 0
     names: tuple[str, ...] = GAUSSIAN
 
-    spares_own_units = True
-
     def __post_init__(self) -> None:
         start = check_number(CALL, "start", self.start, 0.0, 1.0)
         set_options(
@@ -73,6 +72,17 @@ class Fading(Part):
             names=check_names(CALL, self.names),
         )
 
+    def plan(self, step: Step, course: Course) -> None:
+        """Fade by the newest event since this parameter's last step, if there was one."""
+        total = course.total_steps
+        if total is None:
+            return
+        done = self.events_before(step.last + 1, total)
+        now = self.events_before(step.iteration + 1, total)
+        # Several are due where the trainer has left steps out; they are one.
+        if now > done and any(self.happens(e, len(step.param)) for e in range(done, now)):
+            step.fade = self.fade(now - 1)
+
     def events_before(self, iteration: int, total_steps: int) -> int:
         """Number of events before the step of this iteration (from 0)."""
         return _events_before(iteration, total_steps, self.start, self.stop, self.events)
@@ -82,65 +92,23 @@ class Fading(Part):
         share = min(1.0, MAX_POINTS_OF_ALL_EVENTS / num_points) ** (2 / 3) if num_points else 0.0
         return int((event + 1) * share) > int(event * share)
 
+    def fade(self, event: int) -> Fade:
+        """What an event does."""
+        key = mixed((event + self.seed * 0x9E3779B1) & 0xFFFFFFFF)
+        return Fade(key, self.share, self.exp_avg, self.exp_avg_sq)
+
     def chosen(self, event: int, num_points: int, device: torch.device) -> Tensor:
         """Which points an event fades, [num_points] bool: the same in every parameter."""
-        # A CPU's generator reads 32 bits; consecutive seeds are far apart in them.
-        seed = (event + self.seed * 0x9E3779B1) % 2**32
-        generator = torch.Generator(device).manual_seed(seed)
-        return (
-            torch.rand(num_points, generator=generator, device=device, dtype=torch.float32)
-            < self.share
-        )
-
-    def before(
-        self, group: Group, param: Tensor, grad: Tensor, state: State, course: Course
-    ) -> Tensor:
-        """Fade the moments by the events since this parameter's last step.
-
-        The events of iterations whose step the trainer left out come with the next step.
-        """
-        last, current = state.last_step, course.current
-        if last is None or last > current:  # the first step, or the clock was set back
-            last = current - 1
-        # The step of iteration i comes after i + 1 observations.
-        done, now = _events_between(
-            last + 1, current + 1, course.total_steps, self.start, self.stop, self.events
-        )
-        if done == now:  # most steps
-            return grad
-        count = param.shape[0] if param.dim() > 0 else 0
-        due = range(max(done, now - MAX_CATCH_UP_EVENTS), now)
-        for event in [each for each in due if self.happens(each, count)]:
-            chosen = broadcast_rows(self.chosen(event, count, param.device), param)
-            for key, factor in self._factors():
-                if key in state:
-                    moment = state[key]
-                    moment.copy_(torch.where(chosen, moment * factor, moment))
-        return grad
-
-    def _factors(self) -> tuple[tuple[str, float], ...]:
-        second = self.exp_avg_sq
-        return ("exp_avg", self.exp_avg), ("exp_avg_sq", second), ("max_exp_avg_sq", second)
+        return chosen_rows(self.fade(event), num_points, device)
 
     def numbers(self, course: Course) -> Mapping[str, float]:
-        """`faded`: the share of up to 10,000 points that the present iteration's events fade.
-
-        In the parameters that it acts on; one that it leaves alone is not counted out.
-        """
-        now, total = course.iteration, course.total_steps
-        events = self.events_before(now, total) - self.events_before(now - 1, total)
-        return {"faded": 1.0 - (1.0 - self.share) ** events}
+        """`faded`: the share of up to 10,000 points that the present iteration's event fades."""
+        now, total = course.iteration, course.total_steps or 1
+        happened = self.events_before(now + 1, total) > self.events_before(now, total)
+        return {"faded": self.share * happened}
 
 
 @functools.lru_cache(maxsize=64)  # every parameter asks for the same two iterations
-def _events_between(
-    first: int, last: int, total_steps: int, start: float, stop: float, events: int
-) -> tuple[int, int]:
-    """Numbers of events before the steps of two iterations."""
-    before = _events_before(first, total_steps, start, stop, events)
-    return before, _events_before(last, total_steps, start, stop, events)
-
-
 def _events_before(iteration: int, total_steps: int, start: float, stop: float, events: int) -> int:
     length = stop - start
     share = (iteration / total_steps - start) / length

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -18,8 +18,9 @@ from opt3dgs_optim.checks import (
     check_number,
 )
 from opt3dgs_optim.course import Course
-from opt3dgs_optim.part import Group, Part, Phase
+from opt3dgs_optim.part import Part, Phase
 from opt3dgs_optim.partitions import FixedPartitions, MovingPartitions, Tally, host_tensor
+from opt3dgs_optim.step import Step
 
 # The temperature is not given in the paper; zeta * tau / du = 1.5 at its zeta and du.
 PAPER: dict[str, Any] = {"energy_range": (0.0, 0.2), "temperature": 2e-3, "warmup": 2500}
@@ -69,6 +70,7 @@ class EnergyHistogram(Part):
     """
 
     during = Phase.EXPLORATION
+    learns = True
 
     def __init__(
         self,
@@ -125,7 +127,6 @@ class EnergyHistogram(Part):
     def observe(  # pyright: ignore[reportIncompatibleMethodOverride]
         self,
         energy: Tensor | float,
-        valid: Tensor | bool | None = None,
         course: Course | None = None,
     ) -> Tensor:
         """Take one energy; return nu, 0-d on its device, of the weights before their update.
@@ -133,12 +134,10 @@ class EnergyHistogram(Part):
         Args:
             energy: the training loss of this iteration, 0-d (or one element; ValueError of more).
                 One that is not finite changes nothing. A GPU is not waited for.
-            valid: whether it is finite, where that is known already.
             course: the training's, which wants no copy of nu.
         """
         value = self._on_device(energy)
-        if valid is None:
-            valid = torch.isfinite(value)
+        valid: Tensor | bool = torch.isfinite(value)
         if self._on_host:
             valid = bool(valid)
         self.num_observed += 1
@@ -167,15 +166,14 @@ class EnergyHistogram(Part):
             self._restore(value.device, self.state_dict())
         return value
 
-    def factor(self, group: Group, course: Course | None = None) -> float | Tensor | None:
-        """Nu, a number where the energies live on a CPU.
-
-        Raises:
-            ValueError: the group is to maximise; nothing has moved yet.
-        """
-        if group.get("maximize"):
-            refuse_to_maximize(CALL)
-        return self._factor if self.num_observed else None
+    def plan(self, step: Step, course: Course) -> None:
+        """Scale the rate by nu: a number where the energies live on a CPU."""
+        if self.num_observed:
+            step.factor = step.factor * self._factor
+        elif step.iteration > 20:
+            course.warn_once(
+                CALL, f"{CALL}: no energy has come; call phases.observe(loss) before the steps"
+            )
 
     @property
     def multiplier(self) -> Tensor:
@@ -215,21 +213,6 @@ class EnergyHistogram(Part):
     def numbers(self, course: Course | None = None) -> dict[str, float | Tensor]:
         """`nu`, after as many energies as the warm-up has; one that is not finite is one here."""
         return {"nu": self._law.nu.clone()} if self.num_observed > self.warmup else {}
-
-    def evidence(self, course: Course) -> Tensor | None:
-        """[4]: sums of nu's powers 0, 1 and 2; Theta's share in the open partition at the top."""
-        return torch.cat([self._moments(), self._law.weights[-1:].to(self._law.nu.dtype)])
-
-    def useless(self, evidence: list[float], course: Course) -> str | None:
-        """Where nu has been nearly 1 in all of 300 energies, or of a thirtieth of the run."""
-        count, total, squares, above = evidence
-        if count < max(WINDOW, WINDOW_SHARE * course.total_steps) or above > TOP_SHARE:
-            return None
-        mean = total / count
-        deviation = math.sqrt(max(squares / count - mean * mean, 0.0))
-        if deviation > EFFECT or abs(mean - 1) > EFFECT:
-            return None
-        return f"nu was {mean:.3f}; its deviation was {deviation:.3f} over {count:.0f} energies"
 
     def state_dict(self) -> dict[str, Any]:
         """All that `observe` has learnt, as plain numbers and lists. Synchronises."""
@@ -283,14 +266,6 @@ class EnergyHistogram(Part):
             return f"{line}1, warm-up: {taken} of {self.warmup} energies"
         mean, deviation = float(self.mean_multiplier), float(self.multiplier_std)
         return f"{line}{float(self.multiplier):.4g}, mean {mean:.4g} +- {deviation:.2g}"
-
-
-def refuse_to_maximize(call: str) -> NoReturn:
-    """ValueError: energies are what is minimised, and nu would act the wrong way round."""
-    raise ValueError(
-        f"{call}: maximize=True, but a histogram makes steps longer at low energies, and maximize="
-        "False is needed; minimise the negated loss instead, and observe that"
-    )
 
 
 def _is_host(device: torch.device) -> bool:

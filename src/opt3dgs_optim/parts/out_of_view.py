@@ -1,22 +1,21 @@
 """Points out of view: where views see little of a scene, regularisers make no full steps."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.course import Course
-from opt3dgs_optim.names import gaussian_of
-from opt3dgs_optim.part import Group, Kept, Part, State
-from opt3dgs_optim.state import broadcast_rows
+from opt3dgs_optim.course import Course, Reading
+from opt3dgs_optim.part import Part
+from opt3dgs_optim.step import Hold, Step
 
-OUT_OF_VIEW, SEEN_SHARE = "out_of_view", "seen_share"  # what it publishes, and keeps
-SHARE_LOOKED_AT = 1 / 4  # of the views
 GOLDEN_RATIO = (5**0.5 - 1) / 2
+SHARE_LOOKED_AT = 1 / 4  # of the views
 WEIGHT = 1 / 25  # of a view that is looked at: the mean is of the last 100 views or so
-MAX_POINTS_LOOKED_AT = 2_048  # of each view, for the mean share over many
 MAX_SEEN_SHARE = 1 / 3  # above it nothing is changed
 MIN_SEEN_SHARE = 0.01  # a view counts as seeing at least so much
 
@@ -35,99 +34,70 @@ class OutOfView(Part):
     view is raised to at least (gradient / (3 s))^2, so that its steps are at most about 3 s of a
     full one. Above a third nothing is changed, bit for bit.
 
-    A point is out of view where the gradient of its position is zero. A gradient that is zero
-    everywhere is of no view, and does not count in the mean. The positions may be stepped before or
-    after the scales and opacities; where the trainer clears their gradient first, they must be
-    stepped first, as in every known trainer. It costs no memory.
+    A point is out of view where the gradient of its position is zero. Points whose position has
+    never had a gradient do not count in s: frozen positions are not out of view. The positions'
+    gradient must be there at the first step of an iteration, as in every known trainer.
     """
 
     names = ("means", "scales", "opacities")
-    keeps = (Kept(SEEN_SHARE, per="parameter", initial=1.0, allowed=(0.0, 1.0)),)
 
-    def before(
-        self, group: Group, param: Tensor, grad: Tensor, state: State, course: Course
-    ) -> Tensor:
-        """See at the positions [N, ..] who is out of view; raise the others' second moments."""
-        if grad.dim() == 0 or grad.shape[0] == 0:
-            return grad
-        if gaussian_of(group) == "means":
-            # Not of what Adam is fed: that is zero where a step turns out not to count, which the
-            # other parameters' steps may do.
-            own = cast(Tensor, param.grad)
-            share: Any = _mean_share(own, state[SEEN_SHARE], course.iteration)
-            course.publish(SEEN_SHARE, param, share)
-            if not isinstance(share, float) or share < MAX_SEEN_SHARE:
-                course.publish(OUT_OF_VIEW, param, ~_has_gradient(own))
-            return grad
-        share = course.published(SEEN_SHARE, param)
-        positions: Tensor | None = None  # their gradient, where they come later
-        if share is None:  # the positions come later in this iteration
-            means = course.gaussians_of(param).get("means")
-            if means is None or means.grad is None:
-                return grad
-            kept = course.number_kept(self, SEEN_SHARE, means)
-            kept = torch.ones((), device=means.device) if kept is None else kept
-            positions = means.grad
-            share = _mean_share(positions, kept.clone(), course.iteration)
-        if isinstance(share, float) and share >= MAX_SEEN_SHARE:
-            return grad
-        if positions is None:
-            unseen = course.published(OUT_OF_VIEW, param)
-        else:
-            unseen = ~_has_gradient(positions)
-        if unseen is None or unseen.shape != grad.shape[:1]:
-            return grad
-        factor = MAX_SEEN_SHARE / share * (share < MAX_SEEN_SHARE)
-        if isinstance(factor, Tensor):
-            factor = factor.to(grad.device)
-        least = torch.where(broadcast_rows(unseen.to(grad.device), grad), grad * factor, 0.0)
-        second = state.peek("exp_avg_sq")
-        second.copy_(torch.maximum(second, least.square_()))
-        return grad
+    def plan(self, step: Step, course: Course) -> None:
+        """See at the positions [N, 3] who is out of view; hold the others' second moments."""
+        notes, place = course.notes_of(self), (self, step.set)
+        seen = course.scratch.get(place)
+        if seen is None or seen.iteration != step.iteration:
+            seen = _looked_at(step, course, notes, seen)
+            course.scratch[place] = seen
+        if seen.rows is not None and step.name != "means" and len(seen.rows) == len(step.param):
+            step.hold = Hold(seen.rows, MAX_SEEN_SHARE / notes["share"])
 
-    def numbers(self, course: Course) -> Mapping[str, float | Tensor]:
+    def settle(self, course: Course) -> None:
+        """Take the share that is on its way."""
+        for place, seen in course.scratch.items():
+            if place[0] is self and seen.reading is not None:
+                if seen.reading.source.is_cuda:
+                    torch.cuda.synchronize()
+                seen.reading = _taken(seen.reading, course.notes_of(self))
+
+    def numbers(self, course: Course) -> Mapping[str, float]:
         """`visible_share`: the mean share of the points that a view sees."""
-        share = course.last_published(SEEN_SHARE)
-        return {"visible_share": 1.0 if share is None else share}
+        return {"visible_share": course.notes_of(self).get("share", 1.0)}
 
 
-def _is_looked_at(view: int) -> bool:
-    """Whether the view of an iteration counts in the mean share: one in four.
+class _Seen:
+    """What was found in an iteration."""
 
-    Multiples of the golden ratio keep step with no order of views, as that of a rig of four
-    cameras.
-    """
-    return view * GOLDEN_RATIO % 1.0 < SHARE_LOOKED_AT
-
-
-def _mean_share(grad: Tensor, kept: Tensor, view: int) -> float | Tensor:
-    """Take the share of the points that a view sees into the mean share `kept`, 0-d, in place.
-
-    Not of each view, because that takes a GPU nine launches and a CPU a tenth of a millisecond.
-    A gradient [N, ..] that is zero everywhere, as that of frozen positions, is of no view.
-
-    Returns:
-        The mean share: a number on a CPU. A GPU's is not read.
-    """
-    if not _is_looked_at(view):
-        return kept.item() if grad.is_cpu else kept
-    seen = _has_gradient(grad[:: 1 + grad.shape[0] // MAX_POINTS_LOOKED_AT])
-    if not grad.is_cpu:
-        # Not `mean`, which takes twice as long.
-        share = seen.sum(dtype=torch.float32).div_(seen.shape[0])
-        of_a_view = share > 0
-        share = share.clamp_(min=MIN_SEEN_SHARE).to(kept)
-        return kept.copy_(torch.where(of_a_view.to(kept.device), kept.lerp(share, WEIGHT), kept))
-    # Numbers of Python's: each small operator would take as long as the sum does.
-    before, count = kept.item(), torch.count_nonzero(seen).item()
-    share = max(count / seen.shape[0], MIN_SEEN_SHARE)
-    if count == 0 or share == before:
-        return before
-    mean = before + WEIGHT * (share - before)
-    kept.fill_(mean)
-    return mean
+    def __init__(self, iteration: int, rows: Tensor | None, reading: Reading | None) -> None:
+        self.iteration = iteration
+        self.rows = rows  # [N] bool, out of view; None where views see enough
+        self.reading = reading  # [1] the share of a view, on its way to the host
 
 
-def _has_gradient(grad: Tensor) -> Tensor:
-    """Which points have a gradient, [N] bool."""
-    return (grad if grad.dim() == 2 else grad.reshape(grad.shape[0], -1)).any(1)
+def _looked_at(step: Step, course: Course, notes: dict[str, Any], before: _Seen | None) -> _Seen:
+    """Look at the positions' gradient of this iteration."""
+    notes.setdefault("share", 1.0)
+    reading = None if before is None else _taken(before.reading, notes)
+    means = step.param if step.name == "means" else course.param_of(step.set, "means")
+    grad = None if means is None else means.grad
+    # Multiples of the golden ratio keep step with no order of views, as of a rig of four cameras.
+    looks = reading is None and step.iteration * GOLDEN_RATIO % 1.0 < SHARE_LOOKED_AT
+    holds = notes["share"] < MAX_SEEN_SHARE
+    if grad is None or not len(grad) or not (looks or holds):
+        return _Seen(step.iteration, None, reading)
+    in_view = (grad != 0).any(1)
+    if looks:
+        state = course.state_of_param(step.set, "means")
+        known = in_view if state is None else in_view | (state["exp_avg_sq"] != 0).any(1)
+        reading = Reading((in_view.sum() / known.sum().clamp_(min=1)).reshape(1))
+        reading.ask()
+    return _Seen(step.iteration, ~in_view if holds else None, reading)
+
+
+def _taken(reading: Reading | None, notes: dict[str, Any]) -> Reading | None:
+    """Take the share of a view into the mean; what is still on its way."""
+    share = None if reading is None else reading.take()
+    if share is None:
+        return reading
+    if share > 0:  # a gradient that is zero everywhere is of no view
+        notes["share"] += WEIGHT * (max(share, MIN_SEEN_SHARE) - notes["share"])
+    return None

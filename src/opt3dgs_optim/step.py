@@ -1,0 +1,271 @@
+"""The step of one parameter: what it has (`Step`), and how it is made (`take_step`).
+
+Parts of a training fill in a `Step` with plain values. The arithmetic is here, once: in plain torch
+operations, the reference, which runs on every device, and as one Triton launch on a GPU, in
+`opt3dgs_optim.triton`. Without any of the parts it is `torch.optim.Adam`, bit for bit on a CPU.
+
+A row is one Gaussian: dimension 0 of a parameter. In the order in which it is made:
+
+    gradient    numbers that are not finite count as zero
+    fade        moments of random rows are shrunk
+    frame       the gradient is turned into each Gaussian's own axes, B^T g
+    hold        second moments of rows out of view are kept large
+    Adam        m, v, and the step m / (sqrt(v) + eps), with bias correction
+    frame       the step is turned back, B z
+    mean        the iterate goes into the running mean; at the end the mean takes its place
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+CHUNK = 65_536  # numbers that a CPU works on at a time, so that intermediates stay in its cache
+# Above it a square is infinite: Adam's second moment would stay so for ever.
+LARGEST = {dtype: torch.finfo(dtype).max ** 0.5 / 2 for dtype in (torch.float32, torch.float64)}
+MIN_QUATERNION = 1e-12  # a shorter one is divided by this
+
+
+class Fade(NamedTuple):
+    """Shrink the moments of random rows before the step."""
+
+    key: int  # which rows: see `chosen_rows`
+    share: float  # of the rows, 0..1
+    exp_avg: float  # factors on the moments
+    exp_avg_sq: float
+
+
+class Frame(NamedTuple):
+    """Step the positions [N, 3] along each Gaussian's axes, in its standard deviations."""
+
+    rate: float  # standard deviations of a full step
+    min_aspect: float  # share of the longest axis that a shorter one counts as, at least
+    quats: Tensor  # [N, 4] wxyz, need not be normalised
+    scales: Tensor  # [N, 3] log of the standard deviations
+
+
+class Hold(NamedTuple):
+    """Raise the second moment of some rows to (weight * gradient)^2 at least."""
+
+    rows: Tensor  # [N] bool
+    weight: float
+
+
+class Mean(NamedTuple):
+    """Take the iterate into the running mean of the last iterates."""
+
+    number: int  # how many iterations are in the mean with this one, from 1
+    put: bool  # whether the mean takes the parameter's place
+
+
+@dataclass(slots=True)
+class Step:
+    """What the step of one parameter has in one iteration. Parts set what they want of it.
+
+    Attributes:
+        param, grad: [N, ...] float32 or float64, and the gradient that Adam is fed.
+        name: gsplat's name of the Gaussian parameter, or None.
+        set: the set of Gaussians that it belongs to, "" where there is one.
+        group, state: torch's parameter group and the optimizer's state of the parameter.
+        iteration: of the training, from 0. `last`: that of the parameter's step before this one.
+        kept: what a part keeps for the rows, see `adam.Lane.rows`.
+        factor: on the learning rate; on a device it may be a tensor of one element.
+        fresh: Adam's moments begin anew before the step.
+        plain: no moments: the step is the gradient times the rate.
+        fade, frame, hold, mean: see there; None: not in this step.
+    """
+
+    param: Tensor
+    grad: Tensor
+    name: str | None
+    set: str
+    group: dict[str, Any]
+    state: dict[str, Any]
+    iteration: int
+    last: int
+    kept: Any = None
+    factor: Any = 1.0
+    fresh: bool = False
+    plain: bool = False
+    fade: Fade | None = None
+    frame: Frame | None = None
+    hold: Hold | None = None
+    mean: Mean | None = None
+
+
+@dataclass(slots=True)
+class Hyper:
+    """The numbers of one Adam step, and the tensors that it changes beside the parameter."""
+
+    lr: float
+    beta1: float
+    beta2: float
+    eps: float
+    correction1: float  # 1 - beta1^t
+    root2: float  # sqrt(1 - beta2^t)
+    exp_avg: Tensor
+    exp_avg_sq: Tensor
+    shrink: float = 1.0  # decoupled weight decay: factor on the parameter
+    decay: float = 0.0  # the other kind: share of the parameter in the gradient
+    mean: Tensor | None = None  # like the parameter
+    began: Tensor | None = None  # [N] the `Mean.number` with which a row's mean began
+    nonfinite: Tensor | None = field(default=None)  # [1] int32 on the device: counts numbers
+
+
+def take_step(step: Step, hyper: Hyper) -> int:
+    """Make the step in plain torch; how many numbers of the gradient were not finite (CPU only).
+
+    On other devices they are added to `hyper.nonfinite`, so that nothing waits.
+    """
+    fade = step.fade
+    chosen = None if fade is None else chosen_rows(fade, len(step.param), step.param.device)
+    return sum(_take_rows(step, hyper, chosen, rows) for rows in _chunks(step.param))
+
+
+def _chunks(param: Tensor) -> Iterator[Any]:
+    """Rows to work on at a time: all of them on a device, as many as fit a CPU's cache there."""
+    numbers, count = param.numel(), param.shape[0] if param.dim() else 1
+    if numbers <= 2 * CHUNK or not param.is_cpu:
+        yield ...
+        return
+    size = max(1, CHUNK * count // numbers)
+    for start in range(0, count, size):
+        yield slice(start, start + size)
+
+
+def _take_rows(step: Step, hyper: Hyper, chosen: Tensor | None, rows: Any) -> int:
+    param, exp_avg, exp_avg_sq = step.param[rows], hyper.exp_avg[rows], hyper.exp_avg_sq[rows]
+    grad, bad = _finite(step.grad[rows], hyper.nonfinite)
+    if step.fade is not None and chosen is not None:
+        faded = like_rows(chosen[rows], param)
+        exp_avg.mul_(torch.where(faded, step.fade.exp_avg, 1.0))
+        exp_avg_sq.mul_(torch.where(faded, step.fade.exp_avg_sq, 1.0))
+    if hyper.shrink != 1.0:
+        param.mul_(hyper.shrink)
+    if hyper.decay:
+        grad = grad.add(param, alpha=hyper.decay)
+    axes = None if step.frame is None else axes_of(step.frame, rows)
+    if axes is not None:
+        grad = into_frame(axes, grad)
+    if step.hold is not None:
+        least = (grad * step.hold.weight).square_()
+        least.mul_(like_rows(step.hold.rows[rows], grad))
+        torch.maximum(exp_avg_sq, least, out=exp_avg_sq)
+    if step.plain:
+        param.sub_(grad * (hyper.lr * step.factor))
+    else:
+        exp_avg.lerp_(grad, 1 - hyper.beta1)
+        exp_avg_sq.mul_(hyper.beta2).addcmul_(grad, grad, value=1 - hyper.beta2)
+        root = exp_avg_sq.sqrt().div_(hyper.root2).add_(hyper.eps)
+        if step.frame is not None and axes is not None:
+            rate = step.frame.rate * step.factor / hyper.correction1
+            param.sub_(out_of_frame(axes, (exp_avg / root).mul_(rate)))
+        elif isinstance(step.factor, Tensor):  # a device's number, which the host does not know
+            param.sub_((exp_avg / root).mul_(step.factor * (hyper.lr / hyper.correction1)))
+        else:
+            param.addcdiv_(exp_avg, root, value=-(hyper.lr * step.factor / hyper.correction1))
+    if step.mean is not None:
+        assert hyper.mean is not None
+        assert hyper.began is not None
+        take_into_mean(step.mean, param, hyper.mean[rows], hyper.began[rows])
+    return bad
+
+
+def _finite(grad: Tensor, nonfinite: Tensor | None) -> tuple[Tensor, int]:
+    """The gradient with zeros for numbers that are not finite; on a CPU how many there were."""
+    if grad.is_cpu:
+        if math.isfinite(grad.sum().item()):  # a finite sum has finite terms
+            return grad, 0
+        bad = grad.numel() - int(torch.isfinite(grad).sum())
+        return (torch.nan_to_num(grad, 0.0, 0.0, 0.0) if bad else grad), bad
+    if nonfinite is not None:
+        nonfinite.add_((~torch.isfinite(grad)).sum())
+    return torch.nan_to_num(grad, 0.0, 0.0, 0.0), 0
+
+
+def take_into_mean(how: Mean, param: Tensor, mean: Tensor, began: Tensor) -> None:
+    """An iterate that is not finite leaves its mean alone; a mean that is not begins with it."""
+    weight = like_rows(1.0 / (how.number + 1 - began), param)
+    if param.is_cpu and math.isfinite((param.sum() + mean.sum()).item()):
+        mean.lerp_(param, weight.to(param.dtype))
+        if how.put:
+            param.copy_(mean)
+        return
+    known = torch.isfinite(param)
+    start = torch.where(torch.isfinite(mean), mean, param)
+    # The old mean in the place of a number that is not finite moves nothing.
+    mean.copy_(torch.where(known, start.lerp(torch.where(known, param, start), weight), mean))
+    if how.put:
+        param.copy_(torch.where(known, mean, param))
+
+
+def like_rows(numbers: Tensor, param: Tensor) -> Tensor:
+    """Numbers of rows [N] that broadcast with a parameter [N, ...]."""
+    return numbers.view(-1, *[1] * (param.dim() - 1)) if param.dim() > 1 else numbers
+
+
+# -- which rows an event fades ---------------------------------------------------------------------
+
+
+def mixed(number: Any) -> Any:
+    """32 bits, each of which depends on all of those of a number: an int, or int64 tensor.
+
+    Two rounds of multiply and shift (Wellons, "hash prospector", 2018: its `lowbias32`).
+    """
+    number = ((number ^ (number >> 16)) * 0x7FEB352D) & 0xFFFFFFFF
+    number = ((number ^ (number >> 15)) * 0x846CA68B) & 0xFFFFFFFF
+    return number ^ (number >> 16)
+
+
+def chosen_rows(fade: Fade, count: int, device: torch.device) -> Tensor:
+    """[count] bool: whether an event fades a row. The same on every device."""
+    row = torch.arange(count, dtype=torch.int64, device=device)
+    return (mixed(row ^ fade.key) >> 8).to(torch.float32) * 2.0**-24 < fade.share
+
+
+# -- own frames ------------------------------------------------------------------------------------
+
+
+class Axes(NamedTuple):
+    """B = R diag(s) of n Gaussians, Sigma = B B^T."""
+
+    real: Tensor  # [n, 1] of the unit quaternion of R
+    imaginary: Tensor  # [n, 3]
+    deviations: Tensor  # [n, 3]
+
+
+def axes_of(frame: Frame, rows: Any = ...) -> Axes:
+    """The axes of the Gaussians; one with numbers that are not finite is never moved."""
+    quats = frame.quats.detach()[rows]
+    length = (quats * quats).sum(-1, keepdim=True).sqrt_().clamp_(min=MIN_QUATERNION)
+    quats = quats / length
+    deviations = frame.scales.detach()[rows].exp()
+    if frame.min_aspect:
+        least = deviations.amax(-1, keepdim=True).mul_(frame.min_aspect)
+        deviations = torch.maximum(deviations, least)
+    return Axes(quats[:, :1], quats[:, 1:], deviations)
+
+
+def into_frame(axes: Axes, vectors: Tensor) -> Tensor:
+    """B^T v [n, 3]; zero where that is no number that Adam can square."""
+    turned = _turned(axes, vectors, -1).mul_(axes.deviations)
+    largest = LARGEST[turned.dtype]
+    return torch.where(turned.abs() <= largest, turned, 0.0)
+
+
+def out_of_frame(axes: Axes, vectors: Tensor) -> Tensor:
+    """B v [n, 3]; zero where that is not finite."""
+    turned = _turned(axes, vectors * axes.deviations, 1)
+    return torch.where(turned.abs() <= torch.finfo(turned.dtype).max, turned, 0.0)
+
+
+def _turned(axes: Axes, v: Tensor, direction: int) -> Tensor:
+    """R v, or R^T v where the direction is -1: v + w t + a x t with t = 2 a x v."""
+    t = torch.linalg.cross(axes.imaginary, v).mul_(2 * direction)
+    turned = torch.addcmul(v, axes.real, t)
+    return turned.add_(torch.linalg.cross(axes.imaginary, t), alpha=direction)

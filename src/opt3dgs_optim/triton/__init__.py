@@ -1,0 +1,13 @@
+"""The step of a parameter as one Triton launch on a GPU."""
+
+from opt3dgs_optim.step import Hyper, Step
+
+
+def takes(step: Step) -> bool:
+    """Whether the kernels make this step."""
+    return False
+
+
+def take_step(step: Step, hyper: Hyper) -> None:
+    """Make the step in one launch."""
+    raise NotImplementedError
