@@ -43,14 +43,13 @@ def line_of(record: Line) -> Line:
 
 
 def command_of(line: Line) -> str:
-    """The command that trains a line, from a folder that holds the scenes."""
-    words = [f"--scene {line['scene']} --arm {line['arm']} --size {line['size']}"]
-    words += [f"--iterations {line['iterations']} --points {line['points']}"]
-    words += [f"--sh-degree {line['sh_degree']}"] * (line["sh_degree"] > 0)
-    words += [f"--rates {line['rates']:g}"] * ("rates" in line)
-    words += [f"--views {line['views']}"] * ("views" in line)
+    """The command that trains a line, in a folder that holds the scenes."""
+    options = {"scene": "", "arm": "own", "size": "", "iterations": 0, "points": 0}
+    options |= {"sh_degree": 0, "views": 0, "rates": 1.0, "seed": -1}
+    said = [(name, line.get(name, usual)) for name, usual in options.items()]
+    words = [f"--{n.replace('_', '-')} {v}" for n, v in said if v != options[n] or n == "arm"]
     words += ["--background white"] * (line["scene"] == "lego")
-    return " ".join(["python examples/benchmarks/train.py", *words, f"--seed {line['seed']}"])
+    return " ".join(["python examples/benchmarks/train.py", *words])
 
 
 def key_of(line: Line) -> tuple[Any, ...]:

@@ -1,6 +1,6 @@
 """Make the tables and pictures of docs/evidence.md anew: python examples/benchmarks/report.py
 
-All of it comes from docs/results/evidence.jsonl, and the cost of a step from docs/results/steps.json.
+All of it comes from docs/results/evidence.jsonl, and the cost of a step from steps.json beside it.
 In the page a table stands between `<!-- evidence:NAME -->` and `<!-- end -->`, where NAME is a
 function of `TABLES`.
 """
@@ -48,7 +48,9 @@ class Evidence:
 
 def seeds_of(lines: Iterable[Line]) -> list[int]:
     """All seeds of the lines."""
-    return sorted(s for x in lines for s in (x["seed"] if isinstance(x["seed"], list) else [x["seed"]]))
+    return sorted(
+        s for x in lines for s in (x["seed"] if isinstance(x["seed"], list) else [x["seed"]])
+    )
 
 
 def mean(lines: Sequence[Line], metric: str) -> float:
@@ -92,7 +94,7 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-# -- the tables -------------------------------------------------------------------------------------
+# -- the tables -----------------------------------------------------------------------------------
 
 
 def iterations(all_: Evidence) -> str:
@@ -103,7 +105,10 @@ def iterations(all_: Evidence) -> str:
         rows.append((scene, "stock, 30,000", shown(stock), ""))
         for arm, count in (
             *(("own", n) for n in (15_000, 10_000, 7_500)),
-            *((arm, 10_000) for arm in ("mcmc", "x2", "x3", "averaged", "x2-averaged", "learn2splat")),
+            *(
+                (arm, 10_000)
+                for arm in ("mcmc", "x2", "x3", "averaged", "x2-averaged", "learn2splat")
+            ),
         ):
             lines = all_.of(arm, scene, iterations=count, **HALF)
             if lines or arm in ("own", "mcmc"):
@@ -129,7 +134,11 @@ def gpu(all_: Evidence) -> str:
     found = [x for x in all_.lines if "NVIDIA" in x["device"]]
     keys = sorted({(x["scene"], x["points"], x["iterations"]) for x in found})
     for scene, points, planned in keys:
-        those = {x["arm"]: x for x in found if (x["scene"], x["points"], x["iterations"]) == (scene, points, planned)}
+        those = {
+            x["arm"]: x
+            for x in found
+            if (x["scene"], x["points"], x["iterations"]) == (scene, points, planned)
+        }
         reached = min(x["curve"]["iteration"][-1] for x in those.values())
         marks = [n for n in those["mcmc"]["curve"]["iteration"] if n <= reached]
         at = sorted({marks[len(marks) // 3], marks[-1]})
@@ -137,7 +146,15 @@ def gpu(all_: Evidence) -> str:
             curve = dict(zip(line["curve"]["iteration"], line["curve"]["psnr"], strict=True))
             cells = [f"{curve[n]:.2f} at {n:,}" for n in at]
             rows.append((f"{scene}, {points:,} of {planned:,}", NAMES[arm], *cells))
-    return table(("scene, Gaussians, planned iterations", "training", "PSNR early", "PSNR at the last that all reached"), rows)
+    return table(
+        (
+            "scene, Gaussians, planned iterations",
+            "training",
+            "PSNR early",
+            "PSNR at the last that all reached",
+        ),
+        rows,
+    )
 
 
 def equal(all_: Evidence) -> str:
@@ -146,7 +163,9 @@ def equal(all_: Evidence) -> str:
     for size, setting in (("half", HALF), ("quarter", QUARTER)):
         for scene in MAIN:
             stock = all_.of("mcmc", scene, iterations=30_000, **setting)
-            lines = (all_.of(a, scene, iterations=30_000, **setting) for a in ("own", "defaults", "x2"))
+            lines = (
+                all_.of(a, scene, iterations=30_000, **setting) for a in ("own", "defaults", "x2")
+            )
             rows.append((scene, size, shown(stock), *(gained(x, stock) for x in lines)))
     heads = ("scene", "size", "stock", "own frame", "fading (the defaults before)", "rates times 2")
     return table(heads, rows)
@@ -156,7 +175,8 @@ def cost(_: Evidence) -> str:
     """What a step costs on a CPU."""
     made = json.loads(steps.OUT.read_text(encoding="utf-8"))
     found = {int(points): rows for points, rows in made["results"].items()}
-    return f"{steps.table(found)}\n\n{made['machine']}, {made['date']}, medians of {made['rounds']} rounds."
+    about = f"{made['machine']}, {made['date']}, medians of {made['rounds']} rounds."
+    return f"{steps.table(found)}\n\n{about}"
 
 
 def few(all_: Evidence) -> str:
@@ -180,7 +200,15 @@ def adaptive(all_: Evidence) -> str:
         for arm in arms:
             lines = all_.of(arm, scene, iterations=30_000, **QUARTER)
             count = f"{mean(lines, 'gaussians'):,.0f}" if lines else "-"
-            rows.append((scene if arm == "adc" else "", NAMES[arm], shown(lines), gained(lines, stock), count))
+            rows.append(
+                (
+                    scene if arm == "adc" else "",
+                    NAMES[arm],
+                    shown(lines),
+                    gained(lines, stock),
+                    count,
+                )
+            )
     heads = ("scene", "training", "PSNR / SSIM / LPIPS", "less stock", "Gaussians")
     return table(heads, rows)
 
@@ -194,30 +222,44 @@ def capture(all_: Evidence) -> str:
     return table(("training", "PSNR / SSIM"), rows)
 
 
-PAPER = (
-    ("AW-SGLD, this package's form", "awsgld-stable", "awsgld-stable-constant"),
-    ("AW-SGLD, the paper's settings", "awsgld", "constant"),
+CLOSED = (  # what, its arm, the same training without it
+    ("the paper's preset", "paper", "mcmc"),
+    ("the same, beside a constant multiplier of its mean nu", "paper", "paper-constant"),
+    (
+        "AW-SGLD, this package's form, beside such a constant",
+        "awsgld-stable",
+        "awsgld-stable-constant",
+    ),
     ("L2 loss in the last thirtieth", "l2@1/30", "mcmc"),
     ("fresh moments in the last thirtieth", "l1+reset@1/30", "mcmc"),
     ("L-BFGS directions in the last thirtieth", "l2+reset+lqn@1/30", "l2+reset@1/30"),
-    ("all of it, the paper's preset", "paper", "mcmc"),
+    ("L-BFGS directions in the last quarter", "l1+reset+lqn@1/4", "l1+reset@1/4"),
+    ("`Annealing` beside fading and averaging", "annealed+averaged", "defaults"),
+    ("one second moment a Gaussian", "faded+pooled+averaged", "defaults"),
+    ("rates times 3", "x3", "mcmc"),
+    ("the positions' rate times 3", "positions-x3", "mcmc"),
+    ("rates times 2", "x2", "mcmc"),
+    ("averaging", "averaged", "mcmc"),
+    ("fading, a hold and averaging: the defaults before", "defaults", "mcmc"),
+    ("own frame: the defaults", "own", "mcmc"),
 )
 
 
-def paper(all_: Evidence) -> str:
-    """The paper's parts, each beside the same training without it."""
+def closed(all_: Evidence) -> str:
+    """What was tried, each beside the same training without it, quarter size, 30,000 iterations."""
     rows = []
-    for what, arm, control in PAPER:
-        gains = []
-        for scene in ("bonsai-misposed", "lego", "plush", *FEW):
-            found = gain(
-                *(all_.of(a, scene, iterations=30_000, **QUARTER) for a in (arm, control))
-            )
-            gains += [found] if found else []
-        beside = "a constant multiplier of its mean" if "constant" in control else "the training without it"
-        cells = [spread([g[m] for g in gains], GAINS[m]) for m in METRICS]
-        rows.append((what, beside, f"{len(gains)}", *cells))
-    return table(("part", "compared with", "scenes", "PSNR", "SSIM", "LPIPS"), rows)
+    for what, arm, control in CLOSED:
+        gains, trainings = {}, 0
+        for scene in (*MAIN, "bonsai-misposed"):
+            pair = [all_.of(a, scene, iterations=30_000, **QUARTER) for a in (arm, control)]
+            if "bonsai" in gains and scene == "bonsai-misposed":
+                continue
+            if found := gain(*pair):
+                gains[scene] = found
+                trainings += len({*seeds_of(pair[0])} & {*seeds_of(pair[1])})
+        cells = [spread([g[m] for g in gains.values()], GAINS[m]) for m in METRICS]
+        rows.append((what, f"{len(gains)}, {trainings}", *cells))
+    return table(("what", "scenes, trainings", "PSNR", "SSIM", "LPIPS"), rows)
 
 
 def spread(values: Sequence[float], form: str) -> str:
@@ -241,38 +283,54 @@ NAMES = {
 }
 TABLES: dict[str, Callable[[Evidence], str]] = {
     f.__name__: f
-    for f in (iterations, kept_aside, gpu, equal, cost, few, adaptive, capture, paper)
+    for f in (iterations, kept_aside, gpu, equal, cost, few, adaptive, capture, closed)
 }
 
 
+DRAWN = (
+    ("mcmc", 30_000, "#555555"),
+    ("own", 30_000, "#9ecae1"),
+    ("own", 15_000, "#4292c6"),
+    ("own", 10_000, "#d55e00"),
+    ("own", 7_500, "#009e73"),
+)
+
+
 def draw(all_: Evidence, path: Path) -> None:
-    """Quality over iterations at half size, with the end of stock's training as a line."""
+    """Quality over iterations at half size, with the end of stock's training as a line.
+
+    The curves of a scene are means over the seeds that all of them have.
+    """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10, 3.9), dpi=130, layout="constrained")
-    axes = figure.subplots(1, len(MAIN))
+    figure = Figure(figsize=(10, 3.7), dpi=130, layout="constrained")
+    axes, entries = figure.subplots(1, len(MAIN)), {}
     for axis, scene in zip(axes, MAIN, strict=True):
-        stock = all_.of("mcmc", scene, iterations=30_000, **HALF)
-        end = mean(stock, "psnr")
-        axis.axhline(end, color="#555555", lw=1, ls="--")
-        said = f"stock after 30,000: {end:.2f} dB"
-        axis.text(0.98, end, said, transform=axis.get_yaxis_transform(), ha="right", va="bottom")
-        drawn = [("mcmc", 30_000, "#555555"), ("own", 30_000, "#9ecae1"), ("own", 15_000, "#4292c6"), ("own", 10_000, "#d55e00"), ("own", 7_500, "#009e73")]
-        for arm, count, colour in drawn:
-            lines = [x for x in all_.of(arm, scene, iterations=count, **HALF) if x.get("curve")]
-            if not lines:
-                continue
-            at = lines[0]["curve"]["iteration"]
-            curves = [[dict(zip(x["curve"]["iteration"], x["curve"]["psnr"], strict=True)).get(n) for n in at] for x in lines]
-            curve = [statistics.mean(v) if None not in v else float("nan") for v in zip(*curves, strict=True)]
-            label = f"{NAMES[arm]}, planned for {count:,}" if arm == "own" else "stock"
-            axis.plot([n / 1000 for n in at], curve, color=colour, lw=2, label=label)
-            axis.plot(at[-1] / 1000, curve[-1], "o", color=colour, ms=5)
-        axis.set(title=scene, xlabel="thousand iterations", xlim=(0, 31), ylim=(end - 5, end + 1.6))
+        found = {
+            (arm, count, colour): {x["seed"]: x["curve"] for x in lines if x.get("curve")}
+            for arm, count, colour in DRAWN
+            if (lines := all_.of(arm, scene, iterations=count, **HALF))
+        }
+        seeds = sorted(set.intersection(*map(set, found.values())))
+        for (arm, count, colour), curves in found.items():
+            at = curves[seeds[0]]["iteration"]
+            values = zip(*(curves[seed]["psnr"] for seed in seeds), strict=True)
+            curve = [statistics.mean(each) for each in values]
+            label = "stock" if arm == "mcmc" else f"own frame, planned for {count:,}"
+            (entries[label],) = axis.plot([n / 1000 for n in at], curve, color=colour, lw=2)
+            axis.plot(at[-1] / 1000, curve[-1], "o", color=colour, ms=6)
+            if arm == "mcmc":
+                axis.axhline(end := curve[-1], color=colour, lw=1, ls="--", zorder=0)
+                axis.set_ylim(end - 5, end + 1.6)
+        said = f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"
+        axis.set(title=f"{scene}, {said}", xlabel="thousand iterations", xlim=(0, 31))
         axis.grid(color="#e4e4e4", lw=0.8)
     axes[0].set_ylabel("PSNR of held-out views, dB")
-    entries = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-    figure.legend(entries.values(), entries, loc="outside lower center", ncols=len(entries), frameon=False)
+    order = dict.fromkeys(["stock", *(f"own frame, planned for {n:,}" for _, n, _ in DRAWN)])
+    names = [name for name in order if name in entries]
+    handles = [entries[name] for name in names]
+    place = "outside lower center"
+    figure.legend(handles, names, loc=place, ncols=len(names), frameon=False, fontsize=9)
     figure.savefig(path)
 
 

@@ -8,14 +8,14 @@ same on a GPU. Five minutes on a CPU.
 from __future__ import annotations
 
 import argparse
-import gc
 import json
+import logging
 import platform
 import statistics
 import sys
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ TOTAL, VIEWS, WARM_UP = 30_000, 4, 4
 SWEPT = torch.zeros(1 << 24)  # 64 MB: more than a core's caches, which a renderer fills as well
 Row = dict[str, Any]
 Call = Callable[[], Any]
+Subject = tuple[Call, list[torch.optim.Optimizer]]  # an iteration, and what it steps
 
 
 @lru_cache(maxsize=1)
@@ -59,10 +60,10 @@ def stepped(
     switch: float = 29 / 30,
     in_view: float = 1.0,
     fused: bool = False,
-) -> Callable[[int, torch.device], Call]:
+) -> Callable[[int, torch.device], Subject]:
     """Six optimizers, of stock or upgraded to these parts; a call is an iteration."""
 
-    def make(points: int, device: torch.device) -> Call:
+    def make(points: int, device: torch.device) -> Subject:
         splats, rates = gaussians(points, device), stock_learning_rates(1.0)
         optimizers: Any = {
             name: torch.optim.Adam(
@@ -91,13 +92,13 @@ def stepped(
             for optimizer in optimizers.values():
                 optimizer.step()
 
-        return step
+        return step, list(optimizers.values())
 
     return make
 
 
 BASELINE, FUSED = "six Adams", "six fused Adams"
-SUBJECTS: dict[str, Callable[[int, torch.device], Call]] = {
+SUBJECTS: dict[str, Callable[[int, torch.device], Subject]] = {
     BASELINE: stepped(None),
     FUSED: stepped(None, fused=True),
     "no parts": stepped([]),
@@ -114,20 +115,18 @@ SUBJECTS: dict[str, Callable[[int, torch.device], Call]] = {
 def measure(points: int, device: torch.device, names: Sequence[str], rounds: int) -> dict[str, Row]:
     """Of each subject: ms of an iteration, its ratio to six Adams in the same round, bytes kept.
 
-    Bytes are beside parameters and gradients: Adam's moments, and what the parts keep.
+    Bytes are of the optimizers' state: Adam's moments, and what the parts keep.
 
     A subject whose name ends in "fused" is compared with six fused Adams. On a GPU also what one
     iteration launches, how often it waits for the device, and the most memory beside what is kept.
     """
     made: dict[str, Row] = {}
     calls: dict[str, Call] = {}
-    gaussians(points, device)
     for name in dict.fromkeys([BASELINE, FUSED, *names]):
-        before = bytes_in_use(device)
-        calls[name] = SUBJECTS[name](points, device)
+        calls[name], optimizers = SUBJECTS[name](points, device)
         for _ in range(WARM_UP):
             calls[name]()
-        kept = (bytes_in_use(device) - before) / points
+        kept = state_bytes(optimizers) / points
         made[name] = {"bytes_per_point": round(kept, 1), **counts(calls[name], device)}
     times: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(rounds):
@@ -183,14 +182,11 @@ def counts(call: Call, device: torch.device) -> Row:
     return {"launches": launches, "waits": waits, "peak_bytes": peak}
 
 
-def bytes_in_use(device: torch.device) -> int:
-    """Bytes of tensors on a device; on a CPU of those that Python holds."""
-    gc.collect()
-    if device.type == "cuda":
-        return torch.cuda.memory_allocated(device)
-    held = (x for x in gc.get_objects() if issubclass(type(x), torch.Tensor))
-    storages = {x.untyped_storage().data_ptr(): x.untyped_storage().nbytes() for x in held}
-    return sum(storages.values())
+def state_bytes(optimizers: Iterable[torch.optim.Optimizer]) -> int:
+    """Of the tensors that the optimizers keep."""
+    states = (state for optimizer in optimizers for state in optimizer.state.values())
+    tensors = (x for state in states for x in state.values() if isinstance(x, torch.Tensor))
+    return sum(x.numel() * x.element_size() for x in tensors)
 
 
 def table(results: dict[int, dict[str, Row]]) -> str:
@@ -226,6 +222,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     device = torch.device(args.device)
     torch.set_num_threads(1)
+    logging.getLogger("opt3dgs_optim").setLevel(logging.ERROR)  # not that nothing is trained here
     results: dict[int, dict[str, Row]] = {}
     for points in tqdm(args.points or POINTS[device.type], unit="size"):
         rounds = args.rounds if points <= 100_000 else max(args.rounds // 5, 5)

@@ -39,9 +39,7 @@ Lpips = Callable[[Tensor, Tensor], float]  # of images [H, W, 3] in 0..1
 
 def scene_of(args: argparse.Namespace) -> Scene:
     """The scene with the views that this training holds out, and as many others as it has."""
-    scene = load_scene(
-        args.scene, args.size, background=args.background, held_out=args.seed % 8
-    )
+    scene = load_scene(args.scene, args.size, background=args.background, held_out=args.seed % 8)
     count = len(scene.train)
     if args.views and not 2 <= args.views <= count:
         raise ValueError(f"--views {args.views}: 2 to {count} are allowed, or 0 for all")
@@ -61,8 +59,8 @@ def fit_of(scene: Scene, arm: Arm, options: FitOptions) -> Fit:
 def lpips_of(tool: Path, weights: Path) -> Lpips:
     """LPIPS by a Python file of yours.
 
-    It has `load(weights_dir, net)` and `lpips(model, a, b)` for images [B, 3, H, W] in -1..1: a thin
-    wrapper of any implementation (the `lpips` package needs torchvision and a download).
+    It has `load(weights_dir, net)` and `lpips(model, a, b)` for images [B, 3, H, W] in -1..1: a
+    thin wrapper of any implementation (the `lpips` package needs torchvision and a download).
     """
     spec = importlib.util.spec_from_file_location("lpips_tool", tool)
     if spec is None or spec.loader is None:
@@ -119,11 +117,10 @@ def train(fit: Fit, record: dict[str, Any], out: Path, lpips: Lpips | None = Non
             fit.save(checkpoint)
 
 
-@command("train")
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    add = parser.add_argument
+def parser() -> argparse.ArgumentParser:
+    """The options."""
+    made = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    add = made.add_argument
     add("--scene", default="embedded", metavar="DIR", help="scene folder, or 'embedded'")
     add("--arm", default="own", choices=ARMS, metavar="ARM", help=", ".join(ARMS))
     add("--size", default="images_4", choices=get_args(Size), help="folder of the photos")
@@ -136,7 +133,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--rates", type=float, default=1.0, help="factor on all of the trainer's learning rates")
     add("--lpips", nargs=2, type=Path, metavar=("FILE.py", "WEIGHTS"), help="see `lpips_of`")
     add("-o", "--out", type=Path, metavar="FILE", help="default: in runs/benchmarks")
-    args = parser.parse_args(arguments)
+    return made
+
+
+@command("train")
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line."""
+    args = parser().parse_args(arguments)
     torch.set_num_threads(1)
     scene, arm = scene_of(args), find_arm(args.arm)
     options = FitOptions(
@@ -146,7 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     record = {"scene": scene.name, **{name: vars(args)[name] for name in kept}}
     record |= {"machine": f"{platform.system()} {platform.machine()}, torch {torch.__version__}"}
     record |= {"date": time.strftime("%Y-%m-%d", time.gmtime())}
-    name = "-".join(str(record[key]) for key in ("scene", "size", "arm", "iterations", "seed"))
+    name = "-".join(str(record[key]) for key in ("scene", *kept))
     out = args.out or Path("runs/benchmarks", f"{name}.json")
     out.parent.mkdir(parents=True, exist_ok=True)
     train(fit_of(scene, arm, options), record, out, args.lpips and lpips_of(*args.lpips))

@@ -51,7 +51,9 @@ class Arm:
 
     def scheduler(self, iterations: int) -> PhaseScheduler | None:
         """Of one training; None where the trainer's own Adam stays as it is."""
-        return None if self.parts is None else PhaseScheduler(iterations, parts=self.parts(iterations))
+        return (
+            None if self.parts is None else PhaseScheduler(iterations, parts=self.parts(iterations))
+        )
 
 
 def of(*parts: Part) -> Callable[[int], Sequence[Part]]:
@@ -67,7 +69,9 @@ def own(frame: OwnFrame | None = None) -> Callable[[int], Sequence[Part]]:
 _ARMS = (
     Arm(BASELINE, "3DGS-MCMC as its authors publish it: the baseline"),
     Arm(DEFAULT_ARM, "the package's defaults", of(*DEFAULTS)),
-    Arm("own", "own frame, the others faded, a hold, averaged: the defaults since 2026-11-27", own()),
+    Arm(
+        "own", "own frame, the others faded, a hold, averaged: the defaults since 2026-11-27", own()
+    ),
     Arm("averaged", "the baseline, its last thirtieth averaged", of(Averaging())),
     Arm("x2", "the baseline, all steps times 2", of(Longer(2.0))),
     Arm("x3", "the baseline, all steps times 3", of(Longer(3.0))),

@@ -6,7 +6,7 @@ import os
 import pickle
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -18,7 +18,6 @@ from splatting.gaussians import (
     DEFAULT_PRESET,
     MCMC_PRESET,
     gaussians_from_points,
-    random_gaussians,
     stock_learning_rates,
 )
 from splatting.metrics import photometric_loss, psnr, ssim
@@ -38,7 +37,6 @@ class FitOptions:
     iterations: int = 1500
     points: int = 2000  # the most Gaussians
     seed: int = 0
-    init: Literal["sfm", "random"] = "sfm"
     sh_degree: int = 0
     rates: float = 1.0  # factor on all learning rates of the trainer
 
@@ -46,8 +44,6 @@ class FitOptions:
         for name in ("iterations", "points"):
             if getattr(self, name) < 1:
                 raise ValueError(f"FitOptions: {name}={getattr(self, name)}, must be at least 1")
-        if self.init not in ("sfm", "random"):
-            raise ValueError(f"FitOptions: init={self.init!r}, must be 'sfm' or 'random'")
         if not self.rates > 0:
             raise ValueError(f"FitOptions: rates={self.rates}, must be above 0")
 
@@ -98,18 +94,15 @@ class Fit:
         self.views: list[int] = []  # what is left of this epoch
 
     def _initial_gaussians(self) -> dict[str, Parameter]:
-        scene, options, draw = self.scene, self.options, self.draws["start"]
-        mcmc = self.arm.density == "mcmc"
-        common: dict[str, Any] = {"sh_degree": options.sh_degree, "generator": draw}
-        common.update(MCMC_PRESET if mcmc else DEFAULT_PRESET)
-        if options.init == "sfm":
-            points, colors = scene.points, scene.colors
-            return gaussians_from_points(points, colors, num_points=options.points, **common)
-        # A tenth of the budget to start with where density control can fill the rest.
-        count = max(options.points // 10, 1) if mcmc else options.points
-        center = scene.points.median(0).values
-        spread = float((scene.points - center).abs().quantile(0.9)) / scene.extent
-        return random_gaussians(scene.extent, count, center=center, spread=spread, **common)
+        preset = MCMC_PRESET if self.arm.density == "mcmc" else DEFAULT_PRESET
+        return gaussians_from_points(
+            self.scene.points,
+            self.scene.colors,
+            num_points=self.options.points,
+            sh_degree=self.options.sh_degree,
+            generator=self.draws["start"],
+            **preset,
+        )
 
     def _density_control(self) -> DensityControl:
         return MCMCDensityControl.for_run(
