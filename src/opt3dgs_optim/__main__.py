@@ -6,14 +6,20 @@ from collections.abc import Sequence
 
 from opt3dgs_optim.version import __version__
 
-MODULES = {"doctor": "doctor", "report": "runs.report", "hosts": "hosts.edits"}
+MODULES = {
+    "lines": "hosts.lines",
+    "hosts": "hosts.diff",
+    "doctor": "doctor",
+    "report": "runs.report",
+}
 USAGE = f"""opt3dgs_optim {__version__}
 
 opt3dgs COMMAND ...
 
-  doctor  versions, which backend runs and why, and a self-test
+  lines   the three lines for your trainer, and where each goes
+  hosts   the same lines put into your trainer's file, as a diff or applied
+  doctor  versions, what runs on this machine and why, and a self-test
   report  compare runs from their logs: error against run time
-  hosts   the lines to change in your trainer, as a diff or applied
 
 opt3dgs COMMAND --help says more."""
 

@@ -46,7 +46,7 @@ class Lane:
         self.set, self.name = slot
         self.last = -1
         self.framed: bool | None = None
-        self.same_object = False  # whether the Parameter is the one of the last step
+        self.same_object = False  # whether the Parameter is still that of the last step
         self.keeps = False  # whether parts keep something for its rows
         self.left: dict[str, tuple[Tensor, int]] = {}
         self.plans: dict[Phase, list[Part]] = {}
@@ -90,6 +90,7 @@ class Lane:
 
     def leave(self, state: dict[str, Any]) -> None:
         """Note what the step has left, by which edits of rows show at the next one."""
+        self.same_object = True
         self.left = {key: (state[key], state[key]._version) for key in KEPT if key in state}
 
 
@@ -115,7 +116,6 @@ class StepAdam(Adam):
         """Have the parts of `course` from now on; slots are, by group, set and name."""
         self.course, self._slots, self._lanes = course, slots, []
         self._masked = own_step(self._base) is not None
-        self._patch_step_function()  # torch's step hooks, for a class that was given afterwards
         self._step_supports_amp_scaling = False  # a GradScaler unscales, and leaves steps out
         self._use_host_steps()
 
@@ -152,21 +152,23 @@ class StepAdam(Adam):
                 INRIA's SparseGaussianAdam get their mask, and what goes with it, unchanged.
         """
         self._opt_called = True  # what learning-rate schedulers would note by wrapping this method
+        for hook in self._optimizer_step_pre_hooks.values():
+            hook(self, (closure, *masked), masks)
         loss, course = None, self.course
         if callable(closure):
             with torch.enable_grad():
                 loss = closure()
             if loss is not None and course.observers:
                 course.observe(loss)  # pyright: ignore[reportAttributeAccessIssue]
-        iteration = course.begin(self)
-        if self._masked:
-            given = () if closure is None and not masked else (closure, *masked)
-            self._step_around(iteration, given, masks)
-        elif masked or masks or isinstance(closure, Tensor):
+        if not self._masked and (masked or masks or isinstance(closure, Tensor)):
             raise TypeError(
                 f"{type(self).__name__}.step: a mask was given, but torch's Adam steps all rows; "
                 "use gsplat's SelectiveAdam or INRIA's SparseGaussianAdam for masked steps"
             )
+        iteration = course.begin(self)
+        if self._masked:
+            given = () if closure is None and not masked else (closure, *masked)
+            self._step_around(iteration, given, masks)
         elif not course.parts:
             _unhooked(self._base)(self)
         else:
@@ -174,10 +176,14 @@ class StepAdam(Adam):
                 for lane in self._present_lanes():
                     if lane.param.grad is not None:
                         self._step_lane(lane, iteration)
+        for hook in self._optimizer_step_post_hooks.values():
+            hook(self, (closure, *masked), masks)
         return loss
 
     # Learning-rate schedulers, which would wrap `step` on the instance, need not: `step` tells.
     step._wrapped_by_lr_sched = True  # pyright: ignore[reportFunctionMemberAccess]
+    # torch's own wrapper, for hooks and profiles, takes longer than all else that Python does here.
+    step.hooked = True  # pyright: ignore[reportFunctionMemberAccess]
 
     def _present_lanes(self) -> list[Lane]:
         """The lanes of all parameters; looked up again when groups or Parameters are new."""
@@ -186,7 +192,6 @@ class StepAdam(Adam):
             for param in group["params"]:
                 if i == len(lanes) or lanes[i].param is not param or lanes[i].group is not group:
                     return self._new_lanes()
-                lanes[i].same_object = True
                 i += 1
         return lanes
 
@@ -211,7 +216,7 @@ class StepAdam(Adam):
                         lane.framed = self.in_own_frame and lane.name == "means"
                 else:
                     lane.last, lane.framed, lane.left = before.last, before.framed, before.left
-                    lane.same_object = before.param is param
+                    lane.same_object = before.same_object and before.param is param
                     self._tell_fewer_rows(before.param, lane)
                 self._check_rows(lane)
                 self._lanes.append(lane)

@@ -92,6 +92,8 @@ class PhaseScheduler(Course):
             raise TypeError(f"{CALL}: log={log!r}, but a RunLog or None is needed")
         self.log, self._loss = log, None
         self._group = process_group
+        own = (part for part in self.parts if overrides(part, "pixel_loss"))
+        self._squared: Part | None = next(own, None)
         self._choose_pixel_loss()
         _UNFINISHED.add(self)
 
@@ -233,7 +235,7 @@ class PhaseScheduler(Course):
         if self.log is not None:
             numbers = self.numbers()
             if self._loss is not None:
-                numbers["loss"] = self._loss
+                numbers["loss"], self._loss = self._loss, None
             self.log.step(self.iteration, phase=self.phase.value, **numbers)
         assert self.total_steps is not None
         if self.iteration > self.total_steps:  # trainers that count from 1 end at total_steps
@@ -252,8 +254,7 @@ class PhaseScheduler(Course):
     def _choose_pixel_loss(self) -> None:
         """Whose photometric term holds for the iteration after this one, whose loss comes next."""
         assert self.switch_step is not None
-        own = next((part for part in self.parts if overrides(part, "pixel_loss")), None)
-        self._pixel = own if self.iteration + 1 >= self.switch_step else None
+        self._pixel = self._squared if self.iteration + 1 >= self.switch_step else None
 
     def restore(self, state: Mapping[str, Any] | None, iteration: int) -> None:
         """As `Course.restore`."""

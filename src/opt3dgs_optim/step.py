@@ -18,7 +18,7 @@ A row is one Gaussian: dimension 0 of a parameter. In the order in which it is m
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -232,40 +232,57 @@ def chosen_rows(fade: Fade, count: int, device: torch.device) -> Tensor:
 
 
 class Axes(NamedTuple):
-    """B = R diag(s) of n Gaussians, Sigma = B B^T."""
+    """B = R diag(s) of n Gaussians, Sigma = B B^T, by columns [n], which a CPU is fast at."""
 
-    real: Tensor  # [n, 1] of the unit quaternion of R
-    imaginary: Tensor  # [n, 3]
-    deviations: Tensor  # [n, 3]
+    quaternion: tuple[Tensor, ...]  # w, x, y, z of R, of length 1
+    deviations: tuple[Tensor, ...]  # s along each axis
 
 
 def axes_of(frame: Frame, rows: Any = ...) -> Axes:
-    """The axes of the Gaussians; one with numbers that are not finite is never moved."""
-    quats = frame.quats.detach()[rows]
-    length = (quats * quats).sum(-1, keepdim=True).sqrt_().clamp_(min=MIN_QUATERNION)
-    quats = quats / length
-    deviations = frame.scales.detach()[rows].exp()
-    if frame.min_aspect:
-        least = deviations.amax(-1, keepdim=True).mul_(frame.min_aspect)
-        deviations = torch.maximum(deviations, least)
-    return Axes(quats[:, :1], quats[:, 1:], deviations)
+    """The axes of the Gaussians, as they are used."""
+    w, x, y, z = frame.quats.detach()[rows].unbind(1)
+    square = torch.addcmul(torch.addcmul(torch.addcmul(w * w, x, x), y, y), z, z)
+    inverse = square.sqrt_().clamp_(min=MIN_QUATERNION).reciprocal_()
+    quaternion = w * inverse, x * inverse, y * inverse, z * inverse
+    a, b, c = frame.scales.detach()[rows].exp().unbind(1)
+    least = torch.maximum(torch.maximum(a, b), c).mul_(frame.min_aspect)
+    deviations = torch.maximum(a, least), torch.maximum(b, least), torch.maximum(c, least)
+    return Axes(quaternion, deviations)
 
 
 def into_frame(axes: Axes, vectors: Tensor) -> Tensor:
     """B^T v [n, 3]; zero where that is no number that Adam can square."""
-    turned = _turned(axes, vectors, -1).mul_(axes.deviations)
-    largest = LARGEST[turned.dtype]
-    return torch.where(turned.abs() <= largest, turned, 0.0)
+    turned = turn(axes.quaternion, vectors.unbind(1), -1)
+    found = [each.mul_(s) for each, s in zip(turned, axes.deviations, strict=True)]
+    return _within(LARGEST[vectors.dtype], torch.stack(found, 1))
 
 
 def out_of_frame(axes: Axes, vectors: Tensor) -> Tensor:
     """B v [n, 3]; zero where that is not finite."""
-    turned = _turned(axes, vectors * axes.deviations, 1)
-    return torch.where(turned.abs() <= torch.finfo(turned.dtype).max, turned, 0.0)
+    scaled = [each * s for each, s in zip(vectors.unbind(1), axes.deviations, strict=True)]
+    found = torch.stack(turn(axes.quaternion, scaled, 1), 1)
+    return _within(torch.finfo(vectors.dtype).max, found)
 
 
-def _turned(axes: Axes, v: Tensor, direction: int) -> Tensor:
-    """R v, or R^T v where the direction is -1: v + w t + a x t with t = 2 a x v."""
-    t = torch.linalg.cross(axes.imaginary, v).mul_(2 * direction)
-    turned = torch.addcmul(v, axes.real, t)
-    return turned.add_(torch.linalg.cross(axes.imaginary, t), alpha=direction)
+def turn(quaternion: Sequence[Tensor], vector: Sequence[Tensor], direction: int) -> list[Tensor]:
+    """R v, or R^T v where the direction is -1, by columns: v + w t + u x t with t = 2 u x v.
+
+    The quaternion is w and u = (x, y, z). The other direction is that of -u.
+    """
+    (w, *u), v = quaternion, vector
+    t = [each.mul_(2 * direction) for each in cross(u, v)]
+    across = cross(u, t)
+    return [torch.addcmul(v[i], w, t[i]).add_(across[i], alpha=direction) for i in range(3)]
+
+
+def cross(a: Sequence[Tensor], b: Sequence[Tensor]) -> list[Tensor]:
+    """The cross product of vectors, by columns."""
+    pairs = ((1, 2), (2, 0), (0, 1))
+    return [torch.addcmul(a[i] * b[j], a[j], b[i], value=-1) for i, j in pairs]
+
+
+def _within(largest: float, numbers: Tensor) -> Tensor:
+    """The numbers, with zeros for those that are larger, or none."""
+    if numbers.is_cpu and (not numbers.numel() or numbers.abs().amax().item() <= largest):
+        return numbers
+    return torch.where(numbers.abs() <= largest, numbers, 0.0)

@@ -11,3 +11,13 @@ def takes(step: Step) -> bool:
 def take_step(step: Step, hyper: Hyper) -> None:
     """Make the step in one launch."""
     raise NotImplementedError
+
+
+def missing() -> str | None:
+    """Why the kernels cannot run in this process, or None."""
+    return "not yet"
+
+
+def interpreted_difference() -> float | None:
+    """How far the kernels, run by Triton's interpreter, are from torch."""
+    return None
