@@ -57,7 +57,8 @@ def key_of(line: Line) -> tuple[Any, ...]:
     usual = [json.dumps(line.get(key, value)) for key, value in USUAL.items()]
     kind = "GPU" if "NVIDIA" in line["device"] else "CPU"
     first = [line["scene"], line["size"], line["sh_degree"], line["points"], line["iterations"]]
-    return (*first, *usual, kind, line["arm"], json.dumps(line["seed"]))
+    last = (kind, line["arm"], json.dumps(line["seed"]), line.get("note", ""))
+    return (*first, *usual, *last)
 
 
 def read(path: Path = FILE) -> list[Line]:

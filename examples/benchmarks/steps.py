@@ -54,7 +54,7 @@ def gaussians(points: int, device: torch.device) -> dict[str, Parameter]:
 
 
 def stepped(
-    parts: Sequence[Part] | None,
+    parts: Callable[[], Sequence[Part]] | None,
     *,
     at: float = 0.25,  # share of the training: there fading is as frequent as it gets
     switch: float = 29 / 30,
@@ -74,11 +74,11 @@ def stepped(
             for name, param in splats.items()
         }
         rows = torch.rand(VIEWS, points, 1, device=device) < in_view
-        gradients = [splats["means"].grad * row for row in rows]
+        gradients = [1e-4 * torch.randn(points, 3, device=device) * row for row in rows]
         losses = [x * torch.ones((), device=device) for x in (0.1, 0.12, 0.09, 0.11)]
         phases = None
         if parts is not None:
-            phases = PhaseScheduler(TOTAL, switch, [*parts])
+            phases = PhaseScheduler(TOTAL, switch, [*parts()])
             optimizers = phases.upgrade(optimizers)
             phases.observe(iteration=round(at * TOTAL))
         count = 0
@@ -101,14 +101,14 @@ BASELINE, FUSED = "six Adams", "six fused Adams"
 SUBJECTS: dict[str, Callable[[int, torch.device], Subject]] = {
     BASELINE: stepped(None),
     FUSED: stepped(None, fused=True),
-    "no parts": stepped([]),
-    "defaults": stepped(DEFAULTS),
-    "defaults, fused": stepped(DEFAULTS, fused=True),
-    "defaults, a tenth in view": stepped(DEFAULTS, in_view=0.1),
-    "defaults, last thirtieth": stepped(DEFAULTS, at=0.975),
-    "OwnFrame alone": stepped([OwnFrame()]),
-    "the paper's exploration": stepped([EnergyHistogram.paper(warmup=4)]),
-    "the paper's exploitation": stepped([Curvature()], at=0.0, switch=0.0),
+    "no parts": stepped(list),
+    "defaults": stepped(lambda: DEFAULTS),
+    "defaults, fused": stepped(lambda: DEFAULTS, fused=True),
+    "defaults, a tenth in view": stepped(lambda: DEFAULTS, in_view=0.1),
+    "defaults, last thirtieth": stepped(lambda: DEFAULTS, at=0.975),
+    "OwnFrame alone": stepped(lambda: [OwnFrame()]),
+    "the paper's exploration": stepped(lambda: [EnergyHistogram.paper(warmup=4)]),
+    "the paper's exploitation": stepped(lambda: [Curvature()], at=0.0, switch=0.0),
 }
 
 

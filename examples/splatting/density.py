@@ -152,7 +152,7 @@ def add_noise(
     factors = rotation_matrices(gaussians["quats"]) * gaussians["scales"].exp()[:, None, :]
     draws = torch.randn(len(gate), 3, 1, generator=generator)
     noise = factors @ (factors.mT @ draws)  # Sigma @ eta
-    gaussians["means"] += noise[..., 0] * (gate * (lr * NOISE_LR))[:, None]
+    gaussians["means"].add_(noise[..., 0] * (gate * (lr * NOISE_LR))[:, None])
 
 
 def regularisers(gaussians: dict[str, Parameter]) -> Tensor:

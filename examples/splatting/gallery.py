@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -31,7 +32,8 @@ def draw_comparison(
     width = 10 / count
     figure = Figure(figsize=(10, width * aspect + 4.2), dpi=120, layout="constrained")
     names = [str(i) for i in range(count)]
-    axes = figure.subplot_mosaic([names, ["curves"] * count], height_ratios=[width * aspect, 3.4])
+    rows: list[Any] = [names, ["curves"] * count]
+    axes = figure.subplot_mosaic(rows, height_ratios=[width * aspect, 3.4])
     colours = {arm.name: COLOURS[i % len(COLOURS)] for i, arm in enumerate(arms)}
     axes["0"].imshow(view.image.numpy(), interpolation="nearest")
     axes["0"].set_title("photo, held out")
