@@ -118,11 +118,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--size", default="images_2", choices=get_args(Size), help="folder of the photos")
     add("--background", default="black", choices=get_args(Background), help="behind the scene")
     add("--points", type=int, default=4_000, help="the most Gaussians")
-    add("--iterations", type=int, default=1_500, help="length of a training")
+    add("--iterations", type=int, default=1_200, help="length of a training")
     add("--sh-degree", type=int, default=0, choices=range(4), help="of the colours")
     add("--arms", default=DEFAULT_ARMS, help=f"comma-separated; {said}")
     add("--seeds", type=int, default=1, help="seeds per arm")
-    add("--looks", type=int, default=15, help="evaluations of a training")
+    add("--looks", type=int, default=12, help="evaluations of a training")
     add("-o", "--out", type=Path, default=Path("runs/error_vs_time"), metavar="DIR", help="folder")
     args = parser.parse_args(arguments)
     arms = [find_arm(name.strip()) for name in args.arms.split(",")]
