@@ -1,15 +1,14 @@
 """Break the arithmetic on purpose, one place at a time, and see the tests notice.
 
-    python tests/mutants.py                    # all of TARGETS; three quarters of an hour on a core
-    python tests/mutants.py --only partitions.py  # one module; the others' last result is kept
-    python tests/mutants.py --again            # the survivors of the last result, after new tests
-    python tests/mutants.py --share 0.1        # a random tenth; writes nothing
+    python tests/mutants.py                       # all of TARGETS
+    python tests/mutants.py parts/histogram.py    # one of them
+    python tests/mutants.py step.py test_a.py parts/test_b.py   # any module, with its tests
+    python tests/mutants.py --share 0.1           # a random tenth
 
-A copy of the package is changed in one place, and the module's own tests run on the copy, first
-those that have noticed most so far. Every mutant gets a forked process with torch already imported
+A copy of the package is changed in one place, and the module's tests run on the copy, first those
+that have noticed most so far. Every mutant gets a forked process with torch already imported
 (Linux, macOS), with a limit on its processor time. The tests must pass on the unchanged copy, in
-the same kind of process, before any mutant is tried. The result goes to
-docs/results/stability/mutants.json; `mutants_equivalent.json` says why a survivor changes nothing.
+the same kind of process, before any mutant is tried. Survivors are printed.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import random
 import resource
 import shutil
@@ -25,10 +23,7 @@ import signal
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from datetime import date
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -37,45 +32,17 @@ sys.path.insert(0, str(ROOT / "tests"))
 from mutations import Mutant, mutants  # noqa: E402
 
 PACKAGE = ROOT / "src/opt3dgs_optim"
-EQUIVALENT = ROOT / "tests/mutants_equivalent.json"
-EXPLAINED = ROOT / "docs/results/stability/mutants_explained.json"
-RESULT = ROOT / "docs/results/stability/mutants.json"
+CHOSEN = "not slow and not hosts and not compiles and not processes and not thorough"
 ENERGY = ["test_partitions.py", "parts/test_histogram.py", "parts/test_histogram_extremes.py"]
-CURVATURE = [
-    f"lbfgs/test_{name}.py" for name in ("history", "two_loop", "lqn_direction", "foresight")
-]
-PARTS = ("annealing", "averaging", "fading", "out_of_view", "own_frame")
-STATE = [  # the fast ones of those that are about it
-    *(f"test_{name}.py" for name in ("state", "masks", "part", "checkpoints")),
-    *(
-        f"test_cases_{name}.py"
-        for name in ("several_tensors", "moved_rows", "copies", "across_passes")
-    ),
-]
-# Of these tests: those that compile C++, a law that the loop oracle sees sooner, other classes.
-CHOSEN = "not slow and not hosts and not compiles and not processes"  # by their markers
-LEFT_OUT = "not sanitizers and not mutants and not kernel and not compiles and not power_four"
-OPTIONS_OF = ("EnergyHistogram", "IsotropicNoise", "PositionNoise", "Annealing", "Fading")
-OPTIONS_OF += ("OwnFrame",)
-LEFT_OUT += f" and not (test_options.py and not {' and not '.join(OPTIONS_OF)})"
-# Module: the tests that are meant to notice. What energy, curvature and noise are made of included.
-TARGETS = {
+TARGETS = {  # module: the tests that are meant to notice
     "partitions.py": ENERGY,
     "parts/histogram.py": ENERGY,
-    "lbfgs/two_loop.py": CURVATURE,
-    "lbfgs/pairs.py": CURVATURE,
-    "lbfgs/history.py": CURVATURE,
-    "parts/noise.py": [
-        "parts/test_noise.py",
-        "parts/test_noise_covariance.py",
-        "test_cases_noise.py",
-        "test_options.py",
-    ],
-    **{f"parts/{name}.py": [f"parts/test_{name}.py", "test_options.py"] for name in PARTS},
-    "parts/averaging.py": ["parts/test_averaging.py", "test_cases_strides.py", "test_options.py"],
-    "frames.py": ["parts/test_own_frame.py", "parts/test_noise_covariance.py"],
-    "removed_rows.py": ["test_removed_rows.py"],
-    "state.py": STATE,
+    "parts/noise.py": ["parts/test_noise.py"],
+    "parts/annealing.py": ["parts/test_annealing.py"],
+    "parts/last_phase.py": ["parts/test_last_phase.py"],
+    "parts/curvature.py": ["parts/test_curvature.py"],
+    "awsgld.py": ["test_awsgld.py"],
+    "lqnadam.py": ["test_lqnadam.py"],
 }
 
 
@@ -84,8 +51,8 @@ class Outcome(NamedTuple):
 
     status: int  # of the process; pytest's exit code, or minus the signal
     failed: str | None = None  # the first test that failed
-    seconds: Mapping[str, float] = MappingProxyType({})  # of every test that passed
-    modules: Sequence[str] = ()  # that the run has imported
+    seconds: dict[str, float] = {}  # noqa: RUF012  # of every test that passed
+    modules: tuple[str, ...] = ()  # that the run has imported
     package: str = ""  # the file that the package was imported from
 
     @property
@@ -93,14 +60,13 @@ class Outcome(NamedTuple):
         """What noticed, None if nothing did."""
         if self.status == 0:
             return None
-        limits = {-signal.SIGXCPU: "processor time", -signal.SIGALRM: "time"}
-        return self.failed or limits.get(self.status, f"exit status {self.status}")
+        return self.failed or f"exit status {self.status}"
 
 
 class Plugin:
     """Runs the promising tests first and remembers what happened."""
 
-    def __init__(self, kills: Counter[str], seconds: Mapping[str, float]) -> None:
+    def __init__(self, kills: Counter[str], seconds: dict[str, float]) -> None:
         self.kills, self.known = kills, seconds
         self.failed: str | None = None
         self.seconds: dict[str, float] = {}
@@ -134,9 +100,7 @@ def run_tests(package: Path, tests: list[Path], plugin: Plugin, limit: int | Non
             finally:
                 os._exit(status)
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        if not said.exists():
-            return Outcome(status)
-        return Outcome(status, *json.loads(said.read_text()))
+        return Outcome(status, *(json.loads(said.read_text()) if said.exists() else ()))
 
 
 def _in_child(
@@ -153,14 +117,9 @@ def _in_child(
     os.dup2(silent, 2)
     os.chdir(tests[0].parents[1])
     sys.path.insert(0, str(package.parent))
-    os.environ["PYTHONPATH"] = str(package.parent)
-    # A mutant of the same second and size would be taken for the one before it.
-    sys.dont_write_bytecode = True
-    os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
+    sys.dont_write_bytecode = True  # of the same second and size it would be the last mutant's
     known = set(sys.modules)
-    # -n 0: in this process, whatever the project's own options are.
-    options = ["-x", "-q", "-n", "0", "-p", "no:cacheprovider", "-k", LEFT_OUT]
-    options += ["-m", CHOSEN]
+    options = ["-x", "-q", "-n", "0", "-p", "no:cacheprovider", "-m", CHOSEN]
     # Hypothesis is imported before pytest could rewrite its assertions; it has none to rewrite.
     options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
     status = pytest.main([*options, *map(str, tests)], [plugin])
@@ -172,28 +131,9 @@ def _in_child(
     return int(status)
 
 
-def preload(names: Iterable[str]) -> None:
-    """Import here what every fork would import."""
-    for name in names:
-        if name not in sys.modules:
-            try:
-                __import__(name)
-            except Exception as error:
-                print(f"not preloaded: {name} ({error})", file=sys.stderr)
-
-
 def _children_seconds() -> float:
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
-
-
-def checked(module: str, outcome: Outcome, package: Path) -> Outcome:
-    """The outcome of a run without a mutant, which must be good."""
-    if outcome.status:
-        raise SystemExit(f"{module}: {outcome.killed} fails without a mutant")
-    if not Path(outcome.package).is_relative_to(package):
-        raise SystemExit(f"{module}: the tests ran on {outcome.package}, not on {package}")
-    return outcome
 
 
 def examine(
@@ -210,11 +150,18 @@ def examine(
         package = Path(folder) / original.name
         shutil.copytree(original, package, ignore=shutil.ignore_patterns("__pycache__"))
         begin = _children_seconds()
-        healthy = checked(module, run_tests(package, tests, Plugin(kills, {}), None), package)
+        healthy = run_tests(package, tests, Plugin(kills, {}), None)
+        if healthy.status:
+            raise SystemExit(f"{module}: {healthy.killed} fails without a mutant")
+        if not Path(healthy.package).is_relative_to(package):
+            raise SystemExit(f"{module}: the tests ran on {healthy.package}, not on {package}")
         limit = patience + 3 * int(_children_seconds() - begin)
-        preload(healthy.modules)
-        again = run_tests(package, tests, Plugin(kills, healthy.seconds), limit)
-        checked(module, again, package)
+        for name in healthy.modules:  # import here what every fork would import
+            if name not in sys.modules:
+                try:
+                    __import__(name)
+                except Exception as error:
+                    print(f"not preloaded: {name} ({error})", file=sys.stderr)
         for mutant in tqdm(chosen, desc=module, mininterval=5):
             (package / module).write_text(mutant.source)
             outcome = run_tests(package, tests, Plugin(kills, healthy.seconds), limit)
@@ -226,78 +173,27 @@ def examine(
     return found
 
 
-# -- the package's own modules ---------------------------------------------------------------------
-
-
-def reasons(path: Path = EQUIVALENT) -> dict[tuple[str, str, str, str], str]:
-    """Why a survivor changes nothing, by (module, function, before, after)."""
-    entries = json.loads(path.read_text())
-    return {(e["module"], e["function"], e["before"], e["after"]): e["why"] for e in entries}
-
-
-def reasons_of_the_committed_run() -> dict[tuple[str, str, str, str], str]:
-    """Those, and what was said of survivors whose lines have changed since that run."""
-    return reasons() | reasons(EXPLAINED)
-
-
-def described(mutant: Mutant) -> dict[str, str]:
-    """A survivor as it is written down."""
-    return {"function": mutant.function, "before": mutant.before, "after": mutant.after}
-
-
-def survivor_key(one: dict[str, str]) -> tuple[str, str, str]:
-    return one["function"], one["before"], one["after"]
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("module", nargs="?", help="of the package; none: all of TARGETS")
+    parser.add_argument("tests", nargs="*", help="that are meant to notice, below tests/")
     parser.add_argument("--share", type=float, default=1.0, help="of the mutants, at random")
-    parser.add_argument("--only", choices=TARGETS, help="one module; the others' result is kept")
-    parser.add_argument("--again", action="store_true", help="the last result's survivors only")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    os.environ["HYPOTHESIS_PROFILE"] = "mutants"
-    os.environ["OMP_NUM_THREADS"] = "1"
+    os.environ.update(HYPOTHESIS_PROFILE="mutants", OMP_NUM_THREADS="1")
     import torch
 
     torch.set_num_threads(1)
-    chance = random.Random(options.seed)
-    last = json.loads(RESULT.read_text())["modules"] if RESULT.exists() else {}
-    modules = last if options.only or options.again else {}
-    for module in [options.only] if options.only else TARGETS:
-        every = list(mutants((PACKAGE / module).read_text()))
-        chosen = [m for m in every if chance.random() < options.share]
-        if options.again:
-            keys = {survivor_key(one) for one in last[module]["survivors"]}
-            chosen = [mutant for mutant in every if mutant.key in keys]
-        if not chosen:
-            continue
-        found = examine(PACKAGE, module, chosen, [ROOT / "tests" / t for t in TARGETS[module]])
-        alive = [described(m) for m, killer in zip(chosen, found, strict=True) if not killer]
-        many = len(every) if options.again else len(chosen)
-        modules[module] = {
-            "date": date.today().isoformat(),
-            "mutants": many,
-            "killed": many - len(alive),
-            "survivors": alive,
-        }
-        print(f"{module}: {many - len(alive)} of {many} killed", flush=True)
-        if options.share == 1.0:
-            write(modules, torch.__version__)
-    total = sum(entry["mutants"] for entry in modules.values())
-    dead = sum(entry["killed"] for entry in modules.values())
+    chance, total, dead = random.Random(options.seed), 0, 0
+    for module in [options.module] if options.module else TARGETS:
+        tests = [ROOT / "tests" / test for test in options.tests or TARGETS[module]]
+        every = mutants((PACKAGE / module).read_text())
+        chosen = [mutant for mutant in every if chance.random() < options.share]
+        found = examine(PACKAGE, module, chosen, tests)
+        total, dead = total + len(found), dead + len(found) - found.count(None)
+        print(f"{module}: {len(found) - found.count(None)} of {len(found)} killed", flush=True)
     print(f"all: {dead} of {total} killed ({dead / max(total, 1):.1%})")
-    return 0 if dead >= 0.9 * total else 1
-
-
-def write(modules: dict[str, Any], torch_version: str) -> None:
-    about = {
-        "command": "python tests/mutants.py",
-        "machine": f"{platform.system()} {platform.machine()}, torch {torch_version}",
-    }
-    ordered = {name: modules[name] for name in TARGETS if name in modules}
-    RESULT.write_text(json.dumps({"about": about, "modules": ordered}, indent=1) + "\n")
-    print(f"wrote {RESULT}", flush=True)
+    return 0 if dead >= 0.95 * total else 1
 
 
 if __name__ == "__main__":

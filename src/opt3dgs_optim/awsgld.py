@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, Literal
 
 from opt3dgs_optim.adam import StepAdam
-from opt3dgs_optim.checks import check_choice, warn_user
+from opt3dgs_optim.checks import check_choice
 from opt3dgs_optim.contract import Slots, check_supported
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import split_name
@@ -32,14 +32,16 @@ class AWSGLD(StepAdam):
 
     Args:
         params, lr, betas, eps, weight_decay: as in `torch.optim.Adam`.
-        histogram: where nu comes from; several optimizers may share one. None: nu is off.
+        histogram: where nu comes from, one that serves this optimizer alone. None: nu is off.
         noise: `IsotropicNoise` for any parameters, `PositionNoise` for the positions of Gaussians
             (the group named `means` or `xyz`, or the only group), or None.
         preconditioner: `"adam"`, or `"none"` for the plain SGLD drift `lr * nu * grad`, which
             samples exp(-energy / temperature) together with `IsotropicNoise(temperature=...)`.
 
     The energy is the closure's value, or comes from `histogram.observe(loss)`, called once per
-    iteration before `step()`. One that is not finite skips the step.
+    iteration before `step()`. One that is not finite leaves nu as it is.
+
+    Its state is `torch.optim.Adam`'s, and what the histogram has learnt is in `state_dict()`.
 
     Examples:
         >>> import torch
@@ -75,10 +77,9 @@ class AWSGLD(StepAdam):
         True
 
     Raises:
-        ValueError: an option is outside what is allowed.
+        ValueError: an option is outside what is allowed, or the histogram serves another optimizer.
+        TypeError: histogram or noise is something else.
     """
-
-    any_group = True
 
     def __init__(
         self,
@@ -93,41 +94,38 @@ class AWSGLD(StepAdam):
         preconditioner: Literal["adam", "none"] = "adam",
     ) -> None:
         check_choice("AWSGLD", "preconditioner", preconditioner, ("adam", "none"))
-        parts: list[Part] = [part for part in (histogram, noise) if part is not None]
-        for part, kinds in (
-            (histogram, (EnergyHistogram,)),
-            (noise, (IsotropicNoise, PositionNoise)),
-        ):
-            if part is not None and not isinstance(part, kinds):
-                wanted = " or ".join(kind.__name__ for kind in kinds)
-                raise TypeError(f"AWSGLD: {part!r}, but {wanted} or None is needed")
-        if preconditioner == "none":
-            parts.append(PlainDrift())
+        if histogram is not None and not isinstance(histogram, EnergyHistogram):
+            raise TypeError(f"AWSGLD: histogram={histogram!r}, but an EnergyHistogram is needed")
+        if noise is not None and not isinstance(noise, (IsotropicNoise, PositionNoise)):
+            raise TypeError(
+                f"AWSGLD: noise={noise!r}, but IsotropicNoise or PositionNoise is needed"
+            )
         super().__init__(params, lr, betas, eps, weight_decay)
         slots: Slots = [split_name(group.get("name")) for group in self.param_groups]
         if len(slots) == 1 and slots[0][1] is None and isinstance(noise, PositionNoise):
             slots = [("", "means")]  # the only group
         check_supported(self, slots)
-        self.histogram = histogram
-        self.follow(_WithHistogram(parts), slots)
+        parts: list[Part] = [part for part in (histogram, noise) if part is not None]
+        if preconditioner == "none":
+            parts.append(PlainDrift())
+        course = Sampling(parts)
+        if histogram is not None:
+            histogram.names = None  # nu is on every group's step
+        self.follow(course, slots)
+
+    @property
+    def histogram(self) -> EnergyHistogram | None:
+        """Where nu comes from."""
+        return self.course.part(EnergyHistogram)
 
 
-class _WithHistogram(Course):
-    """A course without an end; says once that no energy has come."""
+class Sampling(Course):
+    """A course without an end, whose energies come from closures or from the histogram's user."""
 
     def observe(self, loss: Any) -> None:
         """Take the value of a closure."""
         for part in self.observers:
             part.observe(loss, self)
-
-    def _advance(self) -> None:
-        super()._advance()
-        histogram = self.part(EnergyHistogram)
-        if self.iteration == 0 and histogram is not None and histogram.num_observed == 0:
-            warn_user(
-                "AWSGLD: no energy has been observed yet, so the multiplier is not adapted; call "
-                "histogram.observe(loss) before step(), or pass it a closure that returns the loss"
-            )
 
 
 class PlainDrift(Part):

@@ -5,8 +5,7 @@ import math
 import os
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from numbers import Integral, Real
 from typing import Any
 
@@ -56,23 +55,6 @@ def check_count(call: str, name: str, value: Any, low: int, high: int | None = N
     return count
 
 
-@contextmanager
-def as_damage(call: str) -> Iterator[None]:
-    """Errors within are those of a damaged checkpoint: ValueErrors that begin with `call`.
-
-    Warnings that are errors are not, nor is want of memory: a second try may go well.
-    """
-    try:
-        yield
-    except (Warning, MemoryError, torch.cuda.OutOfMemoryError):
-        raise
-    except Exception as error:
-        said = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-        if isinstance(error, ValueError) and said.startswith(call):
-            raise
-        raise ValueError(f"{call}: {said}") from error
-
-
 def check_energy(
     call: str, name: str, value: Any, dtype: torch.dtype = torch.float32
 ) -> torch.Tensor:
@@ -94,14 +76,6 @@ def check_energy(
         except (TypeError, ValueError):
             pass
     raise ValueError(f"{call}: {name}={got}, but one real number is needed")
-
-
-def energy_of(value: Any) -> torch.Tensor | None:
-    """A loss as of `check_energy`; None where it is no real number, as of a closure's own kind."""
-    try:
-        return check_energy("", "", value)
-    except ValueError:
-        return None
 
 
 def check_choice(call: str, name: str, value: Any, allowed: Sequence[Any] = (True, False)) -> Any:
@@ -140,12 +114,3 @@ def warn_user(message: str) -> None:
     while frame.f_back is not None and frame.f_code.co_filename.startswith(inside):
         frame, level = frame.f_back, level + 1
     warnings.warn(message, stacklevel=level)
-
-
-def check_keys(call: str, state: Any, needed: Iterable[str]) -> None:
-    """ValueError unless `state` is a mapping with at least the keys `needed`."""
-    if not isinstance(state, Mapping):
-        raise ValueError(f"{call}: {state!r}, but a dict is needed")
-    missing = sorted(set(needed) - set(state))
-    if missing:
-        raise ValueError(f"{call}: keys {missing} are missing")

@@ -68,8 +68,6 @@ class LQNAdam(StepAdam):
         ValueError, RuntimeError: as `Curvature`.
     """
 
-    any_group = True
-
     def __init__(
         self,
         params: Any,

@@ -4,9 +4,7 @@
 
 #include "two_loop.cuh"
 
-#include "histogram.cu"
 #include "lqn.cu"
-#include "own_frame.cu"
 #include "two_loop.cu"
 
 extern "C" void run_lqn_direction(unsigned block, const Real* positions, const Real* grads, Real* histories, Real* directions,
@@ -18,22 +16,4 @@ extern "C" void run_lqn_direction(unsigned block, const Real* positions, const R
 
 extern "C" void run_two_loop(unsigned block, const Real* grads, const Real* histories, Real* results, long long rows) {
   launch_on_host(block, rows, two_loop, grads, histories, results, rows);
-}
-
-extern "C" void run_take_energy(unsigned block, const Real* energy, const unsigned char* valid, Real* state, Real* nu,
-                                long long* counted, Real* sums, long long partitions, long long warmup,
-                                long long memory, long long unlimited, Real limit, Real low, Real high, Real reach,
-                                Real bandwidth, Real even, Real mean_abs, Real resolution, Real tiny) {
-  launch_on_host(block, 1, take_energy, energy, valid, state, nu, counted, sums, partitions, warmup, memory,
-                 unlimited, limit, low, high, reach, bandwidth, even, mean_abs, resolution, tiny);
-}
-
-extern "C" void run_own_frame_gradient(unsigned block, const Real* grads, const Real* quats, const Real* scales,
-                                       Real* results, long long rows, Real min_aspect) {
-  launch_on_host(block, rows, own_frame_gradient, grads, quats, scales, results, rows, min_aspect);
-}
-
-extern "C" void run_own_frame_displacement(unsigned block, const Real* steps, const Real* quats, const Real* scales,
-                                           Real* results, long long rows, Real min_aspect) {
-  launch_on_host(block, rows, own_frame_displacement, steps, quats, scales, results, rows, min_aspect);
 }

@@ -11,9 +11,7 @@
 #define __restrict__ __restrict
 #endif
 
-using std::exp;
 using std::fabs;
-using std::hypot;
 using std::isfinite;
 using std::sqrt;
 

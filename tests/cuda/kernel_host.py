@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
-import math
 import os
 import shutil
 import subprocess
@@ -20,18 +19,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-import opt3dgs_optim
-from opt3dgs_optim import cuda, partitions
+from opt3dgs_optim import cuda
 from opt3dgs_optim.cuda import BLOCK, macros
-from opt3dgs_optim.frames import LARGEST, Frames
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history
-from opt3dgs_optim.partitions import MovingPartitions, Tally
 
 HERE = Path(__file__).parent
-SOURCES = Path(opt3dgs_optim.__file__).parent / "cuda"
+SOURCES = Path(cuda.__file__).parent
 GUARD_ROWS = 300  # written by nobody: more than one block beyond the last row
 GUARD = 77
-WARMUP = 2  # of the histogram: the third and fourth nu, of no limit, are compared
 OPTIONS = {"min_cosine": 1e-6, "graft": True}
 BUILDS = Path(tempfile.gettempdir()) / "opt3dgs_optim_host_kernels"
 
@@ -121,17 +116,9 @@ class HostKernels:
         """A context in which `cuda.launch` runs these kernels on the host."""
         return mock.patch.object(cuda, "launch", self.launch)
 
-    def launch(
-        self,
-        kernel: str,
-        like: Tensor,
-        threads: int,
-        *arguments: Any,
-        history_size: int | None = None,
-    ) -> None:
+    def launch(self, kernel: str, like: Tensor, *arguments: Any, history_size: int) -> None:
         """As `cuda.launch`; AssertionError if something beyond a tensor's end was written."""
-        assert like.dtype == self.dtype
-        assert history_size in (None, self.history_size)
+        assert (like.dtype, history_size) == (self.dtype, self.history_size)
         tensors = [a for a in arguments if isinstance(a, Tensor)]
         assert all(tensor.is_contiguous() for tensor in tensors)
         # The inputs have room behind them, too, for what a missing tail guard would read.
@@ -139,9 +126,7 @@ class HostKernels:
         buffers = [guarded(t.reshape(-1, *t.shape[1:]), GUARD + i) for i, t in enumerate(tensors)]
         left = iter(buffers)
         values = [
-            ctypes.c_void_p(next(left).data_ptr() if isinstance(a, Tensor) else None)
-            if isinstance(a, (Tensor, int))
-            else C_TYPES[type(a)](a.item())
+            ctypes.c_void_p(next(left).data_ptr()) if isinstance(a, Tensor) else C_TYPES[type(a)](a)
             for a in arguments
         ]
         getattr(self.library, f"run_{kernel}")(ctypes.c_uint(BLOCK), *values)
@@ -155,7 +140,7 @@ C_TYPES = {
     np.float32: ctypes.c_float,
     np.float64: ctypes.c_double,
     np.int32: ctypes.c_int,
-    np.int64: ctypes.c_longlong,
+    int: ctypes.c_longlong,
 }
 
 
@@ -246,88 +231,6 @@ def two_loop_case(rows: int, size: int, seed: int = 0) -> tuple[Tensor, Tensor]:
     return grad, history_from_pairs(s, y)
 
 
-def frame_case(rows: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor, Tensor]:
-    """Vectors [N, 3], quats [N, 4] of any length (one is zero) and log scales [N, 3]."""
-    g = torch.Generator().manual_seed(rows)
-    draw = torch.randn(rows, 10, generator=g, dtype=torch.float64)
-    vectors, scales, quats = draw.split([3, 3, 4], 1)
-    quats = quats * 10.0 ** torch.randint(-3, 4, (rows, 1), generator=g)
-    quats[2:3] = 0.0
-    found = [each.to(dtype).contiguous() for each in (vectors, quats, 2 * scales - 3)]
-    return found[0], found[1], found[2]
-
-
-def frames(quats: Tensor, scales: Tensor, min_aspect: float = 0.0) -> Tensor:
-    """B = R diag(exp(scales)) as matrices [N, 3, 3], in float64: slow and obvious.
-
-    No deviation counts as less than `min_aspect` of the longest.
-    """
-    w, x, y, z = torch.nn.functional.normalize(quats.double(), dim=1).unbind(1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    rotation = torch.stack([torch.stack(row, 1) for row in rows], 1)
-    deviations = scales.double().exp()
-    least = min_aspect * deviations.max(1, keepdim=True).values
-    return rotation * torch.where(deviations < least, least, deviations)[:, None, :]
-
-
-class There(Tensor):
-    """On a GPU, as far as it says."""
-
-    is_cuda = True  # pyright: ignore[reportAssignmentType]
-
-
-def compare_frames(kernels: HostKernels, rows: int, min_aspect: float) -> float:
-    """The largest difference of the own frame's two kernels from matrices of float64.
-
-    Relative to the vector times the largest deviation: in a component they may cancel.
-    """
-    case = frame_case(rows, kernels.dtype)
-    with kernels.launched():
-        found = [
-            function(*case, min_aspect)
-            for function in (cuda.own_frame_gradient, cuda.own_frame_displacement)
-        ]
-    vectors, quats, scales = (each.double() for each in case)
-    sums = ("nij,ni->nj", "nij,nj->ni")
-    expected = [torch.einsum(each, frames(quats, scales, min_aspect), vectors) for each in sums]
-    size = vectors.norm(dim=1, keepdim=True) * scales.exp().amax(1, keepdim=True)
-    gaps = torch.cat([(a.double() - b) / size for a, b in zip(found, expected, strict=True)])
-    return float(gaps.abs().nan_to_num(nan=torch.inf).max()) if rows else 0.0
-
-
-def compare_extreme_frames(kernels: HostKernels, dtype: torch.dtype) -> None:
-    """AssertionError where Adam's second moments would not stay finite, or torch's frames differ.
-
-    Gaussians from the smallest to the largest, with gradients of any size.
-
-    Args:
-        dtype: of the positions.
-    """
-    wide, bound = kernels.dtype, LARGEST[dtype]
-    sizes = torch.linspace(-1.0, 1.0, 41, dtype=wide)[:, None].repeat(1, 3)
-    scales = math.log(torch.finfo(wide).max) * sizes
-    quats = torch.randn(41, 4, generator=torch.Generator().manual_seed(1), dtype=wide)
-    by_torch = Frames(quats, scales, dtype, 0.1)
-    with mock.patch.object(cuda, "has_own_frames", return_value=True):
-        by_kernel = Frames(quats, scales, dtype, 0.1)
-    huge = scales[:, 0].exp() > LARGEST[wide]
-    for size in (1.0, 1e3, torch.finfo(dtype).max / 8):
-        grads = torch.tensor([size, -size / 2, size / 4], dtype=dtype).repeat(41, 1)
-        with kernels.launched():
-            found = by_kernel.gradient(grads)
-            moved = by_kernel.displacement(torch.full_like(grads, 0.1))
-        torch.testing.assert_close(found, by_torch.gradient(grads), rtol=1e-2, atol=0.0)
-        assert found.square().isfinite().all(), "the square of what is fed is infinite"
-        assert (found[huge] == 0).all(), "a Gaussian of infinite size is fed"
-        assert (moved[huge] == 0).all(), "a Gaussian of infinite size moves"
-        assert found[~huge & (sizes[:, 0] > 0)].abs().amax(1).gt(0).all(), "others are not fed"
-    assert found.amax() == -found.amin() == bound, "the bound is not reached"
-
-
 def relative_difference(result: Tensor, reference: Tensor) -> float:
     """Largest difference over the reference's row size; infinite where only one is NaN."""
     if reference.numel() == 0:
@@ -340,83 +243,3 @@ def relative_difference(result: Tensor, reference: Tensor) -> float:
     size = size.amax(dim=-1, keepdim=True).clamp(min=1e-300) if size.dim() > 1 else size + 1e-300
     gap = torch.where(same, 0.0, (result - reference).abs() / size)
     return float(gap.nan_to_num(nan=torch.inf).max())
-
-
-# -- the histogram ---------------------------------------------------------------------------------
-
-
-def energies(name: str, count: int = 3_000) -> Tensor:
-    """A script of energies, [count] in float64."""
-    g = torch.Generator().manual_seed(3)
-    z, k = torch.randn(count, generator=g, dtype=torch.float64), torch.arange(count)
-    result = {
-        "falling": 10 ** (-4 * k / count) * (0.2 * z).exp(),
-        "two levels": 5 + (z > 0) + 0.02 * z,
-        "spike": 5 + 0.3 * z + 300 * ((k == 3) | (k == count // 2)),
-        "constant": torch.full_like(z, 0.25),
-        "broken": 5 + 0.3 * z,
-    }[name]
-    if name == "broken":
-        result[0] = torch.nan
-        for start, value in enumerate((torch.nan, torch.inf, -torch.inf)):
-            result[7 + 5 * start :: 31] = value
-    return result
-
-
-def taken(values: Tensor) -> Tensor:
-    """Which energies change anything: most of those that are finite."""
-    return torch.isfinite(values) & (torch.arange(len(values)) % 40 != 9)
-
-
-def take_all(values: Tensor, dtype: torch.dtype, before: Tensor | None = None) -> Tensor:
-    """What a new law has learnt after each energy, [T, 1 + 3 + m + 4].
-
-    That is nu, its state, the number of energies that count, and the sums over nu.
-
-    Args:
-        values: [T] energies; those of `taken` False are said not to be finite.
-        dtype: of the law; a CPU's is float64 otherwise.
-        before: the same of another run: every step is one from there.
-    """
-    law = MovingPartitions(48, 0.75, (-1.0, 3.0))
-    with mock.patch.object(torch, "float64", dtype):
-        law.allocate(torch.device("cpu"))
-    tally = Tally(WARMUP, law.nu)
-    found = []
-    for step, (energy, valid) in enumerate(zip(values.to(dtype), taken(values), strict=True)):
-        if before is not None and step > 0:
-            nu, state, count, sums = before[step - 1].split([1, len(law._state), 1, 3])
-            law.nu.copy_(nu[0])
-            law._state.copy_(state)
-            tally.count.copy_(count[0])
-            tally.sums.copy_(sums)
-        law.take_on_device(energy, True if valid and step % 2 else valid, tally)
-        found.append(torch.hstack([law.nu, law._state, tally.count, tally.sums]))
-    return torch.stack(found)
-
-
-def take_all_on_host(kernels: HostKernels, values: Tensor, before: Tensor | None = None) -> Tensor:
-    """`take_all` with the kernel in the place of the torch operators."""
-    with (
-        kernels.launched(),
-        mock.patch.object(partitions, "obstacle", return_value=None),
-    ):
-        return take_all(values, kernels.dtype, before)
-
-
-def compare_energies(kernels: HostKernels, values: Tensor, *, free: bool = True) -> float:
-    """The largest difference from pure torch, free-running or of each single step.
-
-    Relative in what has a unit (mean, deviation), in the slope, and in the sums over nu.
-    """
-    reference = take_all(values, kernels.dtype)
-    result = take_all_on_host(kernels, values, None if free else reference)
-    counts, before = taken(values), result if free else reference
-    assert torch.equal(result[1:][~counts[1:]], before[:-1][~counts[1:]]), "one more was taken"
-    assert torch.equal(reference[1:][~counts[1:]], reference[:-1][~counts[1:]]), "and by torch"
-    size = torch.ones_like(reference)
-    size[:, 1:3] = reference[:, 1:3].abs()
-    size[:, 3] = reference[:, 3].abs().clamp(min=1.0)
-    size[:, -3:] = reference[:, -3:].abs().clamp(min=1.0)
-    gap = torch.where(result == reference, 0.0, (result - reference).abs() / size)
-    return float(gap[counts].nan_to_num(nan=torch.inf).max())

@@ -18,12 +18,8 @@ import torch
 from kernel_host import (
     SOURCES,
     HostKernels,
-    compare_energies,
-    compare_extreme_frames,
-    compare_frames,
     compare_runs,
     compile_host,
-    energies,
     relative_difference,
     two_loop_case,
 )
@@ -62,26 +58,6 @@ MUTANTS = (
         "History<T, K>(row)), T(1))",
     ),
     Mutant("a gradient of zero", "two_loop.cuh", "size == T(0) ? T(1) : size", "size"),
-    Mutant("the frame's quaternion", "own_frame.cu", "{q.v.y, q.v.z, q.spare}", "q.v"),
-    Mutant("the inverse rotation", "own_frame.cu", "rotated(v, -w)", "rotated(v, w)"),
-    Mutant("a thin axis", "own_frame.cu", "{larger(s.x, least)", "{s.x"),
-    Mutant("the longest axis", "own_frame.cu", "larger(larger(s.x, s.y), s.z)", "larger(s.x, s.y)"),
-    Mutant("an infinite size", "own_frame.cu", "!(longest < largest(norm))", "false"),
-    Mutant("the bound of what is fed", "own_frame.cu", "bounded(own.y)", "own.y"),
-    Mutant("the bound below zero", "own_frame.cu", "x < -most ? -most : x", "x"),
-    Mutant("a quaternion of zero", "own_frame.cu", "norm > T(1e-12) ? norm : T(1e-12)", "norm"),
-    Mutant("one thread", "histogram.cu", "if (blockIdx.x > 0 || threadIdx.x > 0) return;", ""),
-    Mutant("mean of the slope", "histogram.cu", "slope - state[2]", "slope"),
-    Mutant("energies that do not count", "histogram.cu", "(valid && !*valid)", "false"),
-    Mutant("limit of an energy", "histogram.cu", "-limit, limit)", "-limit, Real(9))"),
-    Mutant("when the limit begins", "histogram.cu", "t = taken > unlimited", "t = taken > 3"),
-    Mutant("when slopes count", "histogram.cu", "taken > unlimited ? widened", "true ? widened"),
-    Mutant("count of the energies", "histogram.cu", "*counted = taken;", "++*counted; ++*counted;"),
-    Mutant("mean of the first energy", "histogram.cu", "taken > 1 ? state[0]", "true ? state[0]"),
-    Mutant("pace of the means", "histogram.cu", "taken < memory ? taken", "taken < 9 ? taken"),
-    Mutant("end of the warm-up", "histogram.cu", "= taken > warmup ?", "= taken > 6 ?"),
-    Mutant("begin of the sums", "histogram.cu", "if (taken > warmup)", "if (taken > 0)"),
-    Mutant("sum of squares", "histogram.cu", "multiplier * multiplier", "multiplier"),
 )
 
 
@@ -93,18 +69,11 @@ def complaint(kernels: HostKernels) -> str | None:
         recursion = relative_difference(
             kernels.two_loop(grad, history), two_loop(grad, history, SIZE)
         )
-        turned = max(compare_frames(kernels, ROWS, aspect) for aspect in (0.0, 0.1))
-        compare_extreme_frames(kernels, kernels.dtype)
-        gap = max(compare_energies(kernels, energies(name, 500)) for name in ("spike", "broken"))
     except AssertionError as error:
         return str(error)
     if not difference < 1e-10:
         return f"lqn_direction differs by {difference:.1e}"
-    if not recursion < 1e-10:
-        return f"two_loop differs by {recursion:.1e}"
-    if not turned < 1e-12:
-        return f"the own frame differs by {turned:.1e}"
-    return None if gap < 1e-10 else f"take_energy differs by {gap:.1e}"
+    return None if recursion < 1e-10 else f"two_loop differs by {recursion:.1e}"
 
 
 def mutated(mutant: Mutant | None, folder: Path) -> HostKernels:

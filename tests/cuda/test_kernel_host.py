@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,28 +14,18 @@ from kernel_host import (
     OPTIONS,
     HostKernels,
     Problem,
-    There,
     built,
-    compare_energies,
-    compare_extreme_frames,
-    compare_frames,
     compare_runs,
     compiler,
-    energies,
-    frame_case,
-    frames,
     host_kernels,
     relative_difference,
-    taken,
     two_loop_case,
 )
 from torch import Tensor
 
 from opt3dgs_optim import cuda
-from opt3dgs_optim.frames import Frames
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
 from opt3dgs_optim.lbfgs.history import laid_out
-from opt3dgs_optim.partitions import LIMIT, MEAN_ABS, MEMORY, UNLIMITED, MovingPartitions, Tally
 
 pytestmark = [
     pytest.mark.skipif(compiler() is None, reason="g++ is not installed"),
@@ -190,141 +178,6 @@ def test_a_point_is_told_its_pairs_wherever_two_loop_runs(
     assert not torch.equal(found.nan_to_num(), two_loop(grad, history, 5).nan_to_num())
 
 
-@pytest.mark.parametrize("dtype", DTYPES, ids=str)
-@pytest.mark.parametrize("rows", [0, 1, 7, 255, 256, 257, 1000, 4096])
-@pytest.mark.parametrize("min_aspect", [0.0, 0.1, 1.0])
-def test_the_own_frame(kernels: dict, rows: int, dtype: torch.dtype, min_aspect: float) -> None:
-    """A dozen roundings, of 1e-16 and of 6e-8."""
-    limit = 2e-15 if dtype == torch.float64 else 1e-6
-    assert compare_frames(kernels[5, dtype], rows, min_aspect) < limit
-
-
-@pytest.mark.parametrize("function", [cuda.own_frame_gradient, cuda.own_frame_displacement])
-@pytest.mark.parametrize("how", ["columns", "buffer", "parameters"])
-@pytest.mark.parametrize("dtype", DTYPES, ids=str)
-def test_the_own_frame_of_any_layout(
-    kernels: dict, dtype: torch.dtype, how: str, function: Callable[..., Tensor]
-) -> None:
-    def lay(each: Tensor) -> Tensor:
-        if how == "columns":
-            return each.T.contiguous().T
-        if how == "parameters":
-            return torch.nn.Parameter(each)
-        return torch.cat([each.new_zeros(1), each.flatten()])[1:].view(each.shape)
-
-    case = frame_case(300, dtype)
-    laid = [lay(each) for each in case]
-    # Begins between two vectors of 16 bytes.
-    assert (laid[1].data_ptr() % cuda.ALIGNMENT != 0) == (how == "buffer")
-    with kernels[5, dtype].launched():
-        found, expected = function(*laid), function(*case)
-    assert torch.equal(found, expected)
-    assert found.is_contiguous()
-    assert not found.requires_grad
-
-
-@pytest.mark.parametrize("of_vectors", [torch.float16, torch.bfloat16, *DTYPES], ids=str)
-@pytest.mark.parametrize("of_frames", [torch.float16, torch.bfloat16, *DTYPES], ids=str)
-def test_the_own_frame_of_several_dtypes(
-    kernels: dict, of_vectors: torch.dtype, of_frames: torch.dtype
-) -> None:
-    """The arithmetic is float32, or float64 where one of them is; the result is the vectors'."""
-    vectors, quats, scales = frame_case(300)
-    given = vectors.to(of_vectors), quats.to(of_frames), scales.to(of_frames)
-    wide = torch.float64 if torch.float64 in (of_vectors, of_frames) else torch.float32
-    with kernels[5, wide].launched():
-        found = cuda.own_frame_gradient(*given)
-        v, q, s = (each.to(wide) for each in given)
-        expected = cuda.own_frame_gradient(v, q, s)
-    assert found.dtype == of_vectors
-    assert torch.equal(found, expected.to(of_vectors))
-
-
-def test_which_gaussians_have_frames_by_a_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, quats, _ = frame_case(9, torch.float32)
-    assert not cuda.has_own_frames(quats)
-    assert cuda.has_own_frames(quats.as_subclass(There)) == (cuda.missing() is None)
-    monkeypatch.setattr(cuda, "missing", lambda: None)
-    assert cuda.has_own_frames(quats.as_subclass(There))
-    assert cuda.has_own_frames(quats.half().as_subclass(There))
-    assert not cuda.has_own_frames(quats.long().as_subclass(There))
-    assert not cuda.has_own_frames(quats)
-
-
-@pytest.mark.parametrize("wrong", ["vectors", "quats", "scales"])
-def test_shapes_of_the_own_frame_are_checked_first(
-    wrong: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The kernels read by them: one row less would be read beyond its end."""
-    monkeypatch.setattr(cuda, "launch", None)
-    case: dict[str, Tensor] = dict(zip(("vectors", "quats", "scales"), frame_case(9), strict=True))
-    own = case[wrong]
-    for bad in (own[:8], own[:, :2], own[0], own[0, 0], own[:, :, None], own.to("meta")):
-        for function in (cuda.own_frame_gradient, cuda.own_frame_displacement):
-            message = rf"{function.__name__}: \w+ of shape .* on .* is needed"
-            v, q, s = {**case, wrong: bad}.values()
-            with pytest.raises(ValueError, match=message):
-                function(v, q, s)
-
-
-@pytest.mark.parametrize("dtype", [*DTYPES, torch.float16, torch.bfloat16], ids=str)
-def test_what_adam_squares_stays_finite(kernels: dict, dtype: torch.dtype) -> None:
-    """Of Gaussians of any size, with gradients of any size, by kernels as by torch."""
-    wide = torch.float64 if dtype == torch.float64 else torch.float32
-    compare_extreme_frames(kernels[5, wide], dtype)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16], ids=str)
-def test_a_part_has_the_same_frames_from_kernels_and_from_torch(
-    kernels: dict, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    vectors, quats, scales = (each.to(dtype) for each in frame_case(300))
-    plain = Frames(quats, scales, dtype, 0.0)
-    monkeypatch.setattr(cuda, "has_own_frames", lambda _: True)
-    by_kernel = Frames(quats, scales, dtype, 0.0)
-    quats += 1  # as one optimizer of all groups moves them before the step is asked for
-    unit = vectors.double().norm(dim=1, keepdim=True) * scales.double().exp().amax(1, keepdim=True)
-    wide = torch.float64 if dtype == torch.float64 else torch.float32
-    with kernels[5, wide].launched():
-        pairs = [
-            (by_kernel.gradient(vectors), plain.gradient(vectors)),
-            (by_kernel.displacement(vectors.clone()), plain.displacement(vectors.clone())),
-        ]
-    for found, expected in pairs:
-        assert found.dtype == expected.dtype == dtype
-        gap = ((found.double() - expected.double()) / unit).abs().max()
-        assert float(gap) < 10 * torch.finfo(dtype).eps  # two dozen roundings
-
-
-@pytest.mark.parametrize("dtype", DTYPES, ids=str)
-@pytest.mark.parametrize("name", ["falling", "two levels", "spike", "constant", "broken"])
-def test_energies(kernels: dict, name: str, dtype: torch.dtype) -> None:
-    """Free-running in float64; in float32 each step from the same state.
-
-    1e-5: pure torch's exponents are up to 100 in float32, before softmax takes the largest away.
-    """
-    exact = dtype == torch.float64
-    difference = compare_energies(kernels[5, dtype], energies(name), free=exact)
-    assert difference < (1e-10 if exact else 1e-5)
-
-
-@pytest.mark.parametrize("dtype", DTYPES, ids=str)
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_an_energy_that_is_not_finite_changes_nothing(
-    kernels: dict, value: float, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Whatever is said of it: it may be a large one of float64, in float32."""
-    state, nu, sums = (torch.full((n,), 0.25, dtype=dtype) for n in (51, 1, 3))
-    numbers = (5.0, -1.0, 3.0, 6.0, 0.4, 0.05, 0.8, 1e-6, 1e-30)
-    monkeypatch.setattr(cuda, "launch", kernels[5, dtype].launch)
-    for before in (0, 1, 500):
-        count = torch.tensor(before)
-        given = (torch.tensor(value), True, state, nu, count, sums, (0, MEMORY, UNLIMITED))
-        cuda.take_energy(*given, *numbers)
-        assert int(count) == before
-        assert bool((torch.cat([state, nu, sums]) == 0.25).all())
-
-
 # -- the same under the sanitizers -----------------------------------------------------------------
 
 
@@ -339,9 +192,7 @@ def test_under_address_and_undefined_sanitizers(tmp_path: Path, size: int) -> No
         run = subprocess.run(command, capture_output=True, text=True, check=False, env=_quiet())
         assert run.returncode == 0, run.stderr
         result = torch.from_numpy(np.fromfile(tmp_path / "out", dtype=np.float64))
-        *expected, learnt = expected
-        assert relative_difference(result[-len(learnt) :], learnt) < 1e-10
-        result = result[: -len(learnt)].reshape(len(expected), rows, 3)
+        result = result.reshape(len(expected), rows, 3)
         for part, reference in zip(result, expected, strict=True):
             assert relative_difference(part, reference) < 1e-10
 
@@ -353,8 +204,7 @@ def _quiet() -> dict[str, str]:
 def _write_input(path: Path, rows: int, size: int) -> list[Tensor]:
     """Steps as the program reads them; what it should write.
 
-    That is directions, as they are fed to Adam and of the recursion alone, and what the histogram
-    has learnt.
+    That is directions, as they are fed to Adam and of the recursion alone.
     """
     states = recorded_steps(rows, size)
     history = new_history(states[0][0], size, contiguous=True)
@@ -366,30 +216,5 @@ def _write_input(path: Path, rows: int, size: int) -> list[Tensor]:
         history[reset.bool()] = 0
         expected.append(lqn_direction(x, grad, history, size, **OPTIONS)[0])  # pyright: ignore
         expected.append(two_loop(grad, history, size))
-    expected += _add_frames(parts, rows)
-    learnt = _add_energies(parts)
     torch.cat([part.flatten() for part in parts]).numpy().tofile(path)
-    return [*expected, learnt]
-
-
-def _add_frames(parts: list[Tensor], rows: int) -> list[Tensor]:
-    """Put Gaussians into the program's input; B^T g, and B B^T g."""
-    grad, quats, scales = frame_case(rows)
-    parts += [quats, scales, grad]
-    axes = frames(quats, scales, 0.1)  # as in the program
-    turned = torch.einsum("nij,ni->nj", axes, grad)
-    return [turned, torch.einsum("nij,nj->ni", axes, turned)]
-
-
-def _add_energies(parts: list[Tensor], m: int = 24) -> Tensor:
-    """Put 100 energies into the program's input; the state and nu after them."""
-    law = MovingPartitions(m, 0.75, (-1.0, 3.0))
-    law.allocate(torch.device("cpu"))
-    tally, values = Tally(7, law.nu), energies("broken", 100)
-    numbers = (tally.warmup, MEMORY, UNLIMITED, LIMIT / MEAN_ABS, *law.clamp, *law._constants)
-    parts += [torch.tensor([100, m, *numbers], dtype=torch.float64), law._state.clone()]
-    for k, (energy, valid) in enumerate(zip(values, taken(values), strict=True)):
-        known = 1 + k % 3 % 2 if valid else 0  # 2: a null pointer
-        parts.append(torch.tensor([energy, known], dtype=torch.float64))
-        law.take_on_device(energy, valid, tally)
-    return torch.hstack([law._state, law.nu, tally.sums, tally.count])
+    return expected

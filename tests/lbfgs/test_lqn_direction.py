@@ -9,18 +9,15 @@ from typing import Any
 
 import pytest
 import torch
-from placed_training import some_of
-from points_first import record
+from points_first import header, record
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-import opt3dgs_optim
 from opt3dgs_optim import cuda
 from opt3dgs_optim.backend import obstacle
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
 from opt3dgs_optim.lbfgs import pairs as columns_of
-from opt3dgs_optim.lbfgs.history import header, laid_out
-from opt3dgs_optim.lbfgs.two_loop import foresight
+from opt3dgs_optim.lbfgs.history import laid_out
 
 # inductor imports parts of torch that torch itself has deprecated
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
@@ -84,12 +81,12 @@ class LiveBytes(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("contiguous", [False, True])
-@pytest.mark.parametrize("dim", some_of([1, 3, 4], lambda dim: dim == 3))
+@pytest.mark.parametrize("dim", [1, 3, 4])
 def test_memory_is_that_of_the_results_and_one_chunk(
     dim: int, contiguous: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """10^7 points: 14 bytes each beside history, position and gradient, whatever D is."""
-    n, chunk = 100_000, 1000
+    n, chunk = 20_000, 500
     monkeypatch.setattr(columns_of, "CHUNK", chunk)
     x, grad, history = points(n, dim=dim)
     history = laid_out(history, contiguous=contiguous)
@@ -98,9 +95,6 @@ def test_memory_is_that_of_the_results_and_one_chunk(
     results = n * (4 * dim + 2)
     # of a chunk: less than its history, three times
     assert results <= memory.most < results + 3 * chunk * history[0].numel() * 4
-    with LiveBytes() as memory:
-        foresight(history, 5, x, grad)
-    assert memory.most < 3 * chunk * history[0].numel() * 4
 
 
 def test_a_gpu_works_on_a_million_rows_at_a_time() -> None:
@@ -117,7 +111,7 @@ def test_python_calls(dim: int) -> None:
 
     def count(frame: Any, event: str, _: Any) -> None:
         nonlocal calls
-        home = str(Path(opt3dgs_optim.__file__).parent)
+        home = str(Path(cuda.__file__).parents[1])
         calls += event == "call" and frame.f_code.co_filename.startswith(home)
 
     sys.setprofile(count)
@@ -125,7 +119,30 @@ def test_python_calls(dim: int) -> None:
         lqn_direction(x, grad, history, 5, min_cosine=1e-6, graft=True)
     finally:
         sys.setprofile(None)
-    assert 10 < calls <= 45
+    assert 10 < calls <= 52
+
+
+class Operators(TorchDispatchMode):
+    """Counts the operators of its scope, and those of them that are views."""
+
+    count = views = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.count += 1
+        self.views += func.is_view
+        return func(*args, **(kwargs or {}))
+
+
+def test_operators_of_a_chunk() -> None:
+    """Twelve for each of the five pairs, and what is about them; views once a chunk."""
+    x, grad, history = points(100)
+    with Operators() as of_a_step:
+        lqn_direction(x, grad, history, 5, min_cosine=1e-6, graft=True)
+    with Operators() as of_the_recursion:
+        two_loop(grad, history, 5)
+    assert of_a_step.count - of_a_step.views <= 148
+    assert of_a_step.views <= 49
+    assert (of_the_recursion.count - of_the_recursion.views) <= 69
 
 
 # -- which backend runs ----------------------------------------------------------------------------
@@ -140,34 +157,20 @@ def test_cuda_is_for_three_coordinates() -> None:
 
 @pytest.mark.parametrize(
     "position",
-    [torch.zeros(5, 3), torch.zeros(4, 2), torch.zeros(4, 3, device="meta")],
-    ids=["other rows", "other columns", "another device"],
+    [
+        torch.zeros(5, 3),
+        torch.zeros(4, 2),
+        torch.zeros(4, 3, device="meta"),
+        torch.zeros(4, 3, dtype=torch.float64),
+    ],
+    ids=["other rows", "other columns", "another device", "another dtype"],
 )
 def test_a_position_that_is_not_the_gradients_is_refused(position: Tensor) -> None:
     grad = torch.ones(4, 3)
     history = new_history(grad, 5)
-    with pytest.raises(ValueError, match=r"position is \(\d, \d\) on \w+, but \(4, 3\) on cpu is"):
+    message = r"position is \(\d, \d\) torch\.\w+ on \w+, but \(4, 3\) torch\.float32 on cpu is"
+    with pytest.raises(ValueError, match=message):
         lqn_direction(position, grad, history, 5, min_cosine=0.0, graft=True)
-
-
-@pytest.mark.parametrize("spoiled", ["position", "history", "shape"])
-def test_cuda_gets_what_it_can_read(spoiled: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It reads by the gradient's dtype and shape: another one would be read beyond its end."""
-    monkeypatch.setattr("opt3dgs_optim.backend.cuda.missing", lambda: None)
-    module = sys.modules["opt3dgs_optim.lbfgs.two_loop"]  # the package has a function of that name
-    monkeypatch.setattr(module, "obstacle", lambda *_: None)
-    called = []
-    monkeypatch.setattr(cuda, "launch", lambda *given, **_: called.append(given))
-    x, grad, history = points(7, torch.float64)
-    if spoiled == "shape":
-        x = x[:6]
-    elif spoiled == "position":
-        x = x.float()
-    else:
-        history = history.float()
-    with pytest.raises(ValueError, match=r"lqn_direction: (position|history)"):
-        lqn_direction(x, grad, history, 5, min_cosine=0.0, graft=True, backend="cuda")
-    assert not called
 
 
 def test_more_pairs_than_a_thread_holds_are_torchs() -> None:
@@ -204,9 +207,8 @@ def test_the_recursion_on_a_gpu_is_one_launch(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(cuda, "two_loop", lambda *_: "launched")
     assert two_loop(grad.as_subclass(There), history, 5) == "launched"
     assert asked == [("auto", grad.device, grad.dtype, 3, 5)]
-    # Nobody asks for points on a host, for two dtypes, or where torch.compile traces.
+    # Nobody asks for points on a host, or where torch.compile traces.
     assert two_loop(grad, history, 5) != "launched"
-    assert two_loop(grad.half().as_subclass(There), history, 5) != "launched"
     monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
     assert two_loop(grad.as_subclass(There), history, 5) != "launched"
     assert len(asked) == 1

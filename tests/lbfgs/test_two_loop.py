@@ -10,11 +10,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import dense_bfgs
-from points_first import direction, record
+from points_first import direction, header, record
 from torch import Tensor
 
 from opt3dgs_optim.lbfgs import history_from_pairs, new_history, two_loop
-from opt3dgs_optim.lbfgs.history import header
 
 SIZES = st.tuples(st.integers(1, 6), st.integers(1, 4), st.integers(1, 9), st.integers(0, 2**31))
 
@@ -41,14 +40,18 @@ def gradients(n: int, d: int, seed: int) -> Tensor:
 
 
 @settings(max_examples=150, deadline=None)
-@given(SIZES)
-def test_equals_dense_bfgs(sizes: tuple[int, int, int, int]) -> None:
+@given(SIZES, st.integers(0, 9))
+def test_equals_dense_bfgs(sizes: tuple[int, int, int, int], taken: int) -> None:
+    """With room for K pairs, of which `taken` were: fewer, as many, or more."""
     k, d, n, seed = sizes
-    s, y, _ = convex_pairs(k, d, n, seed)
+    s, y = map(dyadic, convex_pairs(taken, d, n, seed)[:2])
     g = gradients(n, d, seed)
-    result = two_loop(g, history_from_pairs(s, y), k)
+    history = empty(n, d, k)
+    feed(history, k, s, y)
+    result = two_loop(g, history, k)
     for row in range(n):
-        h = dense_bfgs(s[:, row].numpy(), y[:, row].numpy())
+        last_s, last_y = (each[-k:, row].numpy() for each in (s, y))
+        h = dense_bfgs(last_s, last_y) if taken else np.eye(d)
         # two orders of the same float64 sums; conditioning amplifies to at most 1e4 ulp here
         np.testing.assert_allclose(result[row].numpy(), h @ g[row].numpy(), rtol=1e-9, atol=1e-9)
 
@@ -294,17 +297,15 @@ def test_a_gradient_that_is_not_finite_is_nan_and_the_others_are_not() -> None:
     assert torch.equal(found[[0, 3]], expected[[0, 3]])
 
 
-@pytest.mark.parametrize("grad_dtype", [torch.float16, torch.bfloat16, torch.float32])
-def test_the_result_has_the_gradients_dtype_and_no_graph(grad_dtype: torch.dtype) -> None:
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_the_result_has_the_gradients_dtype_and_no_graph(dtype: torch.dtype) -> None:
     s, y, _ = convex_pairs(3, 3, 4, 0)
-    g = gradients(4, 3, 0).to(grad_dtype)
-    history = history_from_pairs(s.to(grad_dtype).requires_grad_(), y.to(grad_dtype))
-    assert history.dtype == torch.float32
-    assert not history.requires_grad
+    g = gradients(4, 3, 0).to(dtype)
+    history = history_from_pairs(s.to(dtype).requires_grad_(), y.to(dtype))
+    assert (history.dtype, history.requires_grad) == (dtype, False)
     before = history.clone()
     found = two_loop(g.requires_grad_(), history, 3)
-    assert (found.dtype, found.requires_grad) == (grad_dtype, False)
-    assert torch.equal(found, two_loop(g.detach().float(), history, 3).to(grad_dtype))
+    assert (found.dtype, found.requires_grad) == (dtype, False)
     assert torch.equal(history, before)
 
 
@@ -317,14 +318,20 @@ def refused(call: Any, error: type[Exception], message: str, *given: Any) -> Non
 @pytest.mark.parametrize(
     ("grad", "error", "message"),
     [
-        (None, TypeError, "two_loop: grad is None, but a tensor of real numbers is needed"),
-        (torch.ones(4, 3).long(), TypeError, r"grad is a tensor of torch\.int64"),
-        (torch.ones(4, 3, dtype=torch.complex64), TypeError, r"a tensor of torch\.complex64"),
-        (torch.ones(4), ValueError, r"grad has shape \(4,\), but \[N, D\] with D at least 1"),
-        (torch.ones(4, 3, 1), ValueError, r"grad has shape \(4, 3, 1\), but"),
-        (torch.ones(4, 0), ValueError, r"grad has shape \(4, 0\), but"),
-        (torch.ones(5, 3), ValueError, r"history has shape \(4, 4, 8\), but \[5, 4, 8\] is"),
-        (torch.ones(4, 3, device="meta"), ValueError, "history is on cpu, but meta is needed"),
+        (None, TypeError, r"two_loop: grad is None, but a tensor of float32 or float64 is needed"),
+        (torch.ones(4, 3).long(), TypeError, r"grad is \(4, 3\) torch\.int64 on cpu, but a tensor"),
+        (torch.ones(4, 3).half(), TypeError, r"torch\.float16 on cpu, but a tensor of float32"),
+        (torch.ones(4, 3).bfloat16(), TypeError, r"torch\.bfloat16 on cpu, but a tensor of"),
+        (torch.ones(4), ValueError, r"grad is \(4,\) .*, but \[N, D\] with D at least 1"),
+        (torch.ones(4, 3, 1), ValueError, r"grad is \(4, 3, 1\) torch\.float32 on cpu, but"),
+        (torch.ones(4, 0), ValueError, r"grad is \(4, 0\) torch\.float32 on cpu, but"),
+        (torch.ones(5, 3), ValueError, r"history is \(4, 4, 8\) .* but \(5, 4, 8\) .* history_si"),
+        (
+            torch.ones(4, 3).double(),
+            ValueError,
+            r"history is .*, but \(4, 4, 8\) torch\.float64",
+        ),
+        (torch.ones(4, 3, device="meta"), ValueError, "on cpu, but .* on meta is needed"),
     ],
     ids=lambda value: None if isinstance(value, Tensor) else str(value)[:30],
 )
@@ -334,18 +341,20 @@ def test_a_wrong_gradient_is_named(grad: Any, error: type[Exception], message: s
 
 
 @pytest.mark.parametrize(
-    ("spoil", "error", "message"),
+    ("spoil", "message"),
     [
-        (lambda h: None, TypeError, "two_loop: history is None, but a tensor of real numbers"),
-        (lambda h: h.long(), TypeError, r"history is a tensor of torch\.int64"),
-        (lambda h: h.half(), ValueError, r"history is torch\.float16, but one of \[torch\.float32"),
-        (lambda h: h[:, :4], ValueError, r"history has shape \(4, 4, 8\), but \[4, 5, 8\]"),
-        (lambda h: h[0], ValueError, r"history has shape \(5, 8\), but \[4, 5, 8\]"),
+        (lambda h: None, "two_loop: history is None, but"),
+        (
+            lambda h: h.half(),
+            r"history is \(4, 5, 8\) torch\.float16 on cpu, but \(4, 5, 8\)",
+        ),
+        (lambda h: h[:, :4], r"history is \(4, 4, 8\) .*, but \(4, 5, 8\) .* for history_size=5"),
+        (lambda h: h[0], r"history is \(5, 8\) .*, but \(4, 5, 8\)"),
     ],
 )
-def test_a_wrong_history_is_named(spoil: Any, error: type[Exception], message: str) -> None:
+def test_a_wrong_history_is_named(spoil: Any, message: str) -> None:
     history = new_history(torch.ones(4, 3), 5)
-    refused(two_loop, error, message, torch.ones(4, 3), spoil(history), 5)
+    refused(two_loop, ValueError, message, torch.ones(4, 3), spoil(history), 5)
 
 
 @pytest.mark.parametrize("size", [0, -1, 5.0, "5", True, None])
@@ -358,17 +367,16 @@ def test_a_wrong_number_of_pairs_is_named(size: Any) -> None:
 @pytest.mark.parametrize(
     ("s", "y", "error", "message"),
     [
-        ([1.0], [1.0], TypeError, r"history_from_pairs: s is \[1\.0\], but a tensor of real"),
-        (torch.ones(2, 4, 3), None, TypeError, "y is None, but a tensor of real numbers"),
+        ([1.0], [1.0], TypeError, r"history_from_pairs: s is \[1\.0\], but a tensor of float32"),
         (
-            torch.ones(2, 4, 3).int(),
             torch.ones(2, 4, 3),
-            TypeError,
-            r"s is a tensor of torch\.int32",
+            None,
+            ValueError,
+            r"y is None, but \(2, 4, 3\) torch\.float32",
         ),
-        (torch.ones(4, 3), torch.ones(4, 3), ValueError, r"s has shape \(4, 3\), but \[K, N, D\]"),
-        (torch.ones(0, 4, 3), torch.ones(0, 4, 3), ValueError, r"s has shape \(0, 4, 3\), but"),
-        (torch.ones(2, 4, 0), torch.ones(2, 4, 0), ValueError, r"s has shape \(2, 4, 0\), but"),
+        (torch.ones(4, 3), torch.ones(4, 3), ValueError, r"s is \(4, 3\) .*, but \[K, N, D\] with"),
+        (torch.ones(0, 4, 3), torch.ones(0, 4, 3), ValueError, r"s is \(0, 4, 3\) .*, but \[K,"),
+        (torch.ones(2, 4, 0), torch.ones(2, 4, 0), ValueError, r"s is \(2, 4, 0\) .*, but \[K,"),
         (torch.ones(2, 4, 3), torch.ones(2, 3, 3), ValueError, r"y is \(2, 3, 3\) torch\.float32"),
         (torch.ones(2, 4, 3), torch.ones(2, 4, 3).double(), ValueError, r"y is .* torch\.float64"),
         (torch.ones(1, 1, 1), torch.ones(1, 1, 1, device="meta"), ValueError, "y is .* on meta"),
@@ -383,15 +391,3 @@ def test_no_points_have_a_history() -> None:
     none = torch.ones(5, 0, 3)
     assert history_from_pairs(none, none).shape == (0, 5, 8)
     assert two_loop(none[0], history_from_pairs(none, none), 5).shape == (0, 3)
-
-
-@pytest.mark.parametrize("size", [1e39, 1e300, 1e-60, 1e-300])
-def test_a_gradient_of_float64_beside_pairs_of_float32(size: float) -> None:
-    """Of whatever size: the history's dtype holds neither of them."""
-    s, y = (each.float() for each in convex_pairs(3, 3, 5, 0)[:2])
-    history = history_from_pairs(s, y)
-    grad = gradients(5, 3, 1).double()
-    found = two_loop(grad * size, history, 3)
-    expected = two_loop(grad.float(), history, 3).double() * size
-    assert torch.allclose(found / size, expected / size, rtol=1e-5)
-    assert (found != 0).all()

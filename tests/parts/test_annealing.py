@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import pytest
 import torch
-from trainers import assert_same, gsplat_optimizers, make_splats, only, train, upgraded
+from torch.nn import Parameter
 
-from opt3dgs_optim import Annealing, ConstantMultiplier
+from opt3dgs_optim import Annealing, PhaseScheduler
 
-TOTAL = 60
+TOTAL = 20
+SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3)}
 
 
 @pytest.mark.parametrize(
@@ -37,63 +39,56 @@ def test_opacities_have_a_peak_of_their_own() -> None:
 
 
 def test_the_positions_are_left_alone_unless_they_are_named() -> None:
-    annealing = Annealing(8.0, 0.5)
-    assert annealing.at("means", 0.0) == annealing.at("xyz", 0.0) == 1.0
-    assert annealing.names == ("scales", "quats", "opacities", "sh0", "shN")
-    every = Annealing(8.0, 0.5, names=(*annealing.names, "xyz"))
-    assert every.at("means", 0.0) == 8.0
-    assert every.at("scales", 1.0) == 0.5
+    assert Annealing().names == ("scales", "quats", "opacities", "sh0", "shN")
+    assert Annealing(8.0, 0.5).at("xyz", 0.0) == 1.0
+    assert [Annealing().at("scales", t) for t in (0.0, 1.0)] == [4.0, 0.4]  # as measured
 
 
-@pytest.mark.parametrize("nu", [1.0, 1.5])
-@pytest.mark.parametrize("annealing", [Annealing(1.0, 1.0), Annealing(8.0, 0.4)])
-def test_every_step_is_adams_times_the_factors(annealing: Annealing, nu: float) -> None:
-    """The same gradients with rates set by hand give the same bits; nu ends at the switch."""
-    ours, phases, optimizers = upgraded(TOTAL, annealing, ConstantMultiplier(nu), switch=40)
-    plain = gsplat_optimizers(theirs := make_splats())
-    rates = {name: opt.param_groups[0]["lr"] for name, opt in plain.items()}
+@pytest.mark.parametrize("annealing", [Annealing(), Annealing(8.0, 0.5, names=("means", "sh0"))])
+def test_every_step_is_adams_times_the_factor(annealing: Annealing) -> None:
+    """The same gradients with rates set by hand give the same bits."""
+
+    def made() -> tuple[dict[str, Parameter], dict[str, torch.optim.Adam]]:
+        splats = {name: Parameter(torch.ones(4, *shape)) for name, shape in SHAPES.items()}
+        adams = {n: torch.optim.Adam([p], lr=0.01, foreach=False) for n, p in splats.items()}
+        return splats, adams
+
+    (ours, optimizers), (theirs, plain) = made(), made()
+    phases = PhaseScheduler(TOTAL, parts=[annealing])
+    phases.upgrade(optimizers)
     for i in range(TOTAL):
-        for name, optimizer in plain.items():
-            factor = annealing.at(name, i / TOTAL) * (nu if i < 40 else 1.0)
-            optimizer.param_groups[0]["lr"] = rates[name] * factor
-        train(theirs, plain, None, i, i + 1)
-        train(ours, optimizers, phases, i, i + 1)
-    assert_same(ours, theirs)
-    held = {name: opt.param_groups[0]["lr"] for name, opt in optimizers.items()}
-    assert held == rates  # never written
+        for name in SHAPES:
+            plain[name].param_groups[0]["lr"] = 0.01 * annealing.at(name, i / TOTAL)
+            for splats, adams in ((ours, optimizers), (theirs, plain)):
+                splats[name].grad = splats[name].detach().sin() + 0.1 * i
+                adams[name].step()
+        assert phases.numbers() == {"annealing": annealing.at(annealing.names[0], i / TOTAL)}
+    for name in SHAPES:
+        assert torch.equal(ours[name], theirs[name])
+        assert optimizers[name].param_groups[0]["lr"] == 0.01  # never written
 
 
-@pytest.mark.parametrize("decoupled", ["AdamW", "Adam"])
-def test_the_factor_is_none_of_decoupled_decays_business(decoupled: str) -> None:
-    """nu = -5 must not make weights grow: the step turns around, the decay does not."""
-    x, y = [torch.nn.Parameter(torch.ones(4, 3)) for _ in "ab"]
-    options: dict[str, Any] = {"lr": 0.01, "weight_decay": 0.1}
-    if decoupled == "Adam":
-        options["decoupled_weight_decay"] = True
-    cls = getattr(torch.optim, decoupled)
-    phases = only(TOTAL, ConstantMultiplier(-5.0))
-    ours = phases.upgrade({"means": cls([x], **options)})["means"]
-    plain = torch.optim.Adam([y], lr=0.01)
-    for step in range(6):
-        phases.observe(0.1)
-        x.grad = torch.full((4, 3), 1.0 + step)
-        y.grad = x.grad.clone()
+def test_the_factor_is_none_of_decoupled_decays_business() -> None:
+    x, y = Parameter(torch.ones(4, 3)), Parameter(torch.ones(4, 3))
+    adam = torch.optim.AdamW([x], lr=0.01, weight_decay=0.1)
+    phases = PhaseScheduler(TOTAL, parts=[Annealing(5.0, 5.0, names=("means",))])
+    ours, plain = phases.upgrade({"means": adam})["means"], torch.optim.Adam([y], lr=0.01)
+    for step in range(4):
+        x.grad, y.grad = torch.full((4, 3), 1.0 + step), torch.full((4, 3), 1.0 + step)
         before = y.detach().clone()
         ours.step()
         plain.step()
-        with torch.no_grad():  # the decay of AdamW, the step of Adam times nu
-            y.copy_(before * (1 - 0.01 * 0.1) - 5.0 * (y - before))
+        with torch.no_grad():  # the decay of AdamW, the step of Adam times the factor
+            y.copy_(before * (1 - 0.01 * 0.1) + 5.0 * (y - before))
     torch.testing.assert_close(x, y, rtol=1e-6, atol=1e-7)
-    assert ours.param_groups[0]["weight_decay"] == 0.1
-    assert ours.param_groups[0]["lr"] == 0.01
 
 
-def test_the_log_gets_the_factor() -> None:
-    for names, factor in ((("scales", "opacities"), 2.0), (("opacities", "scales"), 1.0)):
-        phases = only(TOTAL, Annealing(4.0, 1.0, names=names))
-        phases.observe(0.1, iteration=TOTAL // 2)
-        assert phases.numbers() == {"annealing": pytest.approx(factor)}
-
-
-def test_the_defaults_are_those_that_were_measured() -> None:
-    assert [Annealing().at("scales", t) for t in (0.0, 1.0)] == [4.0, 0.4]
+@pytest.mark.parametrize("name", ["peak", "final", "opacity_peak"])
+def test_options(name: str) -> None:
+    wrong: Any
+    for wrong in (0.0, -1.0, float("inf"), "4"):
+        with pytest.raises(ValueError, match=re.escape(f"Annealing: {name}={wrong!r}")):
+            Annealing(**{name: wrong})
+    with pytest.raises(ValueError, match="names="):
+        Annealing(names=("colour",))
+    assert repr(Annealing()) == "Annealing(peak=4.0, final=0.4, opacity_peak=1.0)"

@@ -5,166 +5,144 @@ from __future__ import annotations
 import copy
 from typing import Any
 
-import devices
 import pytest
 import torch
+from torch import Tensor
 from torch.nn import Parameter
-from trainers import (
-    gsplat_optimizers,
-    inria_optimizer,
-    make_splats,
-    only,
-    state_of,
-    train,
-    upgraded,
-)
 
-from opt3dgs_optim import Course, Curvature, LQNAdam
+from opt3dgs_optim import Course, Curvature, LQNAdam, PhaseScheduler
+from opt3dgs_optim.parts.curvature import HISTORY
 
-TOTAL, SWITCH = 60, 40
+SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": ()}
+STIFF = torch.tensor([1.0, 5.0, 25.0])
 
 
-@pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
+def positions(optimizer: Any = LQNAdam, n: int = 6, **options: Any) -> tuple[Parameter, Any]:
+    x = Parameter(torch.randn(n, 3, generator=torch.Generator().manual_seed(0)))
+    return x, optimizer([x], lr=0.01, **options)
+
+
+def quadratic_step(x: Parameter, optimizer: Any, stiff: Tensor = STIFF) -> None:
+    x.grad = x.detach() * stiff
+    optimizer.step()
+
+
 @pytest.mark.parametrize("names", [("means",), ("xyz", "scaling"), ("opacities", "quats"), None])
-def test_it_acts_on_its_parameters_from_the_switch_on(make: Any, names: Any) -> None:
+def test_it_acts_on_its_parameters_from_the_switch_on(names: Any) -> None:
+    splats = {name: Parameter(torch.ones(5, *shape)) for name, shape in SHAPES.items()}
+    adams = {name: torch.optim.Adam([param], lr=0.1) for name, param in splats.items()}
     curvature = Curvature(3, names=names)
-    splats, phases, optimizers = upgraded(TOTAL, curvature, switch=SWITCH, make=make)
-    train(splats, optimizers, phases, 0, SWITCH)
-    assert not any("Curvature.history" in state_of(optimizers, p) for p in splats.values())
-    train(splats, optimizers, phases, SWITCH, SWITCH + 3)
-    holders = {name for name, p in splats.items() if "Curvature.history" in state_of(optimizers, p)}
-    assert holders == (set(splats) if names is None else set(curvature.names))
+    phases = PhaseScheduler(8, 4, parts=[curvature])
+    phases.upgrade(adams)
+    for i in range(8):
+        for name, param in splats.items():
+            param.grad = param.detach() + 0.1
+            adams[name].step()
+        holders = {name for name, p in splats.items() if HISTORY in adams[name].state[p]}
+        acts = set(splats) if names is None else set(curvature.names or ())
+        assert holders == (acts if i >= 4 else set())
 
 
 def test_while_exploiting_the_positions_go_where_lqnadam_takes_them() -> None:
-    ours, phases, optimizers = upgraded(TOTAL, Curvature(), switch=0)
-    means, theirs = optimizers["means"], make_splats()
-    twin = LQNAdam([theirs["means"]], lr=1e-2, eps=1e-15)
-    for step in range(12):
-        phases.observe(0.1)
-        for param, optimizer in ((ours["means"], means), (theirs["means"], twin)):
-            param.grad = param.detach() * torch.tensor([1.0, 5.0, 25.0]) + 0.1 * step
-            optimizer.step()
-    assert torch.equal(ours["means"], theirs["means"])
-
-
-@pytest.mark.parametrize("scale", [1.0, 8.0])
-@pytest.mark.parametrize("maximize", [False, True])
-def test_it_sees_the_unscaled_gradient_of_what_is_minimised(maximize: bool, scale: float) -> None:
-    """Whatever GradScaler and `maximize` do to it: the pairs are those of the plain problem."""
-    histories = []
-    for up, factor in ((False, 1.0), (maximize, scale)):
-        x = Parameter(torch.ones(6, 3))
-        phases = only(TOTAL, Curvature(3), switch=0)
-        adam = torch.optim.Adam([x], lr=0.01, maximize=up, fused=True)
-        means: Any = phases.upgrade({"means": adam})["means"]
-        for step in range(5):
-            phases.observe(0.1)
-            gradient = x.detach() * torch.tensor([1.0, 5.0, 25.0]) + 0.1 * step
-            x.grad = gradient * factor * (-1.0 if up else 1.0)
-            means.grad_scale = torch.tensor(factor) if factor != 1.0 else None
-            means.found_inf = torch.zeros(())
-            means.step()
-            assert torch.equal(x.grad, gradient * factor * (-1.0 if up else 1.0))
-        histories.append(means.state[x]["Curvature.history"])
-    torch.testing.assert_close(histories[0], histories[1])
+    (x, adam), (y, twin) = positions(torch.optim.Adam), positions()
+    ours = PhaseScheduler(20, 0, parts=[Curvature()]).upgrade({"means": adam})["means"]
+    for _ in range(12):
+        quadratic_step(x, ours)
+        quadratic_step(y, twin)
+    assert torch.equal(x, y)
 
 
 def test_the_share_is_over_all_parameters_of_a_step() -> None:
-    """Of each optimizer's last step: one whose pairs are refused, one whose are taken."""
+    """One whose pairs are refused, one whose are taken."""
     curvature = Curvature(names=("means", "scales"))
+    assert curvature.accepted_share is None
+    assert curvature.numbers(Course([])) == {}
     x, y = Parameter(torch.zeros(3, 3)), Parameter(torch.zeros(5, 3))
-    phases = only(TOTAL, curvature, switch=0)
     groups = [{"params": [x], "name": "xyz"}, {"params": [y], "name": "scaling"}]
+    phases = PhaseScheduler(10, 0, parts=[curvature])
     optimizer = phases.upgrade(torch.optim.Adam(groups, lr=0.1))
-    for step in range(2):
-        phases.observe(0.1)
+    for expected in (0.0, 3 / 8, 3 / 8):
         x.grad = torch.ones(3, 3) + x.detach()  # convex: accepted
         y.grad = torch.ones(5, 3) - y.detach()  # concave: refused
         optimizer.step()
-        expected = 0.0 if step == 0 else 3 / 8
         assert float(curvature.accepted_share or 0.0) == pytest.approx(expected)
-    assert phases.numbers().keys() == {"accepted"}
     assert float(phases.numbers()["accepted"]) == pytest.approx(3 / 8)
 
 
-def test_no_number_is_said_before_the_first_step() -> None:
-    assert Curvature().accepted_share is None
-    assert Curvature().numbers(Course()) == {}
-
-
-def test_what_it_has_counted_is_in_checkpoints() -> None:
-    one, other = Curvature(), Curvature()
-    counted = {"history_size": 5, "window": None, "seen": [3.0, 4.0, 0.5, 2.0], "probes": 6}
-    one.load_state_dict({key: counted[key] for key in ("seen", "probes")})
-    other.load_state_dict(one.state_dict())
-    assert other.state_dict() == counted
-
-
-@pytest.mark.parametrize(
-    ("evidence", "probes", "said"),
-    [
-        ([0.0, 0.0, 0.0, 0.0], 9, None),  # nothing seen yet
-        ([1.0, 100.0, 50.0, 100.0], 4, None),  # hardly looked
-        ([1.0, 100.0, 50.0, 100.0], 5, "0.010 of the candidate pairs"),
-        ([90.0, 100.0, 2.0, 100.0], 5, "cosine of only 0.020"),
-        ([90.0, 100.0, 20.0, 100.0], 5, None),
-    ],
-)
-def test_when_it_is_useless(evidence: list[float], probes: int, said: str | None) -> None:
-    curvature = Curvature()
-    curvature.load_state_dict({"seen": evidence, "probes": probes})
-    found = curvature.useless(curvature.evidence(Course()).tolist(), Course())
-    assert (found is None) == (said is None)
-    assert said is None or said in (found or "")
-
-
-def test_an_empty_parameter_and_one_without_dimensions() -> None:
-    for start in (torch.zeros(0, 3), torch.ones(())):
-        x = Parameter(start)
-        phases = only(TOTAL, Curvature(), switch=0)
-        means: Any = phases.upgrade({"means": torch.optim.Adam([x], lr=0.1)})["means"]
-        for _ in range(3):
-            phases.observe(0.1)
-            x.grad = 2 * x.detach()
-            means.step()
-        assert x.shape == start.shape
+def test_an_empty_parameter_and_one_of_one_row() -> None:
+    for n in (0, 1):
+        x, optimizer = positions(n=n)
+        for _ in range(4):
+            quadratic_step(x, optimizer)
+        assert x.shape == (n, 3)
         assert bool(torch.isfinite(x).all())
 
 
-def test_a_step_that_the_device_drops_leaves_no_pair(monkeypatch: Any) -> None:
-    """As zero gradients do: the point was not seen."""
-    devices.on_a_device(monkeypatch)
-    x = Parameter(torch.zeros(4, 3))
-    phases = only(TOTAL, Curvature(3), switch=0)
-    means: Any = phases.upgrade({"means": torch.optim.Adam([x], lr=0.1, fused=True)})["means"]
-    before = torch.zeros(0)
-    for loss, slope in ((0.1, 1.0), (float("nan"), 3.0)):
-        x.grad = torch.full((4, 3), slope)
-        before = means.state[x]["Curvature.history"].clone() if means.state else before
-        phases.observe(loss)
-        means.step()
-    assert torch.equal(means.state[x]["Curvature.history"], before)
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_gradient_that_is_not_finite_hurts_no_other_row_and_its_own_recovers(bad: float) -> None:
+    (x, ours), (y, clean) = positions(), positions()
+    for i in range(10):
+        x.grad, y.grad = x.detach() * STIFF, y.detach() * STIFF
+        if i == 5:
+            x.grad[2, 1] = bad
+        ours.step()
+        clean.step()
+    others = torch.arange(6) != 2
+    assert torch.equal(x[others], y[others])
+    assert bool(torch.isfinite(x).all())
+    assert bool((x[2] != y[2]).any())
+    assert float((x - y).detach().abs().max()) < 0.1  # ten steps of 0.01
+
+
+def test_rows_that_the_trainer_adds_begin_without_pairs() -> None:
+    """Rows that it keeps go on bit for bit."""
+    (x, ours), (y, twin) = positions(), positions()
+    for _ in range(6):
+        quadratic_step(x, ours)
+        quadratic_step(y, twin)
+    state = ours.state.pop(x)
+    more = Parameter(torch.cat([x.detach(), torch.ones(2, 3)]))
+    for key, value in state.items():
+        if key != "step":  # as gsplat does
+            state[key] = torch.cat([value, torch.zeros(2, *value.shape[1:])])
+    ours.state[more], ours.param_groups[0]["params"] = state, [more]
+    for _ in range(4):
+        quadratic_step(more, ours)
+        quadratic_step(y, twin)
+    assert torch.equal(more[:6], y)
+    assert float((more[6:] - 1).detach().abs().max()) < 0.2
 
 
 @pytest.mark.parametrize(("saved", "ours"), [(3, 4), (4, 3), (3, 5), (5, 3)])
 def test_pairs_of_another_history_are_refused(saved: int, ours: int) -> None:
     """Of three coordinates, three pairs take as much room as four: the shape does not tell."""
-
-    def trained(history_size: int, steps: int) -> tuple[Parameter, LQNAdam]:
-        x = Parameter(torch.arange(12.0).reshape(4, 3))
-        optimizer = LQNAdam([x], lr=0.1, history_size=history_size)
-        for _ in range(steps):
-            x.grad = x.detach() * torch.tensor([1.0, 2.0, 3.0])
-            optimizer.step()
-        return x, optimizer
-
-    state = trained(saved, 6)[1].state_dict()
-    x, optimizer = trained(ours, 2)
-    before = copy.deepcopy(optimizer.state_dict())
-    with pytest.raises(ValueError, match=r"history_size=|shape"):
-        optimizer.load_state_dict(state)
-    now = optimizer.state_dict()
-    assert now["param_groups"] == before["param_groups"]
+    (x, first), (y, second) = positions(history_size=saved), positions(history_size=ours)
+    for _ in range(6):
+        quadratic_step(x, first)
+    for _ in range(2):
+        quadratic_step(y, second)
+    before = copy.deepcopy(second.state_dict())
+    with pytest.raises(ValueError, match=f"history_size={saved}, but pairs of history_size={ours}"):
+        second.load_state_dict(first.state_dict())
+    assert second.state_dict()["param_groups"] == before["param_groups"]
     for key, value in before["state"][0].items():
-        assert torch.equal(optimizer.state[x][key], value), key
+        assert torch.equal(second.state[y][key], value), key
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"history_size": 0}, "history_size=0"),
+        ({"history_size": 17}, "history_size=17"),
+        ({"min_cosine": -0.1}, "min_cosine"),
+        ({"min_cosine": 1.0}, "min_cosine"),
+        ({"graft": 1}, "graft=1"),
+        ({"names": ("colour",)}, "names="),
+        ({"backend": "opencl"}, "backend='opencl'"),
+    ],
+)
+def test_options(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=f"Curvature: .*{message}"):
+        Curvature(**options)
+    assert repr(Curvature()) == "Curvature(5 pairs per point of means)"
+    assert "of all" in repr(Curvature(names=None))

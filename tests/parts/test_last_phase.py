@@ -1,77 +1,94 @@
-"""What changes at the switch: the loss and the moments."""
+"""What changes at the paper's switch: the loss, and the moments."""
 
 from __future__ import annotations
 
+import copy
+from typing import Any
+
 import pytest
 import torch
-from devices import on_a_device
-from trainers import (
-    assert_same,
-    edit_rows,
-    gsplat_optimizers,
-    inria_optimizer,
-    state_of,
-    train,
-    upgraded,
-    values_of,
-)
+from torch.nn import Parameter
 
-from opt3dgs_optim import FreshMoments
+from opt3dgs_optim import FreshMoments, PhaseScheduler, SquaredLoss
 
-TOTAL, SWITCH = 60, 40
+TOTAL, SWITCH = 12, 8
 
 
-@pytest.mark.parametrize("settling", [0, TOTAL - SWITCH, TOTAL - SWITCH + 1])
-@pytest.mark.parametrize("make", [gsplat_optimizers, inria_optimizer])
-def test_moments_start_anew_at_the_switch_where_there_is_time(make, settling: int) -> None:
-    splats, phases, optimizers = upgraded(TOTAL, FreshMoments(settling), switch=SWITCH, make=make)
-    train(splats, optimizers, phases, 0, SWITCH + 1)
-    fresh = settling <= TOTAL - SWITCH
-    for param in splats.values():
-        state = state_of(optimizers, param)
-        assert float(state["step"]) == (1.0 if fresh else SWITCH + 1.0)
-    train(splats, optimizers, phases, SWITCH + 1, TOTAL)
-    steps = TOTAL - SWITCH if fresh else TOTAL
-    assert {float(state_of(optimizers, p)["step"]) for p in splats.values()} == {steps}
+def made(switch: int = SWITCH, *parts: Any) -> tuple[Parameter, Any, PhaseScheduler]:
+    x = Parameter(torch.arange(12.0).reshape(4, 3))
+    phases = PhaseScheduler(TOTAL, switch, parts=list(parts or (FreshMoments(),)))
+    return x, phases.upgrade({"means": torch.optim.Adam([x], lr=0.1)})["means"], phases
 
 
-def test_the_first_step_after_the_switch_is_that_of_a_new_adam() -> None:
-    ours, phases, optimizers = upgraded(TOTAL, FreshMoments(), switch=SWITCH, amsgrad=True)
-    train(ours, optimizers, phases, 0, SWITCH)
-    theirs = {name: torch.nn.Parameter(value) for name, value in values_of(ours).items()}
-    train(ours, optimizers, phases, SWITCH, TOTAL)
-    train(theirs, gsplat_optimizers(theirs, amsgrad=True), None, SWITCH, TOTAL)
-    assert_same(ours, theirs)
+def step(x: Parameter, optimizer: Any, iteration: int) -> None:
+    x.grad = x.detach().cos() * (1e3 if iteration < SWITCH else 1.0)
+    optimizer.step()
 
 
-def test_points_that_come_after_the_switch_do_not_start_the_others_anew() -> None:
-    splats, phases, optimizers = upgraded(TOTAL, FreshMoments(), switch=SWITCH)
-    train(splats, optimizers, phases, 0, SWITCH + 5)
-    edit_rows(splats, optimizers, torch.arange(12), 3)
-    train(splats, optimizers, phases, SWITCH + 5, SWITCH + 6)
-    assert float(state_of(optimizers, splats["means"])["step"]) == 6.0
+def test_moments_begin_anew_at_the_switch() -> None:
+    """From there on the steps are those of a new Adam."""
+    x, optimizer, _ = made()
+    for i in range(SWITCH):
+        step(x, optimizer, i)
+    assert float(optimizer.state[x]["step"]) == SWITCH
+    y = Parameter(x.detach().clone())
+    plain = torch.optim.Adam([y], lr=0.1, foreach=False)
+    for i in range(SWITCH, TOTAL):
+        step(x, optimizer, i)
+        step(y, plain, i)
+        assert float(optimizer.state[x]["step"]) == i + 1 - SWITCH
+    assert torch.equal(x, y)
+    assert torch.equal(optimizer.state[x]["exp_avg_sq"], plain.state[y]["exp_avg_sq"])
 
 
-@pytest.mark.parametrize("options", [{"foreach": False}, {"foreach": True}, {"fused": True}])
-@pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("device", [False, True])
-def test_a_step_that_is_dropped_at_the_switch_does_not_lose_the_fresh_start(
-    options: dict[str, bool], masked: bool, device: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Where only the device knows, off the fused path, it is made and put back: Adam's part."""
-    if device:
-        on_a_device(monkeypatch)
-    splats, phases, optimizers = upgraded(TOTAL, FreshMoments(), switch=SWITCH, **options)
-    train(splats, optimizers, phases, 0, SWITCH)
-    before = values_of(splats)
-    phases.observe(float("nan"))
-    for name, optimizer in optimizers.items():
-        splats[name].grad = torch.ones_like(splats[name])
-        optimizer.step(visible=torch.arange(len(splats[name])) >= 0 if masked else None)
-    assert_same(splats, before)
-    # A host has not begun; nor has a path that cannot drop a step, for which the host is asked.
-    for param in splats.values() if device and "fused" in options else ():
-        state = state_of(optimizers, param)
-        assert not any(bool(state[key].any()) for key in ("step", "exp_avg", "exp_avg_sq"))
-    train(splats, optimizers, phases, SWITCH + 1, SWITCH + 2)
-    assert {float(state_of(optimizers, p)["step"]) for p in splats.values()} == {1.0}
+@pytest.mark.parametrize("switch", [0, SWITCH, TOTAL])
+def test_wherever_the_switch_is(switch: int) -> None:
+    x, optimizer, _ = made(switch)
+    for i in range(TOTAL):
+        step(x, optimizer, i)
+    assert float(optimizer.state[x]["step"]) == (TOTAL - switch if switch < TOTAL else TOTAL)
+
+
+def test_a_parameter_without_a_gradient_there_begins_anew_later() -> None:
+    x, optimizer, phases = made()
+    for i in range(SWITCH - 1):
+        step(x, optimizer, i)
+    phases.observe(iteration=SWITCH + 2)
+    step(x, optimizer, SWITCH + 2)
+    assert float(optimizer.state[x]["step"]) == 1.0
+
+
+@pytest.mark.parametrize("saved_at", [SWITCH - 1, SWITCH, SWITCH + 2])
+def test_a_resume_begins_anew_only_where_it_would_have_been(saved_at: int) -> None:
+    x, optimizer, _ = made()
+    for i in range(saved_at):
+        step(x, optimizer, i)
+    y, resumed, _ = made()
+    y.data.copy_(x.data)
+    resumed.load_state_dict(copy.deepcopy(optimizer.state_dict()))
+    for i in range(saved_at, TOTAL):
+        step(x, optimizer, i)
+        step(y, resumed, i)
+    assert torch.equal(x, y)
+    assert float(resumed.state[y]["step"]) == TOTAL - SWITCH
+
+
+def test_an_edit_of_the_rows_after_the_switch_does_not_begin_anew() -> None:
+    x, optimizer, _ = made()
+    for i in range(SWITCH + 2):
+        step(x, optimizer, i)
+    state, fewer = optimizer.state.pop(x), Parameter(x.detach()[:2])
+    for key in ("exp_avg", "exp_avg_sq"):
+        state[key] = state[key][:2]
+    optimizer.state[fewer], optimizer.param_groups[0]["params"] = state, [fewer]
+    step(fewer, optimizer, SWITCH + 2)
+    assert float(optimizer.state[fewer]["step"]) == 3.0
+
+
+def test_the_photometric_term_is_squared_from_the_switch_on() -> None:
+    x, optimizer, phases = made(SWITCH, SquaredLoss())
+    render, target = torch.tensor([0.5, 0.0]), torch.tensor([0.1, 0.0])
+    for i in range(TOTAL):
+        expected = 0.2 if i < SWITCH else 0.08
+        assert float(phases.pixel_loss(render, target)) == pytest.approx(expected)
+        step(x, optimizer, i)

@@ -12,17 +12,17 @@ into the spare lanes of slots 0 .. D (slots = K: 160 bytes per point in float32 
 otherwise it gets a slot of its own (slots = K + 1).
 
 A new pair moves the older ones down: readers of a ring would have to gather. A history that torch
-computes on has the strides of [slots, lanes, N], one of the CUDA kernel is contiguous; every
-function here takes both.
+computes on has the strides of [slots, lanes, N], its cells; one of the CUDA kernel is contiguous.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from opt3dgs_optim.backend import obstacle
-from opt3dgs_optim.lbfgs.pairs import BITS, Pair, columns, normalised_pair, overwrite
+from opt3dgs_optim.checks import check_count
+from opt3dgs_optim.lbfgs.pairs import BITS, bits_of, columns, dot, normalised, overwrite
 
 MAX_HISTORY = 16
 
@@ -34,11 +34,10 @@ def history_shape(points: Tensor, history_size: int) -> tuple[int, int, int]:
 
 
 def new_history(points: Tensor, history_size: int, *, contiguous: bool = False) -> Tensor:
-    """An empty history for `points` [N, D], of their float64 or of float32; see `laid_out`."""
-    dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
+    """An empty history for `points` [N, D], in their dtype; see `laid_out`."""
     rows, *cells = history_shape(points, history_size)
     shape = (rows, *cells) if contiguous else (*cells, rows)
-    zeros = torch.zeros(shape, dtype=dtype, device=points.device)
+    zeros = torch.zeros(shape, dtype=points.dtype, device=points.device)
     return zeros if contiguous else zeros.movedim(-1, 0)
 
 
@@ -50,100 +49,134 @@ def laid_out(history: Tensor, *, contiguous: bool) -> Tensor:
     return history if cells.is_contiguous() else cells.contiguous().movedim(-1, 0)
 
 
-class Header(NamedTuple):
-    """Views into a history tensor: what the next pair is taken against."""
-
-    position: Tensor  # [N, D] at the last visible step
-    gradient: Tensor  # [N, D] at the last visible step
-    counter: Tensor  # [N] 0: never visible; c: holds c - 1 pairs
-
-
-def header(history: Tensor, history_size: int) -> Header:
-    """The header's views into `history` [N, slots, 2 (D + 1)]."""
-    dim = history.shape[2] // 2 - 1
-    if history_size > dim:
-        position, gradient = history[:, :dim, dim], history[:, :dim, 2 * dim + 1]
-        return Header(position, gradient, history[:, dim, dim])
-    lanes = history[:, history_size]
-    return Header(lanes[:, :dim], lanes[:, dim + 1 : 2 * dim + 1], lanes[:, dim])
-
-
-def check_history(call: str, grad: Tensor, history: Tensor, history_size: int) -> None:
-    """Whether `history` is one of `history_size` pairs of each of the points of `grad`.
+def check_points(call: str, name: str, points: Any, dims: int) -> None:
+    """Whether `points` are [.., D] in so many dimensions.
 
     Raises:
-        TypeError: one of the two is no tensor of real floating-point numbers.
-        ValueError: `grad` is not [N, D], or `history` has another shape, dtype or device than is
-            needed for it.
+        TypeError: no tensor of float32 or float64.
+        ValueError: another number of dimensions, or none of the coordinates or the pairs.
     """
-    check_real(call, "grad", grad)
-    check_real(call, "history", history)
-    if grad.dim() != 2 or grad.shape[1] == 0:
-        raise ValueError(
-            f"{call}: grad has shape {tuple(grad.shape)}, but [N, D] with D at least 1 is needed"
+    if not isinstance(points, Tensor) or points.dtype not in BITS:
+        raise TypeError(
+            f"{call}: {name} is {described(points)}, but a tensor of float32 or float64 is needed"
         )
-    needed = history_shape(grad, history_size)
-    if history.shape != needed:
+    if points.dim() != dims or points.shape[-1] == 0 or (dims == 3 and len(points) == 0):
+        needed = "[N, D] with D" if dims == 2 else "[K, N, D] with K and D"
         raise ValueError(
-            f"{call}: history has shape {tuple(history.shape)}, but {list(needed)} is needed for a "
-            f"gradient of shape {tuple(grad.shape)} and history_size={history_size}"
-        )
-    if history.dtype not in BITS:
-        raise ValueError(f"{call}: history is {history.dtype}, but one of {list(BITS)} is needed")
-    if history.device != grad.device:
-        raise ValueError(
-            f"{call}: history is on {history.device}, but {grad.device} is needed, as the gradient"
+            f"{call}: {name} is {described(points)}, but {needed} at least 1 is needed"
         )
 
 
-def check_real(call: str, name: str, value: Any) -> None:
-    """TypeError unless `value` is a tensor of real floating-point numbers."""
-    if not isinstance(value, Tensor) or not value.is_floating_point():
-        kind = f"a tensor of {value.dtype}" if isinstance(value, Tensor) else repr(value)
-        raise TypeError(f"{call}: {name} is {kind}, but a tensor of real numbers is needed")
+def check_alike(
+    call: str, name: str, given: Any, like: Tensor, shape: tuple[int, ...], size: int | None = None
+) -> None:
+    """ValueError unless `given` is a tensor of `shape`, of the dtype and on the device of `like`.
+
+    The kernel reads memory by them. `size` is the history size, if that made the shape.
+    """
+    needed = shape, like.dtype, like.device
+    if not isinstance(given, Tensor) or (given.shape, given.dtype, given.device) != needed:
+        why = "" if size is None else f" for history_size={size}"
+        raise ValueError(
+            f"{call}: {name} is {described(given)}, but {tuple(shape)} {like.dtype} on "
+            f"{like.device} is needed{why}"
+        )
 
 
-def stored_pairs(history: Tensor, history_size: int) -> tuple[Tensor, Tensor]:
-    """s and y of the stored pairs, [K, D, N] each, newest first."""
-    dim = history.shape[2] // 2 - 1
-    cells = history[:, :history_size].permute(1, 2, 0)
-    if cells.stride(2) != 1:
-        cells = cells.contiguous()
-    return cells[:, :dim], cells[:, dim + 1 : 2 * dim + 1]
+def check_history(call: str, grad: Any, history: Any, history_size: int) -> int:
+    """The history size K; TypeError or ValueError unless all three fit together."""
+    history_size = check_count(call, "history_size", history_size, 1)
+    check_points(call, "grad", grad, 2)
+    check_alike(call, "history", history, grad, history_shape(grad, history_size), history_size)
+    return history_size
 
 
-def push(history: Tensor, history_size: int, pair: Pair, accept: Tensor) -> None:
-    """Put a pair in front of the others, in the rows of `accept` [N] (bool), in place."""
-    dim = pair.s.shape[0]
-    halves = history[:, :history_size].permute(1, 2, 0).unflatten(1, (2, dim + 1))
-    pairs = halves[:, :, :dim]  # [K, 2, D, N]
-    first = pairs[0].unbind()
-    overwrite(accept, (pairs[1:], pairs[:-1]), (first[0], pair.s), (first[1], pair.y))
+def described(value: Any) -> str:
+    """What an error says of an argument."""
+    if not isinstance(value, Tensor):
+        return repr(value)
+    return f"{tuple(value.shape)} {value.dtype} on {value.device}"
+
+
+class Cells:
+    """The history of some points as torch computes on it, all views [.., N] of its memory.
+
+    Each view is an operator; they are made once a chunk.
+
+    Attributes:
+        dim, history_size: D and K.
+        lanes: of every lane, the numbers of the K pairs, [K, N].
+        s, y: of every pair, the vector [D, N], newest first.
+        s_rows, y_rows: of every pair, the D coordinates [N] of that vector.
+        pairs: all of them, [K, 2, D, N].
+        last: position and gradient of the last visible step, [2, D, N].
+        counter: [N], 0: never visible; c: holds c - 1 pairs.
+    """
+
+    def __init__(self, cells: Tensor, history_size: int) -> None:
+        slots, lanes, _ = cells.shape
+        dim = self.dim = lanes // 2 - 1
+        self.history_size = history_size
+        rows = cells.flatten(0, 1).unbind()
+        halves = cells.unflatten(1, (2, dim + 1))
+        kept = cells if slots == history_size else cells[:history_size]
+        self.lanes = kept.unbind(1)
+        pairs = halves[:, :, :dim]
+        if history_size > dim:
+            self.pairs = pairs
+            self.last = halves[:dim, :, dim].transpose(0, 1)
+            self.counter = rows[dim * lanes + dim]
+        else:
+            self.pairs, self.last = pairs[:history_size], pairs[history_size]
+            self.counter = rows[history_size * lanes + dim]
+        vectors = self.pairs.flatten(0, 1).unbind()
+        self.s, self.y = vectors[::2], vectors[1::2]
+        first = range(0, history_size * lanes, lanes)
+        self.s_rows = [rows[i : i + dim] for i in first]
+        self.y_rows = [rows[i + dim + 1 : i + 2 * dim + 1] for i in first]
+
+    def curvatures(self) -> Tensor:
+        """s.y of every pair, [K, N]; 0 where there is none."""
+        return dot(self.lanes[: self.dim], self.lanes[self.dim + 1 : -1])
+
+
+def cells_of(history: Tensor, rows: slice = slice(None)) -> Tensor:
+    """The rows [slots, 2 (D + 1), n] of `history`: a view, or a copy where N is not innermost."""
+    cells = history.movedim(0, -1)[..., rows]
+    return cells if cells.stride(2) == 1 else cells.contiguous()
+
+
+def push(cells: Cells, vectors: Tensor, accepted: Tensor) -> None:
+    """Put a pair [2, D, N] in front of the others where `accepted` (bool) says, in place."""
+    bits = BITS[vectors.dtype]
+    stored, new, chosen = cells.pairs.view(bits), vectors.view(bits), bits_of(accepted, bits)
+    if cells.history_size > 1:
+        overwrite(stored[1:], stored[:-1], chosen)
+    overwrite(stored[0], new, chosen)
 
 
 def take_pairs(
-    history: Tensor,
-    head: Header,
-    history_size: int,
-    position: Tensor,
-    gradient: Tensor,
+    cells: Cells,
+    seen: Tensor,
     visible: Tensor,
     min_cosine: float,
-) -> tuple[Tensor, Tensor]:
+    accepted: Tensor,
+    candidates: Tensor,
+) -> None:
     """Accept a pair between two consecutive *visible* steps of each point; update the header.
 
-    History and `head`, the views of its header, are changed in place; position and gradient are
-    [D, N] before the step. Returns (accepted, candidates), [N] bool each.
+    `seen` [2, D, N] are position and gradient before the step, `visible` is [N] bool. `cells`,
+    `accepted` and `candidates` [N] bool are changed in place.
     """
-    last_position, last_gradient, counter = head.position.T, head.gradient.T, head.counter
-    pair = normalised_pair(position - last_position, gradient - last_gradient)
-    candidates = visible & (counter > 0)
-    accepted = candidates & (pair.cosine > min_cosine)  # false where the pair is not finite
-    push(history, history_size, pair, accepted)
-    overwrite(visible, (last_position, position), (last_gradient, gradient))
-    count = counter.maximum(visible.to(history.dtype)) + accepted
-    counter.copy_(count.clamp(max=history_size + 1))
-    return accepted, candidates
+    pair = normalised(seen - cells.last)
+    torch.bitwise_and(visible, cells.counter > 0, out=candidates)
+    # False where the pair is not finite.
+    torch.gt(pair.cosine, min_cosine, out=accepted).bitwise_and_(candidates)
+    push(cells, pair.vectors, accepted)
+    bits = BITS[seen.dtype]
+    overwrite(cells.last.view(bits), seen.view(bits), bits_of(visible, bits))
+    torch.maximum(cells.counter, visible, out=cells.counter)
+    cells.counter.add_(accepted).clamp_(max=cells.history_size + 1)
 
 
 def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:
@@ -162,13 +195,13 @@ def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:
             per unit of the parameters.
 
     Returns:
-        The history [N, slots, 2 (D + 1)], of K or K + 1 slots; float64 where the pairs are, else
-        float32. `two_loop(grad, history, K)` reads it, with K the number of pairs that there is
-        room for. It is laid out for the CUDA kernel where that can run, and for torch elsewhere;
-        `two_loop` takes both.
+        The history [N, slots, 2 (D + 1)], of K or K + 1 slots, in the dtype of the pairs.
+        `two_loop(grad, history, K)` reads it, with K the number of pairs that there is room for.
+        It is laid out for the CUDA kernel where that can run, and for torch elsewhere; `two_loop`
+        takes both.
 
     Raises:
-        TypeError: s or y is no tensor of real floating-point numbers.
+        TypeError: s is no tensor of float32 or float64.
         ValueError: s is not [K, N, D] with K and D at least 1, or y has another shape, dtype or
             device.
 
@@ -186,24 +219,16 @@ def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:
         tensor([[ 3., -2.,  1.]])
     """
     call = "history_from_pairs"
-    check_real(call, "s", s)
-    check_real(call, "y", y)
-    if s.dim() != 3 or 0 in (s.shape[0], s.shape[2]):
-        raise ValueError(
-            f"{call}: s has shape {tuple(s.shape)}, but [K, N, D] with K and D at least 1 is needed"
-        )
-    if (y.shape, y.dtype, y.device) != (s.shape, s.dtype, s.device):
-        raise ValueError(
-            f"{call}: y is {tuple(y.shape)} {y.dtype} on {y.device}, but {tuple(s.shape)} "
-            f"{s.dtype} on {s.device} is needed, as s is"
-        )
+    check_points(call, "s", s, 3)
+    check_alike(call, "y", y, s, s.shape)
     s, y, size = s.detach(), y.detach(), s.shape[0]
     kernel = s.is_cuda and obstacle("auto", s.device, s.dtype, s.shape[2], size) is None
-    history = new_history(s[0], size, contiguous=kernel)
-    counter = header(history, size).counter.fill_(1)
+    history = new_history(s[0], size)
+    cells = Cells(cells_of(history), size)
+    cells.counter.fill_(1)
     for k in range(size):
-        pair = normalised_pair(columns(s[k], history.dtype), columns(y[k], history.dtype))
+        pair = normalised(columns(s[k], y[k]))
         accepted = pair.cosine > 0  # false where it is not finite
-        push(history, size, pair, accepted)
-        counter.add_(accepted)
-    return history
+        push(cells, pair.vectors, accepted)
+        cells.counter.add_(accepted)
+    return laid_out(history, contiguous=kernel)

@@ -13,19 +13,18 @@ from torch import Tensor
 
 CHUNK = 32768  # rows that a CPU works on at a time, so that intermediates stay in its cache
 DEVICE_CHUNK = 1 << 20  # rows that fill any GPU; intermediates are some 500 bytes per row
-BITS = {torch.float32: torch.int32, torch.float64: torch.int64}
+BITS = {torch.float32: torch.int32, torch.float64: torch.int64}  # by the dtypes of points
 
 
 class Pair(NamedTuple):
-    """A candidate curvature pair, both vectors divided by |y|."""
+    """A candidate curvature pair of every point."""
 
-    s: Tensor  # [D, N]
-    y: Tensor  # [D, N], unit length (zero where the gradients were equal)
+    vectors: Tensor  # [2, D, N]: s and y, both divided by |y|; y is 0 where gradients were equal
     cosine: Tensor  # [N] s.y / (|s| |y|); 0 where s or y is zero, NaN where they are not finite
 
 
 def dot(a: Iterable[Tensor], b: Iterable[Tensor]) -> Tensor:
-    """a.b of every point, [N], of [D, N] or of its rows."""
+    """a.b of every point, [N], of the rows of [D, N]."""
     (x, y), *others = zip(a, b, strict=True)
     total = x * y
     for x, y in others:  # half the time of a sum of products
@@ -33,17 +32,18 @@ def dot(a: Iterable[Tensor], b: Iterable[Tensor]) -> Tensor:
     return total
 
 
-def overwrite(mask: Tensor, *pairs: tuple[Tensor, Tensor]) -> None:
-    """In each pair (old, new) of [..., N], put the new over the old where `mask` [N] (bool) says.
+def bits_of(mask: Tensor, bits: torch.dtype) -> Tensor:
+    """All bits of a chosen point's numbers: what `overwrite` takes of `mask` (bool)."""
+    return mask.to(bits).neg_()
 
-    Bit for bit. On a CPU `torch.where` branches: where the mask is as good as random, it takes
-    five times as long.
+
+def overwrite(old: Tensor, new: Tensor, chosen: Tensor) -> None:
+    """Put the bits [.., N] of `new` over those of `old`, in place, where `chosen` says.
+
+    On a CPU `torch.where` branches: where the mask is as good as random, it takes five times as
+    long.
     """
-    kind = BITS[pairs[0][0].dtype]
-    chosen = mask.to(kind).neg_()  # all bits of a chosen point's numbers
-    for old, new in pairs:
-        bits = old.view(kind)
-        bits.bitwise_xor_(torch.bitwise_xor(bits, new.view(kind)).bitwise_and_(chosen))
+    old.bitwise_xor_(torch.bitwise_xor(old, new).bitwise_and_(chosen))
 
 
 def largest(x: Tensor) -> Tensor:
@@ -54,48 +54,41 @@ def largest(x: Tensor) -> Tensor:
 def length(x: Tensor) -> Tensor:
     """Euclidean norm of every point without overflow or underflow, [N]; 1 for a zero vector."""
     size = largest(x)
-    scaled = x / torch.threshold(size, 0.0, 1.0)
+    scaled = (x / torch.threshold(size, 0.0, 1.0)).unbind()
     return torch.threshold_(dot(scaled, scaled).sqrt_().mul_(size), 0.0, 1.0)
 
 
-def normalised_pair(s: Tensor, y: Tensor) -> Pair:
-    """Divide a pair by |y|, without overflow or underflow on the way."""
-    size = length(y)
-    s, y = s / size, y / size
-    return Pair(s, y, dot(s / length(s), y))
+def normalised(vectors: Tensor) -> Pair:
+    """Divide a pair [2, D, N] by |y|, in place, without overflow or underflow on the way."""
+    s, y = vectors.unbind()
+    vectors.div_(length(y))
+    return Pair(vectors, dot((s / length(s)).unbind(), y.unbind()))
 
 
-def row_chunks(points: Tensor, on_cpu: int | None = None) -> list[slice]:
-    """Rows to work on at a time; `on_cpu` is how many of a CPU's, in the place of `CHUNK`."""
+def row_chunks(points: Tensor) -> list[slice]:
+    """Rows to work on at a time."""
     rows = points.shape[0]
-    size = (on_cpu or CHUNK) if points.device.type == "cpu" else DEVICE_CHUNK
+    size = CHUNK if points.device.type == "cpu" else DEVICE_CHUNK
     return [slice(start, min(start + size, rows)) for start in range(0, max(rows, 1), size)]
 
 
-def columns(points: Tensor, dtype: torch.dtype, out: Tensor | None = None) -> Tensor:
-    """Points [N, D] as [D, N] of `dtype`, each coordinate contiguous; `out` is where, if given."""
-    found = out
-    if found is None:
-        found = torch.empty(points.shape[1], len(points), dtype=dtype, device=points.device)
-    if points.is_cpu and points.dtype in BITS and dtype in BITS:  # numpy takes half of the time
-        np.copyto(found.numpy(), points.detach().numpy().T)
+def columns(*points: Tensor) -> Tensor:
+    """M times points [N, D] as [M, D, N], each coordinate contiguous."""
+    like = points[0].detach()
+    found = like.new_empty(len(points), *reversed(like.shape))
+    if like.is_cpu:  # numpy takes half of the time
+        for place, given in zip(found.numpy(), points, strict=True):
+            np.copyto(place, given.detach().numpy().T)
     else:  # three times as fast as a transposed copy
-        torch.stack(points.detach().to(dtype).unbind(1), out=found)
+        torch.stack([row for given in points for row in given.unbind(1)], out=found.flatten(0, 1))
     return found
 
 
-def in_range_of(dtype: torch.dtype, numbers: Tensor) -> Tensor:
-    """Numbers of another dtype, to be cast: those that this one cannot hold become its largest."""
-    if numbers.dtype == dtype:
-        return numbers
-    most = torch.finfo(dtype).max
-    return numbers.clamp(-most, most)
-
-
-def put(points: Tensor, found: Iterable[Tensor]) -> None:
-    """Into `points` [N, D] what was found as [D, N] or its rows: as fast as `columns`."""
-    for column, row in zip(points.unbind(1), found, strict=True):
-        if points.is_cpu and points.dtype in BITS and row.dtype in BITS:
-            np.copyto(column.numpy(), row.numpy())
-        else:
-            column.copy_(row)
+def put(points: Tensor, found: Tensor) -> None:
+    """Into `points` [N, D] what was found as [D, N]: as fast as `columns`."""
+    if points.is_cpu:
+        target = points.numpy()
+        for i, row in enumerate(found.numpy()):  # a fifth of the time of a transposed copy
+            np.copyto(target[:, i], row)
+    else:
+        points.copy_(found.T)

@@ -1,24 +1,15 @@
-"""The two-loop recursion on the pairs of every point, one step of it for Adam, and its worth."""
+"""The two-loop recursion on the pairs of every point, and one step of it for Adam."""
 
 import torch
 from torch import Tensor
 
 from opt3dgs_optim import cuda
 from opt3dgs_optim.backend import BACKENDS, Backend, obstacle
-from opt3dgs_optim.checks import check_choice, check_count
-from opt3dgs_optim.lbfgs.history import Header, check_history, header, stored_pairs, take_pairs
-from opt3dgs_optim.lbfgs.pairs import (
-    columns,
-    dot,
-    in_range_of,
-    largest,
-    length,
-    put,
-    row_chunks,
-)
+from opt3dgs_optim.checks import check_choice
+from opt3dgs_optim.lbfgs.history import Cells, cells_of, check_alike, check_history, take_pairs
+from opt3dgs_optim.lbfgs.pairs import columns, dot, largest, length, put, row_chunks
 
 
-@torch.no_grad()
 def two_loop(
     grad: Tensor, history: Tensor, history_size: int, *, backend: Backend = "auto"
 ) -> Tensor:
@@ -40,15 +31,15 @@ def two_loop(
     `Curvature` and `LQNAdam` collect pairs while they train, and use it so.
 
     On an NVIDIA GPU, points of three coordinates with at most five pairs are one CUDA kernel, where
-    `backend_info` says that kernels run and gradient and history have one dtype. All else, and what
-    `torch.compile` traces, is pure torch. Both have the same numbers up to rounding. Nothing waits
-    for the GPU. The result has no autograd graph.
+    `backend_info` says that kernels run. All else, and what `torch.compile` traces, is pure torch.
+    Both have the same numbers up to rounding. Nothing waits for the GPU. The result has no autograd
+    graph.
 
     Args:
-        grad: [N, D] gradients of N points of D coordinates, of any finite size, in units of the
-            loss per unit of the parameters.
-        history: [N, slots, 2 (D + 1)], float32 or float64, as `history_from_pairs` makes it. It is
-            not changed. The arithmetic is in its dtype.
+        grad: [N, D] gradients of N points of D coordinates, float32 or float64, of any finite size,
+            in units of the loss per unit of the parameters.
+        history: [N, slots, 2 (D + 1)] of the gradient's dtype, as `history_from_pairs` makes it. It
+            is not changed.
         history_size: K, the number of pairs that the history has room for, at least 1. Of D
             coordinates, the history of D pairs has the shape of one of D + 1: the shape does not
             tell them apart.
@@ -60,8 +51,8 @@ def two_loop(
         gradient is not finite gets NaN.
 
     Raises:
-        TypeError: gradient or history is no tensor of real floating-point numbers.
-        ValueError: shapes, dtype or devices do not fit, or an option is not allowed.
+        TypeError: the gradient is no tensor of float32 or float64.
+        ValueError: the history does not fit the gradient, or an option is not allowed.
         RuntimeError: `backend="cuda"`, and the kernel cannot run.
 
     Examples:
@@ -75,45 +66,58 @@ def two_loop(
         >>> torch.allclose(two_loop(y[-1], history, history_size=2), s[-1])
         True
     """
-    check_choice("two_loop", "backend", backend, BACKENDS)
-    history_size = check_count("two_loop", "history_size", history_size, 1)
-    check_history("two_loop", grad, history, history_size)
+    history_size = check_history("two_loop", grad, history, history_size)
     # torch.compile cannot trace the kernel's launch, and makes kernels of its own.
-    given = grad.is_cuda and history.dtype == grad.dtype and not torch.compiler.is_compiling()
-    if given or backend == "cuda":
-        like = grad.device, grad.dtype, grad.shape[1], history_size
-        if obstacle(backend, *like) is None:
-            return cuda.two_loop(grad, history, history_size)
+    given = grad.is_cuda and not torch.compiler.is_compiling()
+    if by_kernel("two_loop", grad, history_size, backend, given):
+        return cuda.two_loop(grad, history, history_size)
     result = torch.empty_like(grad)
-    for rows in row_chunks(grad):
-        # In the wider of the two dtypes, since a gradient may be too large or small for the other.
-        g = columns(grad[rows], torch.promote_types(grad.dtype, history.dtype))
-        scale = torch.threshold(largest(g), 0.0, 1.0)  # keeps s.q finite
-        unit = (g / scale).to(history.dtype)
-        found = recursion(unit, *stored_pairs(history[rows], history_size))
-        put(result[rows], found.to(g.dtype).mul_(scale))
+    with torch.no_grad():
+        for rows in row_chunks(grad):
+            (g,) = columns(grad[rows])
+            scale = torch.threshold(largest(g), 0.0, 1.0)  # keeps s.q finite
+            cells = Cells(cells_of(history, rows), history_size)
+            put(result[rows], recursion(g / scale, cells).mul_(scale))
     return result
 
 
-def recursion(grad: Tensor, s: Tensor, y: Tensor) -> Tensor:
-    """`two_loop` for gradients [D, N] of moderate size; pairs [K, D, N], newest first.
+def by_kernel(call: str, grad: Tensor, history_size: int, backend: str, given: bool) -> bool:
+    """Whether the CUDA kernel runs; where it is not `given`, it does not unless insisted on.
+
+    Raises:
+        ValueError: `backend` is none of `BACKENDS`.
+        RuntimeError: the kernel was insisted on, and cannot run.
+    """
+    if backend not in BACKENDS:
+        check_choice(call, "backend", backend, BACKENDS)
+    if not given and backend != "cuda":
+        return False
+    return obstacle(backend, grad.device, grad.dtype, grad.shape[1], history_size) is None
+
+
+def recursion(grad: Tensor, cells: Cells) -> Tensor:
+    """`two_loop` for gradients [D, N] of moderate size.
 
     |y| = 1 where there is a pair, and s = y = 0 where there is none.
     """
-    sy = dot(s.unbind(1), y.unbind(1))  # [K, N]
+    sy = cells.curvatures()
     # |y| = 1, hence gamma = s.y / y.y = s.y. No pair: gamma = 1, and r stays the gradient.
     gamma = torch.threshold(sy[0], 0.0, 1.0)
     inverses = torch.threshold_(sy, 0.0, torch.inf).reciprocal_().unbind()  # no pair: 0
-    r, alphas = grad.clone(), []
-    rows, pairs = r.unbind(), list(zip(s.unbind(), y.unbind(), inverses, strict=True))
-    for s_j, y_j, inverse in pairs:  # newest to oldest
-        alpha = dot(s_j.unbind(), rows).mul_(inverse)
-        r.addcmul_(alpha, y_j, value=-1)
+    r, alphas = grad, []
+    rows = r.unbind()
+    for j in range(cells.history_size):  # newest to oldest
+        alpha = dot(cells.s_rows[j], rows).mul_(inverses[j])
+        if j == 0:  # the gradient stays as it is
+            r = torch.addcmul(grad, alpha, cells.y[0], value=-1)
+            rows = r.unbind()
+        else:
+            r.addcmul_(alpha, cells.y[j], value=-1)
         alphas.append(alpha)
     r.mul_(gamma)
-    for (s_j, y_j, inverse), alpha in zip(reversed(pairs), reversed(alphas), strict=True):
-        beta = dot(y_j.unbind(), rows).mul_(inverse)
-        r.addcmul_(alpha.sub_(beta), s_j)
+    for j in reversed(range(cells.history_size)):
+        beta = dot(cells.y_rows[j], rows).mul_(inverses[j])
+        r.addcmul_(alphas[j].sub_(beta), cells.s[j])
     return r
 
 
@@ -146,80 +150,41 @@ def lqn_direction(
     Returns:
         (fed [N, D], accepted [N] bool, candidates [N] bool): pairs taken, and that could be.
     """
-    check_history("lqn_direction", grad, history, history_size)
-    if position.shape != grad.shape or position.device != grad.device:
-        raise ValueError(
-            f"lqn_direction: position is {tuple(position.shape)} on {position.device}, but "
-            f"{tuple(grad.shape)} on {grad.device} is needed, as the gradient is"
-        )
-    like = grad.device, grad.dtype, grad.shape[1], history_size
-    if (grad.is_cuda or backend == "cuda") and obstacle(backend, *like) is None:
+    call = "lqn_direction"
+    history_size = check_history(call, grad, history, history_size)
+    check_alike(call, "position", position, grad, grad.shape)
+    if by_kernel(call, grad, history_size, backend, grad.is_cuda):
         return cuda.lqn_direction(position, grad, history, history_size, min_cosine, graft)
     fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
     accepted = torch.empty(grad.shape[0], dtype=torch.bool, device=grad.device)
     candidates = torch.empty_like(accepted)
-    for rows in row_chunks(grad):  # while a chunk is in the cache
-        part, x = history[rows], columns(position[rows], history.dtype)
-        g = columns(grad[rows], history.dtype)
-        size = largest(g)  # NaN where the gradient has one, which is not < inf
-        visible = (size > 0) & (size < torch.inf)
-        head = header(part, history_size)
-        taken = take_pairs(part, head, history_size, x, g, visible, min_cosine)
-        accepted[rows], candidates[rows] = taken
-        found = direction(g, size, part, head, history_size, graft)
-        # Half precision ends where a grafted coordinate may lie.
-        put(fed[rows], in_range_of(fed.dtype, found))
+    with torch.no_grad():
+        for rows in row_chunks(grad):  # while a chunk is in the cache
+            seen = columns(position[rows], grad[rows])
+            g = seen[1]
+            size = largest(g)  # NaN where the gradient has one, which is not < inf
+            visible = (size > 0).bitwise_and_(size < torch.inf)
+            chunk = cells_of(history, rows)
+            cells = Cells(chunk, history_size)
+            take_pairs(cells, seen, visible, min_cosine, accepted[rows], candidates[rows])
+            put(fed[rows], direction(g, size, cells, graft))
+            if history.stride(0) != 1:  # the cells were copied
+                history[rows] = chunk.movedim(-1, 0)
     return fed, accepted, candidates
 
 
-def direction(
-    grad: Tensor, scale: Tensor, history: Tensor, head: Header, history_size: int, graft: bool
-) -> Tensor:
+def direction(grad: Tensor, scale: Tensor, cells: Cells, graft: bool) -> Tensor:
     """What Adam is fed, [D, N] of gradients [D, N] and their largest component [N]."""
     scale = torch.threshold(scale, 0.0, 1.0)
     unit = grad / scale  # keeps s.q finite
-    result = recursion(unit, *stored_pairs(history, history_size))
+    rows = unit.unbind()
+    result = recursion(unit, cells)
     size = length(result)
     # Zero where the gradient is, NaN where the result is not finite.
-    descent = dot(unit, result / size)
-    usable = (head.counter > 1) & (descent > 0)
+    usable = dot(rows, (result / size).unbind()) > 0
+    usable &= cells.counter > 1
     if graft:
-        result.mul_(dot(unit, unit).sqrt_().div_(size))
+        result.mul_(dot(rows, rows).sqrt_().div_(size))
     result.mul_(scale)
     usable &= largest(result) < torch.inf
     return torch.where(usable, result, grad)
-
-
-def foresight(history: Tensor, history_size: int, position: Tensor, gradient: Tensor) -> Tensor:
-    """How much better the stored pairs foretell the pair that comes next than gamma I would.
-
-    A pair (s, y) that a curvature matrix describes has H y = s: cos(H y, s) - cos(y, s) with H
-    from the pairs before this one. It is 0 where y is mostly the difference between two views, or
-    the curvature is the same in all directions: then Adam fed with the gradient does as well.
-
-    Args:
-        history: [N, slots, 2 (D + 1)] before the new pair is stored.
-        history_size: K.
-        position, gradient: [N, D] of this step; one that is not finite, or 0, does not count.
-
-    Returns:
-        [2] float64 (float32 on MPS): sum over the points that hold a pair, and their number.
-    """
-    widest = torch.float32 if history.device.type == "mps" else torch.float64
-    total = torch.zeros(2, dtype=widest, device=history.device)
-    for rows in row_chunks(gradient):
-        head = header(history[rows], history_size)
-        s = position[rows].to(history.dtype) - head.position
-        y = gradient[rows].to(history.dtype) - head.gradient
-        foretold = two_loop(y, history[rows], history_size)
-        vectors = (s, y, foretold, gradient[rows])
-        s, y, foretold, g = (columns(each, history.dtype) for each in vectors)
-        gain = _cosine(foretold, s) - _cosine(y, s)
-        known = torch.isfinite(g).all(0) & (g != 0).any(0) & (head.counter > 1)
-        known &= torch.isfinite(gain) & (s != 0).any(0) & (y != 0).any(0)
-        total += torch.stack([torch.where(known, gain, 0.0).sum(), known.sum().to(gain.dtype)])
-    return total
-
-
-def _cosine(a: Tensor, b: Tensor) -> Tensor:
-    return dot(a / length(a), b / length(b))

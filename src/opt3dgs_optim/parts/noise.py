@@ -80,13 +80,14 @@ class PositionNoise(Part):
         return given if given is None or hasattr(given, "keys") else given()  # pyright: ignore
 
     def _add(self, means: Tensor, lr: float, found: Any) -> None:
-        missing = [
-            n for n in ("scales", "quats", "opacities") if n not in found or found[n] is None
-        ]
-        if missing:
-            raise ValueError(
-                f"PositionNoise: {missing} are not among the Gaussians' tensors {sorted(found)}"
-            )
+        for name, numbers in (("scales", 3), ("quats", 4), ("opacities", 1)):
+            tensor = found.get(name)
+            if tensor is None or tensor.numel() != numbers * len(means):
+                has = "missing" if tensor is None else list(tensor.shape)
+                raise ValueError(
+                    f"PositionNoise: {name} is {has}, but [{len(means)}, {numbers}] is needed for "
+                    f"{len(means)} means; give a function where the trainer makes new tensors"
+                )
         eta = torch.randn(
             means.shape, dtype=means.dtype, device=means.device, generator=self.generator
         )

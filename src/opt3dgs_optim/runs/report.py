@@ -8,15 +8,12 @@ import argparse
 import math
 import re
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from opt3dgs_optim.runs.lines import Run, read_run
-from opt3dgs_optim.runs.plot import draw, printable
+from opt3dgs_optim.runs.plot import draw
 from opt3dgs_optim.runs.stats import Comparison, Stat, compare
 
 NO_PICTURE = "report: no picture without matplotlib: pip install 'opt3dgs_optim[report]'"
@@ -37,11 +34,9 @@ def find_logs(paths: Sequence[str | Path]) -> list[Path]:
     """
     found: dict[Path, Path] = {}
     for path in map(Path, paths):
-        if not path.exists():
-            raise FileNotFoundError(f"no such file or folder: {str(path)!r}")
         logs = sorted(path.rglob("*.jsonl")) if path.is_dir() else [path]
-        if not logs:
-            raise FileNotFoundError(f"no *.jsonl file in the folder {str(path)!r}")
+        if not logs or not path.exists():
+            raise FileNotFoundError(f"{str(path)!r}: neither a log nor a folder with *.jsonl in it")
         for log in logs:
             found.setdefault(log.resolve(), log)
     return list(found.values())
@@ -62,17 +57,10 @@ def write_report(
     Args:
         runs: of any number of scenes, arms and seeds.
         out: folder, made if it is missing.
-        metric: to compare by, as the runs log it; None: psnr if there, else the first whose
-            direction is known, else the first.
-        baseline: reference arm; None: "mcmc" if there, else the first.
-        higher_is_better: whether higher values of the metric are better. None: as its name says,
-            such as `val1_psnr`, `test/ssim`, `lpips_vgg` or `l1`. Where the name does not say it,
-            the report shows the values, says so, and judges nothing.
+        metric, baseline, higher_is_better: as `stats.compare`'s, with its errors.
 
     Raises:
-        ValueError, OSError: no runs, no log with that metric, no run of that arm, a direction that
-            is none, or two scenes whose pictures would have one name; `out` cannot be written.
-            Nothing is written then.
+        ValueError, OSError: there are no runs; `out` cannot be written.
 
     Examples:
         >>> import tempfile
@@ -91,13 +79,9 @@ def write_report(
     """
     if not runs:
         raise ValueError("write_report: no runs; pass at least one")
-    if not isinstance(higher_is_better, (bool, np.bool_, type(None))):
-        raise ValueError(
-            f"write_report: higher_is_better={higher_is_better!r}, but True, False or None is "
-            "needed"
-        )
     comparisons = compare(runs, metric, baseline, higher_is_better)
-    names = _picture_names([comparison.scene for comparison in comparisons])
+    scenes = [re.sub(r"[^\w.-]+", "_", each.scene or "")[:60] for each in comparisons]
+    names = ["report.png"] if len(scenes) == 1 else [f"report-{scene}.png" for scene in scenes]
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     try:
@@ -111,54 +95,34 @@ def write_report(
     return [out / name for name in ("report.md", *names)]
 
 
-def _picture_names(scenes: list[str | None]) -> list[str]:
-    if len(scenes) == 1:
-        return ["report.png"]
-    names = ["report-" + re.sub(r"[^\w.-]+", "_", s or "")[:60] + ".png" for s in scenes]
-    if len({name.lower() for name in names}) < len(names):  # as some file systems see them
-        raise ValueError(f"two of the scenes {scenes} would be drawn into one of {names}")
-    return names
-
-
 def as_markdown(
     comparisons: Sequence[Comparison], runs: Sequence[Run], pictures: Sequence[str]
 ) -> str:
     """A section a scene: table and picture (all have one, or none); how to read them."""
     parts = ["# Error against run time"]
     for i, comparison in enumerate(comparisons):
-        if comparison.scene is not None:
-            parts.append(f"## {escaped(comparison.scene)}")
-        elif len(comparisons) > 1:
-            parts.append("## Runs without a scene in their metadata")
+        if comparison.scene is not None or len(comparisons) > 1:
+            parts.append(f"## {escaped(comparison.scene or 'Runs without a scene')}")
         parts.append(_table(comparison))
+        metric = escaped(comparison.metric)
         if pictures:
-            metric = escaped(comparison.metric)
             parts.append(f"![{metric} over seconds and iterations]({pictures[i]})")
+        others = [arm for arm in comparison.arms if arm.name != comparison.baseline]
+        unpaired = [escaped(arm.name) for arm in others if arm.num_paired == 0]
         if comparison.baseline is None:
             parts.append("The baseline arm did not run on this scene: nothing to compare with.")
-        elif comparison.higher_is_better is None:
+        elif unpaired:
             parts.append(
-                f"Whether higher or lower values of {escaped(comparison.metric)} are better is not "
-                "known from its name, so nothing is judged by it: pass `--better higher` or "
-                "`--better lower`."
-            )
-        elif unpaired := _unpaired(comparison):
-            parts.append(
-                f"No gain is shown for {', '.join(map(escaped, unpaired))}: no run has the `seed` "
-                "of one of the baseline's in its metadata."
+                f"No gain is shown for {', '.join(unpaired)}: no run has the `seed` of one of the "
+                "baseline's in its metadata."
             )
     return "\n\n".join([*parts, READING, escaped(origin(runs))]).rstrip() + "\n"
 
 
-def _unpaired(comparison: Comparison) -> list[str]:
-    others = [arm for arm in comparison.arms if arm.name != comparison.baseline]
-    return [arm.name for arm in others if arm.num_paired == 0]
-
-
 def escaped(text: str) -> str:
-    """`text` on one line, without a meaning in Markdown or HTML; `_` inside a word has none."""
-    special = r"[\\`*\[\]<>|~&$#]|(?<![^\W_])_|_(?![^\W_])"
-    return re.sub(special, lambda found: f"&#{ord(found[0])};", printable(text))
+    """`text` without a meaning in Markdown or HTML; `_` inside a word has none."""
+    special = r"[\\`*\[\]<>|~&$#\n]|(?<![^\W_])_|_(?![^\W_])"
+    return re.sub(special, lambda found: f"&#{ord(found[0])};", text)
 
 
 def _table(comparison: Comparison) -> str:
@@ -182,8 +146,7 @@ def _shown(stat: Stat | None, runs: int) -> str:
         digits = 0 if stat.mean == round(stat.mean, 6) else 3
     else:
         digits = min(4, max(0, wanted - 1 - math.floor(math.log10(abs(leading)))))
-    form = f".{digits}f" if abs(stat.mean) < 1e12 else ".3g"
-    text = f"{stat.mean:{form}}" + ("" if stat.std is None else f" ± {stat.std:{form}}")
+    text = f"{stat.mean:.{digits}f}" + ("" if stat.std is None else f" ± {stat.std:.{digits}f}")
     return text if stat.n == runs else f"{text} ({stat.n} of {runs})"
 
 
@@ -195,20 +158,6 @@ def origin(runs: Sequence[Run]) -> str:
         texts = dict.fromkeys(str(f)[:10] if key == "time" else str(f) for f in found if f)
         said.append(", ".join(list(texts)[:3]) + (", ..." if len(texts) > 3 else ""))
     return "; ".join(text for text in said if text)
-
-
-def _named(logs: Sequence[tuple[Path, Run]]) -> list[Run]:
-    """Runs of one file name in several folders by the folders, where nothing else says the arm."""
-    unnamed = {path: run for path, run in logs if "arm" not in run.metadata}
-    folders: dict[str, set[Path]] = {}
-    for path, run in unnamed.items():
-        folders.setdefault(run.name, set()).add(path.resolve().parent)
-    return [
-        replace(run, name=path.resolve().parent.name)
-        if path in unnamed and len(folders[run.name]) > 1
-        else run
-        for path, run in logs
-    ]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -225,19 +174,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         logs = find_logs(options.runs)
-        Path(options.out).mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=options.out).close()  # before any work is done
-        runs = _named([(path, read_run(path)) for path in logs])
+        runs = [read_run(path) for path in logs]
+        if len({run.name for run in runs}) < len(runs):  # A/stock/log.jsonl, A/ours/log.jsonl
+            names = [path.resolve().parent.name for path in logs]
+            runs = [replace(run, name=name) for run, name in zip(runs, names, strict=True)]
         better = None if options.better is None else options.better == "higher"
-        written = write_report(
-            runs,
-            options.out,
-            metric=options.metric,
-            baseline=options.baseline,
-            higher_is_better=better,
-        )
+        chosen = {"metric": options.metric, "baseline": options.baseline}
+        written = write_report(runs, options.out, higher_is_better=better, **chosen)
     except (OSError, ValueError) as error:
-        print("report:", printable(str(error)), file=sys.stderr)  # names from logs in it
+        print(f"report: {error}", file=sys.stderr)
         return 2
     print(*written, sep="\n")
     if not any(path.suffix == ".png" for path in written):

@@ -3,18 +3,30 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from opt3dgs_optim.runs.lines import Run
-from opt3dgs_optim.runs.metrics import higher_is_better
 
 NO_NUMBERS = ("iteration", "seconds", "phase")  # of the columns, not of interest
 KNOWN = ("psnr", "ssim", "train_psnr", "lpips")  # listed first
-_last = operator.itemgetter(-1)
+HIGHER = {"psnr", "ssim", "fps", "accuracy", "iou"}
+LOWER = {"lpips", "dssim", "l1", "l2", "mse", "rmse", "mae", "loss", "error", "energy"}
+WORD = re.compile(r"[^\W_]+")  # letters and digits
+_last: Callable[[np.ndarray], float] = operator.itemgetter(-1)
+
+
+def higher_is_better(metric: str) -> bool | None:
+    """Whether higher values of a metric are better; None where the words of its name do not say so.
+
+    `val_psnr` is a PSNR, and `val1_points` no L1 error. Of `ssim_loss` nothing is known.
+    """
+    words = set(WORD.findall(metric.lower()))
+    higher, lower = bool(words & HIGHER), bool(words & LOWER)
+    return None if higher == lower else higher
 
 
 @dataclass(frozen=True)
@@ -30,9 +42,8 @@ class Stat:
         """The statistic of `values`, or None if there are none; a NaN among them shows."""
         if len(values) == 0:
             return None
-        with np.errstate(all="ignore"):  # inf - inf, squares of 1e200
-            std = float(np.std(values, ddof=1)) if len(values) > 1 else None
-            return Stat(float(np.mean(values)), std, len(values))
+        std = float(np.std(values, ddof=1)) if len(values) > 1 else None
+        return Stat(float(np.mean(values)), std, len(values))
 
 
 @dataclass
@@ -52,9 +63,9 @@ class Comparison:
 
     scene: str | None
     metric: str
-    higher_is_better: bool | None  # None: not known, and nothing is judged by the metric
+    higher_is_better: bool
     baseline: str | None  # None: it did not run on this scene
-    target: float  # the baseline's mean final metric; NaN where it has none that is finite
+    target: float  # the baseline's mean final metric; NaN where it has none
     arms: list[Arm]
 
 
@@ -74,28 +85,32 @@ def compare(
         higher: whether higher values of the metric are better; None: by its name.
 
     Raises:
-        ValueError: no log has that metric, or no run that arm.
+        ValueError: no log has that metric, no run that arm, or the metric's name does not say
+            which values are better.
     """
     scenes: dict[str | None, dict[str, list[Run]]] = {}
     for run in runs:
         scene = run.metadata.get("scene")
         arms = scenes.setdefault(None if scene is None else str(scene), {})
-        arm = run.metadata.get("arm")
-        arms.setdefault(run.name if arm is None else str(arm), []).append(run)
+        arms.setdefault(str(run.metadata.get("arm", run.name)), []).append(run)
     names = list(dict.fromkeys(name for arms in scenes.values() for name in arms))
     metrics = metric_names(runs)
     if metric is None:
         judged = [name for name in metrics if higher_is_better(name) is not None]
         metric = next(iter([*judged, *metrics]), KNOWN[0])
     elif metric not in metrics:
-        there = ", ".join(metrics) or "no metrics at all"
-        raise ValueError(f"--metric {metric!r}: in no log; there are {there}")
+        raise ValueError(f"--metric {metric!r}: in no log; there are {', '.join(metrics)}")
     if baseline is None:
         baseline = "mcmc" if "mcmc" in names else names[0]
     elif baseline not in names:
         raise ValueError(f"--baseline {baseline!r}: no such arm; there are {', '.join(names)}")
     order = list(dict.fromkeys([baseline, *names]))
-    better = higher_is_better(metric) if higher is None else bool(higher)
+    better = higher_is_better(metric) if higher is None else higher
+    if better is None:
+        raise ValueError(
+            f"--metric {metric!r}: its name does not say which values are better; pass "
+            "--better higher or --better lower"
+        )
     return [_compare_scene(scene, arms, order, metric, better) for scene, arms in scenes.items()]
 
 
@@ -104,17 +119,16 @@ def _compare_scene(
     runs: dict[str, list[Run]],
     order: list[str],
     metric: str,
-    better: bool | None,
+    better: bool,
 ) -> Comparison:
     everything = [run for arm in runs.values() for run in arm]
     metrics = metric_names(everything)
     logged = dict.fromkeys(name for run in everything for name in run.steps)
     # The mean of a loss over a training says nothing.
-    losses = [name for name in logged if higher_is_better(name) is False]
-    columns = [name for name in logged if name not in (*NO_NUMBERS, *losses)]
+    columns = [c for c in logged if c not in NO_NUMBERS and higher_is_better(c) is not False]
     references = runs.get(order[0], [])
     final = _stat(references, metric, _last)
-    target = final.mean if final and np.isfinite(final.mean) else np.nan
+    target = np.nan if final is None else final.mean
     arms = []
     for colour, name in enumerate(order):
         if not (own := runs.get(name)):
@@ -127,14 +141,10 @@ def _compare_scene(
         numbers |= {"iterations/s": Stat.of(rates)}
         numbers |= {f"mean {c}": _stat(own, c, _finite_mean, "step") for c in columns}
         pairs = [] if name == order[0] else _pairs(own, references)
-        reached, gains = [], []
-        if better is not None:
-            times = [_first_time(run, metric, target, better) for run in own]
-            reached = [time for time in times if time is not None]
-            found = [_gain(run, partners, metric, better) for run, partners in pairs]
-            gains = [gain for gain in found if gain is not None]
-        numbers[f"seconds to baseline {metric}"] = Stat.of(reached)
-        numbers[f"{metric} gain at equal seconds"] = Stat.of(gains)
+        reached = [_first_time(run, metric, target, better) for run in own]
+        gains = [_gain(run, partners, metric, better) for run, partners in pairs]
+        numbers[f"seconds to baseline {metric}"] = Stat.of([t for t in reached if t is not None])
+        numbers[f"{metric} gain at equal seconds"] = Stat.of([g for g in gains if g is not None])
         arms.append(Arm(name, own, colour, numbers, len(pairs)))
     return Comparison(scene, metric, better, order[0] if references else None, target, arms)
 
@@ -142,11 +152,12 @@ def _compare_scene(
 def metric_names(runs: Sequence[Run]) -> list[str]:
     """Every metric the runs evaluated, PSNR, SSIM and training PSNR first."""
     found = dict.fromkeys(name for run in runs for name in run.evaluations)
-    named = dict.fromkeys([*KNOWN, *found])
-    return [name for name in named if name in found and name not in NO_NUMBERS]
+    return [name for name in dict.fromkeys([*KNOWN, *found]) if name in found.keys() - NO_NUMBERS]
 
 
-def _stat(runs: list[Run], name: str, of: Any, kind: str = "evaluation") -> Stat | None:
+def _stat(
+    runs: list[Run], name: str, of: Callable[[np.ndarray], float], kind: str = "evaluation"
+) -> Stat | None:
     """Of what `of` makes of the values of `name`, over the runs that log it."""
     series = [run.series(name, kind)[2] for run in runs]
     return Stat.of([of(values) for values in series if len(values)])
@@ -154,8 +165,7 @@ def _stat(runs: list[Run], name: str, of: Any, kind: str = "evaluation") -> Stat
 
 def _finite_mean(values: np.ndarray) -> float:
     values = values[np.isfinite(values)]
-    with np.errstate(over="ignore"):
-        return float(values.mean()) if len(values) else float("nan")
+    return float(values.mean()) if len(values) else float("nan")
 
 
 def _curve(run: Run, metric: str, better: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -177,21 +187,13 @@ def _first_time(run: Run, metric: str, target: float, better: bool) -> float | N
     return float(np.interp(goal, values[i - 1 : i + 1], seconds[i - 1 : i + 1]))
 
 
-def _seed(run: Run) -> str | None:
-    """What a run is paired by; None: it has no seed. 0, 0.0 and "0" are one seed."""
-    seed = run.metadata.get("seed")
-    if isinstance(seed, float) and seed.is_integer():
-        seed = int(seed)
-    return None if seed is None or str(seed).strip() == "" else str(seed).strip()
-
-
 def _pairs(runs: list[Run], references: list[Run]) -> list[tuple[Run, list[Run]]]:
     """Each run that has a seed of the reference's runs, and those of them with that seed."""
     by_seed: dict[str, list[Run]] = {}
     for run in references:
-        if (seed := _seed(run)) is not None:
-            by_seed.setdefault(seed, []).append(run)
-    return [(run, by_seed[seed]) for run in runs if (seed := _seed(run)) in by_seed]
+        if (seed := run.metadata.get("seed")) is not None:
+            by_seed.setdefault(str(seed), []).append(run)
+    return [(r, by_seed[s]) for r in runs if (s := str(r.metadata.get("seed"))) in by_seed]
 
 
 def _gain(run: Run, partners: list[Run], metric: str, better: bool) -> float | None:
