@@ -84,8 +84,14 @@ def gained(lines: Sequence[Line], control: Sequence[Line]) -> str:
     if found is None:
         return "not trained" if not lines else "-"
     count = len(set(seeds_of(lines)) & set(seeds_of(control)))
-    values = " / ".join(GAINS[m].format(v) for m, v in found.items())
+    values = " / ".join(signed(v, m) for m, v in found.items())
     return f"{values} ({count} seed{'s' * (count > 1)})"
+
+
+def signed(value: float, metric: str) -> str:
+    """With its sign, but for zero."""
+    form = GAINS[metric].format(value)
+    return form if float(form) else form[1:]
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -97,25 +103,30 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 # -- the tables -----------------------------------------------------------------------------------
 
 
+SHORTER = (
+    *(("own", count) for count in (15_000, 10_000, 7_500)),
+    *((arm, 10_000) for arm in ("mcmc", "x2", "x3", "averaged", "x2-averaged", "learn2splat")),
+)
+
+
 def iterations(all_: Evidence) -> str:
     """Shorter trainings against stock's 30,000 iterations, seed by seed."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
+    missing: dict[str, list[str]] = {}
     for scene in MAIN:
         stock = all_.of("mcmc", scene, iterations=30_000, **HALF)
         rows.append((scene, "stock, 30,000", shown(stock), ""))
-        for arm, count in (
-            *(("own", n) for n in (15_000, 10_000, 7_500)),
-            *(
-                (arm, 10_000)
-                for arm in ("mcmc", "x2", "x3", "averaged", "x2-averaged", "learn2splat")
-            ),
-        ):
+        for arm, count in SHORTER:
             lines = all_.of(arm, scene, iterations=count, **HALF)
-            if lines or arm in ("own", "mcmc"):
-                name = NAMES.get(arm, arm)
-                rows.append(("", f"{name}, {count:,}", shown(lines), gained(lines, stock)))
+            name = f"{NAMES[arm]}, {count:,}"
+            if lines:
+                rows.append(("", name, shown(lines), gained(lines, stock)))
+            else:
+                missing.setdefault(name, []).append(scene)
     heads = ("scene", "training", "PSNR / SSIM / LPIPS", "less stock at 30,000, same seeds")
-    return table(heads, rows)
+    left = "; ".join(f"{name} ({', '.join(scenes)})" for name, scenes in missing.items())
+    said = f"\n\nNot trained yet: {left}." if missing else ""
+    return table(heads, rows) + said
 
 
 def kept_aside(all_: Evidence) -> str:
@@ -129,32 +140,23 @@ def kept_aside(all_: Evidence) -> str:
 
 
 def gpu(all_: Evidence) -> str:
-    """What was read on a GPU."""
+    """What was read on a GPU, at the last evaluation that all arms reached and at a third of it."""
     rows = []
     found = [x for x in all_.lines if "NVIDIA" in x["device"]]
-    keys = sorted({(x["scene"], x["points"], x["iterations"]) for x in found})
-    for scene, points, planned in keys:
+    for setting in sorted({(x["scene"], x["points"], x["iterations"]) for x in found}):
         those = {
-            x["arm"]: x
+            x["arm"]: dict(zip(x["curve"]["iteration"], x["curve"]["psnr"], strict=True))
             for x in found
-            if (x["scene"], x["points"], x["iterations"]) == (scene, points, planned)
+            if (x["scene"], x["points"], x["iterations"]) == setting
         }
-        reached = min(x["curve"]["iteration"][-1] for x in those.values())
-        marks = [n for n in those["mcmc"]["curve"]["iteration"] if n <= reached]
-        at = sorted({marks[len(marks) // 3], marks[-1]})
-        for arm, line in those.items():
-            curve = dict(zip(line["curve"]["iteration"], line["curve"]["psnr"], strict=True))
-            cells = [f"{curve[n]:.2f} at {n:,}" for n in at]
-            rows.append((f"{scene}, {points:,} of {planned:,}", NAMES[arm], *cells))
-    return table(
-        (
-            "scene, Gaussians, planned iterations",
-            "training",
-            "PSNR early",
-            "PSNR at the last that all reached",
-        ),
-        rows,
-    )
+        marks = sorted(set.intersection(*map(set, those.values())))
+        for arm in ("mcmc", "defaults", "own"):
+            cells = [f"{those[arm][n]:.2f} at {n:,}" for n in (marks[len(marks) // 3], marks[-1])]
+            scene, points, planned = setting
+            what = f"{scene}, {points:,}, {planned:,}" if arm == "mcmc" else ""
+            rows.append((what, NAMES[arm], *cells))
+    heads = ("scene, Gaussians, planned iterations", "training", "PSNR early", "PSNR at the last")
+    return table(heads, rows)
 
 
 def equal(all_: Evidence) -> str:
@@ -195,21 +197,13 @@ def few(all_: Evidence) -> str:
 def adaptive(all_: Evidence) -> str:
     """Clone, split, prune and reset."""
     rows = []
-    arms = ("adc", "adc-own", "adc-annealed-faded-averaged")
     for scene in ("lego", "plush"):
         stock = all_.of("adc", scene, iterations=30_000, **QUARTER)
-        for arm in arms:
+        for arm in ("adc", "adc-own", "adc-annealed-faded-averaged"):
             lines = all_.of(arm, scene, iterations=30_000, **QUARTER)
-            count = f"{mean(lines, 'gaussians'):,.0f}" if lines else "-"
-            rows.append(
-                (
-                    scene if arm == "adc" else "",
-                    NAMES[arm],
-                    shown(lines),
-                    gained(lines, stock),
-                    count,
-                )
-            )
+            first, less = (scene, "") if arm == "adc" else ("", gained(lines, stock))
+            count = f"{mean(lines, 'gaussians'):,.0f}"
+            rows.append((first, NAMES[arm], shown(lines), less, count))
     heads = ("scene", "training", "PSNR / SSIM / LPIPS", "less stock", "Gaussians")
     return table(heads, rows)
 
@@ -258,15 +252,15 @@ def closed(all_: Evidence) -> str:
             if found := gain(*pair):
                 gains[scene] = found
                 trainings += len({*seeds_of(pair[0])} & {*seeds_of(pair[1])})
-        cells = [spread([g[m] for g in gains.values()], GAINS[m]) for m in METRICS]
+        cells = [spread([g[m] for g in gains.values()], m) for m in METRICS]
         rows.append((what, f"{len(gains)}, {trainings}", *cells))
     return table(("what", "scenes, trainings", "PSNR", "SSIM", "LPIPS"), rows)
 
 
-def spread(values: Sequence[float], form: str) -> str:
+def spread(values: Sequence[float], metric: str) -> str:
     """Mean and standard error over the scenes."""
     error = statistics.stdev(values) / len(values) ** 0.5 if len(values) > 1 else 0.0
-    return f"{form.format(statistics.mean(values))} ± {form.format(error)[1:]}"
+    return f"{signed(statistics.mean(values), metric)} ± {FORMS[metric].format(error)}"
 
 
 NAMES = {
