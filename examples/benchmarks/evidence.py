@@ -10,8 +10,8 @@ the means of these seeds: results of questions that are closed.
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -76,9 +76,12 @@ def add(lines: Iterable[Line], path: Path = FILE) -> None:
             file.write(json.dumps({key: line[key] for key in shown}) + "\n")
 
 
-def main(paths: Sequence[str]) -> int:
-    """Add the finished trainings among the files."""
-    records = [json.loads(Path(path).read_text(encoding="utf-8")) for path in paths]
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("records", nargs="+", type=Path, metavar="RECORD.json")
+    paths = parser.parse_args(arguments).records
+    records = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
     made = [line_of(record) for record in records if record.get("finished")]
     add(made)
     print(f"{len(made)} of {len(records)} trainings are finished; they are in {FILE.name}")
@@ -86,4 +89,4 @@ def main(paths: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    raise SystemExit(main())
