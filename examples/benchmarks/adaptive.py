@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import importlib
 from typing import Any
+from unittest.mock import patch
 
 import torch
-from hosts.cpu_host import gsplat_modules
 from splatting.density import Optimizers
 from splatting.fit import Fit
 from splatting.scenes import View
@@ -34,9 +34,11 @@ class DefaultDensityControl:
     """
 
     def __init__(self, extent: float, threshold: float) -> None:
-        gsplat_modules.install()
-        self.strategy = importlib.import_module("gsplat").DefaultStrategy(grow_grad2d=threshold)
-        self.reset = importlib.import_module("gsplat.strategy.ops").reset_opa
+        # Where there is nvcc it would compile its CUDA extension, which no strategy needs.
+        with patch("torch.utils.cpp_extension._find_cuda_home", lambda: None):
+            default = importlib.import_module("gsplat.strategy.default")
+        self.strategy: Any = default.DefaultStrategy(grow_grad2d=threshold)
+        self.reset = default.reset_opa
         self.state: dict[str, Any] = self.strategy.initialize_state(scene_scale=extent)
         self.info: dict[str, Any] = {}
 

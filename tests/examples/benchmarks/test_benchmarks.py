@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from pathlib import Path
 from typing import Any
@@ -109,3 +110,23 @@ def test_steps_are_timed_beside_six_adams() -> None:
     # two moments of 59 numbers of four bytes, and six counts of steps
     assert found["six Adams"]["bytes_per_point"] == pytest.approx(472, abs=1)
     assert "| defaults | " in steps.table({64: found})
+
+
+@pytest.mark.skipif(importlib.util.find_spec("gsplat") is None, reason="gsplat is not installed")
+@pytest.mark.filterwarnings("ignore")  # gsplat's, at its import
+@pytest.mark.thorough
+def test_clone_split_and_resets_are_gsplats_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It grows from the first refinement on; a reset leaves no opacity above twice the limit."""
+    fit = train.fit_of(
+        train.load_scene("embedded"), train.find_arm("adc-own"), train.FitOptions(700, 200)
+    )
+    strategy = fit.density.strategy  # pyright: ignore[reportAttributeAccessIssue]
+    monkeypatch.setattr(strategy, "reset_every", 650)
+    counts = []
+    while fit.iteration < 651:
+        fit.step()
+        counts.append(len(fit.gaussians["means"]))
+    assert set(counts[:600]) == {200}
+    assert counts[-1] > 220
+    assert float(torch.sigmoid(fit.gaussians["opacities"].detach()).max()) < 0.0101
+    assert fit.relocated == 0
