@@ -1,4 +1,4 @@
-"""The two steps of this package, written out on tensors: slow, plain, torch only.
+"""The steps of this package, written out on tensors: slow, plain, torch only.
 
 `default_step` is one iteration of `PhaseScheduler(total)`, `paper_step` one of
 `PhaseScheduler.paper(total)`, around torch's Adam. docs/algorithms/reference-step.md reads them
@@ -8,13 +8,13 @@ Arguments of both:
 
     params: the Gaussians' tensors by gsplat's names, points first, in the order in which they are
         stepped, means first. They are changed in place.
-    grads: the gradients of the loss, of the same names and shapes.
+    grads: the gradients of the loss, by the same names. A tensor without one is not stepped.
     state: {} at the start. It holds all that the steps remember.
     rates: the learning rates of this iteration, by the same names.
     iteration: the number of this iteration, from 0.
     total: the number of iterations of the training.
 
-A step is made only after a loss that is finite. Numbers in a gradient that are not count as zero.
+Numbers in a gradient that are not finite count as zero.
 """
 
 import torch
@@ -23,6 +23,21 @@ from torch import Tensor
 Tensors = dict[str, Tensor]
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15  # as the 3DGS trainers set them
 K = 5  # curvature pairs of a point
+COLORS = ("sh0", "shN")
+
+# Which tensors each part acts on: for 3DGS-MCMC's relocation, and for clone, split and prune.
+RELOCATION = {
+    "own_frame": ("means",),
+    "fading": ("scales", "quats", "opacities", *COLORS),
+    "out_of_view": ("scales", "opacities"),
+    "averaging": ("means", "scales", "quats", "opacities", *COLORS),
+}
+CLONE_AND_SPLIT = {
+    "annealing": ("quats", "opacities", *COLORS),
+    "fading": ("means", "quats", "opacities", *COLORS),
+    "out_of_view": RELOCATION["out_of_view"],
+    "averaging": RELOCATION["averaging"],
+}
 
 
 def adam_(target: Tensor, grad: Tensor, own: dict, rate: float) -> None:
@@ -30,8 +45,12 @@ def adam_(target: Tensor, grad: Tensor, own: dict, rate: float) -> None:
     own["step"] += 1
     own["exp_avg"].lerp_(grad, 1 - BETA1)
     own["exp_avg_sq"].mul_(BETA2).addcmul_(grad, grad, value=1 - BETA2)
-    root = own["exp_avg_sq"].sqrt() / (1 - BETA2 ** own["step"]) ** 0.5
-    target.addcdiv_(own["exp_avg"], root + EPS, value=-rate / (1 - BETA1 ** own["step"]))
+    target.addcdiv_(own["exp_avg"], root_of(own), value=-rate / (1 - BETA1 ** own["step"]))
+
+
+def root_of(own: dict) -> Tensor:
+    """What Adam divides by: the root of the second moment, with bias correction."""
+    return own["exp_avg_sq"].sqrt() / (1 - BETA2 ** own["step"]) ** 0.5 + EPS
 
 
 def new_moments(param: Tensor) -> dict:
@@ -50,67 +69,81 @@ def default_step(
     rates: dict,
     iteration: int,
     total: int,
-    *,
-    own_frame: bool = False,
+    parts: dict = RELOCATION,
 ) -> None:
-    """Fading, OutOfView and Averaging around Adam; with `own_frame`, OwnFrame too."""
-    num_points = len(params["means"])
-    grads = {name: grad.nan_to_num(0.0, 0.0, 0.0) for name, grad in grads.items()}
-    # Those of dropped iterations come with the next one.
-    events = range(state.get("events", 0), events_before(iteration + 1, total))
-    state["events"] = events.stop
-    # A point is out of view if its position has no gradient. The share of those in view is a mean
-    # over the last 100 views or so, of which one in four is looked at, and at most 2,048 points.
-    in_view = grads["means"].any(1)
-    seen = in_view[:: 1 + num_points // 2_048]
-    kept = state.setdefault("share", torch.tensor(1.0))
-    share, now = kept.item(), int(seen.sum()) / len(seen)
-    if now > 0 and (iteration + 1) * (5**0.5 - 1) / 2 % 1 < 1 / 4:
-        share += 1 / 25 * (max(now, 0.01) - share)
-        kept.fill_(share)
+    """OwnFrame, Fading, OutOfView, Annealing and Averaging around Adam, as far as `parts` has them.
+
+    parts: by part, the tensors that it acts on.
+    """
+    num_points, progress = len(params["means"]), min(iteration / total, 1.0)
+    for name, param in params.items():
+        state.setdefault(name, {**new_moments(param), "last": iteration - 1})
+    out_of_view, share = views(grads.get("means"), state, iteration)
 
     for name, param in params.items():
-        grad, own = grads[name], state.setdefault(name, new_moments(param))
+        if name not in grads:
+            continue
+        grad, own, rate = grads[name].nan_to_num(0.0, 0.0, 0.0), state[name], rates[name]
+        in_own_frame = name in parts.get("own_frame", ())
+
+        # Annealing: rates of shapes and colours fall from four times the trainer's to 0.4 times.
+        if name in parts.get("annealing", ()):
+            rate *= (1.0 if name == "opacities" else 4.0) ** (1.0 - progress) * 0.4**progress
 
         # Fading: the moments of a random fifth of the points are shrunk, the same in all tensors.
-        # Of more than 10,000 points, fewer of the events happen. Own frames are left alone.
-        thinning = min(1.0, 10_000 / num_points) ** (2 / 3)
-        in_own_frame = own_frame and name == "means"
-        for event in () if in_own_frame else events:
-            if int((event + 1) * thinning) > int(event * thinning):
-                generator = torch.Generator().manual_seed(event)
-                chosen = torch.rand(num_points, generator=generator) < 0.2
-                own["exp_avg"][chosen] *= 0.2
-                own["exp_avg_sq"][chosen] *= 0.04
+        # Events since the tensor's last step are one.
+        due = range(events_before(own["last"] + 1, total), events_before(iteration + 1, total))
+        own["last"] = iteration
+        if name in parts.get("fading", ()) and any(happens(event, num_points) for event in due):
+            chosen = chosen_points(due[-1], num_points)
+            own["exp_avg"][chosen] *= 0.2
+            own["exp_avg_sq"][chosen] *= 0.04
 
         # OutOfView: where views see less than a third of the points, regularisers make no full
         # steps of a point out of view, but about 3 share of one: its second moment is kept large.
-        if name in ("scales", "opacities") and share < 1 / 3:
+        if name in parts.get("out_of_view", ()) and share < 1 / 3 and out_of_view is not None:
             least = (grad * (1 / 3 / share)).square()
             larger = torch.maximum(own["exp_avg_sq"], least)
-            own["exp_avg_sq"][~in_view] = larger[~in_view]
+            own["exp_avg_sq"][out_of_view] = larger[out_of_view]
 
         # OwnFrame: a position is stepped by B z, with Adam's step z in the Gaussian's own frame, in
-        # standard deviations. A full step has 0.1 of them at the start and 0.001 at the end. An
-        # axis counts as no thinner than a tenth of the longest.
+        # standard deviations. A full step has 0.1 of them at the start and 0.001 at the end.
         if in_own_frame:
-            q, deviations = own_axes(params["quats"], params["scales"])
+            frame = own_axes(params["quats"], params["scales"])
             z = torch.zeros_like(param)
-            rate = rates[name] * (0.1 * 0.01 ** (iteration / total) / rates[name])
-            adam_(z, (rotated(q, grad.T, -1) * deviations).T.contiguous(), own, rate)  # B^T g
-            param.add_(rotated(q, z.T * deviations, 1).T)  # B z
+            rate = 0.1 * 0.01**progress if rate else 0.0
+            adam_in_frame_(z, into_frame(frame, grad), own, rate)
+            param.sub_(out_of_frame(frame, z))
         else:
-            adam_(param, grad, own, rates[name])
+            adam_(param, grad, own, rate)
 
         # Averaging: the mean of the iterates of the last thirtieth of the training, which takes the
         # parameter's place in the last tenth of that.
-        left, window = total - iteration, int(total * (1 / 30))
-        if left <= window:
-            count = own["count"] = own.get("count", 0) + 1
-            mean = own.setdefault("mean", torch.zeros_like(param))
-            mean.lerp_(param, 1 / torch.tensor(float(count)))
-            if left <= max(2, window / 10):
-                param.copy_(mean)
+        window = int(1 / 30 * total)
+        if name in parts.get("averaging", ()) and total - window <= iteration < total:
+            take_into_mean(param, own, iteration - (total - window) + 1)
+            if iteration >= total - int(max(2, window / 10)):
+                put_mean(param, own)
+
+
+def views(grad: Tensor | None, state: dict, iteration: int) -> tuple[Tensor | None, float]:
+    """Which points are out of view, [N] bool, and the mean share s of the points that views see.
+
+    A point is out of view if its position has no gradient. The mean is over the last 100 views or
+    so, of which one in four is looked at. A look counts in the next iteration, since the number
+    lies on a GPU. Points that have never had a gradient do not count.
+    """
+    share, looked = state.get("share", 1.0), state.pop("looked", 0.0)
+    if looked > 0:
+        share += 1 / 25 * (max(looked, 0.01) - share)
+    state["share"] = share
+    if grad is None or len(grad) == 0:
+        return None, share
+    in_view = (grad != 0).any(1)
+    if iteration * ((5**0.5 - 1) / 2) % 1 < 1 / 4:
+        known = in_view | (state["means"]["exp_avg_sq"] != 0).any(1)
+        state["looked"] = float(in_view.sum() / known.sum().clamp(min=1))
+    return ~in_view, share
 
 
 def events_before(iteration: int, total: int) -> int:
@@ -120,31 +153,85 @@ def events_before(iteration: int, total: int) -> int:
     return int(share * min(300, length * total / 4))
 
 
-def own_axes(quats: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
-    """Of B = R diag(s) of every Gaussian: the quaternion [4, N] of its rotation R, and s [3, N].
+def happens(event: int, num_points: int) -> bool:
+    """Whether an event happens: of more than 10,000 points, fewer of them do."""
+    share = min(1.0, 10_000 / max(num_points, 1)) ** (2 / 3)
+    return int((event + 1) * share) > int(event * share)
 
-    The quaternion is of length sqrt(2), so that products of two components are doubled.
+
+def chosen_points(event: int, num_points: int) -> Tensor:
+    """Which points an event fades, [num_points] bool: the same on every device."""
+    row = torch.arange(num_points)
+    return (hashed(row ^ hashed(event)) >> 8).float() / 2**24 < 0.2
+
+
+def hashed(number: Tensor | int) -> Tensor | int:
+    """32 bits that look random, of 32 bits: Wellons' `lowbias32`."""
+    number = ((number ^ (number >> 16)) * 0x7FEB352D) % 2**32
+    number = ((number ^ (number >> 15)) * 0x846CA68B) % 2**32
+    return number ^ (number >> 16)
+
+
+def own_axes(quats: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
+    """B = R diag(s) of every Gaussian: the unit quaternion [4, N] of R, and s [3, N].
+
+    An axis counts as no thinner than a tenth of the longest.
     """
-    q, deviations = quats.T, scales.T.exp()
-    size = q[0] * q[0]
-    for component in q[1:]:
-        size = torch.addcmul(size, component, component)
-    q = q * (size.sqrt().clamp(min=1e-12).reciprocal() * 2**0.5)
-    return q, torch.maximum(deviations, deviations.amax(0) * 0.1)
+    w, x, y, z = q = quats.T
+    square = torch.addcmul(torch.addcmul(torch.addcmul(w * w, x, x), y, y), z, z)
+    deviations = scales.T.exp()
+    longest = deviations.amax(0)
+    return q * square.sqrt().clamp(min=1e-12).reciprocal(), torch.maximum(deviations, longest * 0.1)
 
 
 def rotated(q: Tensor, v: Tensor, direction: int) -> Tensor:
-    """R v of vectors [3, N], or R^T v where the direction is -1: v + w t + a x t with t = a x v."""
-    w, a = q[0], q[1:]
-    t = add_cross(torch.zeros_like(v), a, v)
-    return add_cross(torch.addcmul(v, w, t, value=direction), a, t)
+    """R v of vectors [3, N], or R^T v where the direction is -1: v + w t + u x t, t = 2 u x v."""
+    w, u = q[0], q[1:]
+    t = cross(u, v) * (2 * direction)
+    return torch.addcmul(v, w, t).add(cross(u, t), alpha=direction)
 
 
-def add_cross(total: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """The total [3, N] and the cross product a x b."""
-    following, before = [1, 2, 0], [2, 0, 1]
-    total = torch.addcmul(total, a[following], b[before])
-    return torch.addcmul(total, a[before], b[following], value=-1)
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """The cross products of vectors [3, N]."""
+    i, j = [1, 2, 0], [2, 0, 1]
+    return torch.addcmul(a[i] * b[j], a[j], b[i], value=-1)
+
+
+def into_frame(frame: tuple[Tensor, Tensor], v: Tensor) -> Tensor:
+    """B^T v of vectors [N, 3]; 0 where its square is not finite."""
+    turned = (rotated(frame[0], v.T, -1) * frame[1]).T.contiguous()
+    return torch.where(turned.abs() <= torch.finfo(v.dtype).max ** 0.5 / 2, turned, 0.0)
+
+
+def out_of_frame(frame: tuple[Tensor, Tensor], v: Tensor) -> Tensor:
+    """B v of vectors [N, 3]; 0 where it is not finite."""
+    turned = rotated(frame[0], v.T * frame[1], 1).T.contiguous()
+    return torch.where(turned.isfinite(), turned, 0.0)
+
+
+def adam_in_frame_(z: Tensor, grad: Tensor, own: dict, rate: float) -> None:
+    """Adam's step z, in standard deviations, of a gradient in the own frame."""
+    adam_(z, grad, own, 0.0)  # the moments
+    z.copy_(own["exp_avg"] / root_of(own) * (rate / (1 - BETA1 ** own["step"])))
+
+
+def take_into_mean(param: Tensor, own: dict, number: int) -> None:
+    """Take the iterate of that number, from 1, into the mean.
+
+    Rows that the trainer has edited are zero in `began`: their mean begins with this iterate. What
+    is not finite is left out.
+    """
+    mean = own.setdefault("mean", torch.zeros_like(param))
+    began = own.setdefault("began", torch.zeros(len(param), dtype=param.dtype))
+    began[began == 0] = number
+    weight = (1 / (number + 1 - began)).reshape(-1, *[1] * (param.dim() - 1))
+    start = torch.where(mean.isfinite(), mean, param)
+    mean.copy_(torch.where(param.isfinite(), start.lerp(param, weight), mean))
+
+
+def put_mean(param: Tensor, own: dict) -> None:
+    """The mean takes the parameter's place."""
+    param.copy_(torch.where(param.isfinite(), own["mean"], param))
 
 
 # -- the paper's step ------------------------------------------------------------------------------
@@ -161,19 +248,25 @@ def paper_step(
 ) -> None:
     """AW-SGLD's drift, then LQNAdam: Opt3DGS with the settings of `PhaseScheduler.paper`.
 
-    energy: the loss of this iteration, 0-d.
+    energy: the loss of this iteration, 0-d; one that is not finite is left out.
     """
     switch = round(total * 29_000 / 30_000)
     warmup = round(total * 2_500 / 30_000)
-    multiplier = flat_histogram(state, energy, warmup) if iteration < switch else 1.0
+    if energy.isfinite():
+        state["nu"] = flat_histogram(state, energy, warmup)
+    multiplier = state.get("nu", 1.0) if iteration < switch else 1.0
     for name, param in params.items():
-        own = state.setdefault(name, new_moments(param))
-        grad = grads[name].nan_to_num(0.0, 0.0, 0.0)
+        own = state.setdefault(name, {**new_moments(param), "last": iteration - 1})
+        if name not in grads:
+            continue
+        grad = grads[name]
         if iteration >= switch:
-            if not own.setdefault("fresh", False):  # loss and direction have changed their scale
-                own |= {**new_moments(param), "fresh": True}
+            if own["last"] < switch:  # loss and direction have changed their scale
+                own |= new_moments(param)
             if name == "means":
                 grad = pseudo_gradient(param, grad, own)  # the D of eq. 17
+        own["last"] = iteration
+        grad = grad.nan_to_num(0.0, 0.0, 0.0)
         adam_(param, grad, own, rates[name] * multiplier)  # eq. 15 and 17; the trainer adds noise
 
 
@@ -213,7 +306,8 @@ def pseudo_gradient(position: Tensor, grad: Tensor, own: dict) -> Tensor:
     """H g of every point, with its gradient's length, after the point's new pair has been taken."""
     zeros = torch.zeros_like(grad)
     x, g, s, y = own.get("pairs", (zeros, zeros, [zeros] * K, [zeros] * K))
-    visible, before = grad.any(1), own.get("visible_before", zeros.any(1))
+    visible = (largest(grad) > 0) & (largest(grad) < torch.inf)  # false where one is no number
+    before = own.get("visible_before", zeros.any(1))
 
     # The pair between this visible step of a point and its last one, divided by |y|.
     new_s, new_y = position - x, grad - g

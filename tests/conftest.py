@@ -5,10 +5,23 @@
 
 import os
 
+import pytest
+import torch
 from hypothesis import Phase, settings
 
-settings.register_profile("fixed", derandomize=True)
-settings.register_profile("random", derandomize=False)
+settings.register_profile("fixed", derandomize=True, deadline=None)
+settings.register_profile("random", derandomize=False, deadline=None)
 # For mutants.py: a failure is enough, nobody reads the smallest one.
-settings.register_profile("mutants", derandomize=True, phases=(Phase.explicit, Phase.generate))
+settings.register_profile(
+    "mutants", derandomize=True, deadline=None, phases=(Phase.explicit, Phase.generate)
+)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
+
+torch.set_num_threads(1)  # tensors are small, and other processes of the test run need the cores
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Tests leave hundreds of trainings unfinished; each would say so in a line at exit."""
+    from opt3dgs_optim import phases
+
+    phases._UNFINISHED.clear()

@@ -5,32 +5,29 @@
     python tests/mutants.py step.py test_a.py parts/test_b.py   # any module, with its tests
     python tests/mutants.py --share 0.1           # a random tenth
 
-A copy of the package is changed in one place, and the module's tests run on the copy, first those
-that have noticed most so far. Every mutant gets a forked process with torch already imported
-(Linux, macOS), with a limit on its processor time. The tests must pass on the unchanged copy, in
-the same kind of process, before any mutant is tried. Survivors are printed.
+The tests are collected once. For every mutant a forked process (Linux, macOS) puts the changed
+functions in the place of the module's own, in memory, and runs the tests, first those that have
+noticed most so far, with a limit on its processor time. Before that, all of them must pass.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import importlib
 import os
 import random
 import resource
-import shutil
-import signal
 import sys
-import tempfile
+import time
 from collections import Counter
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import FunctionType
+from typing import Any
+
+import pytest
+from mutations import Mutant, mutants
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tests"))
-
-from mutations import Mutant, mutants  # noqa: E402
-
 PACKAGE = ROOT / "src/opt3dgs_optim"
 CHOSEN = "not slow and not hosts and not compiles and not processes and not thorough"
 ENERGY = ["test_partitions.py", "parts/test_histogram.py", "parts/test_histogram_extremes.py"]
@@ -46,131 +43,131 @@ TARGETS = {  # module: the tests that are meant to notice
 }
 
 
-class Outcome(NamedTuple):
-    """What a run of the tests said."""
+def change(module: Any, source: str) -> None:
+    """Have a module that others have imported from do what `source` says.
 
-    status: int  # of the process; pytest's exit code, or minus the signal
-    failed: str | None = None  # the first test that failed
-    seconds: dict[str, float] = {}  # noqa: RUF012  # of every test that passed
-    modules: tuple[str, ...] = ()  # that the run has imported
-    package: str = ""  # the file that the package was imported from
-
-    @property
-    def killed(self) -> str | None:
-        """What noticed, None if nothing did."""
-        if self.status == 0:
-            return None
-        return self.failed or f"exit status {self.status}"
-
-
-class Plugin:
-    """Runs the promising tests first and remembers what happened."""
-
-    def __init__(self, kills: Counter[str], seconds: dict[str, float]) -> None:
-        self.kills, self.known = kills, seconds
-        self.failed: str | None = None
-        self.seconds: dict[str, float] = {}
-
-    def pytest_collection_modifyitems(self, items: list[Any]) -> None:
-        items.sort(key=lambda i: (-self.kills[i.nodeid], self.known.get(i.nodeid, 0.0)))
-
-    def pytest_collectreport(self, report: Any) -> None:
-        if report.failed:
-            self.failed = f"import of {report.nodeid}"
-
-    def pytest_runtest_logreport(self, report: Any) -> None:
-        if report.failed and self.failed is None:
-            self.failed = report.nodeid
-        elif report.when == "call":
-            self.seconds[report.nodeid] = report.duration
+    Its functions and classes stay the objects that they are, with what the new ones have.
+    """
+    before = {n: v for n, v in vars(module).items() if isinstance(v, (type, FunctionType))}
+    exec(compile(source, str(module.__file__), "exec"), vars(module))
+    for name, old in before.items():
+        new = vars(module)[name]
+        if new is old:
+            continue  # imported
+        if isinstance(old, FunctionType):
+            old.__code__, old.__defaults__ = new.__code__, new.__defaults__
+            old.__kwdefaults__ = new.__kwdefaults__
+        else:
+            _change_class(old, new)
+        setattr(module, name, old)
 
 
-def run_tests(package: Path, tests: list[Path], plugin: Plugin, limit: int | None) -> Outcome:
-    """Run tests on `package`, in a fork of this process; limit is in seconds of processor time."""
-    if package.name in sys.modules:
-        raise RuntimeError(f"{package.name} is imported already: a fork would not see its mutants")
-    with tempfile.TemporaryDirectory() as folder:
-        said = Path(folder) / "said.json"
-        sys.stdout.flush()
+def _change_class(old: type, new: type) -> None:
+    for key, value in vars(new).items():
+        if key not in ("__dict__", "__weakref__"):
+            setattr(old, key, value)
+        for cell in getattr(value, "__closure__", None) or ():
+            if cell.cell_contents is new:  # super()'s
+                cell.cell_contents = old
+
+
+class Runner:
+    """A pytest plugin that runs the tests once for every mutant.
+
+    Attributes:
+        found: what noticed each mutant, None if nothing did.
+    """
+
+    def __init__(self, path: Path, chosen: list[Mutant], patience: int) -> None:
+        self.path, self.chosen, self.patience = path, chosen, patience
+        parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+        self.name = ".".join(parts)
+        self.found: list[str | None] = []
+        self._kills: Counter[str] = Counter()
+        self._seconds: dict[str, float] = {}
+
+    def pytest_runtestloop(self, session: Any) -> bool:
+        module, source = importlib.import_module(self.name), self.path.read_text()
+        if Path(str(module.__file__)) != self.path:
+            raise pytest.UsageError(f"{self.name} is imported from {module.__file__}")
+        begin = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+        failed = self._run(session.items, lambda: change(module, source), None)
+        if failed is not None:
+            raise pytest.UsageError(f"{self.name}: {failed} fails without a mutant")
+        used = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - begin
+        for count, mutant in enumerate(self.chosen, 1):
+            order = sorted(
+                session.items, key=lambda i: (-self._kills[i.nodeid], self._seconds[i.nodeid])
+            )
+            killer = self._run(
+                order, lambda m=mutant: change(module, m.source), self.patience + 3 * int(used)
+            )
+            self.found.append(killer)
+            if killer is None:
+                place = f"{self.name}:{mutant.line}"
+                self._say(f"survived: {place}: {mutant.before} -> {mutant.after}")
+            else:
+                self._kills[killer] += 1
+            if count % 10 == 0:
+                self._say(f"{count} of {len(self.chosen)}")
+        return True
+
+    def _say(self, line: str) -> None:
+        print(line, file=sys.stderr, flush=True)
+
+    def _run(self, items: list[Any], prepare: Any, limit: int | None) -> str | None:
+        """The first of the tests that fails, in a fork of this process."""
+        from _pytest.runner import runtestprotocol
+
+        reading, writing = os.pipe()
         child = os.fork()
         if child == 0:
-            status = 1
+            silent = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(silent, 1)
+            os.dup2(silent, 2)
+            if limit is not None:
+                resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+                resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 5))
+            failed = "import"
             try:
-                status = _in_child(package, tests, plugin, limit, said)
+                prepare()
+                failed = None
+                for item in items:
+                    begin = time.perf_counter()
+                    if any(r.failed for r in runtestprotocol(item, nextitem=None, log=False)):
+                        failed = item.nodeid
+                        break
+                    os.write(writing, f"{time.perf_counter() - begin} {item.nodeid}\n".encode())
             finally:
-                os._exit(status)
+                os.write(writing, f"- {failed or ''}\n".encode())
+                os._exit(0)
+        os.close(writing)
+        with os.fdopen(reading) as pipe:
+            said = [line.rstrip("\n").split(" ", 1) for line in pipe]
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        return Outcome(status, *(json.loads(said.read_text()) if said.exists() else ()))
-
-
-def _in_child(
-    package: Path, tests: list[Path], plugin: Plugin, limit: int | None, said: Path
-) -> int:
-    import pytest
-
-    if limit is not None:  # processor time: other work on the machine does not count
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 5))
-        signal.alarm(20 * limit)  # and one that waits for ever
-    silent = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(silent, 1)
-    os.dup2(silent, 2)
-    os.chdir(tests[0].parents[1])
-    sys.path.insert(0, str(package.parent))
-    sys.dont_write_bytecode = True  # of the same second and size it would be the last mutant's
-    known = set(sys.modules)
-    options = ["-x", "-q", "-n", "0", "-p", "no:cacheprovider", "-m", CHOSEN]
-    # Hypothesis is imported before pytest could rewrite its assertions; it has none to rewrite.
-    options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
-    status = pytest.main([*options, *map(str, tests)], [plugin])
-    ours = (str(package), str(tests[0].parent))
-    files = {name: getattr(sys.modules[name], "__file__", None) for name in sys.modules}
-    modules = [n for n, f in files.items() if n not in known and f and not f.startswith(ours)]
-    origin = getattr(sys.modules.get(package.name), "__file__", None) or ""
-    said.write_text(json.dumps([plugin.failed, plugin.seconds, modules, origin]))
-    return int(status)
-
-
-def _children_seconds() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+        for seconds, test in said:
+            if seconds != "-":
+                self._seconds[test] = float(seconds)
+        if not said or said[-1][0] != "-":
+            return f"exit status {status}"
+        return said[-1][1] or None
 
 
 def examine(
-    original: Path, module: str, chosen: list[Mutant], tests: list[Path], patience: int = 10
+    path: Path, chosen: list[Mutant], tests: list[Path], patience: int = 10
 ) -> list[str | None]:
-    """What noticed each mutant of a module of the package in the folder `original`.
+    """What noticed each mutant of a module of the package.
 
     `patience` is the time limit, in seconds beyond three times what the tests need.
     """
-    from tqdm import tqdm
-
-    found, kills = [], Counter[str]()
-    with tempfile.TemporaryDirectory() as folder:
-        package = Path(folder) / original.name
-        shutil.copytree(original, package, ignore=shutil.ignore_patterns("__pycache__"))
-        begin = _children_seconds()
-        healthy = run_tests(package, tests, Plugin(kills, {}), None)
-        if healthy.status:
-            raise SystemExit(f"{module}: {healthy.killed} fails without a mutant")
-        if not Path(healthy.package).is_relative_to(package):
-            raise SystemExit(f"{module}: the tests ran on {healthy.package}, not on {package}")
-        limit = patience + 3 * int(_children_seconds() - begin)
-        for name in healthy.modules:  # import here what every fork would import
-            if name not in sys.modules:
-                try:
-                    __import__(name)
-                except Exception as error:
-                    print(f"not preloaded: {name} ({error})", file=sys.stderr)
-        for mutant in tqdm(chosen, desc=module, mininterval=5):
-            (package / module).write_text(mutant.source)
-            outcome = run_tests(package, tests, Plugin(kills, healthy.seconds), limit)
-            found.append(outcome.killed)
-            if outcome.killed is None:
-                tqdm.write(f"survived: {module}:{mutant.line}: {mutant.before} -> {mutant.after}")
-            else:
-                kills[outcome.killed] += 1
-    return found
+    runner = Runner(path, chosen, patience)
+    options = ["-q", "-s", "-n", "0", "-p", "no:cacheprovider", "-m", CHOSEN]
+    # Hypothesis is imported before pytest could rewrite its assertions; it has none to rewrite.
+    options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
+    status = pytest.main([*options, *map(str, tests)], [runner])
+    if status != pytest.ExitCode.OK:
+        raise SystemExit(f"{path}: pytest ends with {status!r}")
+    return runner.found
 
 
 def main() -> int:
@@ -181,15 +178,13 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     os.environ.update(HYPOTHESIS_PROFILE="mutants", OMP_NUM_THREADS="1")
-    import torch
-
-    torch.set_num_threads(1)
+    sys.path.insert(0, str(PACKAGE.parent))
     chance, total, dead = random.Random(options.seed), 0, 0
     for module in [options.module] if options.module else TARGETS:
         tests = [ROOT / "tests" / test for test in options.tests or TARGETS[module]]
         every = mutants((PACKAGE / module).read_text())
         chosen = [mutant for mutant in every if chance.random() < options.share]
-        found = examine(PACKAGE, module, chosen, tests)
+        found = examine(PACKAGE / module, chosen, tests)
         total, dead = total + len(found), dead + len(found) - found.count(None)
         print(f"{module}: {len(found) - found.count(None)} of {len(found)} killed", flush=True)
     print(f"all: {dead} of {total} killed ({dead / max(total, 1):.1%})")

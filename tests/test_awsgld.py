@@ -90,7 +90,7 @@ def moved_by(optimizer: AWSGLD, x: Parameter, gradient: list[float]) -> list[flo
 
 def test_the_plain_drift_is_rate_times_nu_times_gradient() -> None:
     """Without moments: a gradient is forgotten after its step, and a NaN moves nothing."""
-    x, histogram = Parameter(torch.zeros(2, dtype=torch.float64)), EnergyHistogram(warmup=4)
+    x, histogram, nu = Parameter(torch.zeros(2).double()), EnergyHistogram(warmup=4), 1.0
     walk = AWSGLD([x], lr=0.1, preconditioner="none", histogram=histogram)
     for energy in np.random.default_rng(0).normal(size=20):
         nu = float(histogram.observe(float(energy)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from torch import Tensor
 from opt3dgs_optim.partitions import FLOOR, FixedPartitions, MovingPartitions
 
 CPU = torch.device("cpu")
-Partitions = FixedPartitions | MovingPartitions
+Partitions: TypeAlias = FixedPartitions | MovingPartitions
 
 
 def fixed(

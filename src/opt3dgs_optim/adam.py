@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
@@ -10,8 +11,8 @@ from torch import Tensor
 from torch.optim import Adam
 
 from opt3dgs_optim import triton
-from opt3dgs_optim.checks import LOGGER
-from opt3dgs_optim.contract import Slots, check_supported, own_step
+from opt3dgs_optim.checks import LOGGER, check_count, check_number
+from opt3dgs_optim.contract import REFUSED, Slots, check_supported, own_step
 from opt3dgs_optim.course import STATE_KEY, Course
 from opt3dgs_optim.names import split_name
 from opt3dgs_optim.part import Part, Phase, overrides
@@ -46,7 +47,6 @@ class Lane:
         self.set, self.name = slot
         self.last = -1
         self.framed: bool | None = None
-        self.same_object = False  # whether the Parameter is still that of the last step
         self.keeps = False  # whether parts keep something for its rows
         self.left: dict[str, tuple[Tensor, int]] = {}
         self.plans: dict[Phase, list[Part]] = {}
@@ -69,9 +69,7 @@ class Lane:
     def rows(self, state: dict[str, Any], key: str, shape: tuple[int, ...]) -> tuple[Tensor, bool]:
         """What is kept for the rows under a name, and whether rows may be new since the last step.
 
-        A row of zeros is one for which nothing is kept. Trainers that edit rows edit every tensor
-        of the state so (gsplat's family), or none but Adam's moments (INRIA's): then all rows of a
-        new Parameter are others, and what was kept for them is dropped.
+        A row of zeros is one for which nothing is kept.
         """
         tensor, was, self.keeps = state.get(key), self.left.get(key), True
         if tensor is None or tensor.shape != shape:
@@ -83,14 +81,23 @@ class Lane:
             return tensor, True
         if tensor is not was[0] or tensor._version != was[1]:
             return tensor, True
-        if not self.same_object:
-            tensor.zero_()
-            return tensor, True
         return tensor, False
+
+    def drop_if_moved(self, state: dict[str, Any], rows: int) -> None:
+        """Of a Parameter that is new, drop what is kept for rows that are others now.
+
+        Trainers that edit rows edit every tensor of the state so (gsplat's family), or none but
+        Adam's moments (INRIA's): what they have left as it was belongs to other rows.
+        """
+        for key, (tensor, version) in self.left.items():
+            now = state.get(key)
+            if now is not None and (
+                len(now) != rows or (now is tensor and now._version == version)
+            ):
+                del state[key]
 
     def leave(self, state: dict[str, Any]) -> None:
         """Note what the step has left, by which edits of rows show at the next one."""
-        self.same_object = True
         self.left = {key: (state[key], state[key]._version) for key in KEPT if key in state}
 
 
@@ -111,6 +118,7 @@ class StepAdam(Adam):
     _base: type[Adam] = Adam  # the class whose optimizer it was
     _lanes: list[Lane]
     _slots: Slots
+    _last: tuple[int, ...] = ()  # of every parameter, the iteration of its last step before a load
 
     def follow(self, course: Course, slots: Slots) -> None:
         """Have the parts of `course` from now on; slots are, by group, set and name."""
@@ -122,8 +130,11 @@ class StepAdam(Adam):
     def _use_host_steps(self) -> None:
         """Name the groups; keep Adam's count of steps on the host, which reads it in every step."""
         for group, (_, name) in zip(self.param_groups, self._slots, strict=True):
-            group["fused"], group["foreach"] = False, False
             group["gaussian"] = name  # gsplat's name of what it holds, or None
+        if not self.course.parts:
+            return
+        for group in self.param_groups:
+            group["fused"], group["foreach"] = False, False
         for state in self.state.values():
             if isinstance(state.get("step"), Tensor):
                 state["step"] = state["step"].to("cpu", torch.float32)
@@ -166,11 +177,11 @@ class StepAdam(Adam):
                 "use gsplat's SelectiveAdam or INRIA's SparseGaussianAdam for masked steps"
             )
         iteration = course.begin(self)
-        if self._masked:
-            given = () if closure is None and not masked else (closure, *masked)
+        given = () if not self._masked or (closure is None and not masked) else (closure, *masked)
+        if not course.parts:
+            _unhooked(self._base)(self, *given, **masks)
+        elif self._masked:
             self._step_around(iteration, given, masks)
-        elif not course.parts:
-            _unhooked(self._base)(self)
         else:
             with torch.no_grad():
                 for lane in self._present_lanes():
@@ -211,12 +222,13 @@ class StepAdam(Adam):
                 lane = Lane(group, param, slot).ask(course.parts, self.any_group)
                 before = old[i] if i < len(old) else None
                 if before is None:
-                    lane.last = self.next_iteration - 2
+                    lane.last = self._last[i] if i < len(self._last) else self.next_iteration - 2
                     if self.state.get(param):
                         lane.framed = self.in_own_frame and lane.name == "means"
                 else:
                     lane.last, lane.framed, lane.left = before.last, before.framed, before.left
-                    lane.same_object = before.same_object and before.param is param
+                    if before.param is not param:
+                        before.drop_if_moved(self.state.get(param, {}), len(param))
                     self._tell_fewer_rows(before.param, lane)
                 self._check_rows(lane)
                 self._lanes.append(lane)
@@ -343,7 +355,7 @@ class StepAdam(Adam):
         if step.fade is not None:
             chosen = like_rows(chosen_rows(step.fade, len(param), param.device), param)
             for key, factor in zip(MOMENTS, step.fade[2:], strict=True):
-                state[key].mul_(torch.where(chosen, factor, 1.0))
+                state[key].copy_(torch.where(chosen, state[key] * factor, state[key]))
         framed = None
         if step.frame is not None:
             axes = axes_of(step.frame)
@@ -397,9 +409,13 @@ class StepAdam(Adam):
 
     def state_dict(self) -> dict[str, Any]:
         """As torch's, with the course's numbers in `param_groups[0]["opt3dgs"]`."""
-        if self.course.parts:
-            self.param_groups[0][STATE_KEY] = self.course.state_of(self)
-        return super().state_dict()
+        if not self.course.parts:
+            return super().state_dict()
+        self.param_groups[0][STATE_KEY] = self.course.state_of(self)
+        try:
+            return super().state_dict()
+        finally:  # it is of this moment
+            del self.param_groups[0][STATE_KEY]
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """As torch's; the course goes on where the checkpoint was.
@@ -410,7 +426,7 @@ class StepAdam(Adam):
             ValueError: it is damaged, or of another version; nothing has been changed.
         """
         call = f"{type(self).__name__}.load_state_dict"
-        check_tensors(call, state_dict, len(self.param_groups))
+        check_tensors(call, state_dict, self.param_groups)
         groups = state_dict["param_groups"]
         if groups and STATE_KEY in groups[0]:
             self.course.check_state(call, groups[0][STATE_KEY])
@@ -428,23 +444,29 @@ class StepAdam(Adam):
         course, saved = self.course, self.param_groups[0].pop(STATE_KEY, None)
         steps = [int(state["step"]) for state in self.state.values() if "step" in state]
         if saved is None:
-            iteration, self.in_own_frame = max(steps, default=0), False
+            iteration, self.in_own_frame, self._last = max(steps, default=0), False, ()
         else:
             iteration, self.in_own_frame = saved["iteration"], saved["own_frame"]
+            self._last = tuple(saved["last"])
         if saved is None or saved["total_steps"] != course.total_steps:
             for state in self.state.values():  # they belong to the end of another run
                 for key in KEPT:
                     state.pop(key, None)
-        if saved is not None or steps:
-            course.restore(saved, iteration)
         self.next_iteration, self._lanes = iteration, []
+        if saved is not None or steps:  # an optimizer that steps now and then lags behind the clock
+            others = [each.next_iteration for each, _ in course.members.values()]
+            course.restore(saved, max([iteration, *others]))
+
+    def last_steps(self) -> tuple[int, ...]:
+        """Of every parameter, the iteration of its last step."""
+        return tuple(lane.last for lane in self._lanes) or self._last
 
     # -- copies ------------------------------------------------------------------------------------
 
     def __getstate__(self) -> dict[str, Any]:
         kept = ("course", "_slots", "_masked", "in_own_frame", "next_iteration")
         own = {key: getattr(self, key) for key in kept}
-        return {**super().__getstate__(), **own, "_lanes": []}
+        return {**super().__getstate__(), **own, "_lanes": [], "_last": self.last_steps()}
 
     def __reduce__(self) -> Any:
         # The class of an upgraded optimizer is made when it is needed, and has no name to find.
@@ -489,30 +511,74 @@ def checked_gradient(part: Part, found: Any, grad: Tensor) -> Tensor:
     return found
 
 
-def check_tensors(call: str, state_dict: Any, num_groups: int) -> None:
-    """ValueError unless a state dict has torch's form, and rows of one length in each entry."""
+def check_tensors(call: str, state_dict: Any, groups: list[dict[str, Any]]) -> None:
+    """ValueError unless a state dict has torch's form, for these groups, and fitting tensors."""
     if not isinstance(state_dict, Mapping) or not {"state", "param_groups"} <= set(state_dict):
         raise ValueError(
             f"{call}: needs a dict with 'state' and 'param_groups', as state_dict() has"
         )
-    if len(state_dict["param_groups"]) != num_groups:
+    saved, states = state_dict["param_groups"], state_dict["state"]
+    if not isinstance(saved, list) or len(saved) != len(groups):
         raise ValueError(
-            f"{call}: {len(state_dict['param_groups'])} parameter groups were saved, but this "
-            f"optimizer has {num_groups}"
+            f"{call}: {len(saved) if isinstance(saved, list) else repr(saved)} parameter groups "
+            f"were saved, but this optimizer has {len(groups)}"
         )
-    for index, state in state_dict["state"].items():
-        if not isinstance(state, Mapping):
-            raise ValueError(f"{call}: the state of parameter {index} is no dict")
-        shapes = {
-            key: tuple(value.shape)
-            for key, value in state.items()
-            if isinstance(value, Tensor) and key in (*MOMENTS, MEAN)
-        }
-        if len(set(shapes.values())) > 1:
-            raise ValueError(f"{call}: parameter {index} has shapes {shapes}, but one is needed")
-        rows = {s[:1] for s in shapes.values()}
-        began = state.get(BEGAN)
-        if isinstance(began, Tensor) and rows and tuple(began.shape) not in rows:
-            raise ValueError(
-                f"{call}: parameter {index} has {BEGAN} of {tuple(began.shape)} for {shapes}"
-            )
+    known: set[int] = set()
+    for at, (group, own) in enumerate(zip(saved, groups, strict=True)):
+        check_group(f"{call}: group {at}", group, len(own["params"]))
+        known.update(group["params"])
+    if not isinstance(states, Mapping) or not set(states) <= known:
+        raise ValueError(f"{call}: the state is not of the parameters {sorted(known)}")
+    for index, state in states.items():
+        check_moments(f"{call}: parameter {index}", state)
+
+
+def check_group(call: str, group: Any, count: int) -> None:
+    """ValueError unless a saved group has so many parameters, and options that Adam here takes."""
+    params = group.get("params") if isinstance(group, Mapping) else None
+    if not isinstance(params, list) or len(params) != count:
+        raise ValueError(f"{call} has params={params!r}, but a list of {count} is needed")
+    if not all(type(each) is int for each in params):
+        raise ValueError(f"{call} has params={params!r}, but integers are needed")
+    for option in REFUSED:
+        if group.get(option):
+            raise ValueError(f"{call} has {option}={group[option]!r}, which is not taken")
+    betas = group.get("betas")
+    if not isinstance(betas, (tuple, list)) or len(betas) != 2:
+        raise ValueError(f"{call} has betas={betas!r}, but two numbers are needed")
+    numbers = {name: group.get(name) for name in ("lr", "eps", "weight_decay")}
+    for name, value in {**numbers, "betas[0]": betas[0], "betas[1]": betas[1]}.items():
+        check_number(call, name, value, 0.0, 1.0 if "betas" in name else math.inf)
+
+
+def check_moments(call: str, state: Any) -> None:
+    """ValueError unless the state of a parameter is empty, or Adam's with what is kept for rows."""
+    if not isinstance(state, Mapping):
+        raise ValueError(f"{call} has the state {state!r}, but a dict is needed")
+    if not state:
+        return
+    missing = [key for key in ("step", *MOMENTS) if key not in state]
+    if missing:
+        raise ValueError(f"{call} has no {missing[0]}, but {sorted(map(str, state))}")
+    check_count(call, "step", whole(state["step"]), 0)
+    shapes: dict[str, tuple[int, ...]] = {}
+    for key in (*MOMENTS, *KEPT):
+        value = state.get(key)
+        if value is None and key in KEPT:
+            continue
+        if not isinstance(value, Tensor) or not value.is_floating_point():
+            raise ValueError(f"{call} has {key}={value!r}, but a tensor of real numbers is needed")
+        shapes[key] = tuple(value.shape)
+    one = shapes["exp_avg"]
+    if any(shapes.get(key, one) != one for key in ("exp_avg_sq", MEAN)) or any(
+        shapes.get(key, one)[:1] != one[:1] for key in KEPT
+    ):
+        raise ValueError(f"{call} has shapes {shapes}, but the same rows are needed in all")
+    if (MEAN in shapes) != (BEGAN in shapes) or shapes.get(BEGAN, one[:1]) != one[:1]:
+        raise ValueError(f"{call} has shapes {shapes}, but {BEGAN} needs a number for each row")
+
+
+def whole(step: Any) -> Any:
+    """Adam's count of steps, a tensor or a number, as an int; anything else as it is."""
+    value = step.item() if isinstance(step, Tensor) and step.numel() == 1 else step
+    return int(value) if isinstance(value, float) and value.is_integer() else value

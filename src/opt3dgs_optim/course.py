@@ -158,16 +158,17 @@ class Course:
             part.settle(self)
         return {
             "format": FORMAT,
-            "iteration": optimizer.next_iteration,
+            "iteration": max(optimizer.next_iteration, self.iteration),  # it may have been put on
             "total_steps": self.total_steps,
             "own_frame": optimizer.in_own_frame,
+            "last": list(optimizer.last_steps()),
             "notes": {name: dict(notes) for name, notes in self._notes.items()},
             "parts": {type(p).__name__: p.state_dict() for p in self.parts if p.learns},
         }
 
     def check_state(self, call: str, state: Any) -> None:
         """ValueError unless `state` is what `state_of` gives; the one check of what is loaded."""
-        needed = {"format", "iteration", "total_steps", "own_frame", "notes", "parts"}
+        needed = {"format", "iteration", "total_steps", "own_frame", "last", "notes", "parts"}
         if not isinstance(state, Mapping) or set(state) != needed or state["format"] != FORMAT:
             raise ValueError(
                 f"{call}: param_groups[0][{STATE_KEY!r}] is not of this version (format {FORMAT}); "
@@ -177,6 +178,9 @@ class Course:
         check_count(call, "iteration", state["iteration"], 0)
         if state["total_steps"] is not None:
             check_count(call, "total_steps", state["total_steps"], 1)
+        last = state["last"]
+        if not isinstance(last, list) or not all(type(each) is int for each in last):
+            raise ValueError(f"{call}: last={last!r}, but a list of integers is needed")
         for kind in ("notes", "parts"):
             if not isinstance(state[kind], Mapping) or not all(
                 isinstance(each, Mapping) for each in state[kind].values()
@@ -203,8 +207,9 @@ class Course:
                 self._notes[name].update(notes)
 
     def __getstate__(self) -> dict[str, Any]:
-        # A copy's members are its own: they register with their next step.
-        return {**vars(self), "members": {}, "_counters": {}, "scratch": {}}
+        for part in self.parts:  # what is on its way from a device does not reach a copy
+            part.settle(self)
+        return {**vars(self), "_counters": {}, "scratch": {}}
 
 
 class Reading:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.metadata
+import math
 import platform
 import sys
 from collections.abc import Callable, Sequence
@@ -146,8 +147,9 @@ def _recursion(device: torch.device, dtype: torch.dtype, backend: Backend) -> Te
 
 
 def _difference(ours: Tensor, theirs: Tensor) -> float:
-    """The largest difference, as a share of the largest number."""
-    return float((ours - theirs).detach().abs().max() / theirs.detach().abs().max())
+    """The largest difference, as a share of the largest number; infinite where one is NaN."""
+    found = float((ours - theirs).detach().abs().max() / theirs.detach().abs().max())
+    return math.inf if math.isnan(found) else found  # `max` of numbers would pass over it
 
 
 def _within(limit: float, what: str, difference: float) -> str:

@@ -15,7 +15,7 @@ from torch.optim import Optimizer
 from opt3dgs_optim.adam import StepAdam, upgraded_class
 from opt3dgs_optim.checks import LOGGER, check_count, check_energy, check_number
 from opt3dgs_optim.contract import Slots, check_supported
-from opt3dgs_optim.course import Course
+from opt3dgs_optim.course import STATE_KEY, Course
 from opt3dgs_optim.names import GAUSSIAN_NAMES, split_name
 from opt3dgs_optim.part import Part, overrides
 from opt3dgs_optim.parts.averaging import Averaging
@@ -123,6 +123,9 @@ class PhaseScheduler(Course):
         held = [slot for each in slots for slot in each if slot[1] is not None]
         for (_, optimizer), its in zip(given, slots, strict=True):
             check_supported(optimizer, its)
+            if (saved := optimizer.param_groups[0].get(STATE_KEY)) is not None:
+                self.check_state(f"{CALL}.upgrade", saved)
+                self.restore_parts(saved)
         if not held:
             names = [g.get("name") or key for key, o in given for g in o.param_groups]
             raise ValueError(
@@ -145,7 +148,12 @@ class PhaseScheduler(Course):
         return optimizers
 
     def _upgrade(self, optimizer: Any, slots: Slots) -> None:
-        if not isinstance(optimizer, StepAdam):
+        if isinstance(optimizer, StepAdam):
+            if optimizer.course is self:  # its groups are others now
+                optimizer.follow(self, slots)
+                return
+            optimizer.param_groups[0][STATE_KEY] = optimizer.course.state_of(optimizer)
+        else:
             vars(optimizer).pop("step", None)  # as learning-rate schedulers of old have wrapped it
             optimizer.__class__ = upgraded_class(type(optimizer))
         optimizer.follow(self, slots)

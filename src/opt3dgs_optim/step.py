@@ -143,8 +143,8 @@ def _take_rows(step: Step, hyper: Hyper, chosen: Tensor | None, rows: Any) -> in
     grad, bad = _finite(step.grad[rows], hyper.nonfinite)
     if step.fade is not None and chosen is not None:
         faded = like_rows(chosen[rows], param)
-        exp_avg.mul_(torch.where(faded, step.fade.exp_avg, 1.0))
-        exp_avg_sq.mul_(torch.where(faded, step.fade.exp_avg_sq, 1.0))
+        exp_avg.copy_(torch.where(faded, exp_avg * step.fade.exp_avg, exp_avg))
+        exp_avg_sq.copy_(torch.where(faded, exp_avg_sq * step.fade.exp_avg_sq, exp_avg_sq))
     if hyper.shrink != 1.0:
         param.mul_(hyper.shrink)
     if hyper.decay:

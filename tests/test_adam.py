@@ -1,0 +1,341 @@
+"""The upgraded optimizer is still the trainer's: its class, its options, its hooks, its step."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from typing import Any
+
+import pytest
+import torch
+from gaussians import RATES, adam_of, adams_of, parameters, same_tensors, steps
+from masked_adams import MaskedAdam, SelectiveAdam, SparseGaussianAdam, masked
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Adam, AdamW
+
+from opt3dgs_optim import DEFAULTS, Averaging, Fading, OwnFrame, Part, PhaseScheduler
+from opt3dgs_optim.step import Step
+
+TOTAL, ROWS = 90, 8
+IDLE: list[Part] = [Fading(start=0.99, stop=1.0)]  # a part that never acts here
+KINDS = [SelectiveAdam, SparseGaussianAdam]
+
+
+@pytest.mark.parametrize("parts", [[], IDLE], ids=["no parts", "idle"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"weight_decay": 0.1},
+        {"betas": (0.5, 0.9), "eps": 1e-8},
+        {"fused": True},
+        {"foreach": True},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("kind", [Adam, AdamW])
+def test_without_parts_it_is_the_trainers_adam(kind: Any, options: dict, parts: list[Part]) -> None:
+    """Bit for bit; where there are parts, of the loop that torch has without `fused`."""
+    same_loop = parts == [] or not options.get("fused")
+    ours, theirs = parameters(ROWS), parameters(ROWS)
+    upgraded = PhaseScheduler(1000, parts=parts).upgrade(adams_of(ours, kind, **options))
+    steps(upgraded, ours, 30)
+    steps(adams_of(theirs, kind, **(options if same_loop else {})), theirs, 30)
+    assert same_tensors(ours, theirs)
+
+
+def test_other_groups_are_stepped_by_plain_adam() -> None:
+    """Cameras, exposures, networks: also 0-d, and several tensors in a group."""
+    ends = []
+    for upgrade in (True, False):
+        torch.manual_seed(0)
+        more = {"mlp": Parameter(torch.randn(3, 5)), "scalar": Parameter(torch.ones(()))}
+        params: dict[str, Any] = {**parameters(ROWS), **more}
+        adam = adam_of(params)
+        adam.add_param_group({"params": [Parameter(torch.ones(2)) for _ in range(3)], "lr": 0.1})
+        if upgrade:
+            adam = PhaseScheduler(30, parts=DEFAULTS).upgrade(adam)
+        several = dict(enumerate(adam.param_groups[-1]["params"]))
+        steps({"all": adam}, params | several, 30)
+        ends.append(
+            {str(n): params[n].detach() for n in ("mlp", "scalar")}
+            | {str(n): p for n, p in several.items()}
+        )
+    assert same_tensors(*ends)
+
+
+def test_the_class_stays_the_trainers() -> None:
+    class Mine(Adam):
+        calls = 0
+
+        def zero_grad(self, set_to_none: bool = True) -> None:
+            Mine.calls += 1
+            super().zero_grad(set_to_none)
+
+    optimizer = adam_of(parameters(ROWS), Mine)
+    given = PhaseScheduler(TOTAL).upgrade(optimizer)
+    assert given is optimizer
+    assert isinstance(optimizer, Mine)
+    assert type(optimizer).__name__ == "Mine"
+    optimizer.zero_grad()
+    assert Mine.calls == 1
+
+
+@pytest.mark.parametrize("given", ["dict", "list", "tuple", "one"])
+def test_upgrade_returns_what_was_given(given: str) -> None:
+    adams = adams_of(parameters(ROWS))
+    lists = {"dict": dict, "list": lambda d: list(d.values()), "tuple": lambda d: tuple(d.values())}
+    made: Any = lists.get(given, lambda d: d["means"])(adams)
+    assert PhaseScheduler(TOTAL).upgrade(made) is made
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"],
+        ["means", "features_dc", "features_rest", "opacities", "scales", "quats"],
+        ["positions", "features_albedo", "features_specular", "density", "scale", "rotation"],
+        ["means", "sh0", "shN", "logit_opacities", "log_scales", "quats"],
+        ["means", "shs_dc", "shs_rest", "opacities", "scales", "rotations"],
+        [f"Background#{n}" for n in ("xyz", "sh_dc", "sh_rest", "opacity", "scaling", "rotation")],
+    ],
+)
+def test_the_names_of_other_trainers(names: list[str]) -> None:
+    groups = [{"params": [Parameter(torch.ones(ROWS, 3))], "name": name} for name in names]
+    optimizer = PhaseScheduler(TOTAL).upgrade(Adam(groups))
+    known = ["means", "sh0", "shN", "opacities", "scales", "quats"]
+    assert [group["gaussian"] for group in optimizer.param_groups] == known
+
+
+def test_the_learning_rate_is_the_trainers() -> None:
+    """Its schedule compounds, and MCMC's noise reads it: no part writes into it."""
+    params = parameters(ROWS)
+    optimizers = adams_of(params)
+    decays = [torch.optim.lr_scheduler.ExponentialLR(o, 0.9) for o in optimizers.values()]
+    PhaseScheduler(20).upgrade(optimizers)
+    for _ in range(20):
+        steps(optimizers, params, 1)
+        for decay in decays:
+            decay.step()
+    for name, optimizer in optimizers.items():
+        assert optimizer.param_groups[0]["lr"] == pytest.approx(RATES[name] * 0.9**20)
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_a_scheduler_of_rates_is_made_before_or_after(before: bool) -> None:
+    """Without torch's warning that the optimizer has not been stepped."""
+    params = parameters(ROWS)
+    optimizer = adam_of(params)
+    if before:
+        decay = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda i: 0.5**i)
+    PhaseScheduler(TOTAL).upgrade(optimizer)
+    if not before:
+        decay = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda i: 0.5**i)
+    steps({"all": optimizer}, params, 1)
+    decay.step()  # pyright: ignore
+    assert optimizer.param_groups[0]["lr"] == pytest.approx(RATES["means"] / 2)
+
+
+def test_hooks_and_closures() -> None:
+    calls: list[str] = []
+    params = parameters(ROWS)
+    optimizer = adam_of(params)
+    optimizer.register_step_pre_hook(lambda *_: calls.append("before"))
+    PhaseScheduler(TOTAL).upgrade(optimizer)
+    optimizer.register_step_post_hook(lambda *_: calls.append("after"))
+
+    def closure() -> Tensor:
+        optimizer.zero_grad()
+        loss = params["means"].square().sum()
+        loss.backward()
+        calls.append("closure")
+        return loss
+
+    loss = optimizer.step(closure).item()
+    assert calls == ["before", "closure", "after"]
+    assert params["means"].square().sum().item() < loss
+
+
+def test_a_grad_scaler_unscales_and_leaves_steps_out() -> None:
+    params = parameters(ROWS)
+    phases = PhaseScheduler(TOTAL)
+    optimizers = phases.upgrade(adams_of(params))
+    scaler = torch.amp.GradScaler("cpu", init_scale=1024.0)  # pyright: ignore
+    for bad in (False, True, False):
+        loss = sum(p.square().sum() for p in params.values()) * (torch.inf if bad else 1.0)
+        scaler.scale(loss).backward()
+        for optimizer in optimizers.values():
+            scaler.step(optimizer)
+            optimizer.zero_grad()
+        scaler.update()
+    assert phases.iteration == 1
+    assert all(bool(torch.isfinite(param).all()) for param in params.values())
+
+
+@pytest.mark.parametrize("parts", [DEFAULTS, [Averaging()]], ids=["defaults", "averaging"])
+def test_float64_is_stepped_in_float64(parts: Any) -> None:
+    """Georeferenced positions."""
+    params = {name: Parameter(param.detach().double()) for name, param in parameters(ROWS).items()}
+    optimizers = PhaseScheduler(TOTAL, parts=parts).upgrade(adams_of(params))
+    steps(optimizers, params, TOTAL)
+    assert all(param.dtype == torch.float64 for param in params.values())
+    held = optimizers["means"].state[params["means"]]
+    assert all(v.dtype == torch.float64 for k, v in held.items() if k != "step")
+    single = parameters(ROWS)
+    steps(PhaseScheduler(TOTAL, parts=parts).upgrade(adams_of(single)), single, 5)
+    again = {name: Parameter(param.detach().double()) for name, param in parameters(ROWS).items()}
+    steps(PhaseScheduler(TOTAL, parts=parts).upgrade(adams_of(again)), again, 5)
+    for name, param in single.items():
+        assert torch.allclose(param.double(), again[name], atol=1e-2), name
+
+
+def test_another_default_dtype_is_not_followed() -> None:
+    params = parameters(ROWS)
+    torch.set_default_dtype(torch.float64)
+    try:
+        optimizers = PhaseScheduler(TOTAL).upgrade(adams_of(params))
+        steps(optimizers, params, TOTAL)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    other = parameters(ROWS)
+    steps(PhaseScheduler(TOTAL).upgrade(adams_of(other)), other, TOTAL)
+    assert same_tensors(params, other)
+
+
+def test_more_or_fewer_points_between_none_and_one() -> None:
+    for rows in (0, 1):
+        params = parameters(rows)
+        steps(PhaseScheduler(60).upgrade(adams_of(params)), params, 60)
+        assert all(len(param) == rows for param in params.values())
+
+
+@pytest.mark.parametrize("pickled", [True, False])
+def test_a_copy_goes_on_alike_and_apart(pickled: bool) -> None:
+    """Six Adams in a dict: the copies find each other's scales and quaternions."""
+    params = parameters(ROWS)
+    optimizers = PhaseScheduler(TOTAL).upgrade(adams_of(params))
+    steps(optimizers, params, 40)
+    whole = (params, optimizers)
+    others, copies = pickle.loads(pickle.dumps(whole)) if pickled else copy.deepcopy(whole)
+    steps(optimizers, params, 50, seed=1)
+    before = {name: param.detach().clone() for name, param in params.items()}
+    steps(copies, others, 50, seed=1)
+    assert same_tensors(params, others)
+    assert same_tensors(params, before)
+    assert copies["means"].course is copies["scales"].course is not optimizers["means"].course
+
+
+# -- masked steps: the arithmetic and the mask stay theirs -----------------------------------------
+
+
+def run_masked(kind: type[MaskedAdam], parts: Any, count: int = 60) -> dict[str, Any]:
+    params = parameters(ROWS)
+    optimizer = adam_of(params, kind)
+    if parts is not None:
+        optimizer = PhaseScheduler(60, parts=parts).upgrade(optimizer)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(count):
+        for param in params.values():
+            param.grad = torch.randn(param.shape, generator=generator)
+        visible = torch.rand(ROWS, generator=generator) < 0.5
+        visible[0] = False
+        optimizer.step(*masked(kind, visible))
+    return params
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("parts", [[], IDLE], ids=["no parts", "idle"])
+def test_without_parts_a_masked_step_is_its_own(kind: Any, parts: Any) -> None:
+    assert same_tensors(run_masked(kind, parts), run_masked(kind, None))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_row_that_is_masked_stays_where_it_is(kind: Any) -> None:
+    """In own frames, too; and the mean of what does not move is where it is."""
+    start = parameters(ROWS)
+    for name, param in run_masked(kind, DEFAULTS).items():
+        assert torch.equal(param[0], start[name][0]), name
+        assert bool((param[1:] != start[name][1:]).any())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_parts_act_around_a_masked_step(kind: Any) -> None:
+    """Fading and OwnFrame change where it ends; Averaging puts the mean."""
+    plain = run_masked(kind, None)
+    for part, name in ((Fading(), "sh0"), (OwnFrame(), "means"), (Averaging(), "scales")):
+        found = run_masked(kind, [part])
+        assert not torch.equal(found[name], plain[name]), part
+        assert bool(torch.isfinite(found[name]).all())
+
+
+def test_a_masked_step_in_the_own_frame_is_theirs_in_standard_deviations() -> None:
+    params = parameters(ROWS, "means", "scales", "quats")
+    params["scales"].data.fill_(2.0)
+    params["quats"].data[:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    start = params["means"].detach().clone()
+    optimizer = PhaseScheduler(60, parts=[OwnFrame(rate=0.1)]).upgrade(
+        adam_of(params, SelectiveAdam)
+    )
+    params["means"].grad = torch.ones(ROWS, 3)
+    optimizer.step(torch.ones(ROWS, dtype=torch.bool))
+    full = 0.1 * 0.1 / 0.001**0.5  # without bias correction, of the first step
+    moved = (start - params["means"]) / torch.tensor(2.0).exp()
+    assert torch.allclose(moved, torch.full_like(moved, full), rtol=1e-4)
+    assert optimizer.param_groups[0]["lr"] == RATES["means"]
+
+
+# -- strangers' parts ------------------------------------------------------------------------------
+
+
+class Signs(Part):
+    """Feeds Adam the sign of the gradient, and clamps what comes out."""
+
+    names = ("scales",)
+
+    def before(self, step: Step, course: Any) -> Tensor:
+        return step.grad.sign()
+
+    def after(self, step: Step, course: Any) -> None:
+        step.param.clamp_(-1.0, 1.0)
+
+
+class Counts(Part):
+    """Learns, in the notes of the training."""
+
+    def plan(self, step: Step, course: Any) -> None:
+        notes = course.notes_of(self)
+        notes["steps"] = notes.get("steps", 0) + 1
+        step.factor = step.factor * 0.5
+
+
+def test_a_strangers_part_has_hooks_and_notes() -> None:
+    params = parameters(ROWS, "means", "scales")
+    phases = PhaseScheduler(TOTAL, parts=[Signs(), Counts()])
+    optimizers = phases.upgrade(adams_of(params))
+    start = params["means"].detach().clone()
+    steps(optimizers, params, 1)
+    assert bool((params["scales"].abs() <= 1).all())
+    moment = optimizers["scales"].state[params["scales"]]["exp_avg"]
+    assert torch.allclose(moment.abs(), torch.tensor(0.1))
+    assert torch.allclose(
+        (params["means"] - start).abs(), torch.tensor(RATES["means"] / 2), rtol=1e-3
+    )
+    again = PhaseScheduler(TOTAL, parts=[Counts()])
+    fresh = again.upgrade(adams_of(params))
+    fresh["means"].load_state_dict(optimizers["means"].state_dict())
+    assert again.notes_of(again.parts[0]) == {"steps": 2}
+
+
+@pytest.mark.parametrize("found", [None, torch.ones(2, 2), 1.0])
+def test_a_gradient_of_another_shape_is_refused(found: Any) -> None:
+    class Wrong(Part):
+        def before(self, step: Step, course: Any) -> Tensor:
+            return found
+
+    params = parameters(ROWS, "sh0")
+    optimizers = PhaseScheduler(TOTAL, parts=[Wrong()]).upgrade(adams_of(params))
+    with pytest.raises(
+        ValueError, match=r"Wrong.before: returned .*a tensor of \(8, 1, 3\) is needed"
+    ):
+        steps(optimizers, params, 1)

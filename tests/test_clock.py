@@ -1,0 +1,187 @@
+"""The clock: optimizers count their own steps, whatever the trainer does between them."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+import torch
+from gaussians import adam_of, adams_of, parameters, same_tensors, steps
+from torch.nn import Parameter
+
+from opt3dgs_optim import DEFAULTS, DEFAULTS_ADC, Averaging, Part, Phase, PhaseScheduler
+from opt3dgs_optim.course import Course
+from opt3dgs_optim.step import Step
+
+TOTAL = 120
+
+
+class Clocked(Part):
+    """Notes the iterations of the steps of each parameter."""
+
+    names = None
+
+    def __init__(self) -> None:
+        self.seen: dict[Any, list[int]] = {}
+
+    def plan(self, step: Step, course: Course) -> None:
+        self.seen.setdefault(step.name, []).append(step.iteration)
+
+
+def clocked(total: int = TOTAL) -> tuple[PhaseScheduler, Clocked]:
+    part = Clocked()
+    return PhaseScheduler(total, parts=[part]), part
+
+
+@pytest.mark.parametrize("parts", [DEFAULTS, DEFAULTS_ADC], ids=["relocation", "adc"])
+def test_three_lines_are_enough(parts: Any) -> None:
+    """Without `observe` the defaults end where they end with it, bit for bit."""
+    ends = []
+    for observe in (False, True):
+        params = parameters(20)
+        phases = PhaseScheduler(TOTAL, parts=parts)
+        optimizers = phases.upgrade(adams_of(params))
+        for iteration in range(TOTAL):
+            if observe:
+                phases.observe(torch.tensor(0.1 * iteration), iteration=iteration)
+            steps(optimizers, params, 1, seed=iteration)
+        ends.append({name: param.detach() for name, param in params.items()})
+    assert same_tensors(*ends)
+
+
+def test_one_adam_of_six_groups_or_six_adams() -> None:
+    ends = []
+    for make in (adam_of, adams_of):
+        params = parameters(20)
+        made = PhaseScheduler(TOTAL).upgrade(make(params))
+        steps(made if isinstance(made, dict) else {"all": made}, params, TOTAL)
+        ends.append({name: param.detach() for name, param in params.items()})
+    assert same_tensors(*ends)
+
+
+def test_gradients_are_accumulated() -> None:
+    """A step in every fourth iteration; the trainer's count is said."""
+    phases, part = clocked()
+    params = parameters(5, "means")
+    optimizers = phases.upgrade(adams_of(params))
+    for iteration in range(40):
+        phases.observe(iteration=iteration)
+        if iteration % 4 == 3:
+            steps(optimizers, params, 1)
+    assert part.seen["means"] == list(range(3, 40, 4))
+    assert phases.iteration == 39
+
+
+def test_an_optimizer_that_steps_now_and_then() -> None:
+    """taming-3dgs has f_rest in an optimizer of its own, which steps in every sixteenth."""
+    phases, part = clocked()
+    params = parameters(5, "means", "shN")
+    main, other = phases.upgrade(
+        [adam_of({"means": params["means"]}), adam_of({"shN": params["shN"]})]
+    )
+    for iteration in range(50):
+        steps({"means": main}, params, 1)
+        if iteration % 16 == 15:
+            steps({"shN": other}, params, 1)
+    assert part.seen == {"means": list(range(50)), "shN": [15, 31, 47]}
+    again, part = clocked()
+    resumed = again.upgrade([adam_of({"means": params["means"]}), adam_of({"shN": params["shN"]})])
+    for optimizer, saved in zip(resumed, (main, other), strict=True):
+        optimizer.load_state_dict(saved.state_dict())
+    assert again.iteration == 49
+    steps({"shN": resumed[1]}, params, 1)
+    steps({"means": resumed[0]}, params, 1)
+    assert part.seen == {"shN": [49], "means": [50]}
+
+
+def test_iterations_without_a_gradient_and_a_last_one_without_a_step() -> None:
+    """INRIA's densification makes new Parameters before the step, which then does nothing."""
+    phases, part = clocked()
+    params: dict[str, Any] = parameters(5, "means")
+    optimizer = phases.upgrade(adam_of(params))
+    for iteration in range(1, TOTAL + 1):
+        params["means"].grad = torch.ones(5, 3)
+        if iteration % 10 == 0:
+            new = Parameter(params["means"].detach().clone())
+            optimizer.state[new] = optimizer.state.pop(params["means"])
+            optimizer.param_groups[0]["params"] = [new]
+            params["means"] = new
+        if iteration < TOTAL:
+            optimizer.step()
+    assert phases.iteration == TOTAL - 2
+    assert part.seen["means"] == [i for i in range(TOTAL - 1) if i % 10 != 9]
+
+
+def test_the_mean_is_in_place_before_the_last_step() -> None:
+    """Trainers save before it, and INRIA's leaves it out."""
+    params = parameters(5, "sh0")
+    optimizers = PhaseScheduler(300, parts=[Averaging()]).upgrade(adams_of(params))
+    steps(optimizers, params, 299)
+    assert torch.equal(params["sh0"], optimizers["sh0"].state[params["sh0"]]["averaging.mean"])
+
+
+@pytest.mark.parametrize("upgraded_first", [True, False])
+@pytest.mark.parametrize("stock", [True, False])
+def test_a_resume_takes_the_clock(upgraded_first: bool, stock: bool) -> None:
+    params = parameters(5)
+    optimizer: Any = adam_of(params)
+    if not stock:
+        optimizer = PhaseScheduler(TOTAL).upgrade(optimizer)
+    steps({"all": optimizer}, params, 50)
+    saved = copy.deepcopy(optimizer.state_dict())
+    phases = PhaseScheduler(TOTAL)
+    fresh = adam_of(params)
+    if upgraded_first:
+        phases.upgrade(fresh)
+    fresh.load_state_dict(saved)
+    if not upgraded_first:
+        phases.upgrade(fresh)
+    assert phases.iteration == 49
+    steps({"all": fresh}, params, 1)
+    assert phases.iteration == 50
+
+
+def test_a_second_upgrade_changes_nothing() -> None:
+    """A notebook's cell that is run twice."""
+    ends = []
+    for again in (False, True):
+        params = parameters(8)
+        phases = PhaseScheduler(TOTAL)
+        optimizers = phases.upgrade(adams_of(params))
+        steps(optimizers, params, 60)
+        optimizers["means"].state_dict()
+        if again:
+            phases.upgrade(optimizers)
+        steps(optimizers, params, 60, seed=1)
+        assert phases.iteration == TOTAL - 1
+        ends.append({name: param.detach() for name, param in params.items()})
+    assert same_tensors(*ends)
+
+
+def test_another_scheduler_goes_on_where_the_first_was() -> None:
+    params = parameters(8)
+    optimizers = PhaseScheduler(TOTAL).upgrade(adams_of(params))
+    steps(optimizers, params, 60)
+    moments = optimizers["means"].state[params["means"]]["exp_avg"].clone()
+    later = PhaseScheduler(2 * TOTAL)
+    later.upgrade(optimizers)
+    assert later.iteration == 59
+    for param in params.values():
+        param.grad = torch.zeros_like(param)
+    optimizers["means"].step()  # they are the own frame's still, and not begun anew
+    assert torch.allclose(optimizers["means"].state[params["means"]]["exp_avg"], 0.9 * moments)
+
+
+def test_phase_progress_and_what_is_shown() -> None:
+    phases = PhaseScheduler(100, 0.9)
+    shown = [(phases.iteration, phases.phase, phases.progress)]
+    for iteration in (0, 89, 90, 99):
+        phases.observe(iteration=iteration)
+        shown.append((phases.iteration, phases.phase, phases.progress))
+    explore, exploit = Phase.EXPLORATION, Phase.EXPLOITATION
+    first = [(-1, explore, 0.0), (0, explore, 0.0), (89, explore, 0.89)]
+    assert shown == [*first, (90, exploit, 0.9), (99, exploit, 0.99)]
+    assert "iteration 99 of 100, exploitation" in repr(phases)
+    assert phases.part(Averaging) is DEFAULTS[3]
+    assert phases.numbers()["own_frame_rate"] == pytest.approx(0.1 * 0.01**0.99)
