@@ -1,7 +1,7 @@
 """What mkdocs does to these pages besides Markdown; see `hooks` in mkdocs.yml.
 
-Formulas become MathML (no script, no font), and tables of many columns get narrow ones. Every page
-has the version at its foot. A built page that would fetch anything from the net fails the build.
+Formulas become MathML (no script, no font). Every page has the version at its foot. A built page
+that would fetch anything from the net fails the build.
 """
 
 from __future__ import annotations
@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import Any
 
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.+?)\\[)\]]</\1>', re.S)
-TABLE = re.compile(r"<table>\n<thead>.*?</table>", re.S)
-COLUMNS = 10  # beyond which cells are narrow
 PICTURE = re.compile(r'<img [^>]*\bsrc="([^":]+)"[^>]*>')
 FETCHES = (
     re.compile(r"<(?:script|img|iframe|source|video|embed)\b[^>]*\bsrc=[\"']?(?:https?:)?//", re.I),
@@ -33,14 +31,7 @@ def on_config(config: Any, **_: Any) -> None:
 def on_page_content(html: str, **_: Any) -> str:
     """Turn the formulas into MathML, let a picture open by itself."""
     html = FORMULA.sub(lambda m: mathml(m[2], block=m[1] == "div"), html)
-    html = TABLE.sub(lambda m: narrowed(m[0]), html)
     return PICTURE.sub(r'<a class="picture" href="\1">\g<0></a>', html)
-
-
-def narrowed(table: str) -> str:
-    """A table, marked where it has so many columns that its cells must be narrow."""
-    wide = len(re.findall(r"<th[ >]", table)) > COLUMNS
-    return table.replace("<table>", "<table data-wide>") if wide else table
 
 
 def on_post_build(config: Any, **_: Any) -> None:

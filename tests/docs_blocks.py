@@ -33,9 +33,13 @@ class Block:
 
 def pages() -> list[Path]:
     """The READMEs, CONTRIBUTING and the pages of docs/ that people write (not tables of runs)."""
-    written = [p for p in DOCS.rglob("*.md") if not {"results", "benchmarks"} & set(p.parts)]
-    others = ("README.md", "CONTRIBUTING.md", "examples/hosts/README.md")
-    return [*(ROOT / page for page in others), *sorted(written)]
+    written = [p for p in DOCS.rglob("*.md") if "results" not in p.parts]
+    readmes = [
+        ROOT / "README.md",
+        ROOT / "CONTRIBUTING.md",
+        *(ROOT / "examples").rglob("README.md"),
+    ]
+    return [*readmes, *sorted(written)]
 
 
 def name(page: Path) -> str:
@@ -60,6 +64,14 @@ def unfenced(text: str) -> str:
     """
     text = FENCE.sub(lambda m: "\n" * m[0].count("\n"), text)
     return re.sub(r"`[^`\n]*`", "", text)
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub and mkdocs make them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    headings = re.findall(r"^#{1,6} +(.+?) *$", text, re.M)
+    slugs = (re.sub(r"[^\w\s-]", "", heading.lower()) for heading in headings)
+    return {re.sub(r"[\s]+", "-", slug.strip()) for slug in slugs}
 
 
 def adams(names: dict[str, int]) -> dict[str, torch.optim.Adam]:
@@ -109,6 +121,7 @@ def trainer_names() -> dict[str, Any]:
         "conf": SimpleNamespace(n_iterations=100, strategy=strategy),
         "opt_args": SimpleNamespace(iterations=100),
         "total_steps": 100,
+        "optimizers": dict_of_adams,
         "global_step": 1,
         "PATH": Path(tempfile.mkdtemp()) / "training.pt",
         "device": "cpu",

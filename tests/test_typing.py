@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
 import shutil
 import subprocess
 import sys
@@ -13,7 +15,7 @@ pytestmark = pytest.mark.processes
 
 ROOT = Path(__file__).resolve().parents[1]
 LINES = '''
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -22,24 +24,19 @@ from torch.optim import Adam, Optimizer
 
 from opt3dgs_optim import (
     AWSGLD, DEFAULTS, DEFAULTS_ADC, Annealing, Averaging, Course, Curvature, EnergyHistogram,
-    Fading, FreshMoments, IsotropicNoise, LQNAdam, OwnFrame, Part, Phase, PhaseScheduler,
+    Fading, FreshMoments, IsotropicNoise, LQNAdam, Part, Phase, PhaseScheduler,
     PositionNoise, SquaredLoss, backend_info, two_loop,
 )
 from opt3dgs_optim.step import Step
 
 
 class Trainer:
-    """gsplat's, with the README's three lines."""
+    """gsplat's, with the three lines."""
 
     def __init__(self, optimizers: dict[str, Optimizer], max_steps: int) -> None:
         self.optimizers = optimizers
-        self.phases = PhaseScheduler(total_steps=max_steps)
-        self.optimizers = self.phases.upgrade(self.optimizers)
-
-    def train(self, colors: Tensor, pixels: Tensor) -> Tensor:
-        l1loss: Tensor = self.phases.pixel_loss(colors, pixels)
-        self.phases.observe(l1loss)
-        return l1loss
+        self.phases = PhaseScheduler(max_steps)
+        self.phases.upgrade(self.optimizers)
 
 
 class Gaussians:
@@ -49,8 +46,10 @@ class Gaussians:
 
     def __init__(self, iterations: int) -> None:
         self.optimizer = Adam([{"params": [Parameter(torch.ones(3))], "name": "xyz"}])
-        phases = PhaseScheduler(total_steps=iterations)
+        phases = PhaseScheduler(iterations, parts=DEFAULTS_ADC)
         self.optimizer = phases.upgrade(self.optimizer)
+        phases.observe(iteration=0)
+        phases.finish()
 
 
 adams: dict[str, Adam] = {}
@@ -61,26 +60,22 @@ class SignAgreement(Part):
     during: ClassVar[Phase | None] = Phase.EXPLOITATION
 
     def plan(self, step: Step, course: Course) -> None:
-        step.factor = step.factor * 0.5
+        step.factor *= 2.0
 
     def before(self, step: Step, course: Course) -> Tensor:
         return torch.where(step.grad * step.state["exp_avg"] < 0, 0.0, step.grad)
 
 
-parts: list[Part] = [*DEFAULTS, Averaging(), SignAgreement(), OwnFrame(rate=0.1)]
+parts: list[Part] = [*DEFAULTS, SignAgreement()]
 phases = PhaseScheduler(30_000, 0.9, parts)
-phases = PhaseScheduler(30_000, parts=DEFAULTS_ADC)
-phases.observe(iteration=3)
-phases.observe(torch.ones(()))
-phases.finish()
-numbers: dict[str, float | Tensor] = phases.numbers()
-averaging: Averaging | None = phases.part(Averaging)
-phases = PhaseScheduler(30_000, 29_000, [Annealing(4.0), Fading(seed=3)])
+phases = PhaseScheduler(30_000, 29_000, [Annealing(4.0, names=("means",)), Fading(seed=3)])
 phases = PhaseScheduler(300, parts=[FreshMoments(), SquaredLoss(), Curvature(history_size=3)])
 phases = PhaseScheduler.paper(total_steps=3_000)
 phase: Phase = phases.phase
+loss: Tensor = phases.pixel_loss(torch.ones(3), torch.ones(3))
+phases.observe(loss)
 points = Parameter(torch.ones(4, 3))
-phases = PhaseScheduler(30, parts=[PositionNoise({"scales": points}, scale=5e5)])
+phases = PhaseScheduler(30, parts=[PositionNoise({"scales": points}, scale=5e5), Averaging()])
 a = AWSGLD([points], lr=0.1, histogram=EnergyHistogram(), noise=IsotropicNoise(std=0.1))
 b = LQNAdam([points], lr=0.1, betas=(0.9, 0.99), history_size=5)
 b.step()
@@ -106,14 +101,23 @@ def test_pyright_takes_the_documented_lines_and_refuses_wrong_ones(tmp_path: Pat
     check([pyright, "--pythonpath", sys.executable], tmp_path)
 
 
+def test_mypy_takes_the_documented_lines_and_refuses_wrong_ones(tmp_path: Path) -> None:
+    if importlib.util.find_spec("mypy") is None:
+        pytest.skip("mypy is not installed")
+    options = ["--follow-imports=silent", "--cache-dir", str(tmp_path / "cache")]
+    check([sys.executable, "-m", "mypy", *options], tmp_path)
+
+
 def check(command: list[str], folder: Path) -> None:
     """The lines are fine; with the wrong ones there is an error at each of these."""
     good, bad = folder / "good.py", folder / "bad.py"
     good.write_text(LINES)
     bad.write_text(LINES + "\n".join(WRONG) + "\n")
+    env = {**os.environ, "MYPYPATH": str(ROOT / "src")}
     run = subprocess.run(
         [*command, str(good), str(bad)],
         cwd=folder,
+        env=env,
         capture_output=True,
         text=True,
         check=False,  # it exits with 1: there are errors

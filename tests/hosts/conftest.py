@@ -1,19 +1,23 @@
-"""The scene that the trainers are tried with."""
+"""The scene that the trainers are tried with, and the path of the support for the CPU."""
 
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
-from hosts.trials import copy_scene
 
-BESIDE = Path(__file__).resolve().parents[3] / "shared" / "scenes" / "banana"
+HERE = Path(__file__).resolve().parent
+BESIDE = HERE.parents[1].parent / "shared" / "scenes" / "banana"
+sys.path.insert(0, str(HERE / "support"))
 
 
 @pytest.fixture(scope="session")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small copy of the scene of OPT3DGS_SCENE; its folder's name is the original's."""
+    from trials import copy_scene
+
     source = Path(os.environ.get("OPT3DGS_SCENE", BESIDE))
     if not (source / "images_4").is_dir():
         pytest.skip(f"no scene at {source}: set OPT3DGS_SCENE")

@@ -1,11 +1,12 @@
 """The plugin of gaussian-splatting-lightning, with stand-ins for the trainer's two plugin classes.
 
 What the trainer does around it is read from its sources, ee022aa: two Adams in a list, hooks after
-each backward, a strategy that accumulates gradients and asks for the module of an optimizer.
+each backward, and Lightning loads the optimizers' states after that.
 """
 
 from __future__ import annotations
 
+import copy
 import importlib
 import sys
 import types
@@ -14,12 +15,10 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from opt3dgs_optim import DEFAULTS
-from opt3dgs_optim.presets import paper_parts
+from opt3dgs_optim import DEFAULTS, DEFAULTS_ADC
 
 TOTAL = 60
 NAMES = (("means",), ("shs_dc", "shs_rest", "scales", "rotations", "opacities"))
@@ -45,19 +44,15 @@ def lightning(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     sys.modules.pop("opt3dgs_optim.hosts.lightning", None)
 
 
-class StrangeAdam(Adam):
-    """An Adam of the trainer's own."""
-
-
 def trainer(
+    density: str = "VanillaDensityControllerImpl",
     strategy: str = "VanillaOptStrategy",
     total: int = TOTAL,
-    kind: type[Adam] = Adam,
 ) -> Any:
     """What the plugin sees of the trainer's `GaussianSplatting`."""
     torch.manual_seed(0)
     optimizers = [
-        kind(
+        Adam(
             [
                 {"params": [Parameter(torch.ones(6, WIDTHS[n]))], "lr": 1e-2, "name": n}
                 for n in names
@@ -70,11 +65,9 @@ def trainer(
     return types.SimpleNamespace(
         trainer=types.SimpleNamespace(max_steps=total),
         gaussian_optimizers=optimizers,
+        density_controller=type(density, (), {})(),
         hparams={"opt_strategy": type(strategy, (), {})()},
-        extra_train_metrics=[],
         on_after_backward_hooks=[],
-        metric=types.SimpleNamespace(rgb_diff_loss_fn=lambda a, b: (a - b).abs().mean()),
-        training=True,
     )
 
 
@@ -84,87 +77,70 @@ def set_up(lightning: Any, host: Any, **options: Any) -> Any:
     return module
 
 
-def backward(host: Any, step: int) -> Tensor:
-    """An iteration of the trainer up to the hooks after backward; it counts from 1."""
-    params = [g["params"][0] for o in host.gaussian_optimizers for g in o.param_groups]
-    metrics = {"loss": torch.stack([(p * p).mean() for p in params]).sum()}
-    for hook in host.extra_train_metrics:
-        hook(None, None, None, step, host, metrics, {})
-    metrics["loss"].backward()
-    for hook in host.on_after_backward_hooks:
-        hook(None, None, None, step, host)
-    return metrics["loss"]
-
-
-def test_the_defaults_notice_that_gaussians_are_removed(lightning: Any) -> None:
-    """Whatever the trainer calls its density control."""
-    host = trainer()
-    module = set_up(lightning, host)
-    assert list(module.phases.parts) == list(DEFAULTS)
-    backward(host, 1)
-    assert module.phases.switched_off == {}
-    for optimizer in host.gaussian_optimizers:
-        for group in optimizer.param_groups:
-            group["params"][0] = torch.nn.Parameter(group["params"][0].detach()[1:])
-    backward(host, 2)
-    assert set(module.phases.switched_off) == {"Fading"}
-
-
-def test_the_papers_parts(lightning: Any) -> None:
-    host = trainer()
-    module = set_up(lightning, host, paper=True, switch=0.5)
-    assert [repr(p) for p in module.phases.parts] == [repr(p) for p in paper_parts(TOTAL)]
-    render, photo = torch.full((2, 3), 0.5), torch.zeros(2, 3)
-    assert float(host.metric.rgb_diff_loss_fn(render, photo)) == pytest.approx(0.5)
-    for step in range(1, TOTAL // 2 + 1):
-        backward(host, step)
+def run(host: Any, first: int, last: int) -> None:
+    """Iterations of the trainer, which counts them from 1: hooks after backward, then steps."""
+    for step in range(first, last + 1):
+        torch.manual_seed(step)
+        for optimizer in host.gaussian_optimizers:
+            for group in optimizer.param_groups:
+                param = group["params"][0]
+                param.grad = torch.randn_like(param)
+        for hook in host.on_after_backward_hooks:
+            hook({}, None, None, step, host)
         for optimizer in host.gaussian_optimizers:
             optimizer.step()
-            optimizer.zero_grad()
-    assert float(host.metric.rgb_diff_loss_fn(render, photo)) == pytest.approx(0.25)  # squared
-    host.training = False  # validation goes on as it was
-    assert float(host.metric.rgb_diff_loss_fn(render, photo)) == pytest.approx(0.5)
 
 
-def test_the_clock_is_the_trainers(lightning: Any) -> None:
-    host = trainer()
-    module = set_up(lightning, host)
-    for step in range(1, 6):
-        backward(host, step)
-        assert module.phases.current == step - 1
-    backward(host, 31)  # resumed
-    assert module.phases.current == 30
-    assert module.phases.total_steps == TOTAL
-    assert set_up(lightning, trainer(), total_steps=7).phases.total_steps == 7
+def values(host: Any) -> list[torch.Tensor]:
+    return [g["params"][0].detach() for o in host.gaussian_optimizers for g in o.param_groups]
 
 
-def test_accumulated_gradients(lightning: Any) -> None:
-    """`GradAccOptStrategy` steps torch's Adams every few iterations: they count as torch's."""
-    host = trainer(strategy="GradAccOptStrategy")
-    module = set_up(lightning, host)
-    assert all(o.__module__.startswith("torch.optim.") for o in host.gaussian_optimizers)
-    means = host.gaussian_optimizers[0].param_groups[0]["params"][0]
-    seen = []
-    for step in range(1, 11):
-        before = means.detach().clone()
-        backward(host, step)
-        if step % 5 == 0:
-            for optimizer in host.gaussian_optimizers:
-                optimizer.step()
-                optimizer.zero_grad()
-        assert module.phases.current == step - 1
-        seen.append(not torch.equal(means, before))
-    assert seen == [step % 5 == 0 for step in range(1, 11)]
-    assert float(host.gaussian_optimizers[0].state[means]["step"]) == 2
+@pytest.mark.parametrize("density", ["VanillaDensityControllerImpl", "MCMCDensityControllerImpl"])
+def test_a_run_and_its_resume(lightning: Any, density: str) -> None:
+    whole, half, again = (trainer(density) for _ in range(3))
+    phases = set_up(lightning, whole).phases
+    assert phases.parts == tuple(DEFAULTS if density.startswith("MCMC") else DEFAULTS_ADC)
+    run(whole, 1, TOTAL)
+    assert phases.iteration == TOTAL - 1
+    assert phases.end_line() is None  # it has ended, with the mean
+    set_up(lightning, half)
+    run(half, 1, 25)
+    resumed = set_up(lightning, again)
+    for mine, saved in zip(again.gaussian_optimizers, half.gaussian_optimizers, strict=True):
+        for to, of in zip(mine.param_groups, saved.param_groups, strict=True):
+            to["params"][0].data.copy_(of["params"][0])
+        mine.load_state_dict(copy.deepcopy(saved.state_dict()))
+    assert resumed.phases.iteration == 24
+    run(again, 26, TOTAL)
+    for one, other in zip(values(whole), values(again), strict=True):
+        assert torch.equal(one, other)
 
 
-def test_an_optimizer_that_would_not_be_accumulated_is_refused(lightning: Any) -> None:
-    with pytest.raises(ValueError, match="GradAccOptStrategy would not accumulate gradients"):
-        set_up(lightning, trainer(strategy="GradAccOptStrategy", kind=StrangeAdam))
-    set_up(lightning, trainer(kind=StrangeAdam))
+def test_a_checkpoint_of_the_unchanged_trainer(lightning: Any) -> None:
+    """Its Adam has made fewer steps than iterations: the trainer's count says the place."""
+    stock, mine = trainer(), trainer()
+    run(stock, 1, 20)
+    module = set_up(lightning, mine)
+    for to, of in zip(mine.gaussian_optimizers, stock.gaussian_optimizers, strict=True):
+        to.load_state_dict(copy.deepcopy(of.state_dict()))
+    run(mine, 31, 31)
+    assert module.phases.iteration == 30
 
 
-@pytest.mark.parametrize("total", [-1, 0])
-def test_a_number_of_iterations_is_needed(lightning: Any, total: int) -> None:
+@pytest.mark.parametrize("total", [-1, 0, None])
+def test_a_number_of_iterations_is_needed(lightning: Any, total: Any) -> None:
     with pytest.raises(ValueError, match="the number of iterations is needed"):
         set_up(lightning, trainer(total=total))
+    assert set_up(lightning, trainer(total=total), total_steps=50).phases.total_steps == 50
+
+
+def test_accumulated_gradients_are_refused(lightning: Any) -> None:
+    with pytest.raises(ValueError, match="GradAccOptStrategy would not accumulate gradients"):
+        set_up(lightning, trainer(strategy="GradAccOptStrategy"))
+
+
+def test_without_the_trainer_the_import_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "opt3dgs_optim.hosts.lightning", raising=False)
+    monkeypatch.setitem(sys.modules, "internal", None)
+    with pytest.raises(ImportError, match=r"run its main\.py"):
+        importlib.import_module("opt3dgs_optim.hosts.lightning")

@@ -1,101 +1,122 @@
-"""The real scripts of real trainers, stock and edited, on a CPU through `on_cpu.py`.
+"""The real scripts of real trainers, stock and with the lines, on a CPU.
 
-`python -m pytest -m hosts tests/hosts` with OPT3DGS_TRAINERS: a folder with one subfolder for each
-trainer (names in `examples/hosts/trials.py`), and OPT3DGS_SCENE: a scene in COLMAP's layout, with
-photos in `images` and `images_4`. Some sixty trainings, each 20 to 40 seconds of a core to itself.
-With OPT3DGS_RECORD what came of them goes into docs/hosts/survey.json (use `-n 1` then).
-nerfstudio reads images with a Pillow below 13 (11.3 works). gaussian-splatting-lightning and
-CityGaussian need `"lightning<2.4" "jsonargparse[signatures]<4.30" "setuptools<80"`.
+`python -m pytest -m hosts tests/hosts` with OPT3DGS_TRAINERS: a folder with the sources of each
+trainer (examples/hosts/README.md names them), and OPT3DGS_SCENE: a scene in COLMAP's layout with
+photos in `images` and `images_4`. Some forty trainings of half a minute on a core.
 """
 
 from __future__ import annotations
 
-import json
-import os
+import math
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from hosts.survey import keep, scripts_of
-from hosts.trials import ITERATIONS, TRIALS, Trial, edited_copy, run, try_out
-from real_trainers import OURS, TRAINERS, need, no_worse
+from plyfile import PlyData
+from trials import HALF, LENGTH, TRAINERS, TRIALS, Done, Trial, missing
 
 from opt3dgs_optim.hosts import diff
+from opt3dgs_optim.hosts.trainers import TRAINERS as TABLE
 
-GAUSSIANS = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
-# dB that one which takes a stock run over at half may be worse: opacities that annealing slows do
-# not recover from a reset.
-TAKEN_OVER = 2.5
+PLACES = {  # the folder of each trainer's sources; the others' is their name
+    "gsplat": "gsplat-main", "gsplat-2dgs": "gsplat-main", "inria": "gaussian-splatting",
+    "2dgs": "2d-gaussian-splatting", "mini-splatting-d": "mini-splatting",
+    "grendel-gs": "Grendel-GS", "fvdb": "fvdb-0.6.0", "citygaussian": "CityGaussian",
+}  # fmt: skip
+OLDER = [("gsplat", "gsplat-1.5.3"), ("gsplat", "gsplat-1.4.0"), ("gsplat-2dgs", "gsplat-1.5.3"),
+         ("gsplat-2dgs", "gsplat-1.4.0"), ("inria", "gaussian-splatting-2024-04")]  # fmt: skip
+EACH = [(name, PLACES.get(name, name)) for name, each in TABLE.items() if each.inserted]
+
+PATCHES = Path(__file__).resolve().parents[2] / "examples" / "hosts"
 
 pytestmark = pytest.mark.hosts
 
 
-@pytest.mark.parametrize("trial", [pytest.param(trial, id=trial.name) for trial in TRIALS])
-def test_stock_edited_and_resumed(trial: Trial, scene: Path, tmp_path: Path) -> None:
-    """Both evaluate and save; the edited one says that it is active, is no worse, and goes on."""
-    need(trial)
-    got = try_out(trial, TRAINERS, scene, tmp_path)
-    if "OPT3DGS_RECORD" in os.environ:
-        keep(trial, TRAINERS, scene.name, got)
-    if trial.stock_fails is not None:
-        assert got.stock.code != 0
-        assert trial.stock_fails in got.stock.output
-        return
-    assert got.stock.code == 0, got.stock.output[-3000:]
-    if trial.refused is not None:
-        assert got.ours.code != 0
-        assert trial.refused in got.ours.reason
-        return
-    assert got.ours.code == 0, got.ours.output[-3000:]
-    assert f"total_steps={ITERATIONS}," in got.ours.output  # the sign of life
-    assert got.checkpoint is not None
-    no_worse(got.ours, got.stock, OURS)
+@pytest.mark.parametrize(("name", "folder"), [*EACH, *OLDER])
+def test_the_real_file_gets_its_lines(name: str, folder: str, tmp_path: Path) -> None:
+    """And no linter finds a name in it that is not defined."""
+    path = TRAINERS / folder / TABLE[name].file
+    if not path.is_file():
+        pytest.skip(f"no {path}: put its sources there, set OPT3DGS_TRAINERS")
+    found, new = diff.edited(path.read_bytes().decode())
+    assert found is TABLE[name]
+    if folder == PLACES.get(name, name):  # the commit of the patch
+        copy = tmp_path / TABLE[name].file
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_bytes(path.read_bytes())
+        patch = PATCHES / f"{name}.patch"
+        subprocess.run(["git", "apply", "--unidiff-zero", str(patch)], cwd=tmp_path, check=True)
+        assert copy.read_bytes().decode() == new
+    (tmp_path / "new.py").write_text(new, encoding="utf-8")
+    command = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F821"]
+    said = subprocess.run([*command, str(tmp_path)], capture_output=True, text=True, check=False)
+    assert not [word for word in ("phases", "DEFAULTS_ADC", "Scheduler") if word in said.stdout]
+
+
+@pytest.mark.parametrize("trial", TRIALS, ids=lambda trial: trial.name)
+def test_trains_saves_the_mean_and_resumes(trial: Trial, scene: Path, tmp_path: Path) -> None:
+    """Both evaluate; the lines' run ends at the mean, and goes on from its own checkpoint."""
+    if (why := missing(trial)) is not None:
+        pytest.skip(why)
+    stock = trial.train(scene, tmp_path, "stock", ours=False)
+    ours = trial.train(scene, tmp_path, "ours", ours=True)
+    for done in (stock, ours):
+        assert done.code == 0, done.output[-3000:]
+    steps = LENGTH if trial.gsplat else LENGTH - 1
+    assert f"opt3dgs_optim: {steps} iterations" in ours.output
+    assert "no mean" not in ours.output  # said of a training that ends before its end
+    if ours.psnr is not None:  # mini-splatting prints none
+        assert stock.psnr is not None
+        assert math.isfinite(ours.psnr)
+        assert ours.psnr > stock.psnr - trial.worse
+    ends_at_the_mean(trial, ours)
     if trial.gsplat:
         return
-    again = (got.own, got.ours, OURS), (got.theirs, got.stock, TAKEN_OVER)
-    for done, begun, allowed in again:
-        assert done is not None
-        assert done.code == 0, done.output[-3000:]
-        no_worse(done, begun, allowed)
-    if trial.trainer == "nerfstudio":  # whose own optimizers never step again after a resume
-        for out in ("own", "theirs"):
-            (last,) = (tmp_path / out).glob(f"run/*/one/*/step-{ITERATIONS - 1:09d}.ckpt")
-            saved = torch.load(last, weights_only=False)["optimizers"]
-            steps = {float(saved[name]["state"][0]["step"]) for name in GAUSSIANS}
-            assert steps == {ITERATIONS}
+    resumed = trial.train(
+        *(scene, tmp_path, "resumed", "--start_checkpoint", str(ours.out / f"chkpnt{HALF}.pth")),
+        ours=True,
+    )
+    assert resumed.code == 0, resumed.output[-3000:]
+    assert resumed.saved().read_bytes() == ours.saved().read_bytes()
 
 
-def test_edited_scripts_use_no_unknown_name(tmp_path: Path) -> None:
-    """ruff, which knows nothing of ours, finds no undefined name that the stock script had not."""
-    if not TRAINERS.is_dir():
-        pytest.skip("no trainers: set OPT3DGS_TRAINERS")
-    found: list[Path] = []
-    for folder in sorted(path for path in TRAINERS.iterdir() if path.is_dir()):
-        for path in scripts_of(folder):
-            try:
-                new = diff(path).new
-            except ValueError:
-                continue
-            found.append(path)
-            (tmp_path / f"{len(found)}_old.py").write_bytes(path.read_bytes())
-            (tmp_path / f"{len(found)}_new.py").write_bytes(new)
-    assert found
-    command = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F82"]
-    command += ["--output-format", "json", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    said = [(Path(e["filename"]).stem, e["message"]) for e in json.loads(done.stdout)]
-    old = sorted((name[:-4], message) for name, message in said if name.endswith("_old"))
-    new_ones = sorted((name[:-4], message) for name, message in said if name.endswith("_new"))
-    assert old == new_ones
+def test_ends_early_with_finish(scene: Path, tmp_path: Path) -> None:
+    """The mean of two iterates is saved where `finish()` is called; no line at exit."""
+    trial = next(each for each in TRIALS if each.trainer == "3dgs-mcmc")
+    if (why := missing(trial)) is not None:
+        pytest.skip(why)
+    end = LENGTH - 1  # the iteration before the last, which the trainer counts from 1
+    done = trial.train(scene, tmp_path, "early", ours=True, end=end)
+    assert done.code == 0, done.output[-3000:]
+    assert "no mean" not in done.output
+    is_the_mean(done, done.out / f"point_cloud/iteration_{end}/point_cloud.ply")
 
 
-def test_a_sign_of_life(scene: Path, tmp_path: Path) -> None:
-    trial = next(t for t in TRIALS if t.trainer == "3dgs-mcmc")
-    need(trial)
-    script = edited_copy(trial, TRAINERS, tmp_path / "edited")
-    command = trial.command(scene, tmp_path / "out", 10, ours=True)
-    done = run(script, command, tmp_path / "cwd")
-    lines = [line.lower() for line in done.output.splitlines() if "opt3dgs" in line.lower()]
-    assert any("fading" in line and "10" in line for line in lines)
+def ends_at_the_mean(trial: Trial, done: Done) -> None:
+    """The parameters are the mean at the end, and what is saved is a mean, too."""
+    if not trial.gsplat:
+        is_the_mean(done, done.saved())
+        return
+    ends = torch.load(done.out / "end.pt")
+    saved: Any = torch.load(done.saved(), weights_only=False)["splats"]
+    for name, (param, mean) in ends.items():
+        if name == "means" and "mcmc" in trial.options:
+            continue  # its noise comes after the last step
+        assert torch.equal(param, mean), name
+        assert saved[name].shape == mean.shape  # gsplat saves before its last step
+
+
+def is_the_mean(done: Done, path: Path) -> None:
+    """INRIA's .ply has the means."""
+    ends, vertices = torch.load(done.out / "end.pt"), PlyData.read(str(path))["vertex"]
+    names = {"means": "x y z", "opacities": "opacity", "quats": "rot_0 rot_1 rot_2 rot_3"}
+    for name, columns in names.items():
+        saved = np.stack([vertices[column] for column in columns.split()], 1)
+        assert ends[name][1] is not None, name
+        if name == "means" and "mcmc" in str(path) and "early" not in str(path):
+            continue  # its noise comes after the step
+        assert np.array_equal(saved, ends[name][1].numpy().reshape(saved.shape)), name

@@ -1,0 +1,151 @@
+"""The lines put into a trainer's file: `opt3dgs hosts diff FILE [--write]`.
+
+The file is known by whole lines that it must have exactly so often as `trainers` says. Lines are
+inserted and nothing else changes, which the syntax tree of the new file confirms. Any other file is
+refused, with the lines to write by hand.
+"""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import re
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from opt3dgs_optim.hosts.lines import block
+from opt3dgs_optim.hosts.places import Trainer
+from opt3dgs_optim.hosts.trainers import ANY, TRAINERS
+
+USAGE = """opt3dgs hosts diff FILE           the lines that FILE would get, as a diff
+opt3dgs hosts diff FILE --write   writes them, and keeps the old file as FILE.orig
+
+It knows the files of: {known}.
+For every other trainer, `opt3dgs lines` prints the lines to write by hand."""
+OURS = re.compile(r"\b(opt3dgs_optim|PhaseScheduler|DEFAULTS_ADC|phases)\b")
+
+
+def misses(trainer: Trainer, text: str) -> list[str]:
+    """What the file of a trainer has and this text has not; empty where it is that file."""
+    code = [line for line in text.split("\n") if not line.lstrip().startswith("#")]
+    found = []
+    for place in trainer.places:
+        if (times := len(_starts(place.anchor, text))) != place.times:
+            found.append(f"`{place.anchor.strip()}` stands {times} times, not {place.times}")
+    for sign in trainer.signs:
+        forms = (sign,) if isinstance(sign, str) else sign
+        if sum(len(_starts(form, text)) for form in forms) != 1:
+            found.append(f"`{' '.join(forms[0].split())}` is not there exactly once")
+    for said, number in trainer.counts.items():
+        times = sum(said in line for line in code)
+        if times not in (number if isinstance(number, tuple) else (number,)):
+            found.append(f"{times} lines have `{said}`, not {number}")
+    return found
+
+
+def edited(text: str) -> tuple[Trainer, str]:
+    """The trainer whose file this is, and the file with its lines.
+
+    Raises:
+        ValueError: the file is not known, or has been edited; the message has what to do by hand.
+    """
+    plain = "\n".join(line.rstrip() for line in text.split("\n"))
+    if word := OURS.search(plain):
+        line = plain.count("\n", 0, word.start()) + 1
+        raise ValueError(f"line {line} has `{word[0]}` already, so that nothing is inserted")
+    fit = [each for each in TRAINERS.values() if each.inserted and not misses(each, plain)]
+    if len(fit) != 1:
+        raise ValueError(_by_hand(plain))
+    trainer, lines = fit[0], text.split("\n")
+    inserted: dict[int, list[str]] = {}  # above the line of that number, from 0
+    for place in trainer.places:
+        indent = place.anchor[: len(place.anchor) - len(place.anchor.lstrip())]
+        for at in _starts(place.anchor, plain):
+            end = "\r" if lines[at].endswith("\r") else ""
+            new = [f"{indent}{line}{end}" for line in trainer.lines_at(place)]
+            inserted[at if place.above else at + 1] = new
+    whole: list[str] = []
+    ours: set[int] = set()  # numbers of our lines, from 1
+    for at, line in enumerate([*lines, ""]):
+        ours.update(range(len(whole) + 1, len(whole) + 1 + len(inserted.get(at, ()))))
+        whole += [*inserted.get(at, ()), line]
+    new_text = "\n".join(whole[:-1])
+    if not _only_inserted(text, new_text, ours):
+        raise ValueError(f"the lines would not be statements of their own\n\n{_by_hand(plain)}")
+    return trainer, new_text
+
+
+def _starts(lines: str, text: str) -> list[int]:
+    """The numbers, from 0, of the lines of a text at which these whole lines begin."""
+    found = re.finditer(rf"^{re.escape(lines)}$", text, re.M)
+    return [text.count("\n", 0, match.start()) for match in found]
+
+
+def _only_inserted(old: str, new: str, ours: set[int]) -> bool:
+    """Whether both are Python, and the new one is the old one with statements at our lines."""
+
+    class WithoutOurs(ast.NodeTransformer):
+        def visit(self, node: ast.AST) -> ast.AST | None:
+            return None if getattr(node, "lineno", 0) in ours else self.generic_visit(node)
+
+    try:
+        trees = [ast.parse(text.encode()) for text in (old, new)]
+    except (SyntaxError, ValueError):
+        return False
+    return ast.dump(trees[0]) == ast.dump(WithoutOurs().visit(trees[1]))
+
+
+def _by_hand(text: str) -> str:
+    """Why the file is not known, and the lines for the trainer that it is most like."""
+
+    def alike(trainer: Trainer) -> tuple[int, int]:
+        found = sum(bool(_starts(place.anchor, text)) for place in trainer.places[1:])
+        return found, -len(misses(trainer, text))
+
+    best = max(TRAINERS.values(), key=alike)
+    if not alike(best)[0]:
+        return f"it is no trainer that is known; the lines to write by hand:\n\n{ANY}"
+    numbers = [
+        f"line {at + 1}: `{place.anchor.strip()}`"
+        for place in best.places
+        for at in _starts(place.anchor, text)
+    ]
+    differs = misses(best, text) if best.inserted else ["a line of it must be replaced"]
+    return (
+        f"it is like {best.title}, but {'; '.join(differs[:3])}. Read the file, then write by hand "
+        f"what holds of these lines ({', '.join(numbers)}):\n\n{block(best)}"
+    )
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Print the diff or write it: 0; 1 where the file is refused, 2 for a wrong command."""
+    words = [word for word in arguments if word != "--write"]
+    if not words or words[0] in ("-h", "--help") or words == ["diff"]:
+        files = (f"{each.title} ({each.file})" for each in TRAINERS.values() if each.inserted)
+        print(USAGE.format(known=", ".join(files)))
+        return 0
+    if words[0] != "diff" or len(words) > 2 or words[1].startswith("-"):
+        print(
+            f"opt3dgs hosts: no command {' '.join(words)!r}; diff FILE [--write]", file=sys.stderr
+        )
+        return 2
+    path = Path(words[1])
+    kept = path.with_name(f"{path.name}.orig")
+    try:
+        old = path.read_bytes().decode()
+        trainer, new = edited(old)
+        if "--write" in arguments:
+            if kept.exists():
+                raise ValueError(f"{kept} is there already; move it away")
+            shutil.copy2(path, kept)
+            path.write_bytes(new.encode())
+    except (OSError, ValueError) as error:
+        print(f"opt3dgs hosts diff {path}: {error}", file=sys.stderr)
+        return 1
+    pair = (old.replace("\r", "").split("\n"), new.replace("\r", "").split("\n"))
+    print("\n".join(difflib.unified_diff(*pair, str(path), str(path), lineterm="")))
+    done = f"written; {kept} is the old file" if "--write" in arguments else "not written: --write"
+    print(f"\n{trainer.title}; {done}", file=sys.stderr)
+    return 0
