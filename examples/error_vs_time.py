@@ -25,8 +25,7 @@ from splatting.arms import ARMS, BASELINE, find_arm
 from splatting.fit import Fit, FitOptions
 from splatting.gallery import draw_comparison
 from splatting.scenes import Background, Size, load_scene
-from splatting.stopping import command
-from splatting.writable import check_folder
+from splatting.stopping import check_folder, command
 from tqdm import tqdm
 
 from opt3dgs_optim.runs import Run, RunLog, read_run

@@ -29,8 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import torch
 from benchmarks import steps
-from splatting.stopping import command
-from splatting.writable import check_folder
+from splatting.stopping import check_folder, command
 from tqdm import tqdm
 
 from opt3dgs_optim.doctor import versions

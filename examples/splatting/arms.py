@@ -21,7 +21,6 @@ from opt3dgs_optim import (
 )
 
 BASELINE = "mcmc"
-DEFAULT_ARM = "defaults"
 OTHERS = ("scales", "quats", "opacities", "sh0", "shN")  # than the positions
 
 
@@ -68,7 +67,7 @@ def own(frame: OwnFrame | None = None) -> Callable[[int], Sequence[Part]]:
 
 _ARMS = (
     Arm(BASELINE, "3DGS-MCMC as its authors publish it: the baseline"),
-    Arm(DEFAULT_ARM, "the package's defaults", of(*DEFAULTS)),
+    Arm("defaults", "the package's defaults", of(*DEFAULTS)),
     Arm(
         "own", "own frame, the others faded, a hold, averaged: the defaults since 2026-11-27", own()
     ),

@@ -1,10 +1,12 @@
-"""How a command ends: one line for what is wrong, 130 after Ctrl-C."""
+"""How a command begins and ends: a folder that can be written, one line for what is wrong."""
 
 from __future__ import annotations
 
 import functools
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 Main = Callable[[Sequence[str] | None], int]
 
@@ -27,3 +29,10 @@ def command(name: str) -> Callable[[Main], Callable[..., int]]:
         return ended
 
     return decorated
+
+
+def check_folder(folder: Path) -> None:
+    """Make the folder; OSError, with the path, where it cannot be written to."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=folder):
+        pass
