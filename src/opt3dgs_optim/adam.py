@@ -447,7 +447,9 @@ class StepAdam(Adam):
         course, saved = self.course, self.param_groups[0].pop(STATE_KEY, None)
         steps = [int(state["step"]) for state in self.state.values() if "step" in state]
         if saved is None:
-            iteration, self.in_own_frame, self._last = max(steps, default=0), False, ()
+            # One that is made anew under way steps first in the next iteration.
+            iteration = max(steps) if steps else course.iteration + 1
+            self.in_own_frame, self._last = False, ()
         else:
             iteration, self.in_own_frame = saved["iteration"], saved["own_frame"]
             self._last = tuple(saved["last"])

@@ -109,7 +109,6 @@ def test_a_checkpoint_of_the_unchanged_trainer() -> None:
     assert phases.end_line() is None
 
 
-@pytest.mark.xfail(strict=True, reason="a fresh Adam repeats the iteration before: the core's")
 def test_an_optimizer_made_anew_under_way() -> None:
     """mini-splatting: `training_setup` in the loop, and the line with `upgrade` below it."""
     model = made_model(splats())

@@ -201,7 +201,8 @@ class EnergyHistogram(Part):
         Raises:
             ValueError: it is damaged, or of other partitions; nothing is changed then.
         """
-        learnt, needed = state.get("learnt"), 5 + len(self._partitions.state)
+        learnt: Any = state.get("learnt")
+        needed = 5 + len(self._partitions.state)
         fits = (
             state.get("energy_range") == self.energy_range
             and isinstance(learnt, list)
