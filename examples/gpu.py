@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import os
 import re
 import shutil
@@ -128,6 +129,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if args.gsplat is not None and not (args.gsplat.is_file() and args.scene is not None):
         raise ValueError(f"--gsplat {args.gsplat}: simple_trainer.py, and --scene DIR, are needed")
     check_folder(args.out)
+    logging.getLogger("opt3dgs_optim").setLevel(logging.ERROR)  # nothing is trained to its end
     device, out = torch.device(args.device), args.out.resolve()
     torch.set_num_threads(1)
     about = {"machine": steps.machine(device), "date": time.strftime("%Y-%m-%d", time.gmtime())}

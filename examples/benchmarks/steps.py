@@ -222,7 +222,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     device = torch.device(args.device)
     torch.set_num_threads(1)
-    logging.getLogger("opt3dgs_optim").setLevel(logging.ERROR)  # not that nothing is trained here
+    logging.getLogger("opt3dgs_optim").setLevel(logging.ERROR)  # nothing is trained to its end
     results: dict[int, dict[str, Row]] = {}
     for points in tqdm(args.points or POINTS[device.type], unit="size"):
         rounds = args.rounds if points <= 100_000 else max(args.rounds // 5, 5)
