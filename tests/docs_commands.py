@@ -101,6 +101,8 @@ def check_command(words: list[str]) -> None:
     elif program == "ns-train":  # nerfstudio's, with our methods
         methods = PROJECT["entry-points"]["nerfstudio.method_configs"]
         assert rest[0] in methods, words
+    elif program == "git":  # in a trainer's repository
+        return
     elif program in ("ruff", "pyright", "mkdocs"):
         extras = PROJECT["optional-dependencies"]
         assert any(r.startswith(program) for r in extras["test"] + extras["dev"]), words
