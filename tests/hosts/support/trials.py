@@ -105,7 +105,7 @@ TRIALS = (
     Trial("3dgs-mcmc", "--cap_max 2500 --init_type sfm"),
     Trial("2d-gaussian-splatting"),
     Trial("taming-3dgs", _TAMING),
-    Trial("mini-splatting", "--simp_iteration1 20 --densify_until_iter 20 --simp_iteration2 30 "
+    Trial("mini-splatting", "--simp_iteration1 28 --densify_until_iter 28 --simp_iteration2 32 "
           "--imp_metric indoor", script="ms/train.py"),
 )  # fmt: skip
 GSPLAT_NEEDS = "torchmetrics tyro cv2 sklearn yaml imageio"

@@ -358,8 +358,6 @@ def at_the_mean(host: Host, phases: PhaseScheduler) -> bool:
 def try_out(make: Callable[..., Host]) -> dict[str, Any]:
     """What holds of a trainer."""
     stock, (plain, _), (whole, phases) = make(), begun(make, parts=[]), begun(make)
-    for group in stock.optimizer().param_groups:
-        group["fused"] = False  # an upgraded one is not, and torch's differ in the last bit
     half, early = begun(make)[0], begun(make)
     for each in (stock, plain, whole):
         train(each, 0, ITERATIONS)
