@@ -1,27 +1,24 @@
 """Everything that only a GPU can show, in one command: python examples/gpu.py
 
-On a machine with an NVIDIA GPU, torch for it and `pip install -e ".[cuda,test]"`, in under ten
-minutes:
+On a machine with an NVIDIA GPU, torch for it and `pip install -e ".[cuda,test]"`, in ten minutes:
 
 1. `opt3dgs doctor`, and the tests marked `cuda`;
-2. what a step of the defaults, of the paper's phases, of masked steps and of `two_loop` costs
-   beside six fused torch Adams: time, launches, waits for the device, memory, bandwidth;
-3. with `--gsplat PATH/examples/simple_trainer.py`, gsplat's own `mcmc` training, stock and with the
-   lines of `opt3dgs hosts diff`, on `--scene DIR` or on the embedded scene.
+2. what a step costs beside six fused torch Adams: time, launches, waits for the device, memory;
+3. with `--gsplat PATH/examples/simple_trainer.py` and `--scene DIR`, gsplat's own `mcmc` training,
+   stock and with the lines of `opt3dgs hosts diff`.
 
-Writes `report.md`, `report.json` and `step.png` to `--out`. Without a GPU, or with `--device cpu`,
-all of it runs on the CPU at smaller sizes, and the report says what that leaves out.
+Writes `report.md` and `report.json` to `--out`. With `--device cpu` the first two run on a CPU, at
+smaller sizes, which says nothing about a GPU.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
-import logging
-import platform
+import os
 import re
-import shlex
+import shutil
+import subprocess
 import sys
 import time
 from collections.abc import Sequence
@@ -31,173 +28,127 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import torch
-from splatting.stopping import command
-from splatting.writable import check_folder
-from studies.bench.bench_step import cpu_name
-from studies.bench.gpu_training import KINDS, run, train_both
-from studies.bench.steps import COMPARED, counts_table, draw, measure_all, times_table
-from studies.bench.subjects import BASELINES
-from studies.pages import table
+from benchmarks import steps
+from splatting.stopping import check_folder, command
 from tqdm import tqdm
 
 from opt3dgs_optim.doctor import versions
 
 ROOT = Path(__file__).resolve().parents[1]
 POINTS = {"cuda": (10_000, 100_000, 1_000_000, 5_000_000), "cpu": (1_000, 10_000)}
-REPEATS = {"cuda": 30, "cpu": 5}
-ITERATIONS = {"cuda": 3_000, "cpu": 30}
-GAUSSIANS = {"cuda": 30_000, "cpu": 1_000}
-STEPPED = tuple(name for name in COMPARED if name not in BASELINES)  # on a GPU all are fused
-CPU_NOTE = (
-    "This is a CPU: no kernel was launched, nothing waited for a device, and the figures say "
-    "nothing about a GPU. In the place of launches stand torch's operators, in that of waits the "
-    "values that Python reads (a fused Adam on a GPU reads none)."
-)
+PACKAGE = ("-m", "opt3dgs_optim")
+TESTS = ("-m", "pytest", "-o", "addopts=--import-mode=importlib", "-m", "cuda", "-q", "-rs")
 
 
-def check(device: torch.device) -> dict[str, Any]:
-    """The doctor's and the tests' outcome."""
-    code = "from opt3dgs_optim.doctor import main; raise SystemExit(main())"
-    doctor, _ = run(["-c", code, "--device", str(device)], ROOT)
-    made: dict[str, Any] = {"doctor": {"code": doctor.returncode, "output": doctor.stdout}}
-    if importlib.util.find_spec("pytest") is None:
-        made["tests"] = {"skipped": "pytest is not installed: pip install -e '.[test]'"}
-        return made
-    options = ["-m", "cuda", "-q", "-rs", "-p", "no:cacheprovider"]
-    done, seconds = run(["-m", "pytest", "-o", "addopts=--import-mode=importlib", *options], ROOT)
-    lines = [line for line in done.stdout.splitlines() if line.strip()]
-    counts = {
-        kind: int(found[1]) if (found := re.search(rf"(\d+) {kind}", lines[-1])) else 0
-        for kind in ("passed", "failed", "skipped", "error")
-    }
-    reasons = sorted({re.sub(r"^SKIPPED \[\d+\] \S+ ", "", x) for x in lines if "SKIPPED" in x})
-    made["tests"] = {"code": done.returncode, "seconds": round(seconds, 1), **counts}
-    made["tests"]["reasons"] = reasons
-    if done.returncode not in (0, 5):
-        made["tests"]["output"] = done.stdout[-8_000:]
-    return made
-
-
-def about(device: torch.device, words: Sequence[str]) -> dict[str, Any]:
-    """Machine, versions, command and date."""
-    made: dict[str, Any] = {
-        "command": shlex.join(["python", "examples/gpu.py", *words]),
-        "date": time.strftime("%Y-%m-%d", time.gmtime()),
-        "machine": f"{platform.system()} {platform.machine()}, {cpu_name()}",
-        "versions": versions(device),
-    }
-    if device.type == "cuda":
-        found = torch.cuda.get_device_properties(device)
-        made["gpu"] = {
-            "name": found.name,
-            "compute_capability": f"{found.major}.{found.minor}",
-            "memory_bytes": found.total_memory,
-            "multiprocessors": found.multi_processor_count,
-        }
-    return made
-
-
-def training_text(found: dict[str, Any]) -> str:
-    """Markdown of the two trainings, or why there are none."""
-    if "skipped" in found:
-        return f"Not run: {found['skipped']}."
-    keys = ("psnr", "ssim", "training_seconds", "seconds", "gaussians", "skipped")
-    rows = [(kind, *(found[kind].get(key, "-") for key in keys)) for kind in KINDS if kind in found]
-    said = f"{found['script']} mcmc, {found['iterations']:,} iterations, scene {found['scene']}."
-    return said + "\n\n" + table(("", *keys), "lr", rows)
-
-
-def report(result: dict[str, Any]) -> str:
-    """The whole page."""
-    known, tests = result["about"], result["checks"]["tests"]
-    lines = ["# What only a GPU shows", ""]
-    if "gpu" not in known:
-        lines += [CPU_NOTE, ""]
-    lines += [f"- {key}: {known[key]}" for key in ("command", "date", "machine")]
-    lines += [
-        f"- {key}: {value}" for key, value in {**known["versions"], **known.get("gpu", {})}.items()
-    ]
-    lines += ["", "## Checks", ""]
-    lines += ["```text", result["checks"]["doctor"]["output"].rstrip(), "```", ""]
-    if "skipped" in tests and "code" not in tests:
-        lines.append(f"Tests marked `cuda`: not run, {tests['skipped']}.")
-    else:
-        counts = ", ".join(f"{tests[k]} {k}" for k in ("passed", "failed", "error", "skipped"))
-        lines.append(f"Tests marked `cuda`: {counts}, in {tests['seconds']} s.")
-        lines += [f"Skipped: {reason}." for reason in tests["reasons"]]
-        if "output" in tests:
-            lines += ["", "```text", tests["output"].rstrip(), "```"]
-    lines += ["", "## A step", ""]
-    lines += [
-        "Medians, in turn with six torch Adams, and the quartiles of the ratio. Bytes are kept "
-        "beside parameters and gradients.",
-        "",
-    ]
-    lines += [times_table(result["steps"]), "", counts_table(result["steps"]), ""]
-    picture = "![Times of a step, and ratios to six Adams](step.png)"
-    lines += [picture if result["picture"] else "No picture: matplotlib is not installed.", ""]
-    lines += ["## gsplat's own trainer", "", training_text(result["training"]), ""]
-    lines.append(f"All of it took {result['seconds']:.0f} s.")
-    return "\n".join(lines) + "\n"
-
-
-def training(args: argparse.Namespace, device: torch.device) -> dict[str, Any]:
-    """gsplat's trainer, where there is one."""
-    kind = device.type
-    if args.gsplat is None:
-        return {"skipped": "--gsplat PATH/examples/simple_trainer.py was not given"}
-    if importlib.util.find_spec("gsplat") is None:
-        return {"skipped": "gsplat is not installed: pip install gsplat"}
-    iterations = args.iterations or ITERATIONS[kind]
-    work = args.out / "training"
-    check_folder(work)
-    scene = None if args.scene is None else args.scene.resolve()
-    both = train_both(
-        args.gsplat.resolve(), scene, work.resolve(), iterations, GAUSSIANS[kind], cpu=kind == "cpu"
+def run(words: Sequence[str], folder: Path = ROOT) -> tuple[int, str, float]:
+    """Run Python with these words in a folder: exit status, what it printed, seconds."""
+    folder.mkdir(parents=True, exist_ok=True)
+    begin = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, *words],
+        cwd=folder,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        check=False,
     )
-    named = "embedded" if args.scene is None else args.scene.name
-    return {"script": args.gsplat.name, "scene": named, "iterations": iterations, **both}
+    return done.returncode, done.stdout, round(time.perf_counter() - begin, 1)
+
+
+def training(script: Path, scene: Path, out: Path, iterations: int) -> dict[str, Any]:
+    """What gsplat's script says of its last evaluation, and its seconds; or its last line."""
+    count = str(iterations)
+    words = [str(script), "mcmc", "--data_dir", str(scene), "--data_factor", "1"]
+    words += ["--result_dir", str(out), "--disable_viewer", "--disable_video"]
+    words += ["--max_steps", count, "--eval_steps", count, "--save_steps", count]
+    code, said, seconds = run(words, out / "cwd")
+    if code:
+        lines = [line.strip() for line in re.split(r"[\r\n]", said) if line.strip()]
+        return {"failed": (lines or ["no output"])[-1], "seconds": seconds}
+    found: dict[str, Any] = {"seconds": seconds}
+    for path in sorted((out / "stats").glob("*_step*.json")):
+        found |= json.loads(path.read_text(encoding="utf-8"))
+    return {key: value for key, value in found.items() if isinstance(value, (int, float, str))}
+
+
+def trainings(script: Path, scene: Path, out: Path, iterations: int) -> dict[str, Any]:
+    """gsplat's training as it is, and with the lines that `opt3dgs hosts diff` puts into a copy."""
+    edited = out / "edited"
+    shutil.rmtree(edited, ignore_errors=True)
+    plain = shutil.ignore_patterns(".git", "*.png", "*.jpg", "*.gif", "*.mp4", "results")
+    shutil.copytree(script.parent, edited, ignore=plain)
+    code, said, _ = run([*PACKAGE, "hosts", "diff", str(edited / script.name), "--write"], out)
+    if code:
+        return {"failed": said.strip()}
+    scripts = {"stock": script, "with the lines": edited / script.name}
+    return {kind: training(s, scene, out / kind, iterations) for kind, s in scripts.items()}
+
+
+def counts(results: dict[int, dict[str, steps.Row]]) -> str:
+    """Markdown: what an iteration launches, waits for and takes, at the most Gaussians."""
+    points, rows = max(results.items())
+    lines = [f"At {points:,} Gaussians:", "", "| | launches | waits | bytes kept | bytes within |"]
+    lines.append("|---|---:|---:|---:|---:|")
+    for name, row in rows.items():
+        within = f"{row['peak_bytes'] / points:.0f}" if "peak_bytes" in row else "-"
+        cells = (row.get("launches", "-"), row.get("waits", "-"), row["bytes_per_point"], within)
+        lines.append(f"| {name} | {' | '.join(map(str, cells))} |")
+    return "\n".join([*lines, "", "Bytes are for each Gaussian; those within a step are freed."])
+
+
+def report(made: dict[str, Any]) -> str:
+    """The page."""
+    lines = ["# What only a GPU shows", ""]
+    lines += [f"- {key}: {value}" for key, value in made["about"].items()]
+    for name in ("doctor", "tests"):
+        text = made[name]["output"][-8_000:].rstrip()
+        lines += ["", f"## {name}: exit status {made[name]['code']}", "", "```text", text, "```"]
+    lines += ["", "## A step", "", steps.table(made["steps"]), "", counts(made["steps"])]
+    said = json.dumps(made["training"], indent=1)
+    return "\n".join([*lines, "", "## gsplat's own trainer", "", "```json", said, "```", ""])
 
 
 @command("gpu")
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; 1 where the doctor or a test has failed."""
+    """The command line; 1 where the doctor, a test or a training has failed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     add = parser.add_argument
-    add("--device", choices=("cuda", "cpu"), help="default: the GPU, where torch sees one")
-    add("--points", type=int, nargs="+", metavar="N", help="numbers of points to step")
-    add("--repeats", type=int, metavar="N", help="rounds of every measurement")
+    add("--device", choices=("cuda", "cpu"), default="cuda")
+    add("--points", type=int, nargs="+", metavar="N", help="numbers of Gaussians to step")
+    add("--rounds", type=int, default=30, metavar="N", help="of every measurement")
     add("--gsplat", type=Path, metavar="FILE", help="simple_trainer.py of a gsplat checkout")
-    add("--scene", type=Path, metavar="DIR", help="for it, in COLMAP's layout; default: embedded")
-    add("--iterations", type=int, metavar="N", help="of its trainings")
+    add("--scene", type=Path, metavar="DIR", help="for it, in COLMAP's layout")
+    add("--iterations", type=int, default=3_000, metavar="N", help="of its trainings")
     add("-o", "--out", type=Path, default=Path("runs/gpu"), metavar="DIR")
     args = parser.parse_args(arguments)
-    kind = args.device or ("cuda" if torch.cuda.is_available() else "cpu")
-    if kind == "cuda" and not torch.cuda.is_available():
-        raise ValueError("--device cuda: torch sees no CUDA device; --device cpu runs on this one")
-    if args.gsplat is not None and not args.gsplat.is_file():
-        raise FileNotFoundError(f"--gsplat {args.gsplat}: no such file")
+    if args.device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("torch sees no CUDA device; --device cpu runs the first parts on a CPU")
+    if args.gsplat is not None and not (args.gsplat.is_file() and args.scene is not None):
+        raise ValueError(f"--gsplat {args.gsplat}: simple_trainer.py, and --scene DIR, are needed")
     check_folder(args.out)
-    logging.getLogger("opt3dgs_optim").addHandler(logging.NullHandler())
-    device, start = torch.device(kind), time.perf_counter()
-    words = list(sys.argv[1:] if arguments is None else arguments)
-    result: dict[str, Any] = {"about": about(device, words), "checks": check(device), "steps": {}}
-    torch.manual_seed(0)
-    if kind == "cpu":
-        torch.set_num_threads(1)
-    for points in tqdm(args.points or POINTS[kind], desc="steps", unit="size"):
-        repeats = args.repeats or REPEATS[kind]
-        result["steps"][points] = measure_all(points, device, STEPPED, repeats)
-    title = result["about"].get("gpu", {}).get("name", "CPU, one thread")
-    result["picture"] = draw(result["steps"], title, args.out / "step.png")
-    result["training"] = training(args, device)
-    result["seconds"] = round(time.perf_counter() - start, 1)
-    (args.out / "report.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    (args.out / "report.md").write_text(report(result), encoding="utf-8")
-    print(args.out / "report.md", args.out / "report.json", sep="\n")
-    checks = result["checks"]
-    bad = checks["doctor"]["code"] != 0 or checks["tests"].get("code", 0) not in (0, 5)
-    return int(bad)
+    device, out = torch.device(args.device), args.out.resolve()
+    torch.set_num_threads(1)
+    about = {"machine": steps.machine(device), "date": time.strftime("%Y-%m-%d", time.gmtime())}
+    made: dict[str, Any] = {"about": {**about, **versions(device)}, "steps": {}, "training": {}}
+    for name, words in (
+        ("doctor", (*PACKAGE, "doctor", "--device", args.device)),
+        ("tests", TESTS),
+    ):
+        code, said, seconds = run(words)
+        made[name] = {"code": code, "seconds": seconds, "output": said}
+    names = [n for n in steps.SUBJECTS if args.device == "cpu" or not n.endswith("fused")]
+    for points in tqdm(args.points or POINTS[args.device], desc="steps", unit="size"):
+        made["steps"][points] = steps.measure(points, device, names, args.rounds)
+    if args.gsplat is not None:
+        found = trainings(args.gsplat.resolve(), args.scene.resolve(), out, args.iterations)
+        made["training"] = found
+    (out / "report.json").write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
+    (out / "report.md").write_text(report(made), encoding="utf-8")
+    print(out / "report.md")
+    failed = any("failed" in found for found in (made["training"], *made["training"].values()))
+    return int(made["doctor"]["code"] != 0 or made["tests"]["code"] not in (0, 5) or failed)
 
 
 if __name__ == "__main__":

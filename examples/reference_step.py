@@ -162,10 +162,10 @@ def happens(event: int, num_points: int) -> bool:
 def chosen_points(event: int, num_points: int) -> Tensor:
     """Which points an event fades, [num_points] bool: the same on every device."""
     row = torch.arange(num_points)
-    return (hashed(row ^ hashed(event)) >> 8).float() / 2**24 < 0.2
+    return (hashed(row ^ hashed(torch.tensor(event))) >> 8).float() / 2**24 < 0.2
 
 
-def hashed(number: Tensor | int) -> Tensor | int:
+def hashed(number: Tensor) -> Tensor:
     """32 bits that look random, of 32 bits: Wellons' `lowbias32`."""
     number = ((number ^ (number >> 16)) * 0x7FEB352D) % 2**32
     number = ((number ^ (number >> 15)) * 0x846CA68B) % 2**32

@@ -56,7 +56,7 @@ def test_other_groups_are_stepped_by_plain_adam() -> None:
         adam.add_param_group({"params": [Parameter(torch.ones(2)) for _ in range(3)], "lr": 0.1})
         if upgrade:
             adam = PhaseScheduler(30, parts=DEFAULTS).upgrade(adam)
-        several = dict(enumerate(adam.param_groups[-1]["params"]))
+        several = {str(i): p for i, p in enumerate(adam.param_groups[-1]["params"])}
         steps({"all": adam}, params | several, 30)
         ends.append(
             {str(n): params[n].detach() for n in ("mlp", "scalar")}
@@ -163,7 +163,8 @@ def test_a_grad_scaler_unscales_and_leaves_steps_out() -> None:
     optimizers = phases.upgrade(adams_of(params))
     scaler = torch.amp.GradScaler("cpu", init_scale=1024.0)  # pyright: ignore
     for bad in (False, True, False):
-        loss = sum(p.square().sum() for p in params.values()) * (torch.inf if bad else 1.0)
+        total = torch.stack([p.square().sum() for p in params.values()]).sum()
+        loss = total * (torch.inf if bad else 1.0)
         scaler.scale(loss).backward()
         for optimizer in optimizers.values():
             scaler.step(optimizer)

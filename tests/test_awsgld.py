@@ -353,6 +353,13 @@ def test_schedules_of_the_rate(name: str, preconditioner: Any) -> None:
         assert torch.equal(x[0], y[0])
 
 
+def test_the_options_defaults_are_adams() -> None:
+    x = [Parameter(torch.zeros(1, 3))]
+    ours, theirs = AWSGLD(x).defaults, torch.optim.Adam(x).defaults
+    for name in ("lr", "betas", "eps", "weight_decay"):
+        assert ours[name] == theirs[name], name
+
+
 @pytest.mark.parametrize("option", ["amsgrad", "maximize", "foreach", "fused", "capturable"])
 def test_other_options_of_torch_are_type_errors(option: str) -> None:
     with pytest.raises(TypeError, match=option):

@@ -104,7 +104,8 @@ def equal(a: Any, b: Any) -> bool:
     return a == b or (isinstance(a, float) and math.isnan(a) and math.isnan(b))
 
 
-@settings(max_examples=150, deadline=None)
+@pytest.mark.filterwarnings("ignore:PhaseScheduler. iteration .* of total_steps")  # that is told
+@settings(max_examples=150)
 @given(path=st.sampled_from(PATHS), wrong=st.sampled_from(WRONG), upgraded=st.booleans())
 def test_what_is_damaged_is_refused_and_nothing_has_changed(
     path: tuple[Any, ...], wrong: Any, upgraded: bool

@@ -92,7 +92,7 @@ def test_an_optimizer_that_steps_now_and_then() -> None:
     assert again.iteration == 49
     steps({"shN": resumed[1]}, params, 1)
     steps({"means": resumed[0]}, params, 1)
-    assert part.seen == {"shN": [49], "means": [50]}
+    assert part.seen == {"shN": [50], "means": [50]}
 
 
 def test_iterations_without_a_gradient_and_a_last_one_without_a_step() -> None:

@@ -159,6 +159,13 @@ def test_a_parameter_of_one_dimension_is_warned_of() -> None:
         LQNAdam([Parameter(torch.tensor(s)) for s in (1.0, [1.0], [[1.0, 2.0]])])
 
 
+def test_the_options_defaults_are_adams() -> None:
+    x = [Parameter(torch.zeros(1, 3))]
+    ours, theirs = LQNAdam(x).defaults, torch.optim.Adam(x).defaults
+    for name in ("lr", "betas", "eps", "weight_decay"):
+        assert ours[name] == theirs[name], name
+
+
 @pytest.mark.parametrize("option", ["amsgrad", "maximize", "foreach", "fused", "capturable"])
 def test_other_options_of_torch_are_type_errors(option: str) -> None:
     with pytest.raises(TypeError, match=option):

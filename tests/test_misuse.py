@@ -46,6 +46,12 @@ def two_tensors() -> Adam:
     return Adam([{"params": [Parameter(torch.ones(ROWS, 3)) for _ in "ab"], "name": "xyz"}])
 
 
+def with_option(option: str) -> Adam:
+    optimizer = one()
+    optimizer.param_groups[0][option] = True
+    return optimizer
+
+
 OPTIMIZERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "another optimizer": (
         lambda: torch.optim.SGD([Parameter(torch.ones(ROWS, 3))], lr=0.1),
@@ -98,7 +104,7 @@ OPTIMIZERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     ),
     **{
         option: (
-            lambda option=option: one(**{option: True}),
+            lambda option=option: with_option(option),
             ValueError,
             f"means has {option}=True; make the Adam without it",
         )
@@ -216,9 +222,7 @@ def test_images_of_two_shapes() -> None:
 def test_a_part_that_gets_no_loss_says_so_once() -> None:
     optimizer = PhaseScheduler(100, parts=[EnergyHistogram()]).upgrade(one())
     params = {"means": optimizer.param_groups[0]["params"][0]}
-    with pytest.warns(
-        UserWarning, match=r"no energy has come; call phases.observe\(loss\)"
-    ) as said:
+    with pytest.warns(UserWarning, match=r"no energy has .*; call phases.observe\(loss\)") as said:
         steps({"means": optimizer}, params, 40)
     assert len(said) == 1
 

@@ -187,7 +187,7 @@ def test_more_points_than_a_cpu_takes_at_a_time(has: dict) -> None:
             param.grad = grad * like_rows(seen, grad) if iteration < 15 else grad
         for optimizer in optimizers.values():
             optimizer.step()
-        grads = {name: param.grad for name, param in ours.items()}
+        grads: Any = {name: param.grad for name, param in ours.items()}
         default_step(theirs, grads, state, RATES, iteration, total, has)
     assert same_tensors(ours, theirs)
     assert state["share"] != 1

@@ -1,31 +1,39 @@
-"""The arms of a comparison: what each changes against stock 3DGS-MCMC."""
+"""The arms of every comparison: each way of training, in one list.
+
+To add one, add it to `ARMS`: its name, what it is, and the parts that its steps have.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-
-import torch
-from torch import Tensor
+from typing import Literal
 
 from opt3dgs_optim import (
     DEFAULTS,
-    ConstantMultiplier,
-    EnergyHistogram,
+    Averaging,
+    Fading,
+    OutOfView,
+    OwnFrame,
     Part,
     PhaseScheduler,
-    PositionNoise,
     paper_parts,
 )
-from opt3dgs_optim.presets import PAPER_WARMUP
 
-NOISE_LR = 5e5  # 3DGS-MCMC
 BASELINE = "mcmc"
-HISTOGRAM_ARM = "awsgld"
-DEFAULT_ARM = "defaults"
+OTHERS = ("scales", "quats", "opacities", "sh0", "shN")  # than the positions
 
-# (iterations, mean nu of the arm in `needs` or None) -> what the steps have
-MakeParts = Callable[[int, float | None], list[Part]]
+
+@dataclass
+class Longer(Part):
+    """All steps times a constant: what tuned learning rates would do."""
+
+    times: float
+    names = None
+
+    def plan(self, step, course) -> None:
+        """Scale the rate of every parameter."""
+        step.factor *= self.times
 
 
 @dataclass(frozen=True)
@@ -33,67 +41,50 @@ class Arm:
     """One way of training."""
 
     name: str
-    what: str = ""
-    parts: MakeParts | None = None  # None: torch's own Adam in the trainer
-    mcmc: bool = True  # relocation, growth, noise and regularisers of 3DGS-MCMC
-    needs: str | None = None  # the arm whose mean nu it takes, seed by seed
+    what: str
+    parts: Callable[[int], Sequence[Part]] | None = None  # of the iterations; None: torch's Adam
+    density: Literal["mcmc", "adc"] = "mcmc"  # 3DGS-MCMC, or clone, split, prune and reset
+    rates: float = 1.0  # factor on all of the trainer's learning rates
+    beta1: float = 0.9
+    decays: bool = True  # the positions' rate, to a hundredth
 
-    def make(
-        self, iterations: int, switch: float, nu: float | None, gaussians: Mapping[str, Tensor]
-    ) -> PhaseScheduler:
-        """The scheduler of one training: the arm's parts, and the noise of 3DGS-MCMC.
-
-        Args:
-            iterations: length of the training.
-            switch: where exploitation starts, as a share of it.
-            nu: mean nu of the arm in `needs`.
-            gaussians: the trainer's dict of parameters, which the noise reads in every step.
-        """
-        if self.needs is not None and nu is None:
-            raise ValueError(f"arm {self.name}: needs the mean nu of {self.needs}; run it first")
-        parts = [] if self.parts is None else self.parts(iterations, nu)
-        if self.mcmc:
-            parts.append(PositionNoise(gaussians, NOISE_LR))
-        return PhaseScheduler(iterations, switch, parts)
+    def scheduler(self, iterations: int) -> PhaseScheduler | None:
+        """Of one training; None where the trainer's own Adam stays as it is."""
+        return (
+            None if self.parts is None else PhaseScheduler(iterations, parts=self.parts(iterations))
+        )
 
 
-def fixed(*parts: Callable[[], Part]) -> MakeParts:
-    """These parts, made anew for each training: some learn, and serve one."""
-    return lambda _iterations, _nu: [make() for make in parts]
+def of(*parts: Part) -> Callable[[int], Sequence[Part]]:
+    """The same parts, however long the training is; they learn nothing."""
+    return lambda _iterations: [*parts]
 
 
-def histogram(iterations: int, _nu: float | None = None) -> list[Part]:
-    """The flat-histogram multiplier, its settings measured on the run."""
-    return [EnergyHistogram(warmup=max(4, round(iterations * PAPER_WARMUP)))]
-
-
-def constant(iterations: int, nu: float | None) -> list[Part]:
-    """Its control; float32, as the histogram's nu on the step is."""
-    value = float(torch.tensor(nu, dtype=torch.float32))
-    return [ConstantMultiplier(value, warmup=round(iterations * PAPER_WARMUP))]
+def own(frame: OwnFrame | None = None) -> Callable[[int], Sequence[Part]]:
+    """Steps of the positions in the own frame, the others faded, a hold, the last ones averaged."""
+    return of(frame or OwnFrame(0.1), Fading(names=OTHERS), OutOfView(), Averaging())
 
 
 _ARMS = (
     Arm(BASELINE, "3DGS-MCMC as its authors publish it: the baseline"),
+    Arm("defaults", "the package's defaults", of(*DEFAULTS)),
     Arm(
-        "rates-x3",
-        "3DGS-MCMC with all steps times three: what a larger learning rate gains",
-        fixed(lambda: ConstantMultiplier(3.0)),
+        "own", "own frame, the others faded, a hold, averaged: the defaults since 2026-11-27", own()
     ),
+    Arm("averaged", "the baseline, its last thirtieth averaged", of(Averaging())),
+    Arm("x2", "the baseline, all steps times 2", of(Longer(2.0))),
+    Arm("x3", "the baseline, all steps times 3", of(Longer(3.0))),
+    Arm("x2-averaged", "all steps times 2, averaged", of(Longer(2.0), Averaging())),
     Arm(
-        "adam",
-        "torch's Adam from the start of INRIA's trainer: no density control, no noise",
-        mcmc=False,
+        "learn2splat",
+        "Learn2Splat's tuned Adam: rates times 5, beta1 0.99, a constant rate of the positions",
+        rates=5.0,
+        beta1=0.99,
+        decays=False,
     ),
-    Arm(HISTOGRAM_ARM, "3DGS-MCMC with AW-SGLD's multiplier nu", histogram),
-    Arm(
-        "constant",
-        "its control: a constant multiplier, the mean nu of that arm and seed",
-        constant,
-        needs=HISTOGRAM_ARM,
-    ),
-    Arm("paper", "the paper's preset", lambda iterations, _nu: paper_parts(iterations)),
-    Arm(DEFAULT_ARM, "the package's defaults", lambda _iterations, _nu: [*DEFAULTS]),
+    Arm("paper", "everything that the paper has, with its settings", paper_parts),
+    Arm("adc", "3DGS with clone, split, prune and reset as published", density="adc"),
+    Arm("adc-own", "as adc, own frame, averaged", of(OwnFrame(0.1), Averaging()), "adc"),
 )
 ARMS = {arm.name: arm for arm in _ARMS}
 
@@ -103,14 +94,3 @@ def find_arm(name: str) -> Arm:
     if name not in ARMS:
         raise ValueError(f"arm {name!r} is unknown; there are {', '.join(ARMS)}")
     return ARMS[name]
-
-
-def in_order(names: list[str]) -> list[Arm]:
-    """The named arms, those that another one needs before it (added where they were not named)."""
-    arms: list[Arm] = []
-    for name in names:
-        arm = find_arm(name)
-        for each in ([find_arm(arm.needs)] if arm.needs else []) + [arm]:
-            if each not in arms:
-                arms.append(each)
-    return arms

@@ -1,7 +1,6 @@
-"""Density control of 3DGS-MCMC: dead Gaussians move to live ones, and the number grows to a cap.
+"""What 3DGS-MCMC does beside the optimizers' steps: relocation, growth to a cap, noise, penalties.
 
-Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", NeurIPS 2024. The Langevin
-noise is not here: the optimizer package injects it.
+Kheradmand et al., "3D Gaussian Splatting as Markov Chain Monte Carlo", NeurIPS 2024.
 """
 
 from __future__ import annotations
@@ -13,10 +12,13 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
+from splatting.projection import rotation_matrices
 from splatting.relocation import MAX_OPACITY, relocated_values
 
 _REFERENCE_RUN = 30_000  # iterations that 500, 25,000 and 100 were made for
 Optimizers = Mapping[str, torch.optim.Optimizer]
+NOISE_LR = 5e5  # of 3DGS-MCMC, as are the next two
+NOISE_SHARPNESS, NOISE_OPACITY = 100.0, 0.005  # only nearly transparent Gaussians move
 
 
 class MCMCDensityControl:
@@ -132,6 +134,25 @@ class MCMCDensityControl:
         opacity = opacity.clamp(self.min_opacity, MAX_OPACITY)
         logits[sources] = torch.logit(opacity).reshape(-1, *logits.shape[1:])
         log_scales[sources] = scale.log()
+
+
+@torch.no_grad()
+def add_noise(
+    gaussians: dict[str, Parameter], lr: float, generator: torch.Generator | None = None
+) -> None:
+    """Langevin noise on the positions, shaped by each Gaussian's covariance (eq. 2).
+
+    Args:
+        gaussians: changed in place.
+        lr: the positions' learning rate of this iteration.
+        generator: for the draws; None is torch's global one.
+    """
+    opacities = torch.sigmoid(gaussians["opacities"].flatten())
+    gate = torch.sigmoid(NOISE_SHARPNESS * (NOISE_OPACITY - opacities))
+    factors = rotation_matrices(gaussians["quats"]) * gaussians["scales"].exp()[:, None, :]
+    draws = torch.randn(len(gate), 3, 1, generator=generator)
+    noise = factors @ (factors.mT @ draws)  # Sigma @ eta
+    gaussians["means"].add_(noise[..., 0] * (gate * (lr * NOISE_LR))[:, None])
 
 
 def regularisers(gaussians: dict[str, Parameter]) -> Tensor:

@@ -1,38 +1,33 @@
-"""Fit one scene with one arm: the trainer of the examples, with checkpoints and a run log."""
+"""The trainer of the examples: one scene, one arm, iteration by iteration, with checkpoints."""
 
 from __future__ import annotations
 
 import os
 import pickle
-import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 from torch.nn import Parameter
-from tqdm import tqdm
 
-from opt3dgs_optim import Phase, PhaseScheduler, PositionNoise
-from opt3dgs_optim.runs import RunLog, read_run
-from splatting.arms import NOISE_LR, Arm
-from splatting.density import MCMCDensityControl, Optimizers, regularisers
+from splatting.arms import Arm
+from splatting.density import MCMCDensityControl, Optimizers, add_noise, regularisers
 from splatting.gaussians import (
     DEFAULT_PRESET,
     MCMC_PRESET,
     gaussians_from_points,
-    random_gaussians,
     stock_learning_rates,
 )
 from splatting.metrics import photometric_loss, psnr, ssim
 from splatting.rasterizer import Rendering, render
 from splatting.scenes import Scene, View
-from splatting.stopping import StopRequest
 
 LR_DECAY = 0.01  # of the positions' learning rate over the run
 TRAIN_VIEWS_EVALUATED = 8
-CHECKPOINT_FORMAT = 1
+SH_DEGREE_INTERVAL = 1000  # iterations until one degree more is used, as trainers do
+DRAWS = ("noise", "order", "density", "start")  # one random generator each, seeded in this order
 
 
 @dataclass(frozen=True)
@@ -42,23 +37,15 @@ class FitOptions:
     iterations: int = 1500
     points: int = 2000  # the most Gaussians
     seed: int = 0
-    init: Literal["sfm", "random"] = "sfm"
     sh_degree: int = 0
-    switch: float = 29 / 30
-    evaluations: int = 20
-    sh_degree_interval: int = 1000  # iterations until one degree more is used, as trainers do
     rates: float = 1.0  # factor on all learning rates of the trainer
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "points", "evaluations", "sh_degree_interval"):
+        for name in ("iterations", "points"):
             if getattr(self, name) < 1:
                 raise ValueError(f"FitOptions: {name}={getattr(self, name)}, must be at least 1")
-        if self.init not in ("sfm", "random"):
-            raise ValueError(f"FitOptions: init={self.init!r}, must be 'sfm' or 'random'")
         if not self.rates > 0:
             raise ValueError(f"FitOptions: rates={self.rates}, must be above 0")
-        if not 0 < self.switch <= 1:
-            raise ValueError(f"FitOptions: switch={self.switch}, must be in (0, 1]")
 
 
 class DensityControl(Protocol):
@@ -74,104 +61,87 @@ class DensityControl(Protocol):
 
 
 class Fit:
-    """The state of one training: Gaussians, optimizers, schedules, random generators."""
+    """The state of one training: Gaussians, optimizers, schedules, random generators.
 
-    def __init__(
-        self, scene: Scene, arm: Arm, options: FitOptions, mean_nu: float | None = None
-    ) -> None:
+    Args:
+        scene: views to train on and to judge by.
+        arm: what its optimizers have.
+        options: what it shares with the trainings that it is compared with.
+    """
+
+    def __init__(self, scene: Scene, arm: Arm, options: FitOptions) -> None:
         self.scene, self.arm, self.options = scene, arm, options
-        torch.manual_seed(options.seed)  # the noise
-        self.order = torch.Generator().manual_seed(options.seed + 1)
-        self.density_draws = torch.Generator().manual_seed(options.seed + 2)
+        self.draws = {
+            name: torch.Generator().manual_seed(options.seed + i) for i, name in enumerate(DRAWS)
+        }
         self.gaussians = self._initial_gaussians()
-        stock = stock_learning_rates(scene.extent)
-        self.rates = {name: rate * options.rates for name, rate in stock.items()}
+        factor = options.rates * arm.rates
+        self.rates = {k: lr * factor for k, lr in stock_learning_rates(scene.extent).items()}
         self.optimizers = {
             name: torch.optim.Adam(
-                [{"params": param, "lr": self.rates[name], "name": name}], eps=1e-15
+                [{"params": param, "lr": self.rates[name], "name": name}],
+                betas=(arm.beta1, 0.999),
+                eps=1e-15,
             )
             for name, param in self.gaussians.items()
         }
-        self.phases: PhaseScheduler | None = None
-        self.noise: PositionNoise | None = None  # where the trainer itself adds it
-        if arm.parts is not None:
-            self.phases = arm.make(options.iterations, options.switch, mean_nu, self.gaussians)
+        self.phases = arm.scheduler(options.iterations)
+        if self.phases is not None:
             self.phases.upgrade(self.optimizers)
-        elif arm.mcmc:
-            self.noise = PositionNoise(self.gaussians, NOISE_LR)
         self.density = self._density_control()
         self.iteration = 0
         self.relocated = 0  # Gaussians that density control has moved so far
         self.views: list[int] = []  # what is left of this epoch
 
     def _initial_gaussians(self) -> dict[str, Parameter]:
-        scene, options = self.scene, self.options
-        draw = torch.Generator().manual_seed(options.seed + 3)
-        common: dict[str, Any] = {"sh_degree": options.sh_degree, "generator": draw}
-        common.update(MCMC_PRESET if self.arm.mcmc else DEFAULT_PRESET)
-        if options.init == "sfm":
-            return gaussians_from_points(
-                scene.points, scene.colors, num_points=options.points, **common
-            )
-        # A tenth of the budget to start with where density control can fill the rest.
-        count = max(options.points // 10, 1) if self.arm.mcmc else options.points
-        center = scene.points.median(0).values
-        spread = float((scene.points - center).abs().quantile(0.9)) / scene.extent
-        return random_gaussians(scene.extent, count, center=center, spread=spread, **common)
+        preset = MCMC_PRESET if self.arm.density == "mcmc" else DEFAULT_PRESET
+        return gaussians_from_points(
+            self.scene.points,
+            self.scene.colors,
+            num_points=self.options.points,
+            sh_degree=self.options.sh_degree,
+            generator=self.draws["start"],
+            **preset,
+        )
 
-    def _density_control(self) -> DensityControl | None:
-        if not self.arm.mcmc:
-            return None
+    def _density_control(self) -> DensityControl:
         return MCMCDensityControl.for_run(
             self.options.iterations,
             self.options.points,
             num_points=len(self.gaussians["means"]),
-            generator=self.density_draws,
+            generator=self.draws["density"],
         )
 
     # -- one iteration -------------------------------------------------------------------------
 
     def step(self) -> Tensor:
         """One iteration; returns the detached loss."""
-        view = self.scene.train[self._next_view()]
-        image = self._train_image(view)
+        view, mcmc = self.scene.train[self._next_view()], self.arm.density == "mcmc"
         pixel_loss = None if self.phases is None else self.phases.pixel_loss
-        loss = photometric_loss(image, view.image, pixel_loss)
-        if self.arm.mcmc:
+        loss = photometric_loss(self._train_image(view), view.image, pixel_loss)
+        if mcmc:
             loss = loss + regularisers(self.gaussians)
         loss.backward()
         if self.phases is not None:
-            self.phases.observe(loss, iteration=self.iteration)
+            self.phases.observe(loss)
         for optimizer in self.optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
-        if self.noise is not None:
-            with torch.no_grad():
-                lr = self.optimizers["means"].param_groups[0]["lr"]
-                self.noise.add_to(self.gaussians["means"], lr)
-        if self.density is not None:
-            self.relocated += self.density.step(self.iteration, self.gaussians, self.optimizers)
+        means = self.optimizers["means"].param_groups[0]
+        if mcmc:
+            add_noise(self.gaussians, means["lr"], self.draws["noise"])
+        self.relocated += self.density.step(self.iteration, self.gaussians, self.optimizers)
         self.iteration += 1
-        decay = LR_DECAY ** (self.iteration / self.options.iterations)
-        self.optimizers["means"].param_groups[0]["lr"] = self.rates["means"] * decay
+        if self.arm.decays:
+            decay = LR_DECAY ** (self.iteration / self.options.iterations)
+            means["lr"] = self.rates["means"] * decay
         return loss.detach()
 
     def _next_view(self) -> int:
         if not self.views:
-            self.views = torch.randperm(len(self.scene.train), generator=self.order).tolist()
+            order = torch.randperm(len(self.scene.train), generator=self.draws["order"])
+            self.views = order.tolist()
         return self.views.pop()
-
-    @property
-    def phase(self) -> Phase:
-        """The phase of the iteration that comes next."""
-        return Phase.EXPLORATION if self.phases is None else self.phases.phase
-
-    @property
-    def mean_nu(self) -> float | None:
-        """Mean of nu since the warm-up, or None where nu is off."""
-        parts = [] if self.phases is None else self.phases.parts
-        means = [part.mean_multiplier for part in parts if hasattr(part, "mean_multiplier")]  # pyright: ignore
-        return float(means[0]) if means else None
 
     # -- looking at it -------------------------------------------------------------------------
 
@@ -191,8 +161,8 @@ class Fit:
 
     @property
     def active_sh_degree(self) -> int:
-        """The degree of spherical harmonics in use: one more each `sh_degree_interval`."""
-        return min(self.iteration // self.options.sh_degree_interval, self.options.sh_degree)
+        """The degree of spherical harmonics in use: one more every thousand iterations."""
+        return min(self.iteration // SH_DEGREE_INTERVAL, self.options.sh_degree)
 
     def compile_kernels(self) -> None:
         """Have the rasterizer compiled, or loaded from its cache, before the run's clock starts."""
@@ -218,54 +188,36 @@ class Fit:
     def save(self, path: Path) -> None:
         """Write a checkpoint; an old one stays whole until the new one is."""
         state = {
-            "format": CHECKPOINT_FORMAT,
-            "arm": self.arm.name,
-            "scene": self.scene.name,
-            "options": asdict(self.options),
-            "photos": self._photos(),
+            "training": self._training(),
             "iteration": self.iteration,
             "relocated": self.relocated,
-            "density": {} if self.density is None else self.density.state,
+            "density": self.density.state,
             "gaussians": {name: param.detach() for name, param in self.gaussians.items()},
             "optimizers": {name: opt.state_dict() for name, opt in self.optimizers.items()},
             "views": self.views,
-            "random": [
-                torch.get_rng_state(),
-                self.order.get_state(),
-                self.density_draws.get_state(),
-            ],
+            "draws": {name: draw.get_state() for name, draw in self.draws.items()},
         }
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = path.with_suffix(".partial")
         torch.save(state, partial)
         os.replace(partial, path)
 
-    def _photos(self) -> list[float]:
-        """Height and width of the first, and the background: what a checkpoint must agree in."""
-        return [*self.scene.train[0].image.shape[:2], *self.scene.background.tolist()]
+    def _training(self) -> list[Any]:
+        """What a checkpoint must agree in: also the photos' size, and what is behind them."""
+        photo = [*self.scene.train[0].image.shape[:2], *self.scene.background.tolist()]
+        return [self.scene.name, photo, self.arm.name, asdict(self.options)]
 
-    def load(self, path: Path, trunk: str | None = None) -> None:
-        """Go on from a checkpoint; ValueError if it is none, or of another scene, arm or options.
-
-        Args:
-            path: the file.
-            trunk: the arm that it is of, where this run branches off another arm's.
-        """
-        state = _loaded(path)
-        arm = trunk or self.arm.name
-        mine = (self.scene.name, arm, asdict(self.options), CHECKPOINT_FORMAT)
-        options = asdict(FitOptions()) | state["options"]  # older files lack newer options
-        its = (state["scene"], state["arm"], options, state["format"])
-        shown = self._photos()
-        if state.get("photos", shown) != shown:
+    def load(self, path: Path) -> None:
+        """Go on from a checkpoint; ValueError if it is none, or one of another training."""
+        try:
+            state = torch.load(path, weights_only=True)
+            its = state["training"]
+        except (EOFError, LookupError, RuntimeError, TypeError, pickle.UnpicklingError) as error:
+            raise ValueError(f"{path}: no checkpoint of this trainer: {error!r:.200}") from None
+        if its != self._training():
             raise ValueError(
-                f"{path}: a checkpoint of photos of other sizes or on another background (height, "
-                f"width, background: {state['photos']}), but those of this run are {shown}; choose "
+                f"{path}: a checkpoint of {its}, but this run is {self._training()}; choose "
                 "another folder"
-            )
-        if mine != its:
-            raise ValueError(
-                f"{path}: a checkpoint of {its}, but this run is {mine}; choose another folder"
             )
         for name, value in state["gaussians"].items():
             fresh = Parameter(value)
@@ -273,89 +225,9 @@ class Fit:
             self.optimizers[name].load_state_dict(state["optimizers"][name])
             self.gaussians[name] = fresh
         self.iteration, self.views = state["iteration"], state["views"]
-        self.relocated = state.get("relocated", 0)
-        if self.density is not None:
-            self.density.state = state.get("density") or {}
-        torch.set_rng_state(state["random"][0])
-        self.order.set_state(state["random"][1])
-        self.density_draws.set_state(state["random"][2])
-        if self.phases is not None:  # a trunk may be stock, whose checkpoint has no clock
-            self.phases.current = self.iteration - 1
-
-
-def run(
-    fit: Fit, folder: Path, metadata: dict[str, Any] | None = None, *, quiet: bool = True
-) -> dict[str, float]:
-    """Train to the end, or on from where an earlier call was stopped; return the last metrics.
-
-    Writes `folder/log.jsonl` and `folder/checkpoint.pt`. The log counts this process's seconds, so
-    that other trainings beside it change nothing. On Ctrl-C the iteration is finished, its
-    checkpoint written, and KeyboardInterrupt raised; a second Ctrl-C stops at once.
-    """
-    checkpoint, path, total = folder / "checkpoint.pt", folder / "log.jsonl", fit.options.iterations
-    if checkpoint.exists():
-        fit.load(checkpoint)
-    about = {"arm": fit.arm.name, "scene": fit.scene.name, **asdict(fit.options)}
-    about |= metadata or {}
-    if fit.iteration == total:
-        _say_finished(fit, path)
-        return fit.evaluate()
-    fit.compile_kernels()
-    # Lines past the checkpoint, or of a run without one, are superseded.
-    if path.exists():
-        log = RunLog.resume(path, iteration=fit.iteration, metadata=about, clock=time.process_time)
-    else:
-        log = RunLog(path, metadata=about, clock=time.process_time)
-    every = max(total // fit.options.evaluations, 1)
-    bar = tqdm(total=total, initial=fit.iteration, desc=fit.arm.name, unit="it", disable=quiet)
-    with log, bar, StopRequest() as stop:
-        metrics = _evaluate(fit, log)
-        while fit.iteration < total:
-            phase = fit.phase
-            loss = fit.step()
-            numbers = {} if fit.phases is None else fit.phases.numbers()
-            log.step(fit.iteration, phase=phase.value, loss=loss, **numbers)
-            look = fit.iteration % every == 0 or fit.iteration == total
-            if look:
-                metrics = _evaluate(fit, log)
-            if look or stop.requested:
-                with log.paused():
-                    fit.save(checkpoint)
-            bar.update()
-            if not quiet and fit.iteration % 10 == 0:
-                shown = f"loss {float(loss):.4f}, PSNR {metrics['psnr']:.2f} dB, {phase.value}"
-                bar.set_postfix_str(shown)
-            if stop.requested:
-                log.event("interrupted", fit.iteration)
-                raise KeyboardInterrupt
-        log.event("finished", fit.iteration, mean_nu=fit.mean_nu)
-    return metrics
-
-
-def _loaded(path: Path) -> dict[str, Any]:
-    """What `Fit.save` has written; ValueError where a file is something else."""
-    try:
-        state = torch.load(path, weights_only=True)
-    except (EOFError, KeyError, OSError, RuntimeError, ValueError, pickle.UnpicklingError) as error:
-        raise ValueError(f"{path}: no checkpoint can be read from it: {error!r:.200}") from None
-    if not isinstance(state, dict) or not {"scene", "arm", "options", "format"} <= state.keys():
-        raise ValueError(f"{path}: no checkpoint of this trainer")
-    return state
-
-
-def _say_finished(fit: Fit, path: Path) -> None:
-    """Of a run that was stopped after its last checkpoint, and before its log said so."""
-    if not any(event["event"] == "finished" for event in read_run(path).events):
-        with RunLog.resume(path, iteration=fit.iteration, clock=time.process_time) as log:
-            _evaluate(fit, log)
-            log.event("finished", fit.iteration, mean_nu=fit.mean_nu)
-
-
-def _evaluate(fit: Fit, log: RunLog) -> dict[str, float]:
-    with log.paused():
-        metrics = fit.evaluate()
-    log.evaluation(fit.iteration, **metrics)
-    return metrics
+        self.relocated, self.density.state = state["relocated"], state["density"]
+        for name, draw in state["draws"].items():
+            self.draws[name].set_state(draw)
 
 
 def _mean(values: list[Tensor]) -> float:

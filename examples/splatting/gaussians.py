@@ -1,4 +1,4 @@
-"""Gaussians as a dict of parameters: how they start, their learning rates, and .ply files.
+"""Gaussians as a dict of parameters: how they start, and their learning rates.
 
 Keys and activations are gsplat's: `means` [N, 3] world units, `scales` [N, 3] log, `quats` [N, 4]
 wxyz, not normalised, `opacities` [N] logit, `sh0` [N, 1, 3] and, from SH degree 1 on, `shN`
@@ -8,12 +8,9 @@ wxyz, not normalised, `opacities` [N] logit, `sh0` [N, 1, 3] and, from SH degree
 from __future__ import annotations
 
 import math
-from pathlib import Path
-from typing import Any, TypedDict
+from typing import TypedDict
 
-import numpy as np
 import torch
-from plyfile import PlyData, PlyElement
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -23,7 +20,7 @@ Gaussians = dict[str, Parameter]
 
 
 class InitPreset(TypedDict):
-    """Options of `gaussians_from_points` and `random_gaussians`."""
+    """Options of `gaussians_from_points`."""
 
     init_opacity: float
     init_scale: float
@@ -79,33 +76,6 @@ def gaussians_from_points(
     return {key: Parameter(tensor) for key, tensor in tensors.items()}
 
 
-def random_gaussians(
-    extent: float,
-    num_points: int,
-    *,
-    center: Tensor,
-    spread: float,
-    generator: torch.Generator | None = None,
-    **options: Any,
-) -> Gaussians:
-    """Gaussians of random colour, uniform in a cube: what trainers do without sparse points.
-
-    Args:
-        extent: `Scene.extent`, world units.
-        num_points: how many.
-        center: of the cube, [3], world units.
-        spread: half-side of the cube in extents; the trainers' is 3, around the origin.
-        options: of `gaussians_from_points`.
-    """
-    offsets = (2.0 * torch.rand(num_points, 3, generator=generator) - 1.0) * (spread * extent)
-    return gaussians_from_points(
-        offsets + center.to(offsets.dtype),
-        torch.rand(num_points, 3, generator=generator),
-        generator=generator,
-        **options,
-    )
-
-
 def neighbour_distance(points: Tensor, chunk: int = 512) -> Tensor:
     """Root mean square distance to the (up to) three nearest other points, [P], world units.
 
@@ -141,35 +111,3 @@ def stock_learning_rates(extent: float) -> dict[str, float]:
         "sh0": 2.5e-3,
         "shN": 2.5e-3 / 20,
     }
-
-
-# Columns of INRIA's point_cloud.ply. f_rest is channel-major: all of red's coefficients, then
-# green's, then blue's; the normals are unused but expected by some viewers.
-_COLUMNS = {
-    "means": ("x", "y", "z"),
-    "normals": ("nx", "ny", "nz"),
-    "sh0": ("f_dc_0", "f_dc_1", "f_dc_2"),
-    "opacities": ("opacity",),
-    "scales": ("scale_0", "scale_1", "scale_2"),
-    "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
-}
-
-
-def save_ply(path: str | Path, gaussians: Gaussians) -> None:
-    """Write the .ply layout of INRIA's trainer, which standard viewers open, as float32."""
-    count = len(gaussians["means"])
-    tables = {key: gaussians[key].detach().cpu().reshape(count, -1) for key in gaussians}
-    tables["normals"] = torch.zeros(count, 3)
-    parts, names = [], []
-    for key, columns in _COLUMNS.items():
-        parts.append(tables[key])
-        names.extend(columns)
-        if key == "sh0" and "shN" in gaussians:
-            rest = gaussians["shN"].detach().cpu().transpose(1, 2).reshape(count, -1)
-            parts.append(rest)
-            names.extend(f"f_rest_{index}" for index in range(rest.shape[1]))
-    table = torch.cat([part.float() for part in parts], dim=1).numpy()
-    vertices = np.empty(count, dtype=[(name, "<f4") for name in names])
-    for index, name in enumerate(names):
-        vertices[name] = table[:, index]
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))

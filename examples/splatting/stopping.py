@@ -1,12 +1,12 @@
-"""How a command ends: one line for what is wrong; Ctrl-C without losing what it has."""
+"""How a command begins and ends: a folder that can be written, one line for what is wrong."""
 
 from __future__ import annotations
 
 import functools
-import signal
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
-from signal import SIGINT, SIGTERM
+from pathlib import Path
 
 Main = Callable[[Sequence[str] | None], int]
 
@@ -23,10 +23,7 @@ def command(name: str) -> Callable[[Main], Callable[..., int]]:
                 print(f"{name}: {error}", file=sys.stderr)
                 return 2
             except KeyboardInterrupt:
-                print(
-                    "interrupted: the same command goes on from the checkpoints, if it writes any",
-                    file=sys.stderr,
-                )
+                print(f"{name}: interrupted", file=sys.stderr)
                 return 130
 
         return ended
@@ -34,26 +31,8 @@ def command(name: str) -> Callable[[Main], Callable[..., int]]:
     return decorated
 
 
-def stop_at_once() -> None:
-    """Let both signals raise KeyboardInterrupt; a shell's background job ignores Ctrl-C's."""
-    for kind in (SIGINT, SIGTERM):
-        signal.signal(kind, signal.default_int_handler)
-
-
-class StopRequest:
-    """Ctrl-C or a termination signal asks for a stop after the iteration; a second one insists."""
-
-    requested = False
-
-    def __enter__(self) -> StopRequest:
-        self._old = {kind: signal.signal(kind, self._ask) for kind in (SIGINT, SIGTERM)}
-        return self
-
-    def _ask(self, _kind: int, _frame: object) -> None:
-        if self.requested:
-            raise KeyboardInterrupt
-        self.requested = True
-
-    def __exit__(self, *_: object) -> None:
-        for kind, old in self._old.items():
-            signal.signal(kind, old)
+def check_folder(folder: Path) -> None:
+    """Make the folder; OSError, with the path, where it cannot be written to."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=folder):
+        pass

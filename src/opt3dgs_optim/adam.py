@@ -53,11 +53,9 @@ class Lane:
         self.before: list[Part] = []
         self.after: list[Part] = []
 
-    def ask(self, parts: tuple[Part, ...], any_group: bool) -> Lane:
+    def ask(self, parts: tuple[Part, ...]) -> Lane:
         """Take the parts that act on this parameter."""
-        mine = [
-            p for p in parts if any_group or p.names is None or (self.name and self.name in p.names)
-        ]
+        mine = [p for p in parts if p.names is None or (self.name and self.name in p.names)]
         for phase in Phase:
             self.plans[phase] = [
                 p for p in mine if overrides(p, "plan") and p.during in (None, phase)
@@ -83,17 +81,19 @@ class Lane:
             return tensor, True
         return tensor, False
 
-    def drop_if_moved(self, state: dict[str, Any], rows: int) -> None:
-        """Of a Parameter that is new, drop what is kept for rows that are others now.
+    def drop_moved(self, state: dict[str, Any], new: bool) -> None:
+        """Drop what is kept for rows that are others now, if the Parameter is new.
 
         Trainers that edit rows edit every tensor of the state so (gsplat's family), or none but
         Adam's moments (INRIA's): what they have left as it was belongs to other rows.
         """
-        for key, (tensor, version) in self.left.items():
-            now = state.get(key)
-            if now is not None and (
-                len(now) != rows or (now is tensor and now._version == version)
-            ):
+        rows = len(self.param) if self.param.dim() else 1
+        for key in KEPT:
+            now, was = state.get(key), self.left.get(key)
+            if now is None:
+                continue
+            as_it_was = was is not None and now is was[0] and now._version == was[1]
+            if len(now) != rows or (new and as_it_was):
                 del state[key]
 
     def leave(self, state: dict[str, Any]) -> None:
@@ -112,7 +112,6 @@ class StepAdam(Adam):
     """
 
     course: Course
-    any_group = False  # whether the parts act on groups that are no Gaussian parameter's, too
     next_iteration = 0
     in_own_frame = False  # whether its moments of the positions are those of the own frame
     _base: type[Adam] = Adam  # the class whose optimizer it was
@@ -219,7 +218,7 @@ class StepAdam(Adam):
                 course.members[(slot[0], slot[1])] = self, at
             for param in group["params"]:
                 i = len(self._lanes)
-                lane = Lane(group, param, slot).ask(course.parts, self.any_group)
+                lane = Lane(group, param, slot).ask(course.parts)
                 before = old[i] if i < len(old) else None
                 if before is None:
                     lane.last = self._last[i] if i < len(self._last) else self.next_iteration - 2
@@ -227,9 +226,9 @@ class StepAdam(Adam):
                         lane.framed = self.in_own_frame and lane.name == "means"
                 else:
                     lane.last, lane.framed, lane.left = before.last, before.framed, before.left
-                    if before.param is not param:
-                        before.drop_if_moved(self.state.get(param, {}), len(param))
                     self._tell_fewer_rows(before.param, lane)
+                new = before is not None and before.param is not param
+                lane.drop_moved(self.state.get(param, {}), new)
                 self._check_rows(lane)
                 self._lanes.append(lane)
         return self._lanes
@@ -254,6 +253,11 @@ class StepAdam(Adam):
         """What the lane's step has, as its parts say."""
         param, group, course = lane.param, lane.group, self.course
         grad = cast(Tensor, param.grad)
+        if grad.layout != torch.strided:
+            raise ValueError(
+                f"{type(self).__name__}.step: the gradient of {lane.name or 'a parameter'} is "
+                f"{grad.layout}; have the trainer make dense gradients (gsplat: no sparse_grad)"
+            )
         state = self.state[param]
         if not state:
             state["step"] = torch.zeros((), dtype=torch.float32, device="cpu")
@@ -284,8 +288,9 @@ class StepAdam(Adam):
     def _step_lane(self, lane: Lane, iteration: int) -> None:
         step, course = self._plan(lane, iteration), self.course
         group, state = lane.group, step.state
-        state["step"] += 1
-        t, (beta1, beta2) = state["step"].item(), group["betas"]
+        count = state["step"].numpy()  # torch's own addition takes as long as a launch
+        count[()] += 1
+        t, (beta1, beta2) = count.item(), group["betas"]
         lr, decay = group["lr"], group["weight_decay"]
         hyper = Hyper(
             lr, beta1, beta2, group["eps"], 1 - beta1**t, (1 - beta2**t) ** 0.5,
@@ -315,10 +320,8 @@ class StepAdam(Adam):
         """The running mean, and with which count the mean of each row began."""
         param, state = step.param, step.state
         assert step.mean is not None
-        began, touched = lane.rows(state, BEGAN, (len(param),))
-        mean, other = lane.rows(state, MEAN, tuple(param.shape))
-        if touched or other:  # rows that are new have a mean of zeros, and begin with this step
-            began.copy_(torch.where(began == 0, float(step.mean.number), began))
+        began, _ = lane.rows(state, BEGAN, (len(param),))
+        mean, _ = lane.rows(state, MEAN, tuple(param.shape))
         return mean, began
 
     # -- optimizers that have a step of their own --------------------------------------------------
@@ -563,7 +566,7 @@ def check_moments(call: str, state: Any) -> None:
     check_count(call, "step", whole(state["step"]), 0)
     shapes: dict[str, tuple[int, ...]] = {}
     for key in (*MOMENTS, *KEPT):
-        value = state.get(key)
+        value: Any = state.get(key)
         if value is None and key in KEPT:
             continue
         if not isinstance(value, Tensor) or not value.is_floating_point():

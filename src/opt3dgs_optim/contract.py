@@ -45,6 +45,12 @@ def check_supported(optimizer: Any, slots: Slots) -> None:
             f"upgrade: {kind.__name__} has a step of its own; have the trainer make a "
             "torch.optim.Adam (or AdamW) with the same groups, or gsplat's SelectiveAdam"
         )
+    held = [slot for slot in slots if slot[1] is not None]
+    if len(set(held)) < len(held):
+        raise ValueError(
+            f"upgrade: two groups hold the same of {sorted({str(n) for _, n in held})}; for two "
+            "sets of Gaussians name the groups 'first#means', 'second#means'"
+        )
     for group, (_, name) in zip(optimizer.param_groups, slots, strict=True):
         shown = group.get("name") or name or "a group"
         for option in REFUSED:

@@ -44,6 +44,7 @@ class Course:
         self._notes: dict[str, dict[str, Any]] = {type(part).__name__: {} for part in self.parts}
         self.members: dict[tuple[str, str], tuple[StepAdam, int]] = {}
         self.scratch: dict[Any, Any] = {}  # what parts keep from step to step, and never save
+        self._resumed = False  # whether the present iteration is over, for all optimizers
         self.finished = False  # whether the run has been ended early
         self._said: set[str] = set()
         self._bad = 0  # numbers of gradients that were not finite
@@ -75,7 +76,8 @@ class Course:
 
     def begin(self, optimizer: StepAdam) -> int:
         """The iteration of a step that an optimizer is about to make."""
-        iteration = max(optimizer.next_iteration, self.iteration, 0)
+        iteration = max(optimizer.next_iteration, self.iteration + self._resumed, 0)
+        self._resumed = False
         optimizer.next_iteration = iteration + 1
         if iteration > self.iteration:
             self.iteration = iteration
@@ -200,7 +202,7 @@ class Course:
 
     def restore(self, state: Mapping[str, Any] | None, iteration: int) -> None:
         """Go on at an iteration, with what was noted there."""
-        self.iteration = iteration - 1
+        self.iteration, self._resumed = iteration - 1, True
         for name, notes in () if state is None else state["notes"].items():
             if name in self._notes:
                 self._notes[name].clear()

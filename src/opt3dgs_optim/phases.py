@@ -122,7 +122,13 @@ class PhaseScheduler(Course):
         slots = [_slots_of(key, optimizer) for key, optimizer in given]
         held = [slot for each in slots for slot in each if slot[1] is not None]
         for (_, optimizer), its in zip(given, slots, strict=True):
-            check_supported(optimizer, its)
+            if isinstance(getattr(optimizer, "course", self), PhaseScheduler):
+                check_supported(optimizer, its)
+                continue
+            raise TypeError(
+                f"{CALL}.upgrade: {type(optimizer).__name__} has parts of its own; upgrade a "
+                "torch.optim.Adam, with parts=[...] for what its steps are to have"
+            )
             if (saved := optimizer.param_groups[0].get(STATE_KEY)) is not None:
                 self.check_state(f"{CALL}.upgrade", saved)
                 self.restore_parts(saved)
@@ -186,7 +192,7 @@ class PhaseScheduler(Course):
                     f"{2 * self.total_steps} at most; make a new PhaseScheduler for another run"
                 )
             if iteration > self.iteration:
-                self.iteration = iteration
+                self.iteration, self._resumed = iteration, False
                 self._advance()
         if loss is None:
             return

@@ -113,7 +113,7 @@ class Hyper:
     shrink: float = 1.0  # decoupled weight decay: factor on the parameter
     decay: float = 0.0  # the other kind: share of the parameter in the gradient
     mean: Tensor | None = None  # like the parameter
-    began: Tensor | None = None  # [N] the `Mean.number` with which a row's mean began
+    began: Tensor | None = None  # [N] the `Mean.number` with which a row's mean began; 0: not yet
     nonfinite: Tensor | None = field(default=None)  # [1] int32 on the device: counts numbers
 
 
@@ -189,7 +189,11 @@ def _finite(grad: Tensor, nonfinite: Tensor | None) -> tuple[Tensor, int]:
 
 
 def take_into_mean(how: Mean, param: Tensor, mean: Tensor, began: Tensor) -> None:
-    """An iterate that is not finite leaves its mean alone; a mean that is not begins with it."""
+    """An iterate that is not finite leaves its mean alone; a mean that is not begins with it.
+
+    A row that has `began` with 0 begins now.
+    """
+    began.masked_fill_(began == 0, how.number)
     weight = like_rows(1.0 / (how.number + 1 - began), param)
     if param.is_cpu and math.isfinite((param.sum() + mean.sum()).item()):
         mean.lerp_(param, weight.to(param.dtype))

@@ -7,9 +7,11 @@ photos in `images` and `images_4`. Some forty trainings of half a minute on a co
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import subprocess
 import sys
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData
-from trials import HALF, LENGTH, TRAINERS, TRIALS, Done, Trial, missing
+from trials import HALF, LENGTH, TRAINERS, TRIALS, Done, Trial, missing, run
 
 from opt3dgs_optim.hosts import diff
 from opt3dgs_optim.hosts.trainers import TRAINERS as TABLE
@@ -94,6 +96,43 @@ def test_ends_early_with_finish(scene: Path, tmp_path: Path) -> None:
     assert done.code == 0, done.output[-3000:]
     assert "no mean" not in done.output
     is_the_mean(done, done.out / f"point_cloud/iteration_{end}/point_cloud.ply")
+
+
+@pytest.mark.parametrize(
+    ("folder", "method"),
+    [("nerfstudio", "splatfacto"), ("nerfstudio", "splatfacto-mcmc"),
+     ("nerfstudio-1.1.5", "splatfacto")],
+)  # fmt: skip
+def test_nerfstudio_trains_and_saves_the_mean(
+    folder: str, method: str, scene: Path, tmp_path: Path
+) -> None:
+    """`ns-train` itself finds the method by its entry point, without a warning of it."""
+    sources = TRAINERS / folder / "nerfstudio"
+    if not sources.is_dir():
+        pytest.skip(f"no {sources}: put its sources there, set OPT3DGS_TRAINERS")
+    needs = "nerfacc pytorch_msssim tyro appdirs pathos fpsample mediapy rawpy torchmetrics"
+    lacking = [name for name in needs.split() if not importlib.util.find_spec(name)]
+    if lacking or not entry_points(group="nerfstudio.method_configs"):
+        pytest.skip(f"install opt3dgs_optim beside what nerfstudio needs, as {lacking}")
+    end = str(LENGTH)
+    command = [
+        *(f"{method}-opt3dgs", "--vis", "tensorboard", "--output-dir", str(tmp_path / "out")),
+        *("--experiment-name", "run", "--timestamp", "one", "--max-num-iterations", end),
+        *("--pipeline.model.warmup-length", "10", "--pipeline.model.refine-every", "10"),
+        *("--steps-per-eval-image", "0", "--steps-per-eval-all-images", "0"),
+        *("colmap", "--data", str(scene), "--colmap-path", "sparse/0", "--downscale-factor", "1"),
+    ]
+    done = run(sources / "scripts" / "train.py", command, tmp_path / "out")
+    assert done.code == 0, done.output[-3000:]
+    assert f"opt3dgs_optim: {LENGTH} iterations" in done.output
+    assert "Could entry point" not in done.output
+    assert "no mean" not in done.output
+    (path,) = done.out.glob(f"run/*/one/nerfstudio_models/step-*{LENGTH - 1}.ckpt")
+    saved = torch.load(path, weights_only=False)["pipeline"]
+    ends = torch.load(done.out / "end.pt")
+    for name, other in {"scales": "scales", "opacities": "opacities", "sh0": "features_dc"}.items():
+        assert torch.equal(ends[name][0], ends[name][1]), name
+        assert torch.equal(saved[f"_model.gauss_params.{other}"], ends[name][1]), name
 
 
 def ends_at_the_mean(trial: Trial, done: Done) -> None:

@@ -123,10 +123,10 @@ def test_without_energies_it_says_so_once_and_nu_is_one() -> None:
 
 @KINDS
 def test_on_a_device_nu_stays_there(options: dict[str, Any]) -> None:
-    """On torch's device without memory whatever reads a number raises."""
+    """On torch's device without memory whatever reads a number raises; it moves there first."""
     histogram = EnergyHistogram(**options)
+    nus_of(histogram, stream(10))
     energy = torch.empty((), device="meta")
-    histogram._place(energy.device)  # a move would read what has been learnt
     nu, course = histogram.observe(energy), Course([], 10)
     step = Step(torch.zeros(1), torch.zeros(1), "means", "", {}, {}, 0, -1)
     histogram.plan(step, course)

@@ -70,9 +70,9 @@ def apply(
             name = next(n for n, p in params.items() if p is old)
             if name not in names:
                 continue
-            state = optimizer.state.pop(old, None)
+            state: Any = optimizer.state.pop(old, None)
             new = Parameter(edit.param(old.detach()))
-            for key in () if state is None else set(state) - {"step"}:
+            for key in set(state or ()) - {"step"}:
                 if not inria or key in MOMENTS:
                     state[key] = edit.kept(state[key])
             group["params"] = [new]

@@ -24,7 +24,6 @@ opt3dgs hosts diff FILE --write   writes them, and keeps the old file as FILE.or
 
 It knows the files of: {known}.
 For every other trainer, `opt3dgs lines` prints the lines to write by hand."""
-OURS = re.compile(r"\b(opt3dgs_optim|PhaseScheduler|DEFAULTS_ADC|phases)\b")
 
 
 def misses(trainer: Trainer, text: str) -> list[str]:
@@ -52,25 +51,25 @@ def edited(text: str) -> tuple[Trainer, str]:
         ValueError: the file is not known, or has been edited; the message has what to do by hand.
     """
     plain = "\n".join(line.rstrip() for line in text.split("\n"))
-    if word := OURS.search(plain):
+    if word := re.search(r"\b(opt3dgs_optim|PhaseScheduler|DEFAULTS_ADC|phases)\b", plain):
         line = plain.count("\n", 0, word.start()) + 1
         raise ValueError(f"line {line} has `{word[0]}` already, so that nothing is inserted")
     fit = [each for each in TRAINERS.values() if each.inserted and not misses(each, plain)]
     if len(fit) != 1:
         raise ValueError(_by_hand(plain))
     trainer, lines = fit[0], text.split("\n")
-    inserted: dict[int, list[str]] = {}  # above the line of that number, from 0
+    inserted: dict[int, list[str]] = {}  # above that line, from 0
     for place in trainer.places:
-        indent = place.anchor[: len(place.anchor) - len(place.anchor.lstrip())]
         for at in _starts(place.anchor, plain):
             end = "\r" if lines[at].endswith("\r") else ""
-            new = [f"{indent}{line}{end}" for line in trainer.lines_at(place)]
-            inserted[at if place.above else at + 1] = new
+            new = [f"{place.indent}{line}{end}" for line in trainer.lines_at(place)]
+            inserted.setdefault(at if place.above else at + 1, []).extend(new)
     whole: list[str] = []
     ours: set[int] = set()  # numbers of our lines, from 1
     for at, line in enumerate([*lines, ""]):
-        ours.update(range(len(whole) + 1, len(whole) + 1 + len(inserted.get(at, ()))))
-        whole += [*inserted.get(at, ()), line]
+        new = inserted.get(at, [])
+        ours.update(range(len(whole) + 1, len(whole) + 1 + len(new)))
+        whole += [*new, line]
     new_text = "\n".join(whole[:-1])
     if not _only_inserted(text, new_text, ours):
         raise ValueError(f"the lines would not be statements of their own\n\n{_by_hand(plain)}")
@@ -94,7 +93,8 @@ def _only_inserted(old: str, new: str, ours: set[int]) -> bool:
         trees = [ast.parse(text.encode()) for text in (old, new)]
     except (SyntaxError, ValueError):
         return False
-    return ast.dump(trees[0]) == ast.dump(WithoutOurs().visit(trees[1]))
+    WithoutOurs().generic_visit(trees[1])
+    return ast.dump(trees[0]) == ast.dump(trees[1])
 
 
 def _by_hand(text: str) -> str:
@@ -107,11 +107,8 @@ def _by_hand(text: str) -> str:
     best = max(TRAINERS.values(), key=alike)
     if not alike(best)[0]:
         return f"it is no trainer that is known; the lines to write by hand:\n\n{ANY}"
-    numbers = [
-        f"line {at + 1}: `{place.anchor.strip()}`"
-        for place in best.places
-        for at in _starts(place.anchor, text)
-    ]
+    found = ((place.anchor, at) for place in best.places for at in _starts(place.anchor, text))
+    numbers = [f"line {at + 1}: `{anchor.strip()}`" for anchor, at in found]
     differs = misses(best, text) if best.inserted else ["a line of it must be replaced"]
     return (
         f"it is like {best.title}, but {'; '.join(differs[:3])}. Read the file, then write by hand "
@@ -146,6 +143,6 @@ def main(arguments: Sequence[str]) -> int:
         return 1
     pair = (old.replace("\r", "").split("\n"), new.replace("\r", "").split("\n"))
     print("\n".join(difflib.unified_diff(*pair, str(path), str(path), lineterm="")))
-    done = f"written; {kept} is the old file" if "--write" in arguments else "not written: --write"
-    print(f"\n{trainer.title}; {done}", file=sys.stderr)
+    done = f"written, the old file is {kept}" if "--write" in arguments else "not written"
+    print(f"\n{trainer.title}: {done}", file=sys.stderr)
     return 0

@@ -41,8 +41,7 @@ def where(place: Place) -> str:
         return place.anchor
     side = "above" if place.above else "below"
     each = "" if place.times == 1 else f", at each of its {place.times} places"
-    spaces = len(place.anchor) - len(place.anchor.lstrip())
-    inside = f", indented by {spaces} as it is" if spaces else ""
+    inside = f", indented by {len(place.indent)} as it is" if place.indent else ""
     return f"{side} `{place.anchor.strip()}`{inside}{each}"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 
@@ -16,6 +17,11 @@ class Place:
     lines: tuple[str, ...]
     above: bool = False
     times: int = 1
+
+    @property
+    def indent(self) -> str:
+        """The spaces before the anchor, and before the lines."""
+        return self.anchor[: len(self.anchor) - len(self.anchor.lstrip())]
 
 
 @dataclass(frozen=True)
@@ -44,7 +50,7 @@ class Trainer:
     relocates: bool | str
     places: tuple[Place, ...]
     signs: tuple[str | tuple[str, ...], ...] = ()
-    counts: dict[str, int | tuple[int, ...]] = field(default_factory=dict)
+    counts: Mapping[str, int | tuple[int, ...]] = field(default_factory=dict)
     notes: dict[str, str] = field(default_factory=dict)
     inserted: bool = True
     variants: dict[str, bool] = field(default_factory=dict)

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from opt3dgs_optim.hosts.places import Place, Trainer
 
 IMPORT = "from opt3dgs_optim import {names}"
@@ -123,7 +125,7 @@ def _inria(
     step: str | tuple[str, ...] = _STEP,
     upgrade: str = UPGRADE,
     again: tuple[Place, ...] = (),
-    counts: dict[str, int | tuple[int, ...]] | None = None,
+    counts: Mapping[str, int | tuple[int, ...]] | None = None,
     notes: dict[str, str] | None = None,
 ) -> Trainer:
     """A trainer with INRIA's loop."""

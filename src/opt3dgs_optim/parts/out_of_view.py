@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from opt3dgs_optim import triton
 from opt3dgs_optim.course import Course, Reading
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.step import Hold, Step
@@ -45,9 +46,10 @@ class OutOfView(Part):
         """See at the positions [N, 3] who is out of view; hold the others' second moments."""
         notes, place = course.notes_of(self), (self, step.set)
         seen = course.scratch.get(place)
-        if seen is None or seen.iteration != step.iteration:
-            seen = _looked_at(step, course, notes, seen)
-            course.scratch[place] = seen
+        if seen is None:
+            seen = course.scratch[place] = _Seen()
+        if seen.iteration != step.iteration:
+            seen.look(step, course, notes)
         if seen.rows is not None and step.name != "means" and len(seen.rows) == len(step.param):
             step.hold = Hold(seen.rows, MAX_SEEN_SHARE / notes["share"])
 
@@ -57,7 +59,7 @@ class OutOfView(Part):
             if place[0] is self and seen.reading is not None:
                 if seen.reading.source.is_cuda:
                     torch.cuda.synchronize()
-                seen.reading = _taken(seen.reading, course.notes_of(self))
+                seen.take(course.notes_of(self))
 
     def numbers(self, course: Course) -> Mapping[str, float]:
         """`visible_share`: the mean share of the points that a view sees."""
@@ -65,39 +67,75 @@ class OutOfView(Part):
 
 
 class _Seen:
-    """What was found in an iteration."""
+    """What was found of a set of Gaussians.
 
-    def __init__(self, iteration: int, rows: Tensor | None, reading: Reading | None) -> None:
-        self.iteration = iteration
-        self.rows = rows  # [N] bool, out of view; None where views see enough
-        self.reading = reading  # [1] the share of a view, on its way to the host
+    Attributes:
+        iteration: in which it was looked at last.
+        rows: [N] bool, out of view; None where views see enough.
+        counter: [1] int64, 2^32 for each point in view and 1 for each that is or was, of all looks.
+        counted: the counter before the look whose `reading` is on its way to the host.
+    """
+
+    def __init__(self) -> None:
+        self.iteration = -1
+        self.rows: Tensor | None = None
+        self.counter: Tensor | None = None
+        self.counted = 0
+        self.reading: Reading | None = None
+        self._mask: Tensor | None = None
+
+    def look(self, step: Step, course: Course, notes: dict[str, Any]) -> None:
+        """Look at the positions' gradient of this iteration."""
+        notes.setdefault("share", 1.0)
+        self.iteration, self.rows = step.iteration, None
+        self.take(notes)
+        means = step.param if step.name == "means" else course.param_of(step.set, "means")
+        grad = None if means is None else means.grad
+        # Multiples of the golden ratio keep step with no order of views, as of a rig of cameras.
+        looks = self.reading is None and step.iteration * GOLDEN_RATIO % 1.0 < SHARE_LOOKED_AT
+        holds = notes["share"] < MAX_SEEN_SHARE
+        if grad is None or not len(grad) or not (looks or holds):
+            return
+        state = course.state_of_param(step.set, "means") if looks else None
+        counter = self._counter(grad.device) if looks else None
+        if holds:
+            self.rows = self._rows(grad)
+        second = None if state is None else state["exp_avg_sq"]
+        look = triton.look if triton.looks(grad) else look_at_positions
+        look(grad, second, self.rows, counter)
+        if counter is not None:
+            self.reading = Reading(counter)
+            self.reading.ask()
+
+    def take(self, notes: dict[str, Any]) -> None:
+        """Take the share of a view into the mean, if it has come."""
+        counted = None if self.reading is None else self.reading.take()
+        if counted is None:
+            return
+        self.reading, new = None, (int(counted) - self.counted) % 2**64
+        self.counted = int(counted)
+        share = (new >> 32) / max(new % 2**32, 1)
+        if share > 0:  # a gradient that is zero everywhere is of no view
+            notes["share"] += WEIGHT * (max(share, MIN_SEEN_SHARE) - notes["share"])
+
+    def _counter(self, device: torch.device) -> Tensor:
+        if self.counter is None or self.counter.device != device:
+            self.counter, self.counted = torch.zeros(1, dtype=torch.int64, device=device), 0
+        return self.counter
+
+    def _rows(self, grad: Tensor) -> Tensor:
+        if self._mask is None or self._mask.device != grad.device or len(self._mask) != len(grad):
+            self._mask = torch.empty(len(grad), dtype=torch.bool, device=grad.device)
+        return self._mask
 
 
-def _looked_at(step: Step, course: Course, notes: dict[str, Any], before: _Seen | None) -> _Seen:
-    """Look at the positions' gradient of this iteration."""
-    notes.setdefault("share", 1.0)
-    reading = None if before is None else _taken(before.reading, notes)
-    means = step.param if step.name == "means" else course.param_of(step.set, "means")
-    grad = None if means is None else means.grad
-    # Multiples of the golden ratio keep step with no order of views, as of a rig of four cameras.
-    looks = reading is None and step.iteration * GOLDEN_RATIO % 1.0 < SHARE_LOOKED_AT
-    holds = notes["share"] < MAX_SEEN_SHARE
-    if grad is None or not len(grad) or not (looks or holds):
-        return _Seen(step.iteration, None, reading)
+def look_at_positions(
+    grad: Tensor, exp_avg_sq: Tensor | None, out_of_view: Tensor | None, counter: Tensor | None
+) -> None:
+    """`opt3dgs_optim.triton.look` in plain torch."""
     in_view = (grad != 0).any(1)
-    if looks:
-        state = course.state_of_param(step.set, "means")
-        known = in_view if state is None else in_view | (state["exp_avg_sq"] != 0).any(1)
-        reading = Reading((in_view.sum() / known.sum().clamp_(min=1)).reshape(1))
-        reading.ask()
-    return _Seen(step.iteration, ~in_view if holds else None, reading)
-
-
-def _taken(reading: Reading | None, notes: dict[str, Any]) -> Reading | None:
-    """Take the share of a view into the mean; what is still on its way."""
-    share = None if reading is None else reading.take()
-    if share is None:
-        return reading
-    if share > 0:  # a gradient that is zero everywhere is of no view
-        notes["share"] += WEIGHT * (max(share, MIN_SEEN_SHARE) - notes["share"])
-    return None
+    if out_of_view is not None:
+        torch.logical_not(in_view, out=out_of_view)
+    if counter is not None:
+        known = in_view if exp_avg_sq is None else in_view | (exp_avg_sq != 0).any(1)
+        counter.add_(in_view.sum() * 2**32 + known.sum())

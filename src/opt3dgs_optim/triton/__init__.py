@@ -1,23 +1,224 @@
-"""The step of a parameter as one Triton launch on a GPU."""
+"""The step of a parameter as one Triton launch on a GPU.
 
+Triton comes with torch's CUDA and ROCm builds for Linux. It is imported with the first step of a
+tensor on a GPU. Where it is missing, or cannot compile, `opt3dgs_optim.step.take_step` runs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import os
+import subprocess
+import sys
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.step import Hyper, Step
+
+ROWS_BLOCK, FRAME_BLOCK, LOOK_BLOCK = 1024, 128, 1024  # as in `kernels`
+LONG = 2**31 - ROWS_BLOCK  # above it a number's place needs 64 bits
+NO_FADE = (0, 0.0, 1.0, 1.0)
+_HERE = contextlib.nullcontext()
+_COMPILED: dict[Any, Any] = {}  # what Triton has compiled, by what it depends on
+CHECK = "opt3dgs_optim.triton.check"  # run as a program, with Triton's interpreter
+
+
+@functools.cache
+def missing() -> str | None:
+    """Why no kernel runs on this machine's GPU, in a sentence; None: they run.
+
+    The first call makes a launch, by which it shows whether Triton can compile here.
+    """
+    try:
+        _kernels()
+    except Exception as error:  # of a Triton for another machine, anything
+        return f"Triton cannot be imported ({error}), so that a step on a GPU is many launches."
+    if not torch.cuda.is_available():
+        return "torch sees no GPU, so that a step is plain torch."
+    try:
+        p, g, m, v = torch.zeros(4, 1, device="cuda")
+        hyper = Hyper(0.0, 0.9, 0.999, 1.0, 1.0, 1.0, m, v)
+        launch(Step(p, g, None, "", {}, {}, 0, -1), hyper)
+    except Exception as error:  # no C compiler, a GPU that is too old, a folder that is read-only
+        return (
+            f"Triton cannot launch a kernel ({type(error).__name__}: {error}), so that a step on "
+            "a GPU is many launches; it needs a C compiler (apt install gcc) and a writable home."
+        )
+    return None
+
+
+@functools.cache
+def _runs() -> bool:
+    reason = missing()
+    if reason is not None:
+        LOGGER.warning("opt3dgs_optim: %s", reason)
+    return reason is None
+
+
+@functools.cache
+def _kernels() -> Any:
+    return importlib.import_module("opt3dgs_optim.triton.kernels")
 
 
 def takes(step: Step) -> bool:
-    """Whether the kernels make this step."""
-    return False
+    """Whether the kernels make this step: float32 without gaps, on a GPU with Triton."""
+    return step.param.is_cuda and _runs() and fits(step)
+
+
+def fits(step: Step) -> bool:
+    """`takes`, wherever the tensors lie."""
+    state, frame = step.state, step.frame
+    if not (
+        _plain(step.param) and _plain(step.grad)
+        and _plain(state["exp_avg"]) and _plain(state["exp_avg_sq"])
+    ):  # fmt: skip
+        return False
+    if frame is None:
+        return not step.plain or (step.fade is None and step.hold is None)
+    if step.plain or step.fade is not None or step.hold is not None:
+        return False  # none of our parts says so of positions in their own frames
+    return _plain(frame.quats) and _plain(frame.scales) and 4 * step.param.shape[0] < LONG
+
+
+def _plain(tensor: Tensor) -> bool:
+    return tensor.dtype is torch.float32 and tensor.is_contiguous()
 
 
 def take_step(step: Step, hyper: Hyper) -> None:
-    """Make the step in one launch."""
-    raise NotImplementedError
+    """Make the step in one launch: what `opt3dgs_optim.step.take_step` means.
+
+    Numbers that are not finite are added to `hyper.nonfinite` [1] int32. Nothing waits for the
+    device, and nothing is allocated there.
+    """
+    with _device_of(step.param):
+        launch(step, hyper)
+    # Autograd is to see that a parameter has changed, as after an operator of torch's.
+    torch.autograd.graph.increment_version(step.param)
 
 
-def missing() -> str | None:
-    """Why the kernels cannot run in this process, or None."""
-    return "not yet"
+def looks(grad: Tensor) -> bool:
+    """Whether `look` takes the positions' gradient."""
+    return grad.is_cuda and _runs() and _plain(grad) and 3 * len(grad) < LONG
 
 
-def interpreted_difference() -> float | None:
-    """How far the kernels, run by Triton's interpreter, are from torch."""
-    return None
+def look(
+    grad: Tensor, exp_avg_sq: Tensor | None, out_of_view: Tensor | None, counter: Tensor | None
+) -> None:
+    """See in one launch which positions have no gradient.
+
+    Args:
+        grad: [N, 3] of the positions; `looks(grad)`. N above 0.
+        exp_avg_sq: [N, 3] their second moments, or None before their first step.
+        out_of_view: [N] bool to write into, or None.
+        counter: [1] int64, to which 2^32 is added for each position with a gradient, and 1 for each
+            that has or had one; or None.
+    """
+    mask = None if out_of_view is None else out_of_view.view(torch.uint8)
+    with _device_of(grad):
+        _run(
+            "look_at_positions", -(-len(grad) // LOOK_BLOCK), (grad, exp_avg_sq, mask, counter),
+            (len(grad),),
+        )  # fmt: skip
+
+
+def _device_of(tensor: Tensor) -> Any:
+    """A context in which kernels are launched where a tensor lies."""
+    index = tensor.get_device()
+    return _HERE if index in (-1, torch.cuda.current_device()) else torch.cuda.device(index)
+
+
+def launch(step: Step, hyper: Hyper) -> None:
+    param = step.param
+    numbers = param.numel()
+    if not numbers:
+        return
+    frame, fade, hold, how, factor = step.frame, step.fade, step.hold, step.mean, step.factor
+    size = hyper.lr if frame is None else frame.rate
+    on_device = None
+    if isinstance(factor, Tensor):
+        on_device = factor
+    else:
+        size *= factor
+    if not step.plain:
+        size /= hyper.correction1
+    number, put = (0.0, 0.0) if how is None else (float(how.number), float(how.put))
+    mean, began = (None, None) if how is None else (hyper.mean, hyper.began)
+    adam = (
+        hyper.beta2, 1 - hyper.beta1, 1 - hyper.beta2, hyper.eps, hyper.root2, hyper.shrink,
+        hyper.decay,
+    )  # fmt: skip
+    if frame is not None:
+        _run(
+            "step_in_own_frame", -(-param.shape[0] // FRAME_BLOCK),
+            (param, step.grad, hyper.exp_avg, hyper.exp_avg_sq, frame.quats, frame.scales, mean,
+             began, on_device, hyper.nonfinite),
+            (param.shape[0], frame.min_aspect, size, *adam, number, put),
+        )  # fmt: skip
+        return
+    key, share, fade_m, fade_v = NO_FADE if fade is None else fade
+    held, weight = (None, 0.0) if hold is None else (hold.rows.view(torch.uint8), hold.weight)
+    m, v = (None, None) if step.plain else (hyper.exp_avg, hyper.exp_avg_sq)
+    _run(
+        "step_rows", -(-numbers // ROWS_BLOCK),
+        (param, step.grad, m, v, mean, began, held, on_device, hyper.nonfinite),
+        (numbers, numbers // param.shape[0] if param.dim() else 1, size, *adam,
+         key if key < 2**31 else key - 2**32, share, fade_m, fade_v, weight, number, put),
+    )  # fmt: skip
+
+
+def _run(
+    name: str, programs: int, tensors: tuple[Tensor | None, ...], numbers: tuple[float, ...]
+) -> None:
+    """Launch a kernel; what Triton has compiled is launched again without its launcher.
+
+    Triton's launcher looks at every argument, which takes 30 us. What it finds is the same again
+    where the same tensors are there, all begin at a multiple of 16 bytes, and are on one device.
+    """
+    pointers = [None if tensor is None else tensor.data_ptr() for tensor in tensors]
+    every, absent, bit = 0, 0, 1
+    for pointer in pointers:
+        if pointer is None:
+            absent |= bit
+        else:
+            every |= pointer
+        bit *= 2
+    first = tensors[0]
+    assert first is not None
+    key = name, absent, first.get_device(), numbers[0] > LONG
+    compiled = _COMPILED.get(key) if every % 16 == 0 else None
+    if compiled is not None:
+        compiled[programs, 1, 1](*pointers, *numbers)
+        return
+    kernel = getattr(_kernels(), name)
+    # Without the fusion of a product and a sum the numbers are those of torch's operators.
+    compiled = kernel[programs,](*tensors, *numbers, enable_fp_fusion=False)
+    if every % 16 == 0 and compiled is not None:
+        _COMPILED[key] = compiled
+
+
+def interpreted_difference(timeout: float = 120.0) -> float | None:
+    """How far the kernels, run on this CPU by Triton's interpreter, are from plain torch.
+
+    The largest difference of a parameter, a moment or a mean after thirty steps with all that a
+    step can have, as a share of its size (of 1 for smaller ones). It takes some seconds, in a
+    process of its own. None: Triton is not installed.
+
+    Raises:
+        RuntimeError: the kernels fail, with what they said.
+    """
+    try:
+        importlib.import_module("triton.language")
+    except ImportError:
+        return None
+    done = subprocess.run(
+        [sys.executable, "-m", CHECK], env={**os.environ, "TRITON_INTERPRET": "1"},
+        capture_output=True, text=True, timeout=timeout, check=False,
+    )  # fmt: skip
+    if done.returncode:
+        raise RuntimeError(f"Triton's interpreter has failed on the kernels: {done.stderr[-500:]}")
+    return float(done.stdout.split()[-1])

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 from relocation_oracle import printed_equation
-from splatting.density import MCMCDensityControl, regularisers
+from splatting.density import MCMCDensityControl, add_noise, regularisers
 from splatting.gaussians import gaussians_from_points
 from splatting.relocation import relocated_values
 
@@ -213,6 +213,30 @@ def test_for_run_at_full_length_is_stock():
     short = MCMCDensityControl.for_run(1500, 2000, num_points=2000)
     assert (short.refine_start, short.refine_stop, short.refine_every) == (25, 1250, 20)
     assert short.growth == 1.05
+
+
+def test_noise_has_the_gaussians_own_covariance_and_fades_with_opacity():
+    """Sigma @ eta has the covariance Sigma^2; eq. 2's gate, at opacities on both sides of it."""
+    count, lr = 60_000, 1e-6
+    quat, scales = torch.tensor([0.8, 0.4, -0.2, 0.4]), torch.tensor([0.5, -0.5, -2.0])
+    rotation = torch.tensor(  # of that quaternion, by hand: R = (w^2 - u.u) I + 2 u u^T + 2 w [u]
+        [[0.6, -0.8, 0.0], [0.48, 0.36, -0.8], [0.64, 0.48, 0.6]]
+    )
+    covariance = rotation @ torch.diag((2 * scales).exp()) @ rotation.T
+    for opacity in (0.001, 0.02):
+        gaussians = {
+            "means": torch.nn.Parameter(torch.zeros(count, 3)),
+            "quats": torch.nn.Parameter(2 * quat.repeat(count, 1)),
+            "scales": torch.nn.Parameter(scales.repeat(count, 1)),
+            "opacities": torch.nn.Parameter(torch.full((count,), opacity).logit()),
+        }
+        add_noise(gaussians, lr, torch.Generator().manual_seed(0))
+        moved = gaussians["means"].detach() / (lr * 5e5)
+        gate = 1 / (1 + math.exp(-100 * (0.005 - opacity)))
+        expected = gate**2 * covariance @ covariance
+        # 5 standard errors of a variance of 60,000 draws
+        tolerance = 5 * (2 / count) ** 0.5 * float(expected.diagonal().max())
+        torch.testing.assert_close(moved.T @ moved / count, expected, rtol=0, atol=tolerance)
 
 
 def test_regularisers():

@@ -1,20 +1,16 @@
-"""Initial Gaussians, learning rates and the .ply round trip."""
+"""Initial Gaussians and learning rates."""
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 import torch
-from plyfile import PlyData
 from splatting.gaussians import (
     DEFAULT_PRESET,
     MCMC_PRESET,
     gaussians_from_points,
     neighbour_distance,
-    random_gaussians,
-    save_ply,
     stock_learning_rates,
 )
 
@@ -107,17 +103,6 @@ def test_float64_points_give_float64_parameters():
     assert {p.dtype for p in gaussians.values()} == {torch.float64}
 
 
-def test_random_gaussians_fill_their_cube():
-    center = torch.tensor([10.0, 0.0, -4.0])
-    gaussians = random_gaussians(
-        2.0, 3000, center=center, spread=3.0, generator=torch.Generator().manual_seed(0)
-    )
-    offsets = gaussians["means"].detach() - center
-    assert offsets.abs().max() <= 6.0
-    assert offsets.abs().max() > 5.9  # 3000 uniform draws come closer than 0.1 to the wall
-    assert offsets.mean(dim=0).abs().max() < 0.32  # 5 deviations: 5 * 12 / sqrt(12 * 3000)
-
-
 def test_stock_learning_rates():
     assert stock_learning_rates(4.0) == {
         "means": 4 * 1.6e-4,
@@ -127,20 +112,3 @@ def test_stock_learning_rates():
         "sh0": 2.5e-3,
         "shN": 1.25e-4,
     }
-
-
-def test_ply_columns_are_inrias(tmp_path):
-    gaussians = gaussians_from_points(*_cloud(4), sh_degree=1)
-    rest = torch.arange(4 * 3 * 3).reshape(4, 3, 3).float()
-    gaussians["shN"].data.copy_(rest)
-    save_ply(tmp_path / "g.ply", gaussians)
-    vertices = PlyData.read(str(tmp_path / "g.ply"))["vertex"]
-    expected = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-    expected += [f"f_rest_{i}" for i in range(9)]
-    expected += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    assert [prop.name for prop in vertices.properties] == expected
-    for name, key in (("x", "means"), ("opacity", "opacities"), ("rot_0", "quats")):
-        values = gaussians[key].detach().reshape(4, -1)[:, 0]
-        np.testing.assert_array_equal(vertices[name], values.numpy())
-    # channel-major: coefficient 1 of green is column 3 + 1
-    np.testing.assert_array_equal(vertices["f_rest_4"], rest[:, 1, 1].numpy())

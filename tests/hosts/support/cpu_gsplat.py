@@ -13,7 +13,7 @@ from splatting.metrics import ssim_map
 from splatting.relocation import relocated_values
 from torch import Tensor
 
-REFUSED = ("packed", "sparse_grad", "absgrad", "covars", "with_ut", "with_eval3d", "distributed")
+REFUSED = ("packed", "sparse_grad", "covars", "with_ut", "with_eval3d", "distributed")
 
 
 def install() -> None:
@@ -77,6 +77,8 @@ def rasterize(
 
     def arrived(grad: Tensor) -> None:  # strategies read the gradient of the projected means
         means2d.grad = grad if means2d.grad is None else means2d.grad + grad
+        if others.get("absgrad"):  # smaller than the sum of the pixels' absolute values
+            setattr(means2d, "absgrad", means2d.grad.abs())  # noqa: B010
 
     moved.register_hook(arrived)
     info = {

@@ -92,7 +92,7 @@ class Done:
 
 
 _TAMING = "--cams 2 --percent_dense 0.03 --mode final_count --budget 6000"
-_TAMING += " --opacity_reset_interval 1000"  # afterwards no gradient is large enough to split
+_TAMING += " --opacity_reset_interval 1000 --densify_until_iter 40"  # a budget for each refinement
 TRIALS = (
     *(
         Trial(f"gsplat-{version}", options, "examples/simple_trainer.py")

@@ -1,0 +1,354 @@
+"""Make the tables and pictures of docs/evidence.md anew: python examples/benchmarks/report.py
+
+All of it comes from docs/results/evidence.jsonl, and the cost of a step from steps.json beside it.
+In the page a table stands between `<!-- evidence:NAME -->` and `<!-- end -->`, where NAME is a
+function of `TABLES`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import statistics
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks import evidence, steps
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "evidence.md"
+PICTURE = evidence.FILE.with_name("iterations.png")
+MAIN = ("bonsai", "lego", "plush")
+FEW = ("banana", "brighton_beach", "embedded", "lund_door")
+HALF: dict[str, Any] = {"size": "images_2", "points": 50_000, "sh_degree": 0}
+QUARTER: dict[str, Any] = {"size": "images_4", "sh_degree": 0}
+METRICS = ("psnr", "ssim", "lpips")
+FORMS = {"psnr": "{:.2f}", "ssim": "{:.4f}", "lpips": "{:.4f}"}
+GAINS = {"psnr": "{:+.2f}", "ssim": "{:+.4f}", "lpips": "{:+.4f}"}
+Line = dict[str, Any]
+
+
+class Evidence:
+    """All lines, to choose from."""
+
+    def __init__(self, path: Path = evidence.FILE) -> None:
+        self.lines = evidence.read(path)
+
+    def of(self, arm: str, scene: str, **those: Any) -> list[Line]:
+        """The lines of an arm; what is not said is as usual, on a CPU. One a seed, in order."""
+        wanted = evidence.USUAL | those | {"arm": arm, "scene": scene}
+        found = [x for x in self.lines if all(x.get(k) == v for k, v in wanted.items())]
+        found = [x for x in found if "NVIDIA" not in x["device"]]
+        return sorted(found, key=lambda x: str(x["seed"]))
+
+
+def seeds_of(lines: Iterable[Line]) -> list[int]:
+    """All seeds of the lines."""
+    return sorted(
+        s for x in lines for s in (x["seed"] if isinstance(x["seed"], list) else [x["seed"]])
+    )
+
+
+def mean(lines: Sequence[Line], metric: str) -> float:
+    """Over the seeds."""
+    weights = [len(seeds_of([x])) for x in lines]
+    return sum(w * x[metric] for w, x in zip(weights, lines, strict=True)) / sum(weights)
+
+
+def shown(lines: Sequence[Line]) -> str:
+    """PSNR / SSIM / LPIPS and the number of seeds."""
+    if not lines:
+        return "not trained"
+    values = (FORMS[m].format(mean(lines, m)) for m in METRICS if lines[0][m] is not None)
+    count = len(seeds_of(lines))
+    return f"{' / '.join(values)} ({count} seed{'s' * (count > 1)})"
+
+
+def gain(lines: Sequence[Line], control: Sequence[Line]) -> dict[str, float] | None:
+    """Mean difference over the seeds that both have; None where there is none."""
+    common = set(seeds_of(lines)) & set(seeds_of(control))
+    if not common or any(isinstance(x["seed"], list) for x in (*lines, *control)):
+        same = lines and control and seeds_of(lines) == seeds_of(control)
+        return {m: mean(lines, m) - mean(control, m) for m in METRICS} if same else None
+    ours, theirs = ([x for x in each if x["seed"] in common] for each in (lines, control))
+    return {m: mean(ours, m) - mean(theirs, m) for m in METRICS if ours[0][m] is not None}
+
+
+def gained(lines: Sequence[Line], control: Sequence[Line]) -> str:
+    """The gain, and over how many seeds."""
+    found = gain(lines, control)
+    if found is None:
+        return "not trained" if not lines else "-"
+    count = len(set(seeds_of(lines)) & set(seeds_of(control)))
+    values = " / ".join(signed(v, m) for m, v in found.items())
+    return f"{values} ({count} seed{'s' * (count > 1)})"
+
+
+def signed(value: float, metric: str) -> str:
+    """With its sign, but for zero."""
+    form = GAINS[metric].format(value)
+    return form if float(form) else form[1:]
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Markdown."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+# -- the tables -----------------------------------------------------------------------------------
+
+
+SHORTER = (
+    *(("own", count) for count in (15_000, 10_000, 7_500)),
+    *((arm, 10_000) for arm in ("mcmc", "x2", "x3", "averaged", "x2-averaged", "learn2splat")),
+)
+
+
+def iterations(all_: Evidence) -> str:
+    """Shorter trainings against stock's 30,000 iterations, seed by seed."""
+    rows: list[tuple[str, ...]] = []
+    missing: dict[str, list[str]] = {}
+    for scene in MAIN:
+        stock = all_.of("mcmc", scene, iterations=30_000, **HALF)
+        rows.append((scene, "stock, 30,000", shown(stock), ""))
+        for arm, count in SHORTER:
+            lines = all_.of(arm, scene, iterations=count, **HALF)
+            name = f"{NAMES[arm]}, {count:,}"
+            if lines:
+                rows.append(("", name, shown(lines), gained(lines, stock)))
+            else:
+                missing.setdefault(name, []).append(scene)
+    heads = ("scene", "training", "PSNR / SSIM / LPIPS", "less stock at 30,000, same seeds")
+    left = "; ".join(f"{name} ({', '.join(scenes)})" for name, scenes in missing.items())
+    said = f"\n\nNot trained yet: {left}." if missing else ""
+    return table(heads, rows) + said
+
+
+def kept_aside(all_: Evidence) -> str:
+    """A scene that nobody tuned to."""
+    rows = []
+    for arm in ("mcmc", "x2", "defaults", "own"):
+        found = [x for x in all_.lines if x["scene"] == "kept-aside" and x["arm"] == arm]
+        cells = {x["iterations"]: shown([x]).removesuffix(" (1 seed)") for x in found}
+        rows.append((NAMES[arm], *(cells.get(n, "-") for n in (1_875, 2_500, 3_750, 7_500))))
+    return table(("training", "1,875", "2,500", "3,750", "7,500 iterations"), rows)
+
+
+def gpu(all_: Evidence) -> str:
+    """What was read on a GPU, at the last evaluation that all arms reached and at a third of it."""
+    rows = []
+    found = [x for x in all_.lines if "NVIDIA" in x["device"]]
+    for setting in sorted({(x["scene"], x["points"], x["iterations"]) for x in found}):
+        those = {
+            x["arm"]: dict(zip(x["curve"]["iteration"], x["curve"]["psnr"], strict=True))
+            for x in found
+            if (x["scene"], x["points"], x["iterations"]) == setting
+        }
+        marks = sorted(set.intersection(*map(set, those.values())))
+        for arm in ("mcmc", "defaults", "own"):
+            cells = [f"{those[arm][n]:.2f} at {n:,}" for n in (marks[len(marks) // 3], marks[-1])]
+            scene, points, planned = setting
+            what = f"{scene}, {points:,}, {planned:,}" if arm == "mcmc" else ""
+            rows.append((what, NAMES[arm], *cells))
+    heads = ("scene, Gaussians, planned iterations", "training", "PSNR early", "PSNR at the last")
+    return table(heads, rows)
+
+
+def equal(all_: Evidence) -> str:
+    """All of 30,000 iterations."""
+    rows = []
+    for size, setting in (("half", HALF), ("quarter", QUARTER)):
+        for scene in MAIN:
+            stock = all_.of("mcmc", scene, iterations=30_000, **setting)
+            lines = (
+                all_.of(a, scene, iterations=30_000, **setting) for a in ("own", "defaults", "x2")
+            )
+            rows.append((scene, size, shown(stock), *(gained(x, stock) for x in lines)))
+    heads = ("scene", "size", "stock", "own frame", "fading (the defaults before)", "rates times 2")
+    return table(heads, rows)
+
+
+def cost(_: Evidence) -> str:
+    """What a step costs on a CPU."""
+    made = json.loads(steps.OUT.read_text(encoding="utf-8"))
+    found = {int(points): rows for points, rows in made["results"].items()}
+    about = f"{made['machine']}, {made['date']}, medians of {made['rounds']} rounds."
+    return f"{steps.table(found)}\n\n{about}"
+
+
+def few(all_: Evidence) -> str:
+    """Scenes with 10 to 24 photos; all beside stock at 30,000."""
+    rows = []
+    for scene in FEW:
+        stock = all_.of("mcmc", scene, iterations=30_000, **QUARTER)
+        others = (("defaults", 30_000), ("own", 30_000), ("own", 10_000))
+        lines = (all_.of(arm, scene, iterations=n, **QUARTER) for arm, n in others)
+        rows.append((scene, shown(stock), *(gained(x, stock) for x in lines)))
+    fading, own = NAMES["defaults"], "own frame"
+    heads = ("scene", "stock", fading, f"{own}, 30,000", f"{own}, 10,000")
+    return table(heads, rows)
+
+
+def adaptive(all_: Evidence) -> str:
+    """Clone, split, prune and reset."""
+    rows = []
+    for scene in ("lego", "plush"):
+        stock = all_.of("adc", scene, iterations=30_000, **QUARTER)
+        for arm in ("adc", "adc-own", "adc-annealed-faded-averaged"):
+            lines = all_.of(arm, scene, iterations=30_000, **QUARTER)
+            first, less = (scene, "") if arm == "adc" else ("", gained(lines, stock))
+            count = f"{mean(lines, 'gaussians'):,.0f}"
+            rows.append((first, NAMES[arm], shown(lines), less, count))
+    heads = ("scene", "training", "PSNR / SSIM / LPIPS", "less stock", "Gaussians")
+    return table(heads, rows)
+
+
+def capture(all_: Evidence) -> str:
+    """A large capture, where views see little."""
+    rows = []
+    for arm in ("mcmc", "out-of-view", "defaults-without", "defaults"):
+        lines = all_.of(arm, "capture")
+        rows.append((lines[0]["note"].split(";")[0], shown(lines)))
+    return table(("training", "PSNR / SSIM"), rows)
+
+
+CLOSED = (  # what, its arm, the same training without it
+    ("the paper's preset", "paper", "mcmc"),
+    ("the same, beside a constant multiplier of its mean nu", "paper", "paper-constant"),
+    (
+        "AW-SGLD, this package's form, beside such a constant",
+        "awsgld-stable",
+        "awsgld-stable-constant",
+    ),
+    ("L2 loss in the last thirtieth", "l2@1/30", "mcmc"),
+    ("fresh moments in the last thirtieth", "l1+reset@1/30", "mcmc"),
+    ("L-BFGS directions in the last thirtieth", "l2+reset+lqn@1/30", "l2+reset@1/30"),
+    ("L-BFGS directions in the last quarter", "l1+reset+lqn@1/4", "l1+reset@1/4"),
+    ("`Annealing` beside fading and averaging", "annealed+averaged", "defaults"),
+    ("one second moment a Gaussian", "faded+pooled+averaged", "defaults"),
+    ("rates times 3", "x3", "mcmc"),
+    ("the positions' rate times 3", "positions-x3", "mcmc"),
+    ("rates times 2", "x2", "mcmc"),
+    ("averaging", "averaged", "mcmc"),
+    ("fading, a hold and averaging: the defaults before", "defaults", "mcmc"),
+    ("own frame: the defaults", "own", "mcmc"),
+)
+
+
+def closed(all_: Evidence) -> str:
+    """What was tried, each beside the same training without it, quarter size, 30,000 iterations."""
+    rows = []
+    for what, arm, control in CLOSED:
+        gains, trainings = {}, 0
+        for scene in (*MAIN, "bonsai-misposed"):
+            pair = [all_.of(a, scene, iterations=30_000, **QUARTER) for a in (arm, control)]
+            if "bonsai" in gains and scene == "bonsai-misposed":
+                continue
+            if found := gain(*pair):
+                gains[scene] = found
+                trainings += len({*seeds_of(pair[0])} & {*seeds_of(pair[1])})
+        cells = [spread([g[m] for g in gains.values()], m) for m in METRICS]
+        rows.append((what, f"{len(gains)}, {trainings}", *cells))
+    return table(("what", "scenes, trainings", "PSNR", "SSIM", "LPIPS"), rows)
+
+
+def spread(values: Sequence[float], metric: str) -> str:
+    """Mean and standard error over the scenes."""
+    error = statistics.stdev(values) / len(values) ** 0.5 if len(values) > 1 else 0.0
+    return f"{signed(statistics.mean(values), metric)} ± {FORMS[metric].format(error)}"
+
+
+NAMES = {
+    "mcmc": "stock",
+    "own": "own frame",
+    "defaults": "fading (the defaults before)",
+    "x2": "rates times 2",
+    "x3": "rates times 3",
+    "averaged": "stock, averaged",
+    "x2-averaged": "rates times 2, averaged",
+    "learn2splat": "Learn2Splat's tuned Adam",
+    "adc": "stock",
+    "adc-own": "`OwnFrame` and `Averaging`",
+    "adc-annealed-faded-averaged": "`Annealing` and `Fading`, not of the scales",
+}
+TABLES: dict[str, Callable[[Evidence], str]] = {
+    f.__name__: f
+    for f in (iterations, kept_aside, gpu, equal, cost, few, adaptive, capture, closed)
+}
+
+
+DRAWN = (
+    ("mcmc", 30_000, "#555555"),
+    ("own", 30_000, "#9ecae1"),
+    ("own", 15_000, "#4292c6"),
+    ("own", 10_000, "#d55e00"),
+    ("own", 7_500, "#009e73"),
+)
+
+
+def draw(all_: Evidence, path: Path) -> None:
+    """Quality over iterations at half size, with the end of stock's training as a line.
+
+    The curves of a scene are means over the seeds that all of them have.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 3.7), dpi=130, layout="constrained")
+    axes, entries = figure.subplots(1, len(MAIN)), {}
+    for axis, scene in zip(axes, MAIN, strict=True):
+        found = {
+            (arm, count, colour): {x["seed"]: x["curve"] for x in lines if x.get("curve")}
+            for arm, count, colour in DRAWN
+            if (lines := all_.of(arm, scene, iterations=count, **HALF))
+        }
+        seeds = sorted(set.intersection(*map(set, found.values())))
+        for (arm, count, colour), curves in found.items():
+            at = curves[seeds[0]]["iteration"]
+            values = zip(*(curves[seed]["psnr"] for seed in seeds), strict=True)
+            curve = [statistics.mean(each) for each in values]
+            label = "stock" if arm == "mcmc" else f"own frame, planned for {count:,}"
+            (entries[label],) = axis.plot([n / 1000 for n in at], curve, color=colour, lw=2)
+            axis.plot(at[-1] / 1000, curve[-1], "o", color=colour, ms=6)
+            if arm == "mcmc":
+                axis.axhline(end := curve[-1], color=colour, lw=1, ls="--", zorder=0)
+                axis.set_ylim(end - 5, end + 1.6)
+        said = f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"
+        axis.set(title=f"{scene}, {said}", xlabel="thousand iterations", xlim=(0, 31))
+        axis.grid(color="#e4e4e4", lw=0.8)
+    axes[0].set_ylabel("PSNR of held-out views, dB")
+    order = dict.fromkeys(["stock", *(f"own frame, planned for {n:,}" for _, n, _ in DRAWN)])
+    names = [name for name in order if name in entries]
+    handles = [entries[name] for name in names]
+    place = "outside lower center"
+    figure.legend(handles, names, loc=place, ncols=len(names), frameon=False, fontsize=9)
+    figure.savefig(path)
+
+
+def filled(page: str, all_: Evidence) -> str:
+    """The page with its tables made anew; ValueError where it names one that there is not."""
+
+    def made(found: re.Match[str]) -> str:
+        if found[1] not in TABLES:
+            raise ValueError(f"{PAGE.name}: evidence:{found[1]}, but there are {', '.join(TABLES)}")
+        return f"<!-- evidence:{found[1]} -->\n{TABLES[found[1]](all_)}\n<!-- end -->"
+
+    return re.sub(r"<!-- evidence:(\w+) -->.*?<!-- end -->", made, page, flags=re.DOTALL)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line."""
+    argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0]).parse_args(arguments)
+    all_ = Evidence()
+    PAGE.write_text(filled(PAGE.read_text(encoding="utf-8"), all_), encoding="utf-8")
+    draw(all_, PICTURE)
+    print(PAGE, PICTURE, sep="\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,139 @@
+"""The kernels beside plain torch on a CPU, by Triton's interpreter.
+
+TRITON_INTERPRET=1 python -m opt3dgs_optim.triton.check
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim import triton
+from opt3dgs_optim.step import Fade, Frame, Hold, Hyper, Mean, Step, like_rows, take_step
+
+SHAPES = ((257, 3), (31, 4), (1000,), (19, 15, 3))
+
+
+def case(
+    shape: tuple[int, ...],
+    generator: torch.Generator,
+    *,
+    steps: int = 10,
+    fade: bool = False,
+    frame: bool = False,
+    hold: bool = False,
+    mean: bool = False,
+    put: bool = False,
+    plain: bool = False,
+    factor: Any = 1.0,
+    shrink: float = 1.0,
+    decay: float = 0.0,
+    bad: int = 0,
+) -> tuple[Step, Hyper]:
+    """A step of a parameter amid a training, with what is asked for, from random numbers.
+
+    Args:
+        steps: of Adam, with this one. bad: how many numbers of the gradient are not finite.
+    """
+
+    def draw(*size: int) -> Tensor:
+        return torch.randn(size, generator=generator)
+
+    rows = shape[0]
+    param, grad = draw(*shape), draw(*shape) * 10.0 ** (draw(*shape) * 2).clamp(-6, 6)
+    exp_avg, exp_avg_sq = 0.1 * draw(*shape), draw(*shape).square()
+    grad.view(-1)[:bad] = torch.tensor([float("nan"), float("inf"), -float("inf")])[
+        torch.arange(min(bad, grad.numel())) % 3
+    ]
+    step = Step(param, grad, None, "", {}, {"exp_avg": exp_avg, "exp_avg_sq": exp_avg_sq}, 0, -1)
+    step.factor, step.plain = factor, plain
+    if fade:
+        step.fade = Fade(0x9E3779B1, 0.3, 0.2, 0.04)
+    if frame:
+        step.frame = Frame(0.1, 0.1, draw(rows, 4), draw(rows, 3) - 3)
+    if hold:
+        step.hold = Hold(draw(rows) < 0, 7.0)
+    hyper = Hyper(
+        1e-2, 0.9, 0.999, 1e-15, 1 - 0.9**steps, (1 - 0.999**steps) ** 0.5, exp_avg, exp_avg_sq,
+        shrink, decay, nonfinite=torch.zeros(1, dtype=torch.int32),
+    )  # fmt: skip
+    if mean:
+        step.mean = Mean(steps, put)
+        began = torch.randint(0, steps, (rows,), generator=generator).to(torch.float32)
+        hyper.mean, hyper.began = (param + 0.1 * draw(*shape)), began
+        hyper.mean.mul_(like_rows(began > 0, param))  # others begin with this step
+    return step, hyper
+
+
+def tensors(step: Step, hyper: Hyper) -> list[Tensor]:
+    """What a step changes."""
+    found = [step.param, hyper.exp_avg, hyper.exp_avg_sq]
+    if hyper.mean is None or hyper.began is None:
+        return found
+    return [*found, hyper.mean, hyper.began]
+
+
+def both(options: dict[str, Any], shape: tuple[int, ...], seed: int = 0) -> tuple[Any, Any]:
+    """The same case, stepped by plain torch, and by the kernels; each a step and its numbers."""
+    made = []
+    for kernels in (False, True):
+        step, hyper = case(shape, torch.Generator().manual_seed(seed), **options)
+        if kernels:
+            assert triton.fits(step), options
+            triton.launch(step, hyper)
+        else:
+            bad = take_step(step, hyper)
+            assert hyper.nonfinite is not None
+            hyper.nonfinite += bad
+        made.append((step, hyper))
+    return made[0], made[1]
+
+
+def difference(options: dict[str, Any], shape: tuple[int, ...], seed: int = 0) -> float:
+    """The largest difference, as a share of a number's size (of 1 for smaller ones).
+
+    In the own frame, of the longest of the row's three: they are sums that may cancel.
+    Infinite where one is not finite and the other is, or other numbers were counted as not finite.
+    """
+    (step, hyper), (step2, hyper2) = both(options, shape, seed)
+    assert hyper.nonfinite is not None
+    assert hyper2.nonfinite is not None
+    if not torch.equal(hyper.nonfinite, hyper2.nonfinite):
+        return float("inf")
+    worst = 0.0
+    for ours, theirs in zip(tensors(step, hyper), tensors(step2, hyper2), strict=True):
+        if not ours.numel():
+            continue
+        known = torch.isfinite(ours)
+        if not torch.equal(known, torch.isfinite(theirs)):
+            return float("inf")
+        size = torch.where(known, ours, 0.0).abs()
+        size = size.amax(1, keepdim=True) if step.frame is not None and ours.dim() > 1 else size
+        away = (ours - theirs).abs() / size.clamp(min=1.0)
+        worst = max(worst, float(away[known].max()) if known.any() else 0.0)
+    return worst
+
+
+def combinations() -> Iterator[tuple[dict[str, Any], tuple[int, ...]]]:
+    """Steps with everything that can meet in one."""
+    for shape, (fade, hold, mean) in itertools.product(
+        SHAPES, itertools.product((False, True), repeat=3)
+    ):
+        yield {"fade": fade, "hold": hold, "mean": mean, "bad": 5, "shrink": 0.999}, shape
+    for mean, decay in itertools.product((False, True), (0.0, 0.01)):
+        options = {"mean": mean, "put": mean, "decay": decay, "bad": 2}
+        yield {"frame": True, **options}, (257, 3)
+        yield {"plain": True, "factor": torch.tensor(0.7), **options}, (257, 4)
+
+
+def main() -> None:
+    """Print the largest difference."""
+    print(max(difference(options, shape) for options, shape in combinations()))
+
+
+if __name__ == "__main__":
+    main()

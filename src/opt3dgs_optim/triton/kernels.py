@@ -1,0 +1,262 @@
+"""The step of one parameter in one launch: what `opt3dgs_optim.step.take_step` means, line by line.
+
+Every number is read once and written once; nothing lies between. One thread has four numbers of
+`step_rows`, or one Gaussian of `step_in_own_frame`. What changes from step to step is an argument
+that compiles nothing anew; what is not there is None, and compiles to nothing.
+What a load gives outside of its mask is never stored.
+
+No argument is a constexpr, so that a compiled kernel takes the same arguments in every version of
+Triton. Nothing of Triton's standard library is used, so that Triton's interpreter can run this file
+beside a Triton that compiles.
+"""
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportOperatorIssue=false
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+
+import triton
+import triton.language as tl
+
+INFINITY = tl.constexpr(float("inf"))
+LARGEST = tl.constexpr(9.223371761976868e18)  # float32's in `step.LARGEST`: its square is finite
+ROWS_BLOCK = tl.constexpr(1024)  # numbers of a program
+FRAME_BLOCK = tl.constexpr(128)  # Gaussians of a program
+LOOK_BLOCK = tl.constexpr(1024)  # Gaussians of a program that looks at them
+# Numbers of Python that a step changes; with an unknown size Triton compiles one kernel for all.
+PLAIN_INTS = ["numbers", "width", "key", "rows"]
+
+
+@triton.jit
+def finite(grad, nonfinite, inside):
+    """The gradient with zeros for numbers that are not finite, which are counted."""
+    known = tl.abs(grad) < INFINITY
+    if nonfinite is not None:
+        bad = known == 0
+        if inside is not None:
+            bad = bad & inside
+        tl.atomic_add(nonfinite + tl.where(known, 0, 0), 1, bad, sem="relaxed")
+    return tl.where(known, grad, 0.0)
+
+
+@triton.jit
+def larger(a, b):
+    """The larger of two, or the one that is not finite."""
+    return tl.maximum(a, b, propagate_nan=tl.PropagateNan.ALL)
+
+
+@triton.jit
+def chosen_rows(row, key, share):
+    """Whether an event fades a row: `step.chosen_rows`, on 32 bits."""
+    x = row.to(tl.uint32) ^ key.to(tl.uint32)
+    x = (x ^ (x >> 16)) * 0x7FEB352D
+    x = (x ^ (x >> 15)) * 0x846CA68B
+    x = x ^ (x >> 16)
+    return (x >> 8).to(tl.float32) * (1.0 / 16777216.0) < share
+
+
+@triton.jit
+def new_row(began, inside):
+    """Whether a row's mean begins with this step."""
+    first = began == 0.0
+    if inside is not None:
+        first = first & inside
+    return first
+
+
+@triton.jit
+def into_mean(value, mean, began, row, at, inside, number, put):
+    """`step.take_into_mean` of one number; what the parameter is afterwards."""
+    first = tl.load(began + row, inside)
+    tl.store(began + row, number, new_row(first, inside))  # by each number of a row: the same
+    weight = 1.0 / (number + 1.0 - tl.where(first == 0.0, number, first))
+    old = tl.load(mean + at, inside)
+    known = tl.abs(value) < INFINITY
+    start = tl.where(tl.abs(old) < INFINITY, old, value)
+    way = value - start
+    moved = tl.where(weight < 0.5, start + way * weight, value - way * (1.0 - weight))
+    moved = tl.where(known, moved, old)
+    tl.store(mean + at, moved, inside)
+    return tl.where(known & (put > 0.0), moved, value)
+
+
+@triton.jit
+def _step_rows(
+    p, g, m, v, mean, began, held, factor, nonfinite, at, inside, width, size, beta2, ones1, ones2,
+    eps, root2, shrink, decay, key, share, fade_m, fade_v, weight, number, put,
+):  # fmt: skip
+    grad = finite(tl.load(g + at, inside), nonfinite, inside)
+    value = tl.load(p + at, inside) * shrink
+    if decay != 0.0:
+        grad = grad + value * decay
+    if factor is not None:
+        size = size * tl.load(factor)
+    if m is None:
+        value = value - grad * size
+    else:
+        exp_avg = tl.load(m + at, inside)
+        exp_avg_sq = tl.load(v + at, inside)
+        if share > 0.0:
+            chosen = chosen_rows(at // width, key, share)
+            exp_avg = tl.where(chosen, exp_avg * fade_m, exp_avg)
+            exp_avg_sq = tl.where(chosen, exp_avg_sq * fade_v, exp_avg_sq)
+        if held is not None:
+            least = grad * weight
+            least = tl.where(tl.load(held + at // width, inside) != 0, least * least, 0.0)
+            exp_avg_sq = larger(exp_avg_sq, least)
+        exp_avg = exp_avg + (grad - exp_avg) * ones1
+        exp_avg_sq = exp_avg_sq * beta2 + grad * grad * ones2
+        value = value - size * exp_avg / (tl.sqrt(exp_avg_sq) / root2 + eps)
+        tl.store(m + at, exp_avg, inside)
+        tl.store(v + at, exp_avg_sq, inside)
+    if mean is not None:
+        value = into_mean(value, mean, began, at // width, at, inside, number, put)
+    tl.store(p + at, value, inside)
+
+
+@triton.jit(do_not_specialize=PLAIN_INTS)
+def step_rows(
+    p, g, m, v, mean, began, held, factor, nonfinite, numbers, width, size, beta2, ones1, ones2,
+    eps, root2, shrink, decay, key, share, fade_m, fade_v, weight, number, put,
+):  # fmt: skip
+    """Step a parameter [rows, width], ROWS_BLOCK of its numbers in a program.
+
+    Args:
+        p, g, m, v, mean: numbers float32: parameter, gradient, moments (None: the step is the
+            gradient times the rate), mean (or None).
+        began: [rows] float32, the number with which a row's mean began, 0: it begins now; or None.
+        held: [rows] uint8, not 0: raise the second moment to (weight * gradient)^2; or None.
+        factor: one float32 on the device, on the size; or None.
+        nonfinite: one int32 to which numbers that are not finite are added; or None.
+        size: the rate, with the correction of the first moment in it.
+        ones1, ones2: 1 - beta1, 1 - beta2.
+        shrink, decay: of weight decay, decoupled and the other kind; 1.0 and 0.0: none.
+        key, share, fade_m, fade_v: of fading; a share of 0.0: none.
+        number, put: of the mean; put > 0: it takes the parameter's place.
+        numbers: 64 bits, where there are more than 2^31.
+    """
+    first = tl.program_id(0).to(numbers.dtype) * ROWS_BLOCK
+    at = first + tl.arange(0, ROWS_BLOCK)
+    # Without a mask four numbers are read at a time.
+    if first + ROWS_BLOCK <= numbers:
+        _step_rows(
+            p, g, m, v, mean, began, held, factor, nonfinite, at, None, width, size,
+            beta2, ones1, ones2, eps, root2, shrink, decay, key, share, fade_m, fade_v, weight,
+            number, put,
+        )  # fmt: skip
+    else:
+        _step_rows(
+            p, g, m, v, mean, began, held, factor, nonfinite, at, at < numbers, width, size,
+            beta2, ones1, ones2, eps, root2, shrink, decay, key, share, fade_m, fade_v, weight,
+            number, put,
+        )  # fmt: skip
+
+
+@triton.jit
+def turned(w, x, y, z, a, b, c):
+    """The vector a, b, c turned by the unit quaternion w, x, y, z: v + w t + q x t, t = 2 q x v."""
+    t, u, s = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    return a + w * t + (y * s - z * u), b + w * u + (z * t - x * s), c + w * s + (x * u - y * t)
+
+
+@triton.jit
+def adam(grad, m, v, at, inside, size, beta2, ones1, ones2, eps, root2):
+    """Adam's step of one number, whose moments are written."""
+    exp_avg = tl.load(m + at, inside)
+    exp_avg_sq = tl.load(v + at, inside)
+    exp_avg = exp_avg + (grad - exp_avg) * ones1
+    exp_avg_sq = exp_avg_sq * beta2 + grad * grad * ones2
+    tl.store(m + at, exp_avg, inside)
+    tl.store(v + at, exp_avg_sq, inside)
+    return size * exp_avg / (tl.sqrt(exp_avg_sq) / root2 + eps)
+
+
+@triton.jit(do_not_specialize=PLAIN_INTS)
+def step_in_own_frame(
+    p, g, m, v, quats, scales, mean, began, factor, nonfinite, rows, min_aspect, size, beta2,
+    ones1, ones2, eps, root2, shrink, decay, number, put,
+):  # fmt: skip
+    """Step positions along each Gaussian's axes, mu <- mu - B Adam(B^T g), FRAME_BLOCK a program.
+
+    Args:
+        p, g, m, v, scales, mean: [rows, 3] float32; scales are logarithms.
+        quats: [rows, 4] float32, wxyz.
+        size: standard deviations of a full step, with the correction of the first moment in it.
+        min_aspect: share of the longest axis that a shorter one counts as, at least.
+        the others: as of `step_rows`.
+    """
+    row = tl.program_id(0) * FRAME_BLOCK + tl.arange(0, FRAME_BLOCK)
+    inside = row < rows
+    i, j, k, q = 3 * row, 3 * row + 1, 3 * row + 2, 4 * row
+    gx = finite(tl.load(g + i, inside), nonfinite, inside)
+    gy = finite(tl.load(g + j, inside), nonfinite, inside)
+    gz = finite(tl.load(g + k, inside), nonfinite, inside)
+    px = tl.load(p + i, inside) * shrink
+    py = tl.load(p + j, inside) * shrink
+    pz = tl.load(p + k, inside) * shrink
+    if decay != 0.0:
+        gx, gy, gz = gx + px * decay, gy + py * decay, gz + pz * decay
+
+    w = tl.load(quats + q, inside)
+    x = tl.load(quats + q + 1, inside)
+    y = tl.load(quats + q + 2, inside)
+    z = tl.load(quats + q + 3, inside)
+    length = larger(tl.sqrt(w * w + x * x + y * y + z * z), 1e-12)
+    w, x, y, z = w / length, x / length, y / length, z / length
+    sx = tl.exp(tl.load(scales + i, inside))
+    sy = tl.exp(tl.load(scales + j, inside))
+    sz = tl.exp(tl.load(scales + k, inside))
+    least = larger(larger(sx, sy), sz) * min_aspect
+    sx, sy, sz = larger(sx, least), larger(sy, least), larger(sz, least)
+
+    gx, gy, gz = turned(w, -x, -y, -z, gx, gy, gz)
+    gx, gy, gz = gx * sx, gy * sy, gz * sz
+    gx = tl.where(tl.abs(gx) <= LARGEST, gx, 0.0)
+    gy = tl.where(tl.abs(gy) <= LARGEST, gy, 0.0)
+    gz = tl.where(tl.abs(gz) <= LARGEST, gz, 0.0)
+    if factor is not None:
+        size = size * tl.load(factor)
+    dx = sx * adam(gx, m, v, i, inside, size, beta2, ones1, ones2, eps, root2)
+    dy = sy * adam(gy, m, v, j, inside, size, beta2, ones1, ones2, eps, root2)
+    dz = sz * adam(gz, m, v, k, inside, size, beta2, ones1, ones2, eps, root2)
+    dx, dy, dz = turned(w, x, y, z, dx, dy, dz)
+    px = px - tl.where(tl.abs(dx) < INFINITY, dx, 0.0)
+    py = py - tl.where(tl.abs(dy) < INFINITY, dy, 0.0)
+    pz = pz - tl.where(tl.abs(dz) < INFINITY, dz, 0.0)
+    if mean is not None:
+        px = into_mean(px, mean, began, row, i, inside, number, put)
+        py = into_mean(py, mean, began, row, j, inside, number, put)
+        pz = into_mean(pz, mean, began, row, k, inside, number, put)
+    tl.store(p + i, px, inside)
+    tl.store(p + j, py, inside)
+    tl.store(p + k, pz, inside)
+
+
+@triton.jit
+def added(a, b):
+    """The sum of two."""
+    return a + b
+
+
+@triton.jit(do_not_specialize=PLAIN_INTS)
+def look_at_positions(g, v, out_of_view, counter, rows):
+    """See which positions have no gradient.
+
+    Args:
+        g: [rows, 3] float32, the gradient. v: [rows, 3] the second moments, not 0 where a position
+            has had one before; or None.
+        out_of_view: [rows] uint8, 1 where there is none; or None.
+        counter: [1] int64, to which 2^32 is added for each row in view, and 1 for each that is or
+            has been; or None.
+    """
+    row = tl.program_id(0) * LOOK_BLOCK + tl.arange(0, LOOK_BLOCK)
+    inside = row < rows
+    i = 3 * row
+    x, y, z = tl.load(g + i, inside), tl.load(g + i + 1, inside), tl.load(g + i + 2, inside)
+    seen = ((x != 0.0) | (y != 0.0) | (z != 0.0)) & inside
+    if out_of_view is not None:
+        tl.store(out_of_view + row, tl.where(seen, 0, 1).to(tl.uint8), inside)
+    if counter is not None:
+        known = seen
+        if v is not None:
+            x, y, z = tl.load(v + i, inside), tl.load(v + i + 1, inside), tl.load(v + i + 2, inside)
+            known = seen | (((x != 0.0) | (y != 0.0) | (z != 0.0)) & inside)
+        counts = tl.where(seen, 1 << 32, 0).to(tl.int64) + tl.where(known, 1, 0).to(tl.int64)
+        tl.atomic_add(counter, tl.reduce(counts, 0, added), sem="relaxed")

@@ -1,0 +1,110 @@
+"""The step's kernels on a GPU: `pytest -m cuda tests/cuda/test_step.py` on a machine with one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from opt3dgs_optim import PhaseScheduler, triton
+from opt3dgs_optim.step import Hyper, Step, chosen_rows, take_step
+from opt3dgs_optim.triton.check import case, combinations, tensors
+
+pytestmark = [
+    pytest.mark.cuda,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device"),
+]
+CASES = list(combinations())
+# exp, sqrt and division of a GPU are right to some units in the last place, thrice in a row.
+TOLERANCE = 2e-5
+
+
+def moved(value: Any) -> Any:
+    """Tensors on the GPU, within what a step has."""
+    if isinstance(value, Tensor):
+        return value.cuda()
+    return type(value)(*map(moved, value)) if isinstance(value, tuple) else value
+
+
+def on_gpu(step: Step, hyper: Hyper) -> None:
+    """Move what a step has."""
+    for owner in (step, hyper):
+        for name in owner.__slots__:
+            setattr(owner, name, moved(getattr(owner, name)))
+    step.state = {"exp_avg": hyper.exp_avg, "exp_avg_sq": hyper.exp_avg_sq}
+
+
+def test_triton_launches_here() -> None:
+    assert triton.missing() is None
+
+
+@pytest.mark.parametrize("at", range(len(CASES)))
+def test_a_step_is_that_of_a_cpu(at: int) -> None:
+    options, shape = CASES[at]
+    made = []
+    for gpu in (False, True):
+        step, hyper = case(shape, torch.Generator().manual_seed(0), **options)
+        if gpu:
+            on_gpu(step, hyper)
+            assert triton.takes(step)
+            triton.take_step(step, hyper)
+        else:
+            bad = take_step(step, hyper)
+            assert hyper.nonfinite is not None
+            hyper.nonfinite += bad
+        made.append((step, hyper))
+    assert torch.equal(made[0][1].nonfinite, made[1][1].nonfinite.cpu())
+    for ours, theirs in zip(tensors(*made[0]), tensors(*made[1]), strict=True):
+        size = ours.abs()
+        size = size.amax(1, keepdim=True) if options.get("frame") and ours.dim() > 1 else size
+        assert ((ours - theirs.cpu()).abs() <= TOLERANCE * size.clamp(min=1.0)).all()
+
+
+def test_the_same_rows_fade() -> None:
+    step, hyper = case((4099, 3), torch.Generator().manual_seed(0), fade=True)
+    hyper.exp_avg.fill_(1.0)
+    on_gpu(step, hyper)
+    step.grad.zero_()
+    triton.take_step(step, hyper)
+    assert step.fade is not None
+    chosen = chosen_rows(step.fade, 4099, torch.device("cpu"))
+    assert torch.equal((hyper.exp_avg < 0.5).any(1).cpu(), chosen)
+
+
+QUIET = pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype:UserWarning")
+
+
+@QUIET
+def test_a_training_neither_waits_nor_allocates() -> None:
+    shapes = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "shN": (15, 3)}
+    adams = {}
+    for name, shape in shapes.items():
+        param = torch.nn.Parameter(torch.randn(10_000, *shape, device="cuda"))
+        param.grad = torch.randn_like(param)
+        adams[name] = torch.optim.Adam([param], lr=1e-3, eps=1e-15)
+    PhaseScheduler(300).upgrade(adams)
+
+    def iterate(count: int) -> None:
+        for _ in range(count):
+            for adam in adams.values():
+                adam.step()
+
+    iterate(10)
+    torch.cuda.synchronize()
+    before = torch.cuda.memory_allocated()
+    torch.cuda.reset_peak_memory_stats()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        iterate(250)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert torch.cuda.max_memory_allocated() == before
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        iterate(40)  # the last thirtieth, which keeps the mean
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    mean = sum(4 * p.numel() for a in adams.values() for p in a.param_groups[0]["params"])
+    assert torch.cuda.max_memory_allocated() - before <= mean + 6 * 4 * 10_000 + 65_536

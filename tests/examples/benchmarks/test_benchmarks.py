@@ -1,0 +1,132 @@
+"""The study: one command trains a line of the evidence, one adds it, one makes the page."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from benchmarks import evidence, report, steps, train
+
+TINY = ["--scene", "embedded", "--arm", "own", "--iterations", "20", "--points", "60"]
+
+
+def line(**changes: Any) -> dict[str, Any]:
+    made = {"scene": "lego", "size": "images_2", "arm": "mcmc", "iterations": 30_000}
+    made |= {"points": 50_000, "sh_degree": 0, "seed": 0, "psnr": 30.0, "ssim": 0.9, "lpips": 0.1}
+    made |= {"seconds": 1.0, "device": "a CPU", "date": "2026-11-27", "command": "train"}
+    return made | changes
+
+
+@pytest.fixture
+def stopped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A training that was stopped in the middle of its sixth tenth."""
+    step, out = train.Fit.step, tmp_path / "one.json"
+
+    def until(fit: train.Fit) -> torch.Tensor:
+        if fit.iteration == 11:
+            raise KeyboardInterrupt
+        return step(fit)
+
+    monkeypatch.setattr(train.Fit, "step", until)
+    assert train.main([*TINY, "-o", str(out)]) == 130
+    monkeypatch.setattr(train.Fit, "step", step)
+    return out
+
+
+def test_a_stopped_training_goes_on_and_becomes_a_line(stopped: Path, tmp_path: Path) -> None:
+    assert [row["iteration"] for row in json.loads(stopped.read_text())["curve"]][-1] == 10
+    whole = tmp_path / "whole.json"
+    for out in (stopped, whole):
+        assert train.main([*TINY, "-o", str(out)]) == 0
+    one, other = (json.loads(path.read_text()) for path in (stopped, whole))
+    for row in (*one["curve"], *other["curve"]):
+        del row["seconds"]
+    assert one["curve"] == other["curve"]
+    assert [row["iteration"] for row in one["curve"]] == list(range(0, 21, 2))
+    found = evidence.line_of(json.loads(whole.read_text()))
+    assert found["psnr"] == other["curve"][-1]["psnr"]
+    assert found["command"] == (
+        "python examples/benchmarks/train.py --scene embedded --arm own --size images_4 "
+        "--iterations 20 --points 60 --seed 0"
+    )
+
+
+def test_seed_and_views_say_what_is_trained_on(tmp_path: Path) -> None:
+    parsed = train.parser().parse_args(["--seed", "2", "--views", "5"])
+    scene = train.scene_of(parsed)
+    assert [view.name for view in scene.test] == [f"view_{i:02d}" for i in (2, 9, 16, 23)]
+    assert [view.name for view in scene.train] == [f"view_{i:02d}" for i in (0, 5, 11, 17, 22)]
+    words = [*TINY, "--views", "99", "-o", str(tmp_path / "x.json")]
+    assert train.main(words) == 2
+
+
+def test_lines_are_replaced_and_kept_in_order(tmp_path: Path) -> None:
+    path = tmp_path / "evidence.jsonl"
+    evidence.add([line(seed=1), line(psnr=31.0), line(views=14)], path)
+    evidence.add([line(psnr=32.0), line(arm="own")], path)
+    lines = evidence.read(path)
+    assert [(x["arm"], x["seed"], x["views"], x["psnr"]) for x in lines] == [
+        ("mcmc", 0, 0, 32.0),
+        ("mcmc", 1, 0, 30.0),
+        ("own", 0, 0, 30.0),
+        ("mcmc", 0, 14, 30.0),
+    ]
+    assert "rotated" not in path.read_text()
+
+
+def test_gains_are_of_seeds_that_both_have() -> None:
+    stock = [line(seed=s, psnr=p) for s, p in ((0, 30.0), (1, 20.0))]
+    ours = [line(arm="own", seed=s, psnr=p) for s, p in ((1, 21.0), (2, 40.0))]
+    assert report.gained(ours, stock).startswith("+1.00 / ")
+    assert report.gained(ours, stock).endswith("(1 seed)")
+    assert report.gained([], stock) == "not trained"
+    closed = [line(arm="paper", seed=[0, 1], psnr=26.0)]
+    assert report.gained(closed, stock).startswith("+1.00 / ")  # of the same seeds, in one line
+    assert report.shown(closed) == "26.00 / 0.9000 / 0.1000 (2 seeds)"
+
+
+def test_the_page_is_made_of_the_evidence() -> None:
+    """What stands in docs/evidence.md is what `report.py` writes."""
+    page = report.PAGE.read_text(encoding="utf-8")
+    assert report.filled(page, report.Evidence()) == page
+    with pytest.raises(ValueError, match="evidence:nothing, but there are"):
+        report.filled("<!-- evidence:nothing --><!-- end -->", report.Evidence())
+
+
+def test_the_picture_is_drawn(tmp_path: Path) -> None:
+    report.draw(report.Evidence(), tmp_path / "iterations.png")
+    assert (tmp_path / "iterations.png").stat().st_size > 20_000
+
+
+def test_steps_are_timed_beside_six_adams() -> None:
+    device = torch.device("cpu")
+    found = steps.measure(64, device, ["six Adams", "defaults", "the paper's exploitation"], 3)
+    assert found["six Adams"]["ratio"] == 1.0
+    assert all(row["low"] <= row["ratio"] <= row["high"] for row in found.values())
+    # two moments of 59 numbers of four bytes, and six counts of steps
+    assert found["six Adams"]["bytes_per_point"] == pytest.approx(472, abs=1)
+    assert "| defaults | " in steps.table({64: found})
+
+
+@pytest.mark.skipif(importlib.util.find_spec("gsplat") is None, reason="gsplat is not installed")
+@pytest.mark.filterwarnings("ignore")  # gsplat's, at its import
+@pytest.mark.thorough
+def test_clone_split_and_resets_are_gsplats_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It grows from the first refinement on; a reset leaves no opacity above twice the limit."""
+    fit = train.fit_of(
+        train.load_scene("embedded"), train.find_arm("adc-own"), train.FitOptions(700, 200)
+    )
+    strategy = fit.density.strategy  # pyright: ignore[reportAttributeAccessIssue]
+    monkeypatch.setattr(strategy, "reset_every", 650)
+    counts = []
+    while fit.iteration < 651:
+        fit.step()
+        counts.append(len(fit.gaussians["means"]))
+    assert set(counts[:600]) == {200}
+    assert counts[-1] > 220
+    assert float(torch.sigmoid(fit.gaussians["opacities"].detach()).max()) < 0.0101
+    assert fit.relocated == 0

@@ -1,0 +1,165 @@
+"""The step's kernels, by Triton's interpreter, beside `step.take_step` in plain torch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from interpreted import interpreted_kernels
+
+from opt3dgs_optim import triton
+from opt3dgs_optim.step import Fade, Hyper, Step, chosen_rows, take_step
+from opt3dgs_optim.triton.check import both, case, difference, tensors
+
+ROWS = (0, 1, 255, 256, 257, 1000, 4096)
+WIDTHS: tuple[tuple[int, ...], ...] = ((), (3,), (4,), (15, 3))
+TOLERANCE = 5e-7  # some four roundings of float32, of 6e-8 each
+FRAME_TOLERANCE = 4e-6  # squares of sums of nine terms, which may cancel
+
+
+@pytest.fixture(autouse=True, scope="module")
+def kernels() -> Iterator[Any]:
+    with pytest.MonkeyPatch.context() as patch:
+        yield interpreted_kernels(patch)
+
+
+@pytest.mark.parametrize(
+    ("rows", "width"),
+    [
+        pytest.param(n, w, marks=[pytest.mark.thorough] * (n >= 1000 and len(w) == 2))
+        for n in ROWS
+        for w in WIDTHS
+    ],
+)
+def test_rows_of_every_size(rows: int, width: tuple[int, ...]) -> None:
+    shape = (rows, *width)
+    assert difference({"bad": 3}, shape) <= TOLERANCE
+    everything = {"fade": True, "hold": True, "mean": True, "put": True, "bad": 3, "decay": 0.1}
+    assert difference(everything, shape) <= TOLERANCE
+
+
+@pytest.mark.parametrize("rows", ROWS)
+def test_own_frames_of_every_size(rows: int) -> None:
+    assert difference({"frame": True, "bad": 3}, (rows, 3)) <= FRAME_TOLERANCE
+    assert difference({"frame": True, "mean": True, "put": True}, (rows, 3)) <= FRAME_TOLERANCE
+
+
+flag = st.booleans()
+OPTIONS = st.fixed_dictionaries(
+    {
+        "steps": st.sampled_from([1, 2, 10, 1000, 100_000]),
+        "mean": flag,
+        "put": flag,
+        "factor": st.sampled_from([1.0, 0.25, torch.tensor(0.7), torch.tensor([1.5])]),
+        "bad": st.integers(0, 7),
+    }
+)
+WEIGHT_DECAY = st.sampled_from([{}, {"shrink": 0.999}, {"decay": 0.01}])
+KINDS = st.one_of(
+    st.fixed_dictionaries({"fade": flag, "hold": flag}),
+    st.just({"plain": True}),
+    st.just({"frame": True}),
+)
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    OPTIONS, WEIGHT_DECAY, KINDS, st.integers(1, 40), st.sampled_from(WIDTHS), st.integers(0, 99)
+)
+def test_whatever_a_step_has(
+    options: dict[str, Any],
+    decay: dict[str, float],
+    kind: dict[str, bool],
+    rows: int,
+    width: tuple[int, ...],
+    seed: int,
+) -> None:
+    frame = "frame" in kind
+    shape = (rows, 3) if frame else (rows, *width)
+    found = difference({**options, **decay, **kind}, shape, seed)
+    assert found <= (FRAME_TOLERANCE if frame else TOLERANCE)
+
+
+@pytest.mark.parametrize("key", [0, 1, 2**31 - 1, 2**31, 2**32 - 1])
+@pytest.mark.parametrize("share", [0.01, 0.2, 0.5, 1.0])
+def test_the_same_rows_fade(key: int, share: float) -> None:
+    exp_avg, exp_avg_sq = torch.ones(2, 4099, 3)
+    param, grad = torch.zeros(2, 4099, 3)
+    fade = Fade(key, share, 0.5, 0.25)
+    step = Step(param, grad, None, "", {}, {}, 0, -1, fade=fade)
+    triton.launch(step, Hyper(0.1, 0.5, 0.5, 1e-8, 1.0, 1.0, exp_avg, exp_avg_sq))
+    chosen = chosen_rows(fade, 4099, param.device)
+    assert torch.equal(exp_avg, torch.where(chosen, 0.25, 0.5)[:, None].expand(-1, 3))
+    assert torch.equal(exp_avg_sq, torch.where(chosen, 0.125, 0.5)[:, None].expand(-1, 3))
+    assert chosen.float().mean() == pytest.approx(share, abs=0.03)
+
+
+def test_every_number_that_is_not_finite_is_counted() -> None:
+    for options, shape, bad in (({}, (700, 4), 2_800), ({"frame": True}, (300, 3), 899)):
+        (step, _), (_, hyper) = both({**options, "bad": bad}, shape)
+        assert int(hyper.nonfinite) == bad
+        assert torch.isfinite(step.param).all()
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e30])
+@pytest.mark.parametrize("place", ["param", "mean", "quats", "scales", "exp_avg", "exp_avg_sq"])
+def test_numbers_that_are_not_finite_go_the_same_way(value: float, place: str) -> None:
+    for frame in (False, True):
+        made = []
+        for run in (take_step, triton.launch):
+            options: Any = {"frame": frame, "mean": True, "put": True, "hold": not frame}
+            step, hyper = case((40, 3), torch.Generator().manual_seed(1), **options)
+            holders: list[Any] = [hyper, step.frame, step]
+            owner = next((each for each in holders if hasattr(each, place)), None)
+            if owner is None:
+                return
+            before = step.param.clone()
+            getattr(owner, place)[7, 1] = value
+            run(step, hyper)
+            made.append(tensors(step, hyper))
+            if place in ("quats", "scales") and not abs(value) < 1e30:
+                # The mean is put; without one the Gaussian would not have moved.
+                assert torch.isfinite(step.param).all()
+                assert not torch.equal(before, step.param)
+        for ours, theirs in zip(*made, strict=True):
+            assert torch.equal(ours.isnan(), theirs.isnan())
+            assert torch.equal(ours.isinf(), theirs.isinf())
+            close = (ours - theirs).abs() <= FRAME_TOLERANCE * ours.abs().clamp(min=1.0)
+            assert close[ours.isfinite()].all()
+
+
+def test_a_gaussian_whose_axes_are_not_finite_is_not_moved() -> None:
+    step, hyper = case((9, 3), torch.Generator().manual_seed(0), frame=True)
+    assert step.frame is not None
+    step.frame.scales[2, 0] = float("nan")
+    step.frame.scales[3, 1] = 200.0  # its standard deviation overflows
+    step.frame.quats[5, 3] = float("nan")
+    before = step.param.clone()
+    triton.launch(step, hyper)
+    moved = (step.param != before).any(1)
+    assert moved.tolist() == [True, True, False, False, True, False, True, True, True]
+
+
+def test_what_it_takes() -> None:
+    """Anything else is made by plain torch."""
+    draw = torch.Generator().manual_seed(0)
+    assert triton.fits(case((8, 3), draw, frame=True, mean=True)[0])
+    assert triton.fits(case((8, 3), draw, fade=True, hold=True)[0])
+    assert triton.fits(case((8, 3), draw, plain=True, mean=True)[0])
+    assert not triton.fits(case((8, 3), draw, frame=True, fade=True)[0])
+    assert not triton.fits(case((8, 3), draw, frame=True, hold=True)[0])
+    assert not triton.fits(case((8, 3), draw, plain=True, fade=True)[0])
+    for change in (torch.Tensor.double, lambda x: x.t().contiguous().t()):
+        for name in ("param", "grad", "exp_avg"):
+            step, _ = case((8, 3), draw)
+            owner: Any = step.state if name == "exp_avg" else step
+            if name == "exp_avg":
+                owner[name] = change(owner[name])
+            else:
+                setattr(owner, name, change(getattr(owner, name)))
+            assert not triton.fits(step), name
+    assert not triton.takes(case((8, 3), draw)[0])  # of a CPU

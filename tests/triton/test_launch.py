@@ -1,0 +1,155 @@
+"""How the kernels are compiled and launched, for a GPU that is not there."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import pytest
+import torch
+from fake_driver import FakeDriver, fake_driver
+from interpreted import fresh_kernels
+
+from opt3dgs_optim import triton
+from opt3dgs_optim.triton import FRAME_BLOCK, ROWS_BLOCK
+from opt3dgs_optim.triton.check import case
+
+pytest.importorskip("triton.language", reason="Triton is not installed")
+pytestmark = pytest.mark.compiles
+
+
+@pytest.fixture
+def driver(monkeypatch: pytest.MonkeyPatch) -> FakeDriver:
+    kernels = fresh_kernels({})
+    monkeypatch.setattr(triton, "_kernels", lambda: kernels)
+    monkeypatch.setattr(triton, "_COMPILED", {})
+    made = fake_driver()
+    made.launched, made.loaded = [], []
+    return made
+
+
+def launched(driver: FakeDriver, shape: tuple[int, ...], **options: Any) -> list[Any]:
+    """The grid and the arguments of a step's launch, tensors as their addresses."""
+    step, hyper = case(shape, torch.Generator().manual_seed(0), **options)
+    before = len(driver.launched)
+    triton.launch(step, hyper)
+    assert len(driver.launched) == before + 1
+    return [x.data_ptr() if isinstance(x, torch.Tensor) else x for x in driver.launched[-1]]
+
+
+@pytest.mark.parametrize(
+    ("shape", "options"),
+    [
+        ((500, 3), {"frame": True, "mean": True}),
+        ((500, 15, 3), {"fade": True}),
+        ((500, 3), {"hold": True, "mean": True, "put": True}),
+        ((500,), {"plain": True, "factor": torch.ones(1)}),
+    ],
+)
+def test_a_compiled_kernel_is_launched_as_tritons_launcher_does(
+    driver: FakeDriver, shape: tuple[int, ...], options: Any
+) -> None:
+    """The same arguments in the same places, with addresses for tensors; by this Triton."""
+    first, again = (launched(driver, shape, **options) for _ in range(2))
+    assert len(driver.loaded) == 1
+    assert len(first) == len(again)
+    addresses = 0
+    for one, other in zip(first, again, strict=True):
+        if isinstance(one, int) and one > 2**32:
+            addresses += 1  # of other tensors, both of them aligned
+            assert other % 16 == 0
+        else:
+            assert one == other
+    assert addresses >= 4
+    assert driver.launched[-1][:3] == (programs(shape, options), 1, 1)
+
+
+def programs(shape: tuple[int, ...], options: Any) -> int:
+    """How many programs there are."""
+    if options.get("frame"):
+        return -(shape[0] // -128)
+    return -(torch.Size(shape).numel() // -1024)
+
+
+def test_nothing_that_changes_from_step_to_step_compiles_anew(driver: FakeDriver) -> None:
+    """One kernel for every size, width, count, rate, event and weight decay; one for frames."""
+    for shape in ((1, 1), (16, 3), (17, 3), (1000, 45), (5,), (4096, 4)):
+        for steps in (1, 2, 16):
+            for options in ({}, {"fade": True}, {"shrink": 0.9}, {"decay": 0.1}, {"factor": 0.5}):
+                launched(driver, shape, steps=steps, **options)
+    for rows in (1, 16, 1000):
+        launched(driver, (rows, 3), frame=True, steps=rows)
+    assert driver.loaded == ["step_rows", "step_in_own_frame"]
+
+
+def test_tensors_that_begin_anywhere_are_launched_by_triton(driver: FakeDriver) -> None:
+    """A view that begins at 4 bytes is compiled for by itself; others go on as they were."""
+    whole, _ = launched(driver, (64, 3)), launched(driver, (64, 3))
+    step, hyper = case((64, 3), torch.Generator().manual_seed(0))
+    step.grad = torch.zeros(64 * 3 + 1)[1:].view(64, 3)
+    triton.launch(step, hyper)
+    assert len(driver.loaded) == 2
+    assert isinstance(driver.launched[-1][4], torch.Tensor)
+    assert len(launched(driver, (64, 3))) == len(whole)
+    assert len(driver.loaded) == 2
+
+
+COMPILED = {
+    "step": {},
+    "fading": {"fade": True},
+    "held": {"hold": True},
+    "mean": {"mean": True},
+    "all": {"hold": True, "mean": True, "factor": torch.ones(1)},
+    "plain": {"plain": True},
+    "long": {"numbers": 2**31 + 7},
+}
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_rows_are_read_four_numbers_at_a_time(
+    driver: FakeDriver, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    options: dict[str, Any] = dict(COMPILED[name])
+    long = options.pop("numbers", None)
+    if long is not None:
+        run = triton._run
+        monkeypatch.setattr(triton, "_run", lambda *a: run(*a[:3], (long, *a[3][1:])))
+    launched(driver, (64, 4), **options)
+    ((key, made),) = triton._COMPILED.items()
+    ptx = made.asm["ptx"]
+    moments, means = (0 if "plain" in options else 2), (1 if "mean" in options else 0)
+    reads = ROWS_BLOCK // (4 * 128)  # of four numbers, by 128 threads
+    assert ptx.count("ld.global.v4") == reads * (2 + moments + means)
+    assert ptx.count("st.global.v4") == reads * (1 + moments + means)
+    assert ".local" not in ptx  # all in registers
+    assert key[-1] == (long is not None)
+    assert ".s64" in ptx or not long
+
+
+@pytest.mark.parametrize("options", [{}, {"mean": True, "factor": torch.ones(1)}], ids=str)
+def test_own_frames_are_in_registers(driver: FakeDriver, options: Any) -> None:
+    launched(driver, (64, 3), frame=True, **options)
+    ((_, made),) = triton._COMPILED.items()
+    assert ".local" not in made.asm["ptx"]
+
+
+def test_the_sizes_of_programs() -> None:
+    kernels = fresh_kernels({})
+    assert kernels.ROWS_BLOCK.value == ROWS_BLOCK
+    assert kernels.FRAME_BLOCK.value == FRAME_BLOCK
+
+
+def test_a_triton_that_cannot_compile_is_said_with_the_cure(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fails(*_: Any) -> None:
+        raise RuntimeError("Failed to find C compiler.")
+
+    zeros = torch.zeros
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(triton, "launch", fails)
+    monkeypatch.setattr(torch, "zeros", lambda *size, **_: zeros(*size))
+    said = inspect.unwrap(triton.missing)()
+    assert said is not None
+    assert "Failed to find C compiler" in said
+    assert "apt install gcc" in said

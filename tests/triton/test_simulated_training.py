@@ -1,0 +1,164 @@
+"""Whole trainings on a GPU that is not there: what is launched, that nothing waits, what comes out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+import torch
+from simulated_device import DeviceTensor, SimulatedDevice, on_device, on_host
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Adam
+
+from opt3dgs_optim import DEFAULTS, DEFAULTS_ADC, PhaseScheduler
+from opt3dgs_optim.part import Part
+
+SHAPES = {
+    "means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (15, 3),
+}  # fmt: skip
+STEPS, POINTS = 60, 20
+MOST_LAUNCHES = 8
+
+
+class Training:
+    """Gradients of views that each see some of the points, and gsplat's edits of rows."""
+
+    def __init__(self, parts: Sequence[Part], gpu: SimulatedDevice | None, seen: float) -> None:
+        self.draw, self.gpu, self.seen = torch.Generator().manual_seed(0), gpu, seen
+        self.adams: dict[str, Adam] = {}
+        for name, shape in SHAPES.items():
+            param = Parameter(self.placed(self.noise(POINTS, *shape)))
+            self.adams[name] = Adam([param], lr=1e-2, eps=1e-15)
+        self.phases = PhaseScheduler(STEPS, parts=parts)
+        self.phases.upgrade(self.adams)
+        self.launched: list[int] = []
+
+    def placed(self, tensor: Tensor) -> Tensor:
+        return tensor if self.gpu is None else on_device(tensor)
+
+    def noise(self, *shape: int) -> Tensor:
+        return torch.randn(shape, generator=self.draw)
+
+    def params(self) -> dict[str, Parameter]:
+        return {name: adam.param_groups[0]["params"][0] for name, adam in self.adams.items()}
+
+    def iterate(self, bad: bool = False) -> None:
+        rows = len(self.params()["means"])
+        view = torch.rand(rows, generator=self.draw) < self.seen
+        for param in self.params().values():
+            grad = self.noise(*param.shape) + 0.3 * on_host(param)
+            grad *= view.view(-1, *[1] * (param.dim() - 1))
+            if bad:
+                grad.view(-1)[:2] = torch.tensor([float("nan"), float("inf")])
+            param.grad = self.placed(grad)
+        if self.gpu is not None:
+            self.gpu.forget()
+        for adam in self.adams.values():
+            adam.step()
+        if self.gpu is not None:
+            assert self.gpu.synchronisations == []
+            self.launched.append(
+                self.gpu.launches.total()
+                + sum(n for name, n in self.gpu.operators.items() if name != "zeros_like")
+            )
+
+    def edit(self, edit: Any) -> None:
+        """Edit rows of parameters and all that the state keeps for them, as gsplat does."""
+        for adam in self.adams.values():
+            group = adam.param_groups[0]
+            old = group["params"][0]
+            state = adam.state.pop(old)
+            new = Parameter(edit(old.detach(), False))
+            for key, value in state.items():
+                if key != "step":
+                    state[key] = edit(value, True)
+            group["params"], adam.state[new] = [new], state
+
+
+def append(rows: Tensor, is_state: bool) -> Tensor:
+    more = torch.zeros_like(rows[:5]) if is_state else rows[:5] * 0.5
+    return torch.cat([rows, more])
+
+
+def prune(rows: Tensor, is_state: bool) -> Tensor:
+    return rows[3:]
+
+
+def train(parts: Sequence[Part], gpu: SimulatedDevice | None, seen: float) -> Training:
+    made = Training(parts, gpu, seen)
+    for i in range(STEPS):
+        made.iterate(bad=i == 25)
+        if i in (10, 40):
+            made.edit(append)
+        if i == STEPS - 2:
+            made.edit(prune)
+        if i == 30:
+            made.edit(prune)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("parts", "seen"),
+    [
+        (DEFAULTS, 0.1),
+        (DEFAULTS_ADC, 0.6),
+        pytest.param(DEFAULTS, 0.6, marks=pytest.mark.thorough),
+        pytest.param(DEFAULTS_ADC, 0.1, marks=pytest.mark.thorough),
+    ],
+    ids=[
+        "relocation",
+        "clone and split",
+        "relocation, all in view",
+        "clone and split, few in view",
+    ],
+)
+def test_a_training_ends_as_on_a_cpu(parts: Sequence[Part], seen: float) -> None:
+    ours = train(parts, None, seen)
+    with SimulatedDevice() as gpu:
+        theirs = train(parts, gpu, seen)
+        assert all(isinstance(p, DeviceTensor) for p in theirs.params().values())
+    for name, param in theirs.params().items():
+        mean = theirs.adams[name].state[param]["averaging.mean"]
+        assert isinstance(mean, DeviceTensor)
+        # Roundings grow in 60 steps of Adam, of gradients that depend on where it is.
+        torch.testing.assert_close(on_host(param), ours.params()[name].data, rtol=1e-3, atol=1e-3)
+    # The share of a view comes an iteration later than on a CPU, and is the same otherwise.
+    shares = [t.phases.numbers()["visible_share"] for t in (ours, theirs)]
+    assert shares[0] == pytest.approx(shares[1], abs=0.05)
+    steps = [n for i, n in enumerate(theirs.launched) if i not in (0, 11, 31, 41, STEPS - 1)]
+    assert max(steps) <= MOST_LAUNCHES
+    assert min(steps) == 6  # one a parameter
+
+
+def test_numbers_that_are_not_finite_are_told_without_a_wait() -> None:
+    with SimulatedDevice() as gpu:
+        made = Training(DEFAULTS, gpu, 0.5)
+        made.phases = PhaseScheduler(1000)
+        made.phases.upgrade(made.adams)
+        made.iterate(bad=True)
+        for iteration in (99, 100):
+            made.phases.observe(iteration=iteration)
+            made.iterate()
+        with pytest.warns(UserWarning, match="12 numbers of gradients have not been finite"):
+            made.phases.observe(iteration=200)
+        made.iterate()
+        made.phases.observe(iteration=300)  # once
+
+
+def test_a_strangers_rate_on_the_device_is_read_there() -> None:
+    class Rate(Part):
+        names = None
+
+        def plan(self, step: Any, course: Any) -> None:
+            step.factor = step.param.new_full((), 0.5) if step.name != "means" else 1.0
+
+    with SimulatedDevice() as gpu:
+        made = Training([Rate()], gpu, 1.0)
+        before = {name: on_host(p).clone() for name, p in made.params().items()}
+        made.iterate()
+        assert gpu.launches == {"step_rows": 6}
+    for name, param in made.params().items():
+        moved = (on_host(param) - before[name]).abs().amax().item()
+        assert moved == pytest.approx(1e-2 if name == "means" else 0.5e-2, rel=1e-4)
