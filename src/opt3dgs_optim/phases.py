@@ -6,7 +6,7 @@ import atexit
 import weakref
 from collections.abc import Mapping, Sequence
 from numbers import Integral
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import torch
 from torch import Tensor
@@ -45,11 +45,13 @@ class PhaseScheduler(Course):
         switch: where exploitation starts: a fraction of `total_steps` in (0, 1] if a float, an
             iteration if an int (`total_steps`: never). The paper: 29/30.
         parts: what the steps have, in order; None: `DEFAULTS`.
+        moments: bits of each of Adam's two moments of a number; 16 take half of Adam's memory
+            (see docs/algorithms).
         log: a `RunLog` that gets one line an iteration, with what the parts say of themselves.
         process_group: a `torch.distributed` process group over whose ranks the loss is averaged,
             for parts that read it.
 
-    Memory: that of Adam. In the last thirtieth `Averaging` keeps a copy of the parameters.
+    Memory: that of Adam, or half of it with `moments=16`. In the last thirtieth `Averaging` keeps a copy of the parameters.
 
     Examples:
         >>> import torch
@@ -74,6 +76,7 @@ class PhaseScheduler(Course):
         switch: float | int = PAPER_SWITCH,
         parts: Sequence[Part] | None = None,
         *,
+        moments: Literal[32, 16] = 32,
         log: RunLog | None = None,
         process_group: Any = None,
     ) -> None:
@@ -87,7 +90,7 @@ class PhaseScheduler(Course):
         else:
             switch_step = round(check_number(CALL, "switch", switch, 0.0, 1.0) * total_steps)
         self._chosen = parts is not None  # by the user
-        super().__init__(_checked_parts(parts), total_steps, switch_step)
+        super().__init__(_checked_parts(parts), total_steps, switch_step, moments)
         if log is not None and not hasattr(log, "step"):
             raise TypeError(f"{CALL}: log={log!r}, but a RunLog or None is needed")
         self.log, self._loss = log, None
@@ -123,7 +126,7 @@ class PhaseScheduler(Course):
         held = [slot for each in slots for slot in each if slot[1] is not None]
         for (_, optimizer), its in zip(given, slots, strict=True):
             if isinstance(getattr(optimizer, "course", self), PhaseScheduler):
-                check_supported(optimizer, its)
+                check_supported(optimizer, its, self.moments)
                 continue
             raise TypeError(
                 f"{CALL}.upgrade: {type(optimizer).__name__} has parts of its own; upgrade a "
