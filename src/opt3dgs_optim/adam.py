@@ -14,6 +14,7 @@ from opt3dgs_optim import triton
 from opt3dgs_optim.checks import LOGGER, check_count, check_number
 from opt3dgs_optim.contract import REFUSED, Slots, check_supported, own_step
 from opt3dgs_optim.course import STATE_KEY, Course
+from opt3dgs_optim.moments import CODES, NEAREST, decoded, encode
 from opt3dgs_optim.names import split_name
 from opt3dgs_optim.part import Part, Phase, overrides
 from opt3dgs_optim.step import (
@@ -23,6 +24,7 @@ from opt3dgs_optim.step import (
     chosen_rows,
     into_frame,
     like_rows,
+    mixed,
     out_of_frame,
     take_into_mean,
     take_step,
@@ -113,6 +115,7 @@ class StepAdam(Adam):
 
     course: Course
     next_iteration = 0
+    coded = False  # whether its moments are codes of 16 bits, see `moments`
     in_own_frame = False  # whether its moments of the positions are those of the own frame
     _base: type[Adam] = Adam  # the class whose optimizer it was
     _lanes: list[Lane]
@@ -130,7 +133,7 @@ class StepAdam(Adam):
         """Name the groups; keep Adam's count of steps on the host, which reads it in every step."""
         for group, (_, name) in zip(self.param_groups, self._slots, strict=True):
             group["gaussian"] = name  # gsplat's name of what it holds, or None
-        if not self.course.parts:
+        if not self.course.acts:
             return
         for group in self.param_groups:
             group["fused"], group["foreach"] = False, False
@@ -145,7 +148,8 @@ class StepAdam(Adam):
             return
         group = self.param_groups[-1]
         try:
-            check_supported(self, [*self._slots, split_name(group.get("name"))])
+            slots = [*self._slots, split_name(group.get("name"))]
+            check_supported(self, slots, self.course.moments)
         except ValueError:
             self.param_groups.pop()
             raise
@@ -262,7 +266,10 @@ class StepAdam(Adam):
         if not state:
             state["step"] = torch.zeros((), dtype=torch.float32, device="cpu")
             for key in MOMENTS:
-                state[key] = torch.zeros_like(param, memory_format=torch.preserve_format)
+                state[key] = torch.zeros_like(
+                    param, dtype=CODES if course.moments == 16 else None,
+                    memory_format=torch.preserve_format,
+                )  # fmt: skip
         step = Step(param, grad, lane.name, lane.set, group, state, iteration, lane.last, lane.rows)
         for part in lane.plans[course.phase]:
             part.plan(step, course)
@@ -292,9 +299,11 @@ class StepAdam(Adam):
         count[()] += 1
         t, (beta1, beta2) = count.item(), group["betas"]
         lr, decay = group["lr"], group["weight_decay"]
+        if course.moments == 16:
+            take_back(state)
         hyper = Hyper(
             lr, beta1, beta2, group["eps"], 1 - beta1**t, (1 - beta2**t) ** 0.5,
-            state["exp_avg"], state["exp_avg_sq"],
+            state["exp_avg"], state["exp_avg_sq"], key=mixed(int(t)) if course.moments == 16 else 0,
         )  # fmt: skip
         if decay:
             if group.get("decoupled_weight_decay"):
@@ -412,7 +421,7 @@ class StepAdam(Adam):
 
     def state_dict(self) -> dict[str, Any]:
         """As torch's, with the course's numbers in `param_groups[0]["opt3dgs"]`."""
-        if not self.course.parts:
+        if not self.course.acts:
             return super().state_dict()
         self.param_groups[0][STATE_KEY] = self.course.state_of(self)
         try:
@@ -435,6 +444,7 @@ class StepAdam(Adam):
             self.course.check_state(call, groups[0][STATE_KEY])
             self.course.restore_parts(groups[0][STATE_KEY])
         own = [dict(group) for group in self.param_groups]
+        self.coded = False  # unless the course says so
         super().load_state_dict(state_dict)
         for group, was in zip(self.param_groups, own, strict=True):
             for key, value in was.items():
@@ -452,6 +462,7 @@ class StepAdam(Adam):
             self.in_own_frame, self._last = False, ()
         else:
             iteration, self.in_own_frame = saved["iteration"], saved["own_frame"]
+            self.coded = saved["moments"] == 16
             self._last = tuple(saved["last"])
         if saved is None or saved["total_steps"] != course.total_steps:
             for state in self.state.values():  # they belong to the end of another run
@@ -461,6 +472,29 @@ class StepAdam(Adam):
         if saved is not None or steps:  # an optimizer that steps now and then lags behind the clock
             others = [each.next_iteration for each, _ in course.members.values()]
             course.restore(saved, max([iteration, *others]))
+        self._recode()
+
+    @torch.no_grad()
+    def _recode(self) -> None:
+        """Have the moments at as many bits as the course says; rounded where they had more."""
+        bits, found = self.course.moments, False
+        for param, state in self.state.items():
+            if "exp_avg" not in state:
+                continue
+            found = True
+            if self.coded:
+                take_back(state)
+            first, second = (state[key] for key in MOMENTS)
+            if self.coded and bits == 32:
+                first, second = (each.to(param.dtype) for each in decoded(first, second))
+            elif not self.coded and bits == 16:
+                codes = torch.empty_like(first, dtype=CODES), torch.empty_like(second, dtype=CODES)
+                encode(first, second, *codes, key=NEAREST, at=0)
+                first, second = codes
+            state["exp_avg"], state["exp_avg_sq"] = first, second
+        if found and self.coded != (bits == 16):
+            LOGGER.info("opt3dgs_optim: the moments that were there are now at %d bits", bits)
+        self.coded = bits == 16
 
     def last_steps(self) -> tuple[int, ...]:
         """Of every parameter, the iteration of its last step."""
@@ -469,7 +503,7 @@ class StepAdam(Adam):
     # -- copies ------------------------------------------------------------------------------------
 
     def __getstate__(self) -> dict[str, Any]:
-        kept = ("course", "_slots", "_masked", "in_own_frame", "next_iteration")
+        kept = ("course", "_slots", "_masked", "in_own_frame", "next_iteration", "coded")
         own = {key: getattr(self, key) for key in kept}
         return {**super().__getstate__(), **own, "_lanes": [], "_last": self.last_steps()}
 
@@ -503,6 +537,16 @@ def upgraded_class(base: type[Adam]) -> type[StepAdam]:
         made = type(base.__name__, (StepAdam, base), {"_base": base, "__module__": base.__module__})
         _CLASSES[base] = cast(type[StepAdam], made)
     return _CLASSES[base]
+
+
+def take_back(state: dict[str, Any]) -> None:
+    """Have codes as integers again.
+
+    An edit of rows, and torch's loading, make them float32, with the same values.
+    """
+    for key in MOMENTS:
+        if state[key].dtype != CODES:
+            state[key] = state[key].to(CODES)
 
 
 def checked_gradient(part: Part, found: Any, grad: Tensor) -> Tensor:
@@ -571,7 +615,9 @@ def check_moments(call: str, state: Any) -> None:
         value: Any = state.get(key)
         if value is None and key in KEPT:
             continue
-        if not isinstance(value, Tensor) or not value.is_floating_point():
+        if not isinstance(value, Tensor) or not (
+            value.is_floating_point() or (key in MOMENTS and value.dtype == CODES)
+        ):
             raise ValueError(f"{call} has {key}={value!r}, but a tensor of real numbers is needed")
         shapes[key] = tuple(value.shape)
     one = shapes["exp_avg"]

@@ -37,6 +37,7 @@ class AWSGLD(StepAdam):
             (the group named `means` or `xyz`, or the only group), or None.
         preconditioner: `"adam"`, or `"none"` for the plain SGLD drift `lr * nu * grad`, which
             samples exp(-energy / temperature) together with `IsotropicNoise(temperature=...)`.
+        moments: bits of each of Adam's two moments of a number; 16 take half of Adam's memory.
 
     The energy is the closure's value, or comes from `histogram.observe(loss)`, called once per
     iteration before `step()`. One that is not finite leaves nu as it is.
@@ -92,8 +93,10 @@ class AWSGLD(StepAdam):
         histogram: EnergyHistogram | None = None,
         noise: IsotropicNoise | PositionNoise | None = None,
         preconditioner: Literal["adam", "none"] = "adam",
+        moments: Literal[32, 16] = 32,
     ) -> None:
         check_choice("AWSGLD", "preconditioner", preconditioner, ("adam", "none"))
+        check_choice("AWSGLD", "moments", moments, (32, 16))
         if histogram is not None and not isinstance(histogram, EnergyHistogram):
             raise TypeError(f"AWSGLD: histogram={histogram!r}, but an EnergyHistogram is needed")
         if noise is not None and not isinstance(noise, (IsotropicNoise, PositionNoise)):
@@ -104,11 +107,11 @@ class AWSGLD(StepAdam):
         slots: Slots = [split_name(group.get("name")) for group in self.param_groups]
         if len(slots) == 1 and slots[0][1] is None and isinstance(noise, PositionNoise):
             slots = [("", "means")]  # the only group
-        check_supported(self, slots)
+        check_supported(self, slots, moments)
         parts: list[Part] = [part for part in (histogram, noise) if part is not None]
         if preconditioner == "none":
             parts.append(PlainDrift())
-        course = Sampling(parts)
+        course = Sampling(parts, moments=moments)
         if histogram is not None:
             histogram.names = None  # nu is on every group's step
         self.follow(course, slots)

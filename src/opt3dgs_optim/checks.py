@@ -114,3 +114,10 @@ def warn_user(message: str) -> None:
     while frame.f_back is not None and frame.f_code.co_filename.startswith(inside):
         frame, level = frame.f_back, level + 1
     warnings.warn(message, stacklevel=level)
+
+
+def say(message: str) -> None:
+    """Tell the user, by the logger, or on stderr where nothing has been set up to show INFO."""
+    LOGGER.info(message)
+    if not LOGGER.hasHandlers():
+        print(message, file=sys.stderr)

@@ -19,12 +19,13 @@ def own_step(kind: type) -> type | None:
     return None if owner in (Adam, AdamW) else owner
 
 
-def check_supported(optimizer: Any, slots: Slots) -> None:
+def check_supported(optimizer: Any, slots: Slots, moments: int = 32) -> None:
     """Refuse an optimizer that is outside of the contract, before anything has been changed.
 
     Args:
         optimizer: what is to be upgraded.
         slots: by group, the set of Gaussians and which of its parameters it holds, or None.
+        moments: bits of each of Adam's moments of a number.
 
     Raises:
         TypeError: it is no Adam of torch's, nor gsplat's or INRIA's masked one.
@@ -44,6 +45,11 @@ def check_supported(optimizer: Any, slots: Slots) -> None:
         raise TypeError(
             f"upgrade: {kind.__name__} has a step of its own; have the trainer make a "
             "torch.optim.Adam (or AdamW) with the same groups, or gsplat's SelectiveAdam"
+        )
+    if moments == 16 and owner is not None:
+        raise ValueError(
+            f"upgrade: moments=16, but {kind.__name__} makes its own step on moments of 32 bits; "
+            "take torch.optim.Adam, or moments=32"
         )
     held = [slot for slot in slots if slot[1] is not None]
     if len(set(held)) < len(held):
@@ -69,6 +75,8 @@ def check_supported(optimizer: Any, slots: Slots) -> None:
                     f"upgrade: {shown} is {param.dtype}, {param.layout}; dense float32 is needed "
                     "(or float64, which is stepped in plain torch)"
                 )
+            if moments == 16 and param.dtype != torch.float32:
+                raise ValueError(f"upgrade: moments=16, but {shown} is {param.dtype}; use float32")
             if name == "means" and param.shape[1:] != (3,):
                 raise ValueError(f"upgrade: {shown} is {tuple(param.shape)}; positions are [N, 3]")
     devices = {str(p.device) for g in optimizer.param_groups for p in g["params"]}

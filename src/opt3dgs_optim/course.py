@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import check_count, warn_user
+from opt3dgs_optim.checks import check_choice, check_count, warn_user
 from opt3dgs_optim.part import Part, Phase, overrides
 
 if TYPE_CHECKING:
@@ -30,16 +30,22 @@ class Course:
         parts: what the steps have, in order.
         total_steps: iterations of the training; None: it has no end.
         switch_step: the iteration in which exploitation starts; None: never.
+        moments: bits of each of Adam's moments of a number, 32 or 16.
 
     Attributes:
         iteration: the present one, from 0; -1 before the first step.
     """
 
     def __init__(
-        self, parts: Iterable[Part], total_steps: int | None = None, switch_step: int | None = None
+        self,
+        parts: Iterable[Part],
+        total_steps: int | None = None,
+        switch_step: int | None = None,
+        moments: int = 32,
     ) -> None:
         self.parts = tuple(parts)
         self.total_steps, self.switch_step = total_steps, switch_step
+        self.moments = check_choice(type(self).__name__, "moments", moments, (32, 16))
         self.iteration = -1
         self._notes: dict[str, dict[str, Any]] = {type(part).__name__: {} for part in self.parts}
         self.members: dict[tuple[str, str], tuple[StepAdam, int]] = {}
@@ -88,6 +94,11 @@ class Course:
         """Called once in each iteration, before its first step."""
         if self.iteration % LOOK_INTERVAL == 0:
             self._look()
+
+    @property
+    def acts(self) -> bool:
+        """Whether the steps are others than torch's."""
+        return bool(self.parts) or self.moments != 32
 
     # -- what the parts share --------------------------------------------------------------------
 
@@ -163,6 +174,7 @@ class Course:
             "iteration": max(optimizer.next_iteration, self.iteration),  # it may have been put on
             "total_steps": self.total_steps,
             "own_frame": optimizer.in_own_frame,
+            "moments": self.moments,
             "last": list(optimizer.last_steps()),
             "notes": {name: dict(notes) for name, notes in self._notes.items()},
             "parts": {type(p).__name__: p.state_dict() for p in self.parts if p.learns},
@@ -170,7 +182,8 @@ class Course:
 
     def check_state(self, call: str, state: Any) -> None:
         """ValueError unless `state` is what `state_of` gives; the one check of what is loaded."""
-        needed = {"format", "iteration", "total_steps", "own_frame", "last", "notes", "parts"}
+        needed = {"format", "iteration", "total_steps", "own_frame", "moments", "last", "notes"}
+        needed |= {"parts"}
         if not isinstance(state, Mapping) or set(state) != needed or state["format"] != FORMAT:
             raise ValueError(
                 f"{call}: param_groups[0][{STATE_KEY!r}] is not of this version (format {FORMAT}); "
@@ -180,6 +193,7 @@ class Course:
         check_count(call, "iteration", state["iteration"], 0)
         if state["total_steps"] is not None:
             check_count(call, "total_steps", state["total_steps"], 1)
+        check_choice(call, "moments", state["moments"], (32, 16))
         last = state["last"]
         if not isinstance(last, list) or not all(type(each) is int for each in last):
             raise ValueError(f"{call}: last={last!r}, but a list of integers is needed")

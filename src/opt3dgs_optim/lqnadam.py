@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 from torch import Tensor
 
 from opt3dgs_optim.adam import StepAdam
 from opt3dgs_optim.backend import Backend
-from opt3dgs_optim.checks import warn_user
+from opt3dgs_optim.checks import check_choice, warn_user
 from opt3dgs_optim.contract import check_supported
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import split_name
@@ -43,6 +43,7 @@ class LQNAdam(StepAdam):
     Args:
         params, lr, betas, eps, weight_decay: as in `torch.optim.Adam`.
         history_size, min_cosine, graft, backend: as in `Curvature`.
+        moments: bits of each of Adam's two moments of a number; 16 take half of Adam's memory.
 
     Examples:
         Fifty starts in Rosenbrock's valley, each optimizer with the best of its rates there:
@@ -80,14 +81,16 @@ class LQNAdam(StepAdam):
         min_cosine: float = 1e-6,
         graft: bool = True,
         backend: Backend = "auto",
+        moments: Literal[32, 16] = 32,
     ) -> None:
+        check_choice("LQNAdam", "moments", moments, (32, 16))
         curvature = Curvature(
             history_size, min_cosine=min_cosine, graft=graft, names=None, backend=backend
         )
         super().__init__(params, lr, betas, eps, weight_decay)
         slots = [split_name(group.get("name")) for group in self.param_groups]
-        check_supported(self, slots)
-        self.follow(Course([curvature], switch_step=0), slots)
+        check_supported(self, slots, moments)
+        self.follow(Course([curvature], switch_step=0, moments=moments), slots)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Add a group as in `torch.optim.Adam`; parameters of one dimension get a warning."""

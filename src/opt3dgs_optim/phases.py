@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import atexit
 import weakref
 from collections.abc import Mapping, Sequence
 from numbers import Integral
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
 from opt3dgs_optim.adam import StepAdam, upgraded_class
-from opt3dgs_optim.checks import LOGGER, check_count, check_energy, check_number
+from opt3dgs_optim.checks import LOGGER, check_count, check_energy, check_number, say
 from opt3dgs_optim.contract import Slots, check_supported
 from opt3dgs_optim.course import STATE_KEY, Course
 from opt3dgs_optim.names import GAUSSIAN_NAMES, split_name
 from opt3dgs_optim.part import Part, overrides
 from opt3dgs_optim.parts.averaging import Averaging
 from opt3dgs_optim.parts.curvature import Curvature
+from opt3dgs_optim.parts.fading import Fading
 from opt3dgs_optim.parts.own_frame import OwnFrame
 from opt3dgs_optim.presets import DEFAULTS, PAPER_STEPS, PAPER_SWITCH, paper_parts
 
@@ -27,8 +27,9 @@ if TYPE_CHECKING:
     from opt3dgs_optim.runs import RunLog
 
 CALL = "PhaseScheduler"
-Optimizers = TypeVar("Optimizers", bound="Optimizer | Mapping[str, Optimizer] | list[Optimizer]")
-_UNFINISHED: weakref.WeakSet[PhaseScheduler] = weakref.WeakSet()
+Optimizers = TypeVar(
+    "Optimizers", bound="Optimizer | Mapping[str, Optimizer] | Sequence[Optimizer]"
+)
 
 
 class PhaseScheduler(Course):
@@ -45,11 +46,14 @@ class PhaseScheduler(Course):
         switch: where exploitation starts: a fraction of `total_steps` in (0, 1] if a float, an
             iteration if an int (`total_steps`: never). The paper: 29/30.
         parts: what the steps have, in order; None: `DEFAULTS`.
+        moments: bits of each of Adam's two moments of a number; 16 take half of Adam's memory
+            (see docs/algorithms).
         log: a `RunLog` that gets one line an iteration, with what the parts say of themselves.
         process_group: a `torch.distributed` process group over whose ranks the loss is averaged,
             for parts that read it.
 
-    Memory: that of Adam. In the last thirtieth `Averaging` keeps a copy of the parameters.
+    Memory: that of Adam, or half of it with `moments=16`. In the last thirtieth `Averaging` keeps a
+    copy of the parameters.
 
     Examples:
         >>> import torch
@@ -74,6 +78,7 @@ class PhaseScheduler(Course):
         switch: float | int = PAPER_SWITCH,
         parts: Sequence[Part] | None = None,
         *,
+        moments: Literal[32, 16] = 32,
         log: RunLog | None = None,
         process_group: Any = None,
     ) -> None:
@@ -87,7 +92,7 @@ class PhaseScheduler(Course):
         else:
             switch_step = round(check_number(CALL, "switch", switch, 0.0, 1.0) * total_steps)
         self._chosen = parts is not None  # by the user
-        super().__init__(_checked_parts(parts), total_steps, switch_step)
+        super().__init__(_checked_parts(parts), total_steps, switch_step, moments)
         if log is not None and not hasattr(log, "step"):
             raise TypeError(f"{CALL}: log={log!r}, but a RunLog or None is needed")
         self.log, self._loss = log, None
@@ -95,7 +100,8 @@ class PhaseScheduler(Course):
         own = (part for part in self.parts if overrides(part, "pixel_loss"))
         self._squared: Part | None = next(own, None)
         self._choose_pixel_loss()
-        _UNFINISHED.add(self)
+        self._end = End(total_steps, self.part(Averaging))
+        weakref.finalize(self, self._end.say)  # at exit, or where the function that trains ends
 
     @classmethod
     def paper(cls, total_steps: int = PAPER_STEPS, **options: Any) -> PhaseScheduler:
@@ -127,7 +133,7 @@ class PhaseScheduler(Course):
                     f"{CALL}.upgrade: {type(optimizer).__name__} has parts of its own; upgrade a "
                     "torch.optim.Adam, with parts=[...] for what its steps are to have"
                 )
-            check_supported(optimizer, its)
+            check_supported(optimizer, its, self.moments)
             if (saved := optimizer.param_groups[0].get(STATE_KEY)) is not None:
                 self.check_state(f"{CALL}.upgrade", saved)
                 self.restore_parts(saved)
@@ -145,12 +151,17 @@ class PhaseScheduler(Course):
             )
         for (_, optimizer), its in zip(given, slots, strict=True):
             self._upgrade(optimizer, its)
-        LOGGER.info(
-            "opt3dgs_optim: %d iterations, %s, in the steps of %s",
-            self.total_steps, ", ".join(map(repr, self.parts)) or "no parts",
-            " ".join(name for _, name in held if name),
-        )  # fmt: skip
+        self._say_upgraded(" ".join(name for _, name in held if name))
         return optimizers
+
+    def _say_upgraded(self, names: str) -> None:
+        """One line, so that a user sees that something has happened."""
+        means, fading = self.param_of("", "means"), self.part(Fading)
+        line = f"opt3dgs_optim: {self.total_steps} iterations, "
+        line += ", ".join(type(part).__name__ for part in self.parts) or "no parts"
+        if means is not None and fading is not None:
+            line += f" ({fading.num_events(self.total_steps or 0, len(means))} events)"
+        say(f"{line}, in the steps of {names}")
 
     def _upgrade(self, optimizer: Any, slots: Slots) -> None:
         if isinstance(optimizer, StepAdam):
@@ -238,12 +249,13 @@ class PhaseScheduler(Course):
                 "parameters stay the last iterate", self.iteration + 1, self.total_steps,
                 Averaging.start(self.total_steps or 0),
             )  # fmt: skip
-        self.finished = True
+        self.finished = self._end.finished = True
 
     # -- what it watches ---------------------------------------------------------------------------
 
     def _advance(self) -> None:
         super()._advance()
+        self._end.done = self.iteration + 1
         self._choose_pixel_loss()
         if self.log is not None:
             numbers = self.numbers()
@@ -285,15 +297,8 @@ class PhaseScheduler(Course):
             )
 
     def end_line(self) -> str | None:
-        """What is said at exit of a training that has ended before its end; None: it has not."""
-        total, done = self.total_steps or 0, self.iteration + 1
-        averaging = self.part(Averaging)
-        if self.finished or averaging is None or not 0 < done <= averaging.put_from(total):
-            return None
-        return (
-            f"opt3dgs_optim: the training ended at iteration {done} of {total}, so that the "
-            "parameters are the last iterate and no mean; call phases.finish() where it ends early"
-        )
+        """What is said of a training that ends now, before its end; None where it does not."""
+        return self._end.line()
 
     def __getstate__(self) -> dict[str, Any]:
         # Two would write into one file; another process has groups of its own.
@@ -304,10 +309,29 @@ class PhaseScheduler(Course):
         return "\n".join([f"{CALL}(", f"  {clock}", *(f"  {part!r}" for part in self.parts), ")"])
 
 
-@atexit.register
-def _say_unfinished() -> None:
-    for scheduler in _UNFINISHED:
-        if (line := scheduler.end_line()) is not None:
+class End:
+    """How far a training has come, which outlives its scheduler."""
+
+    def __init__(self, total_steps: int, averaging: Averaging | None) -> None:
+        self.total_steps, self.averaging = total_steps, averaging
+        self.done = 0  # iterations, if any was made here
+        self.finished = False
+
+    def line(self) -> str | None:
+        """What is said where it ends before its end; None: it does not."""
+        if self.finished or self.averaging is None or not self.done:
+            return None
+        if self.done > self.averaging.put_from(self.total_steps):
+            return None
+        return (
+            f"opt3dgs_optim: the training ended at iteration {self.done} of {self.total_steps}, so "
+            "that the parameters are the last iterate and no mean; call phases.finish() where it "
+            "ends early"
+        )
+
+    def say(self) -> None:
+        """Log the line, if there is one."""
+        if (line := self.line()) is not None:
             LOGGER.warning(line)
 
 

@@ -25,6 +25,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from opt3dgs_optim.moments import CODES, decoded, encode
+
 CHUNK = 65_536  # numbers that a CPU works on at a time, so that intermediates stay in its cache
 # Above it a square is infinite: Adam's second moment would stay so for ever.
 LARGEST = {dtype: torch.finfo(dtype).max ** 0.5 / 2 for dtype in (torch.float32, torch.float64)}
@@ -108,13 +110,14 @@ class Hyper:
     eps: float
     correction1: float  # 1 - beta1^t
     root2: float  # sqrt(1 - beta2^t)
-    exp_avg: Tensor
+    exp_avg: Tensor  # float32 or float64, or codes int16 of both: see `moments`
     exp_avg_sq: Tensor
     shrink: float = 1.0  # decoupled weight decay: factor on the parameter
     decay: float = 0.0  # the other kind: share of the parameter in the gradient
     mean: Tensor | None = None  # like the parameter
     began: Tensor | None = None  # [N] the `Mean.number` with which a row's mean began; 0: not yet
     nonfinite: Tensor | None = field(default=None)  # [1] int32 on the device: counts numbers
+    key: int = 0  # 32 bits on which this step's rounding of moments to codes depends
 
 
 def take_step(step: Step, hyper: Hyper) -> int:
@@ -139,7 +142,21 @@ def _chunks(param: Tensor) -> Iterator[Any]:
 
 
 def _take_rows(step: Step, hyper: Hyper, chosen: Tensor | None, rows: Any) -> int:
-    param, exp_avg, exp_avg_sq = step.param[rows], hyper.exp_avg[rows], hyper.exp_avg_sq[rows]
+    exp_avg, exp_avg_sq = hyper.exp_avg[rows], hyper.exp_avg_sq[rows]
+    if exp_avg.dtype != CODES:
+        return _take_decoded(step, hyper, chosen, rows, exp_avg, exp_avg_sq)
+    first, second = decoded(exp_avg, exp_avg_sq)
+    bad = _take_decoded(step, hyper, chosen, rows, first, second)
+    if not step.plain:
+        at = 0 if rows is ... else rows.start * (step.param.numel() // step.param.shape[0])
+        encode(first, second, exp_avg, exp_avg_sq, hyper.key, at)
+    return bad
+
+
+def _take_decoded(
+    step: Step, hyper: Hyper, chosen: Tensor | None, rows: Any, exp_avg: Tensor, exp_avg_sq: Tensor
+) -> int:
+    param = step.param[rows]
     grad, bad = _finite(step.grad[rows], hyper.nonfinite)
     if step.fade is not None and chosen is not None:
         faded = like_rows(chosen[rows], param)

@@ -1,4 +1,4 @@
-"""Whole trainings on a GPU that is not there: what is launched, that nothing waits, what comes out."""
+"""Whole trainings on a GPU that is not there: what is launched, and what comes out of them."""
 
 from __future__ import annotations
 

@@ -92,6 +92,11 @@ class Fading(Part):
         share = min(1.0, MAX_POINTS_OF_ALL_EVENTS / num_points) ** (2 / 3) if num_points else 0.0
         return int((event + 1) * share) > int(event * share)
 
+    def num_events(self, total_steps: int, num_points: int) -> int:
+        """How many events a run of so many points has."""
+        most = self.events_before(total_steps, total_steps)
+        return sum(self.happens(event, num_points) for event in range(most))
+
     def fade(self, event: int) -> Fade:
         """What an event does."""
         key = mixed((event + self.seed * 0x9E3779B1) & 0xFFFFFFFF)

@@ -18,10 +18,10 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.checks import LOGGER
+from opt3dgs_optim.moments import CODES
 from opt3dgs_optim.step import Hyper, Step
 
 ROWS_BLOCK, FRAME_BLOCK, LOOK_BLOCK = 1024, 128, 1024  # as in `kernels`
-LONG = 2**31 - ROWS_BLOCK  # above it a number's place needs 64 bits
 NO_FADE = (0, 0.0, 1.0, 1.0)
 _HERE = contextlib.nullcontext()
 _COMPILED: dict[Any, Any] = {}  # what Triton has compiled, by what it depends on
@@ -75,18 +75,22 @@ def fits(step: Step) -> bool:
     state, frame = step.state, step.frame
     if not (
         _plain(step.param) and _plain(step.grad)
-        and _plain(state["exp_avg"]) and _plain(state["exp_avg_sq"])
+        and _moment(state["exp_avg"]) and _moment(state["exp_avg_sq"])
     ):  # fmt: skip
         return False
     if frame is None:
         return not step.plain or (step.fade is None and step.hold is None)
     if step.plain or step.fade is not None or step.hold is not None:
         return False  # none of our parts says so of positions in their own frames
-    return _plain(frame.quats) and _plain(frame.scales) and 4 * step.param.shape[0] < LONG
+    return _plain(frame.quats) and _plain(frame.scales) and 4 * step.param.shape[0] < 2**31
 
 
 def _plain(tensor: Tensor) -> bool:
     return tensor.dtype is torch.float32 and tensor.is_contiguous()
+
+
+def _moment(tensor: Tensor) -> bool:
+    return tensor.dtype in (torch.float32, CODES) and tensor.is_contiguous()
 
 
 def take_step(step: Step, hyper: Hyper) -> None:
@@ -103,7 +107,7 @@ def take_step(step: Step, hyper: Hyper) -> None:
 
 def looks(grad: Tensor) -> bool:
     """Whether `look` takes the positions' gradient."""
-    return grad.is_cuda and _runs() and _plain(grad) and 3 * len(grad) < LONG
+    return grad.is_cuda and _runs() and _plain(grad) and 4 * len(grad) < 2**31
 
 
 def look(
@@ -122,7 +126,7 @@ def look(
     with _device_of(grad):
         _run(
             "look_at_positions", -(-len(grad) // LOOK_BLOCK), (grad, exp_avg_sq, mask, counter),
-            (len(grad),),
+            (len(grad),), exp_avg_sq is not None and exp_avg_sq.dtype is CODES,
         )  # fmt: skip
 
 
@@ -148,16 +152,17 @@ def launch(step: Step, hyper: Hyper) -> None:
         size /= hyper.correction1
     number, put = (0.0, 0.0) if how is None else (float(how.number), float(how.put))
     mean, began = (None, None) if how is None else (hyper.mean, hyper.began)
+    coded = hyper.exp_avg.dtype is CODES
     adam = (
         hyper.beta2, 1 - hyper.beta1, 1 - hyper.beta2, hyper.eps, hyper.root2, hyper.shrink,
-        hyper.decay,
+        hyper.decay, _signed(hyper.key),
     )  # fmt: skip
     if frame is not None:
         _run(
             "step_in_own_frame", -(-param.shape[0] // FRAME_BLOCK),
             (param, step.grad, hyper.exp_avg, hyper.exp_avg_sq, frame.quats, frame.scales, mean,
              began, on_device, hyper.nonfinite),
-            (param.shape[0], frame.min_aspect, size, *adam, number, put),
+            (param.shape[0], frame.min_aspect, size, *adam, number, put), coded,
         )  # fmt: skip
         return
     key, share, fade_m, fade_v = NO_FADE if fade is None else fade
@@ -167,13 +172,20 @@ def launch(step: Step, hyper: Hyper) -> None:
         "step_rows", -(-numbers // ROWS_BLOCK),
         (param, step.grad, m, v, mean, began, held, on_device, hyper.nonfinite),
         (numbers, numbers // param.shape[0] if param.dim() else 1, size, *adam,
-         key if key < 2**31 else key - 2**32, share, fade_m, fade_v, weight, number, put),
+         _signed(key), share, fade_m, fade_v, weight, number, put),
+        coded,
     )  # fmt: skip
 
 
+def _signed(number: int) -> int:
+    """32 bits as an argument of one type."""
+    return number if number < 2**31 else number - 2**32
+
+
 def _run(
-    name: str, programs: int, tensors: tuple[Tensor | None, ...], numbers: tuple[float, ...]
-) -> None:
+    name: str, programs: int, tensors: tuple[Tensor | None, ...], numbers: tuple[float, ...],
+    coded: bool,
+) -> None:  # fmt: skip
     """Launch a kernel; what Triton has compiled is launched again without its launcher.
 
     Triton's launcher looks at every argument, which takes 30 us. What it finds is the same again
@@ -189,7 +201,7 @@ def _run(
         bit *= 2
     first = tensors[0]
     assert first is not None
-    key = name, absent, first.get_device(), numbers[0] > LONG
+    key = name, coded, absent, first.get_device(), numbers[0] >= 2**31
     compiled = _COMPILED.get(key) if every % 16 == 0 else None
     if compiled is not None:
         compiled[programs, 1, 1](*pointers, *numbers)

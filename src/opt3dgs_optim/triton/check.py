@@ -13,7 +13,18 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim import triton
-from opt3dgs_optim.step import Fade, Frame, Hold, Hyper, Mean, Step, like_rows, take_step
+from opt3dgs_optim.moments import CODES, NEAREST, decoded, encode
+from opt3dgs_optim.step import (
+    Fade,
+    Frame,
+    Hold,
+    Hyper,
+    Mean,
+    Step,
+    like_rows,
+    mixed,
+    take_step,
+)
 
 SHAPES = ((257, 3), (31, 4), (1000,), (19, 15, 3))
 
@@ -33,11 +44,13 @@ def case(
     shrink: float = 1.0,
     decay: float = 0.0,
     bad: int = 0,
+    coded: bool = False,
 ) -> tuple[Step, Hyper]:
     """A step of a parameter amid a training, with what is asked for, from random numbers.
 
     Args:
         steps: of Adam, with this one. bad: how many numbers of the gradient are not finite.
+        coded: whether the moments are codes of 16 bits.
     """
 
     def draw(*size: int) -> Tensor:
@@ -49,6 +62,11 @@ def case(
     grad.view(-1)[:bad] = torch.tensor([float("nan"), float("inf"), -float("inf")])[
         torch.arange(min(bad, grad.numel())) % 3
     ]
+    if coded:
+        codes = torch.zeros(2, *shape, dtype=CODES)
+        encode(exp_avg, exp_avg_sq, codes[0], codes[1], NEAREST, 0)
+        exp_avg, exp_avg_sq = codes[0], codes[1]
+        exp_avg_sq[:1] = 0  # a row without history
     step = Step(param, grad, None, "", {}, {"exp_avg": exp_avg, "exp_avg_sq": exp_avg_sq}, 0, -1)
     step.factor, step.plain = factor, plain
     if fade:
@@ -59,7 +77,7 @@ def case(
         step.hold = Hold(draw(rows) < 0, 7.0)
     hyper = Hyper(
         1e-2, 0.9, 0.999, 1e-15, 1 - 0.9**steps, (1 - 0.999**steps) ** 0.5, exp_avg, exp_avg_sq,
-        shrink, decay, nonfinite=torch.zeros(1, dtype=torch.int32),
+        shrink, decay, nonfinite=torch.zeros(1, dtype=torch.int32), key=mixed(steps),
     )  # fmt: skip
     if mean:
         step.mean = Mean(steps, put)
@@ -71,7 +89,10 @@ def case(
 
 def tensors(step: Step, hyper: Hyper) -> list[Tensor]:
     """What a step changes."""
-    found = [step.param, hyper.exp_avg, hyper.exp_avg_sq]
+    moments = [hyper.exp_avg, hyper.exp_avg_sq]
+    if hyper.exp_avg.dtype == CODES:
+        moments = list(decoded(*moments))
+    found = [step.param, *moments]
     if hyper.mean is None or hyper.began is None:
         return found
     return [*found, hyper.mean, hyper.began]

@@ -21,7 +21,7 @@ ROWS_BLOCK = tl.constexpr(1024)  # numbers of a program
 FRAME_BLOCK = tl.constexpr(128)  # Gaussians of a program
 LOOK_BLOCK = tl.constexpr(1024)  # Gaussians of a program that looks at them
 # Numbers of Python that a step changes; with an unknown size Triton compiles one kernel for all.
-PLAIN_INTS = ["numbers", "width", "key", "rows"]
+PLAIN_INTS = ["numbers", "width", "key", "round_key", "rows"]
 
 
 @triton.jit
@@ -43,13 +43,18 @@ def larger(a, b):
 
 
 @triton.jit
-def chosen_rows(row, key, share):
-    """Whether an event fades a row: `step.chosen_rows`, on 32 bits."""
-    x = row.to(tl.uint32) ^ key.to(tl.uint32)
+def mixed(number, key):
+    """`step.mixed` of a number and a key, 32 bits."""
+    x = number.to(tl.uint32) ^ key.to(tl.uint32)
     x = (x ^ (x >> 16)) * 0x7FEB352D
     x = (x ^ (x >> 15)) * 0x846CA68B
-    x = x ^ (x >> 16)
-    return (x >> 8).to(tl.float32) * (1.0 / 16777216.0) < share
+    return x ^ (x >> 16)
+
+
+@triton.jit
+def chosen_rows(row, key, share):
+    """Whether an event fades a row: `step.chosen_rows`."""
+    return (mixed(row, key) >> 8).to(tl.float32) * (1.0 / 16777216.0) < share
 
 
 @triton.jit
@@ -59,6 +64,34 @@ def new_row(began, inside):
     if inside is not None:
         first = first & inside
     return first
+
+
+@triton.jit
+def moments_of(m, v, at, inside):
+    """The moments of a number: float32, or of their codes, `moments.decoded`."""
+    exp_avg, exp_avg_sq = tl.load(m + at, inside), tl.load(v + at, inside)
+    if exp_avg.dtype == tl.int16:
+        second = (exp_avg_sq.to(tl.int32) & 0xFFFF) << 15
+        first = tl.where(second != 0, exp_avg.to(tl.int32) << 16, 0)
+        exp_avg, exp_avg_sq = (
+            first.to(tl.float32, bitcast=True),
+            second.to(tl.float32, bitcast=True),
+        )
+    return exp_avg, exp_avg_sq
+
+
+@triton.jit
+def store_moments(m, v, at, inside, exp_avg, exp_avg_sq, key):
+    """Write the moments of a number: float32, or their codes, `moments.encode`."""
+    if m.dtype.element_ty == tl.int16:
+        chance = mixed(at, key)
+        second = exp_avg_sq.to(tl.int32, bitcast=True) + (chance & 0x7FFF).to(tl.int32)
+        first = exp_avg.to(tl.int32, bitcast=True) + (chance >> 16).to(tl.int32)
+        tl.store(m + at, (first >> 16).to(tl.int16), inside)
+        tl.store(v + at, (second >> 15).to(tl.int16), inside)
+    else:
+        tl.store(m + at, exp_avg, inside)
+        tl.store(v + at, exp_avg_sq, inside)
 
 
 @triton.jit
@@ -80,7 +113,7 @@ def into_mean(value, mean, began, row, at, inside, number, put):
 @triton.jit
 def _step_rows(
     p, g, m, v, mean, began, held, factor, nonfinite, at, inside, width, size, beta2, ones1, ones2,
-    eps, root2, shrink, decay, key, share, fade_m, fade_v, weight, number, put,
+    eps, root2, shrink, decay, round_key, key, share, fade_m, fade_v, weight, number, put,
 ):  # fmt: skip
     grad = finite(tl.load(g + at, inside), nonfinite, inside)
     value = tl.load(p + at, inside) * shrink
@@ -91,8 +124,7 @@ def _step_rows(
     if m is None:
         value = value - grad * size
     else:
-        exp_avg = tl.load(m + at, inside)
-        exp_avg_sq = tl.load(v + at, inside)
+        exp_avg, exp_avg_sq = moments_of(m, v, at, inside)
         if share > 0.0:
             chosen = chosen_rows(at // width, key, share)
             exp_avg = tl.where(chosen, exp_avg * fade_m, exp_avg)
@@ -104,8 +136,7 @@ def _step_rows(
         exp_avg = exp_avg + (grad - exp_avg) * ones1
         exp_avg_sq = exp_avg_sq * beta2 + grad * grad * ones2
         value = value - size * exp_avg / (tl.sqrt(exp_avg_sq) / root2 + eps)
-        tl.store(m + at, exp_avg, inside)
-        tl.store(v + at, exp_avg_sq, inside)
+        store_moments(m, v, at, inside, exp_avg, exp_avg_sq, round_key)
     if mean is not None:
         value = into_mean(value, mean, began, at // width, at, inside, number, put)
     tl.store(p + at, value, inside)
@@ -114,38 +145,40 @@ def _step_rows(
 @triton.jit(do_not_specialize=PLAIN_INTS)
 def step_rows(
     p, g, m, v, mean, began, held, factor, nonfinite, numbers, width, size, beta2, ones1, ones2,
-    eps, root2, shrink, decay, key, share, fade_m, fade_v, weight, number, put,
+    eps, root2, shrink, decay, round_key, key, share, fade_m, fade_v, weight, number, put,
 ):  # fmt: skip
     """Step a parameter [rows, width], ROWS_BLOCK of its numbers in a program.
 
     Args:
-        p, g, m, v, mean: numbers float32: parameter, gradient, moments (None: the step is the
-            gradient times the rate), mean (or None).
+        p, g, m, v, mean: numbers float32: parameter, gradient, moments (or codes int16; None: the
+            step is the gradient times the rate), mean (or None).
         began: [rows] float32, the number with which a row's mean began, 0: it begins now; or None.
         held: [rows] uint8, not 0: raise the second moment to (weight * gradient)^2; or None.
         factor: one float32 on the device, on the size; or None.
         nonfinite: one int32 to which numbers that are not finite are added; or None.
         size: the rate, with the correction of the first moment in it.
         ones1, ones2: 1 - beta1, 1 - beta2.
+        round_key: for the rounding of moments to codes, see `opt3dgs_optim.moments`.
         shrink, decay: of weight decay, decoupled and the other kind; 1.0 and 0.0: none.
         key, share, fade_m, fade_v: of fading; a share of 0.0: none.
         number, put: of the mean; put > 0: it takes the parameter's place.
         numbers: 64 bits, where there are more than 2^31.
     """
     first = tl.program_id(0).to(numbers.dtype) * ROWS_BLOCK
-    at = first + tl.arange(0, ROWS_BLOCK)
     # Without a mask four numbers are read at a time.
-    if first + ROWS_BLOCK <= numbers:
+    if first <= numbers - ROWS_BLOCK:
+        at = first + tl.arange(0, ROWS_BLOCK)
         _step_rows(
             p, g, m, v, mean, began, held, factor, nonfinite, at, None, width, size,
-            beta2, ones1, ones2, eps, root2, shrink, decay, key, share, fade_m, fade_v, weight,
-            number, put,
+            beta2, ones1, ones2, eps, root2, shrink, decay, round_key, key, share, fade_m, fade_v,
+            weight, number, put,
         )  # fmt: skip
-    else:
+    else:  # in 64 bits, since the place of a number that is not there may need them
+        last = first.to(tl.int64) + tl.arange(0, ROWS_BLOCK)
         _step_rows(
-            p, g, m, v, mean, began, held, factor, nonfinite, at, at < numbers, width, size,
-            beta2, ones1, ones2, eps, root2, shrink, decay, key, share, fade_m, fade_v, weight,
-            number, put,
+            p, g, m, v, mean, began, held, factor, nonfinite, last, last < numbers, width, size,
+            beta2, ones1, ones2, eps, root2, shrink, decay, round_key, key, share, fade_m, fade_v,
+            weight, number, put,
         )  # fmt: skip
 
 
@@ -157,21 +190,19 @@ def turned(w, x, y, z, a, b, c):
 
 
 @triton.jit
-def adam(grad, m, v, at, inside, size, beta2, ones1, ones2, eps, root2):
+def adam(grad, m, v, at, inside, size, beta2, ones1, ones2, eps, root2, round_key):
     """Adam's step of one number, whose moments are written."""
-    exp_avg = tl.load(m + at, inside)
-    exp_avg_sq = tl.load(v + at, inside)
+    exp_avg, exp_avg_sq = moments_of(m, v, at, inside)
     exp_avg = exp_avg + (grad - exp_avg) * ones1
     exp_avg_sq = exp_avg_sq * beta2 + grad * grad * ones2
-    tl.store(m + at, exp_avg, inside)
-    tl.store(v + at, exp_avg_sq, inside)
+    store_moments(m, v, at, inside, exp_avg, exp_avg_sq, round_key)
     return size * exp_avg / (tl.sqrt(exp_avg_sq) / root2 + eps)
 
 
 @triton.jit(do_not_specialize=PLAIN_INTS)
 def step_in_own_frame(
     p, g, m, v, quats, scales, mean, began, factor, nonfinite, rows, min_aspect, size, beta2,
-    ones1, ones2, eps, root2, shrink, decay, number, put,
+    ones1, ones2, eps, root2, shrink, decay, round_key, number, put,
 ):  # fmt: skip
     """Step positions along each Gaussian's axes, mu <- mu - B Adam(B^T g), FRAME_BLOCK a program.
 
@@ -213,9 +244,9 @@ def step_in_own_frame(
     gz = tl.where(tl.abs(gz) <= LARGEST, gz, 0.0)
     if factor is not None:
         size = size * tl.load(factor)
-    dx = sx * adam(gx, m, v, i, inside, size, beta2, ones1, ones2, eps, root2)
-    dy = sy * adam(gy, m, v, j, inside, size, beta2, ones1, ones2, eps, root2)
-    dz = sz * adam(gz, m, v, k, inside, size, beta2, ones1, ones2, eps, root2)
+    dx = sx * adam(gx, m, v, i, inside, size, beta2, ones1, ones2, eps, root2, round_key)
+    dy = sy * adam(gy, m, v, j, inside, size, beta2, ones1, ones2, eps, root2, round_key)
+    dz = sz * adam(gz, m, v, k, inside, size, beta2, ones1, ones2, eps, root2, round_key)
     dx, dy, dz = turned(w, x, y, z, dx, dy, dz)
     px = px - tl.where(tl.abs(dx) < INFINITY, dx, 0.0)
     py = py - tl.where(tl.abs(dy) < INFINITY, dy, 0.0)
@@ -240,8 +271,8 @@ def look_at_positions(g, v, out_of_view, counter, rows):
     """See which positions have no gradient.
 
     Args:
-        g: [rows, 3] float32, the gradient. v: [rows, 3] the second moments, not 0 where a position
-            has had one before; or None.
+        g: [rows, 3] float32, the gradient. v: [rows, 3] the second moments (or their codes), not 0
+            where a position has had one before; or None.
         out_of_view: [rows] uint8, 1 where there is none; or None.
         counter: [1] int64, to which 2^32 is added for each row in view, and 1 for each that is or
             has been; or None.
@@ -257,6 +288,6 @@ def look_at_positions(g, v, out_of_view, counter, rows):
         known = seen
         if v is not None:
             x, y, z = tl.load(v + i, inside), tl.load(v + i + 1, inside), tl.load(v + i + 2, inside)
-            known = seen | (((x != 0.0) | (y != 0.0) | (z != 0.0)) & inside)
+            known = seen | (((x != 0) | (y != 0) | (z != 0)) & inside)
         counts = tl.where(seen, 1 << 32, 0).to(tl.int64) + tl.where(known, 1, 0).to(tl.int64)
         tl.atomic_add(counter, tl.reduce(counts, 0, added), sem="relaxed")

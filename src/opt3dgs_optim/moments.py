@@ -1,0 +1,59 @@
+"""Adam's moments at 16 bits a number: what a code means, and how a number becomes one.
+
+    first moment    the upper half of its float32: sign, 8 bits of exponent, 7 of mantissa
+    second moment   8 bits of exponent and 8 of mantissa of its float32, which has no sign
+
+Both reach as far as float32 does, and need no scale of a row or of a tensor, so that rows can be
+cut, copied and appended by trainers that know nothing of it. A code of 0 is the number 0. Where the
+second moment is 0 the first one is, too: the row has no history.
+
+A number lies between two codes, of which it takes the upper one with the chance that makes the mean
+right (stochastic rounding): Adam changes its averages by a thousandth in a step, a quarter of the
+way between two codes. The chances are an integer hash of the number's place and of Adam's step, so
+that a resumed run repeats them, and every device and execution has the same.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+CODES = torch.int16
+NEAREST = None  # in the place of a key: no chance
+
+
+def decoded(exp_avg: Tensor, exp_avg_sq: Tensor) -> tuple[Tensor, Tensor]:
+    """The moments, float32, of their codes [N, ...] int16."""
+    second = (exp_avg_sq.to(torch.int32) & 0xFFFF) << 15
+    first = (exp_avg.to(torch.int32) << 16).mul_(second != 0)
+    return first.view(torch.float32), second.view(torch.float32)
+
+
+def encode(
+    first: Tensor, second: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, key: int | None, at: int
+) -> None:
+    """Write the codes of moments.
+
+    Args:
+        first, second: [n, ...] float32.
+        exp_avg, exp_avg_sq: [n, ...] int16, written.
+        key: 32 bits on which the chances of this step depend; `NEAREST`: to the nearest code.
+        at: the place of the first number in its parameter.
+    """
+    chance = _signed(0x80004000) if key is NEAREST else _chances(second, key, at)
+    codes = (second.contiguous().view(torch.int32) + (chance & 0x7FFF)) >> 15
+    exp_avg_sq.copy_((codes ^ 0x8000) - 0x8000)  # the upper half of 16 bits is negative
+    exp_avg.copy_((first.contiguous().view(torch.int32) + ((chance >> 16) & 0xFFFF)) >> 16)
+
+
+def _chances(like: Tensor, key: int, at: int) -> Tensor:
+    """`step.mixed` of the numbers' places, in 32 bits with a sign."""
+    x = torch.arange(like.numel(), dtype=torch.int32, device=like.device)
+    x = x.add_(_signed(at)).bitwise_xor_(_signed(key))
+    x = x.bitwise_xor_((x >> 16) & 0xFFFF).mul_(0x7FEB352D)
+    x = x.bitwise_xor_((x >> 15) & 0x1FFFF).mul_(_signed(0x846CA68B))
+    return x.bitwise_xor_((x >> 16) & 0xFFFF).view(like.shape)
+
+
+def _signed(number: int) -> int:
+    return (number + 2**31) % 2**32 - 2**31
