@@ -51,7 +51,8 @@ class PhaseScheduler(Course):
         process_group: a `torch.distributed` process group over whose ranks the loss is averaged,
             for parts that read it.
 
-    Memory: that of Adam, or half of it with `moments=16`. In the last thirtieth `Averaging` keeps a copy of the parameters.
+    Memory: that of Adam, or half of it with `moments=16`. In the last thirtieth `Averaging` keeps a
+    copy of the parameters.
 
     Examples:
         >>> import torch
