@@ -181,7 +181,7 @@ class StepAdam(Adam):
             )
         iteration = course.begin(self)
         given = () if not self._masked or (closure is None and not masked) else (closure, *masked)
-        if not course.parts:
+        if not course.acts:
             _unhooked(self._base)(self, *given, **masks)
         elif self._masked:
             self._step_around(iteration, given, masks)

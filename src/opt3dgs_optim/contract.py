@@ -46,11 +46,7 @@ def check_supported(optimizer: Any, slots: Slots, moments: int = 32) -> None:
             f"upgrade: {kind.__name__} has a step of its own; have the trainer make a "
             "torch.optim.Adam (or AdamW) with the same groups, or gsplat's SelectiveAdam"
         )
-    if moments == 16 and owner is not None:
-        raise ValueError(
-            f"upgrade: moments=16, but {kind.__name__} makes its own step on moments of 32 bits; "
-            "take torch.optim.Adam, or moments=32"
-        )
+    _check_bits(optimizer, owner, moments)
     held = [slot for slot in slots if slot[1] is not None]
     if len(set(held)) < len(held):
         raise ValueError(
@@ -75,10 +71,22 @@ def check_supported(optimizer: Any, slots: Slots, moments: int = 32) -> None:
                     f"upgrade: {shown} is {param.dtype}, {param.layout}; dense float32 is needed "
                     "(or float64, which is stepped in plain torch)"
                 )
-            if moments == 16 and param.dtype != torch.float32:
-                raise ValueError(f"upgrade: moments=16, but {shown} is {param.dtype}; use float32")
             if name == "means" and param.shape[1:] != (3,):
                 raise ValueError(f"upgrade: {shown} is {tuple(param.shape)}; positions are [N, 3]")
     devices = {str(p.device) for g in optimizer.param_groups for p in g["params"]}
     if len(devices) > 1:
         raise ValueError(f"upgrade: its parameters lie on {sorted(devices)}; one device is needed")
+
+
+def _check_bits(optimizer: Any, owner: type | None, moments: int) -> None:
+    """ValueError where moments of 16 bits are not for an optimizer."""
+    if moments == 32:
+        return
+    if owner is not None:
+        raise ValueError(
+            f"upgrade: moments=16, but {type(optimizer).__name__} makes its own step, on moments "
+            "of 32 bits; take torch.optim.Adam, or moments=32"
+        )
+    dtypes = {param.dtype for group in optimizer.param_groups for param in group["params"]}
+    if dtypes - {torch.float32}:
+        raise ValueError(f"upgrade: moments=16 with {sorted(map(str, dtypes))}; use float32")

@@ -84,6 +84,26 @@ def test_whatever_a_step_has(
     assert found <= (FRAME_TOLERANCE if frame else TOLERANCE)
 
 
+@settings(max_examples=40, deadline=None)
+@given(OPTIONS, KINDS, st.integers(1, 300), st.sampled_from(WIDTHS), st.integers(0, 99))
+def test_whatever_a_step_has_with_moments_of_16_bits(
+    options: dict[str, Any], kind: dict[str, bool], rows: int, width: tuple[int, ...], seed: int
+) -> None:
+    """The codes are the same, but where a rounding before them lies on the border of two."""
+    shape = (rows, 3) if "frame" in kind else (rows, *width)
+    (step, hyper), (step2, hyper2) = both({**options, **kind, "coded": True}, shape, seed)
+    for ours, theirs in ((hyper.exp_avg, hyper2.exp_avg), (hyper.exp_avg_sq, hyper2.exp_avg_sq)):
+        assert ours.dtype == theirs.dtype == torch.int16
+        away = (ours.to(torch.int32) - theirs.to(torch.int32)).abs()
+        assert away.max() <= 1 or (away.max() == 2**16 - 1)
+        assert (away > 0).sum() <= 1 + 0.01 * away.numel()
+    for hyper_, step_ in ((hyper, step), (hyper2, step2)):
+        hyper_.exp_avg, hyper_.exp_avg_sq = torch.zeros(2, *shape)  # compared already
+        assert step_.param.shape == shape
+    for ours, theirs in zip(tensors(step, hyper), tensors(step2, hyper2), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-6)
+
+
 @pytest.mark.parametrize("key", [0, 1, 2**31 - 1, 2**31, 2**32 - 1])
 @pytest.mark.parametrize("share", [0.01, 0.2, 0.5, 1.0])
 def test_the_same_rows_fade(key: int, share: float) -> None:

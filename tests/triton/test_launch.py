@@ -113,7 +113,7 @@ def test_rows_are_read_four_numbers_at_a_time(
     long = options.pop("numbers", None)
     if long is not None:
         run = triton._run
-        monkeypatch.setattr(triton, "_run", lambda *a: run(*a[:3], (long, *a[3][1:])))
+        monkeypatch.setattr(triton, "_run", lambda *a: run(*a[:3], (long, *a[3][1:]), a[4]))
     launched(driver, (64, 4), **options)
     ((key, made),) = triton._COMPILED.items()
     ptx = made.asm["ptx"]
@@ -131,6 +131,18 @@ def test_own_frames_are_in_registers(driver: FakeDriver, options: Any) -> None:
     launched(driver, (64, 3), frame=True, **options)
     ((_, made),) = triton._COMPILED.items()
     assert ".local" not in made.asm["ptx"]
+
+
+@pytest.mark.parametrize("options", [{}, {"frame": True}], ids=str)
+def test_moments_of_16_bits_are_compiled_beside_those_of_32(
+    driver: FakeDriver, options: Any
+) -> None:
+    for coded in (True, False, True):
+        launched(driver, (64, 3), coded=coded, **options)
+    assert len(driver.loaded) == 2
+    ptx = [made.asm["ptx"] for made in triton._COMPILED.values()]
+    assert ["ld.global.b16" in each or "ld.global.v4.b16" in each for each in ptx] == [True, False]
+    assert all(".local" not in each for each in ptx)
 
 
 def test_the_sizes_of_programs() -> None:

@@ -1,0 +1,352 @@
+"""Adam's moments at 16 bits a number: what codes mean, and what trainers do to them."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Adam
+
+from opt3dgs_optim import AWSGLD, DEFAULTS_ADC, LQNAdam, PhaseScheduler
+from opt3dgs_optim.moments import CODES, NEAREST, decoded, encode
+from opt3dgs_optim.step import mixed
+
+SHAPES = {
+    "means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (15, 3),
+}  # fmt: skip
+MOMENTS = ("exp_avg", "exp_avg_sq")
+BYTES = 236  # a half of the 472 of float32, at degree 3
+FIRST, SECOND = 2.0**-8, 2.0**-9  # half of the way between two codes, of a number
+
+
+def coded(first: Tensor, second: Tensor, key: int | None, at: int = 0) -> tuple[Tensor, Tensor]:
+    codes = torch.empty_like(first, dtype=CODES), torch.empty_like(first, dtype=CODES)
+    encode(first, second, *codes, key=key, at=at)
+    return codes
+
+
+def wide(count: int) -> tuple[Tensor, Tensor]:
+    """Moments of every size that float32 has."""
+    draw = torch.Generator().manual_seed(0)
+    size = torch.logspace(-36, 36, count)
+    sign = torch.randn(count, generator=draw).sign()
+    first, second = 0.5 + torch.rand(2, count, generator=draw)
+    return sign * first * size, second * size
+
+
+def trained(count: int = 200, moments: Any = 16, total: int = 60) -> tuple[Any, Any]:
+    draw = torch.Generator().manual_seed(0)
+    adams = {
+        name: Adam([Parameter(torch.randn(count, *shape, generator=draw))], lr=1e-2, eps=1e-15)
+        for name, shape in SHAPES.items()
+    }
+    phases = PhaseScheduler(total, parts=DEFAULTS_ADC, moments=moments)
+    return phases.upgrade(adams), phases
+
+
+def param_of(adam: Adam) -> Parameter:
+    return adam.param_groups[0]["params"][0]
+
+
+def iterate(adams: dict[str, Adam], first: int, last: int) -> None:
+    for i in range(first, last):
+        draw = torch.Generator().manual_seed(i)
+        for adam in adams.values():
+            param = param_of(adam)
+            noise = torch.randn(param.shape, generator=draw)
+            param.grad = 0.1 * noise + 0.1 * param.detach()
+            adam.step()
+
+
+def values(adams: dict[str, Adam]) -> list[Tensor]:
+    return [param_of(adam).detach().clone() for adam in adams.values()]
+
+
+def same(one: list[Tensor], other: list[Tensor]) -> bool:
+    return all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+# -- codes -----------------------------------------------------------------------------------------
+
+
+def test_a_code_is_as_near_as_it_says_over_float32s_whole_range() -> None:
+    first, second = wide(20_000)
+    found = decoded(*coded(first, second, NEAREST))
+    assert ((found[0] - first).abs() <= FIRST * first.abs()).all()
+    assert ((found[1] - second).abs() <= SECOND * second).all()
+
+
+def test_zero_is_zero_and_a_row_without_second_moment_has_no_first() -> None:
+    zeros = torch.zeros(3, dtype=CODES)
+    assert all(torch.equal(each, torch.zeros(3)) for each in decoded(zeros, zeros))
+    codes = coded(torch.zeros(3), torch.zeros(3), key=12345)
+    assert all(torch.equal(each, zeros) for each in codes)
+    ones = coded(torch.ones(3), torch.ones(3), NEAREST)
+    assert torch.equal(decoded(ones[0], zeros)[0], torch.zeros(3))
+
+
+def test_codes_are_right_in_the_mean() -> None:
+    first, second = wide(2_000)
+    sums = torch.zeros(2, 2_000, dtype=torch.float64)
+    for step in range(1, 501):
+        sums += torch.stack(decoded(*coded(first, second, mixed(step))))
+    for total, right, most in zip(sums, (first, second), (FIRST, SECOND), strict=True):
+        away = total / 500 / right - 1.0
+        # The spread of the mean of 500 coins, each up to a code wide, and of 2,000 such means.
+        assert away.abs().max() < 2 * most * 0.5 / 500**0.5 * 5
+        assert abs(away.mean().item()) < 2 * most * 0.5 / (500 * 2_000) ** 0.5 * 5
+
+
+def test_codes_are_the_same_of_a_part_and_of_the_whole() -> None:
+    first, second = wide(1_000)
+    whole = coded(first, second, 2**32 - 1)
+    part = coded(first[300:], second[300:], 2**32 - 1, at=300)
+    assert all(torch.equal(a[300:], b) for a, b in zip(whole, part, strict=True))
+    other = coded(first, second, 2**32 - 2)
+    assert not torch.equal(other[0], whole[0])
+
+
+def test_what_float32_makes_of_codes_is_taken_back() -> None:
+    codes = torch.arange(-(2**15), 2**15, dtype=torch.int32).to(CODES)
+    assert torch.equal(codes.to(torch.float32).to(CODES), codes)
+
+
+@pytest.mark.parametrize("shape", [(0, 3), (1, 3), (9_000, 15, 3)])
+def test_a_step_in_pieces_is_a_step(
+    shape: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A CPU steps some rows at a time: the codes are those of the whole."""
+    from opt3dgs_optim import step
+
+    made = []
+    for chunk in (step.CHUNK, 10**9):
+        monkeypatch.setattr(step, "CHUNK", chunk)
+        adam = AWSGLD([Parameter(torch.zeros(shape))], moments=16)
+        for seed in range(3):
+            draw = torch.Generator().manual_seed(seed)
+            param_of(adam).grad = torch.randn(shape, generator=draw)
+            adam.step()
+        state = adam.state[param_of(adam)]
+        made.append([param_of(adam).detach(), *(state[key] for key in MOMENTS)])
+    assert same(*made)
+
+
+# -- trainings -------------------------------------------------------------------------------------
+
+
+def test_half_of_the_bytes() -> None:
+    sizes = {}
+    for moments in (16, 32):
+        adams, _ = trained(1_000, moments)
+        iterate(adams, 0, 2)
+        states = [adam.state[param_of(adam)] for adam in adams.values()]
+        assert all(set(state) == {"step", *MOMENTS} for state in states)
+        sizes[moments] = sum(s[k].numel() * s[k].element_size() for s in states for k in MOMENTS)
+    assert sizes == {16: 1_000 * BYTES, 32: 2_000 * BYTES}
+
+
+def test_a_training_goes_as_with_32_bits() -> None:
+    ends = []
+    for moments in (32, 16):
+        adams, _ = trained(moments=moments)
+        iterate(adams, 0, 60)
+        ends.append(values(adams))
+    start = values(trained()[0])
+    for one, other, first in zip(*ends, start, strict=True):
+        # Of the way that the training goes.
+        assert (one - other).square().mean().sqrt() < 0.02 * (one - first).square().mean().sqrt()
+
+
+@pytest.mark.parametrize("order", ["gsplat", "INRIA"])
+def test_a_resume_is_bit_for_bit(order: str) -> None:
+    adams, _ = trained()
+    iterate(adams, 0, 33)
+    file = io.BytesIO()
+    torch.save([(param_of(a).detach(), a.state_dict()) for a in adams.values()], file)
+    iterate(adams, 33, 60)
+    file.seek(0)
+    if order == "gsplat":
+        again, _ = trained()
+    else:
+        again = {k: Adam([Parameter(torch.zeros(200, *s))], lr=1e-2) for k, s in SHAPES.items()}
+    for adam, (values_, state) in zip(again.values(), torch.load(file), strict=True):
+        param_of(adam).data.copy_(values_)
+        adam.load_state_dict(state)
+    if order == "INRIA":
+        PhaseScheduler(60, parts=DEFAULTS_ADC, moments=16).upgrade(again)
+    iterate(again, 33, 60)
+    assert same(values(adams), values(again))
+
+
+def test_stocks_moments_are_taken_and_given_back(caplog: pytest.LogCaptureFixture) -> None:
+    stock = {k: Adam([Parameter(torch.ones(200, *s))], lr=1e-2) for k, s in SHAPES.items()}
+    iterate(stock, 0, 10)
+    before = {k: a.state[param_of(a)]["exp_avg_sq"].clone() for k, a in stock.items()}
+    with caplog.at_level("INFO"):
+        PhaseScheduler(60, parts=[], moments=16).upgrade(stock)
+    assert sum("moments that were there are now at 16 bits" in m for m in caplog.messages) == 6
+    for name, adam in stock.items():
+        state = adam.state[param_of(adam)]
+        assert state["exp_avg"].dtype == state["exp_avg_sq"].dtype == CODES
+        found = decoded(state["exp_avg"], state["exp_avg_sq"])[1]
+        torch.testing.assert_close(found, before[name], rtol=SECOND, atol=0.0)
+    PhaseScheduler(60, parts=[]).upgrade(stock)
+    for name, adam in stock.items():
+        state = adam.state[param_of(adam)]
+        torch.testing.assert_close(state["exp_avg_sq"], before[name], rtol=SECOND, atol=0.0)
+    iterate(stock, 10, 12)
+
+
+def test_a_checkpoint_of_16_bits_loads_into_32() -> None:
+    adams, _ = trained()
+    iterate(adams, 0, 20)
+    again, _ = trained(moments=32)
+    for name, adam in again.items():
+        adam.load_state_dict(adams[name].state_dict())
+        ours = adams[name].state[param_of(adams[name])]
+        theirs = adam.state[param_of(adam)]
+        for key, value in zip(MOMENTS, decoded(*(ours[k] for k in MOMENTS)), strict=True):
+            assert torch.equal(theirs[key], value)
+
+
+# -- edits of rows ---------------------------------------------------------------------------------
+
+
+def edit(adam: Adam, rows: Any) -> None:
+    old, group = param_of(adam), adam.param_groups[0]
+    state = adam.state.pop(old)
+    for key in MOMENTS:
+        state[key] = rows(state[key], False)
+    group["params"] = [Parameter(rows(old.detach(), True))]
+    adam.state[group["params"][0]] = state
+
+
+def appended(x: Tensor, is_param: bool) -> Tensor:
+    """As gsplat and INRIA's family do: zeros of float32."""
+    return torch.cat([x, x[:5] if is_param else torch.zeros(5, *x.shape[1:])])
+
+
+@pytest.mark.parametrize("rows", [appended, lambda x, _: x[3:], lambda x, _: torch.cat([x, x[:4]])])
+def test_rows_are_edited_by_trainers_that_know_nothing_of_it(rows: Any) -> None:
+    adams, _ = trained()
+    iterate(adams, 0, 10)
+    states = {k: dict(a.state[param_of(a)]) for k, a in adams.items()}
+    for adam in adams.values():
+        edit(adam, rows)
+    before = {k: rows(states[k]["exp_avg_sq"], False).to(CODES) for k in adams}
+    for name, adam in adams.items():
+        param = param_of(adam)
+        param.grad = torch.zeros_like(param)
+        start = param.detach().clone()
+        adam.step()
+        state = adam.state[param]
+        assert state["exp_avg"].dtype == state["exp_avg_sq"].dtype == CODES
+        zero = before[name] == 0
+        assert torch.equal(state["exp_avg_sq"] == 0, zero)
+        assert torch.equal(param[zero], start[zero])  # no history, no gradient: no step
+        kept = decoded(before[name], before[name])[1][~zero]
+        now = decoded(state["exp_avg"], state["exp_avg_sq"])[1][~zero]
+        assert (now / kept - 0.999).abs().max() <= 2 * SECOND  # a code up or down
+
+
+def test_rows_that_are_zeroed_begin_anew() -> None:
+    """As 3DGS-MCMC's relocation and `reset_rows` do."""
+    adams, _ = trained()
+    iterate(adams, 0, 10)
+    means = adams["means"]
+    state = means.state[param_of(means)]
+    for key in MOMENTS:
+        state[key][:7] = 0
+    param_of(means).grad = torch.ones_like(param_of(means))
+    means.step()
+    first, second = decoded(*(state[key] for key in MOMENTS))
+    ratio = first[:7].abs() / second[:7].sqrt()
+    # Adam's first step of a row: (1 - beta1) / sqrt(1 - beta2).
+    assert (ratio - 0.1 / 0.001**0.5).abs().max() < 0.05
+
+
+# -- averages that change slowly -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("moments", [32, 16])
+def test_a_second_moment_falls_by_a_thousandth_in_a_step(moments: Any) -> None:
+    x = Parameter(torch.zeros(4_000, 1))
+    adam = AWSGLD([x], eps=1e-15, moments=moments)
+    x.grad = torch.full_like(x, 1e-3)
+    adam.step()
+    x.grad = torch.zeros_like(x)
+    for _ in range(1_000):
+        adam.step()
+    state = adam.state[x]
+    pair = state["exp_avg"], state["exp_avg_sq"]
+    second = pair[1] if moments == 32 else decoded(*pair)[1]
+    # Each code is a walk of a thousand coins: 5 % of spread, 0.1 % of the mean of 4,000.
+    assert second.mean().item() == pytest.approx(1e-9 * 0.999**1_000, rel=5e-3)
+
+
+@pytest.mark.parametrize("moments", [32, 16])
+def test_noise_does_not_drift(moments: Any) -> None:
+    """Second moments stay at the mean square of the gradients; what is stepped goes nowhere."""
+    x = Parameter(torch.zeros(2_000, 4))
+    adam = AWSGLD([x], lr=1e-3, eps=1e-15, moments=moments)
+    draw = torch.Generator().manual_seed(0)
+    means = []
+    for i in range(4_000):
+        x.grad = 1e-5 * torch.randn(x.shape, generator=draw)
+        adam.step()
+        if i >= 3_000 and i % 100 == 0:
+            pair = adam.state[x]["exp_avg"], adam.state[x]["exp_avg_sq"]
+            means.append((pair[1] if moments == 32 else decoded(*pair)[1]).mean().item())
+    expected = 1e-10 * (1 - 0.999**3_500)
+    assert sum(means) / len(means) == pytest.approx(expected, rel=5e-3)
+    spread = 1e-3 * 4_000**0.5  # of a walk of steps with a mean square of one rate
+    assert abs(x.mean().item()) < 5 * spread / 8_000**0.5
+    assert x.std().item() == pytest.approx(spread, rel=0.05)
+
+
+# -- what is refused -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bits", [8, 0, 64, "16", 16.0, True])
+def test_other_numbers_of_bits_are_refused(bits: Any) -> None:
+    for make in (
+        lambda: PhaseScheduler(10, moments=bits),
+        lambda: AWSGLD([Parameter(torch.ones(2))], moments=bits),
+        lambda: LQNAdam([Parameter(torch.ones(1, 2))], moments=bits),
+    ):
+        with pytest.raises(ValueError, match=r"moments=.*, but 32 or 16 is needed"):
+            make()
+
+
+def test_steps_of_other_classes_and_float64_are_refused() -> None:
+    class SelectiveAdam(Adam):
+        def step(self, visibility: Any = None) -> None:  # pyright: ignore
+            raise AssertionError
+
+    masked = SelectiveAdam([{"params": [Parameter(torch.ones(2, 3))], "name": "means"}])
+    with pytest.raises(ValueError, match="moments=16, but SelectiveAdam makes its own step"):
+        PhaseScheduler(10, moments=16).upgrade(masked)
+    assert type(masked) is SelectiveAdam
+    double = Adam([{"params": [Parameter(torch.ones(2, 3).double())], "name": "means"}])
+    with pytest.raises(ValueError, match=r"moments=16 with \['torch.float64'\]; use float32"):
+        PhaseScheduler(10, moments=16).upgrade(double)
+    with pytest.raises(ValueError, match="use float32"):
+        AWSGLD([Parameter(torch.ones(2).double())], moments=16)
+
+
+def test_lqnadam_and_awsgld_step_on_16_bits() -> None:
+    for make in (AWSGLD, LQNAdam):
+        ends = []
+        for moments in (32, 16):
+            x = Parameter(torch.ones(50, 3))
+            optimizer = make([x], lr=0.01, moments=moments)
+            for _ in range(50):
+                x.grad = x.detach() * torch.tensor([1.0, 10.0, 100.0])
+                optimizer.step()
+            ends.append(x.detach())
+        assert optimizer.state[x]["exp_avg"].dtype == CODES
+        torch.testing.assert_close(*ends, rtol=0.0, atol=0.02)
