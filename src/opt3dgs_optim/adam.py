@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
 from typing import Any, cast
 
 import torch
@@ -11,96 +9,16 @@ from torch import Tensor
 from torch.optim import Adam
 
 from opt3dgs_optim import triton
-from opt3dgs_optim.checks import LOGGER, check_count, check_number
-from opt3dgs_optim.contract import REFUSED, Slots, check_supported, own_step
+from opt3dgs_optim.checkpoint import check_tensors
+from opt3dgs_optim.checks import LOGGER
+from opt3dgs_optim.contract import Slots, check_supported, own_step
 from opt3dgs_optim.course import STATE_KEY, Course
+from opt3dgs_optim.lane import BEGAN, KEPT, MEAN, MOMENTS, Lane
+from opt3dgs_optim.masked import step_around
 from opt3dgs_optim.moments import CODES, NEAREST, decoded, encode
 from opt3dgs_optim.names import split_name
-from opt3dgs_optim.part import Part, Phase, overrides
-from opt3dgs_optim.step import (
-    Hyper,
-    Step,
-    axes_of,
-    chosen_rows,
-    into_frame,
-    like_rows,
-    mixed,
-    out_of_frame,
-    take_into_mean,
-    take_step,
-)
-
-MOMENTS = ("exp_avg", "exp_avg_sq")  # torch's names
-MEAN, BEGAN = "averaging.mean", "averaging.began"  # ours, of the rows
-KEPT = (MEAN, BEGAN, "curvature.history")  # what a checkpoint may hold for rows beside moments
-
-
-class Lane:
-    """One parameter of an optimizer: what acts on it, and what was left for it at the last step.
-
-    Attributes:
-        name, set: which Gaussian parameter it is, and of which set of Gaussians.
-        last: the iteration of its last step; -1: none.
-        framed: whether its moments are those of the own frame; None: it has none yet.
-    """
-
-    def __init__(self, group: dict[str, Any], param: Tensor, slot: tuple[str, str | None]) -> None:
-        self.group, self.param = group, param
-        self.set, self.name = slot
-        self.last = -1
-        self.framed: bool | None = None
-        self.keeps = False  # whether parts keep something for its rows
-        self.left: dict[str, tuple[Tensor, int]] = {}
-        self.plans: dict[Phase, list[Part]] = {}
-        self.before: list[Part] = []
-        self.after: list[Part] = []
-
-    def ask(self, parts: tuple[Part, ...]) -> Lane:
-        """Take the parts that act on this parameter."""
-        mine = [p for p in parts if p.names is None or (self.name and self.name in p.names)]
-        for phase in Phase:
-            self.plans[phase] = [
-                p for p in mine if overrides(p, "plan") and p.during in (None, phase)
-            ]
-        self.before = [p for p in mine if overrides(p, "before")]
-        self.after = [p for p in mine if overrides(p, "after")]
-        return self
-
-    def rows(self, state: dict[str, Any], key: str, shape: tuple[int, ...]) -> tuple[Tensor, bool]:
-        """What is kept for the rows under a name, and whether rows may be new since the last step.
-
-        A row of zeros is one for which nothing is kept.
-        """
-        tensor, was, self.keeps = state.get(key), self.left.get(key), True
-        if tensor is None or tensor.shape != shape:
-            tensor = state[key] = torch.zeros(
-                shape, dtype=self.param.dtype, device=self.param.device
-            )
-            return tensor, True
-        if was is None:  # loaded
-            return tensor, True
-        if tensor is not was[0] or tensor._version != was[1]:
-            return tensor, True
-        return tensor, False
-
-    def drop_moved(self, state: dict[str, Any], new: bool) -> None:
-        """Drop what is kept for rows that are others now, if the Parameter is new.
-
-        Trainers that edit rows edit every tensor of the state so (gsplat's family), or none but
-        Adam's moments (INRIA's): what they have left as it was belongs to other rows.
-        """
-        rows = len(self.param) if self.param.dim() else 1
-        for key in KEPT:
-            now, was = state.get(key), self.left.get(key)
-            if now is None:
-                continue
-            as_it_was = was is not None and now is was[0] and now._version == was[1]
-            if len(now) != rows or (new and as_it_was):
-                del state[key]
-
-    def leave(self, state: dict[str, Any]) -> None:
-        """Note what the step has left, by which edits of rows show at the next one."""
-        self.left = {key: (state[key], state[key]._version) for key in KEPT if key in state}
+from opt3dgs_optim.part import Part
+from opt3dgs_optim.step import Hyper, Step, mixed, take_step
 
 
 class StepAdam(Adam):
@@ -182,12 +100,12 @@ class StepAdam(Adam):
         iteration = course.begin(self)
         given = () if not self._masked or (closure is None and not masked) else (closure, *masked)
         if not course.acts:
-            _unhooked(self._base)(self, *given, **masks)
+            self.own_class_step(*given, **masks)
         elif self._masked:
-            self._step_around(iteration, given, masks)
+            step_around(self, iteration, given, masks)
         else:
             with torch.no_grad():
-                for lane in self._present_lanes():
+                for lane in self.present_lanes():
                     if lane.param.grad is not None:
                         self._step_lane(lane, iteration)
         for hook in self._optimizer_step_post_hooks.values():
@@ -199,7 +117,7 @@ class StepAdam(Adam):
     # torch's own wrapper, for hooks and profiles, takes longer than all else that Python does here.
     step.hooked = True  # pyright: ignore[reportFunctionMemberAccess]
 
-    def _present_lanes(self) -> list[Lane]:
+    def present_lanes(self) -> list[Lane]:
         """The lanes of all parameters; looked up again when groups or Parameters are new."""
         lanes, i = self._lanes, 0
         for group in self.param_groups:
@@ -253,7 +171,7 @@ class StepAdam(Adam):
                     "Gaussians, or edit their moments with them"
                 )
 
-    def _plan(self, lane: Lane, iteration: int) -> Step:
+    def plan(self, lane: Lane, iteration: int) -> Step:
         """What the lane's step has, as its parts say."""
         param, group, course = lane.param, lane.group, self.course
         grad = cast(Tensor, param.grad)
@@ -293,7 +211,7 @@ class StepAdam(Adam):
         return step
 
     def _step_lane(self, lane: Lane, iteration: int) -> None:
-        step, course = self._plan(lane, iteration), self.course
+        step, course = self.plan(lane, iteration), self.course
         group, state = lane.group, step.state
         count = state["step"].numpy()  # torch's own addition takes as long as a launch
         count[()] += 1
@@ -311,7 +229,7 @@ class StepAdam(Adam):
             else:
                 hyper.decay = decay
         if step.mean is not None:
-            hyper.mean, hyper.began = self._mean_of(lane, step)
+            hyper.mean, hyper.began = self.mean_of(lane, step)
         hyper.nonfinite = course.counter_on(step.param.device)
         if triton.takes(step):
             triton.take_step(step, hyper)
@@ -319,76 +237,30 @@ class StepAdam(Adam):
             bad = take_step(step, hyper)
             if bad:
                 course.count_nonfinite(bad)
-        for part in lane.after:
-            if part.during in (None, course.phase):
-                part.after(step, course)
-        if lane.keeps:
-            lane.leave(state)
+        self.finish_step(lane, step)
 
-    def _mean_of(self, lane: Lane, step: Step) -> tuple[Tensor, Tensor]:
+    def own_class_step(self, *args: Any, **options: Any) -> Any:
+        """The step of the class that it had, without torch's hooks, which `step` runs already."""
+        step: Any = self._base.step
+        return (step.__wrapped__ if getattr(step, "hooked", False) else step)(
+            self, *args, **options
+        )
+
+    def finish_step(self, lane: Lane, step: Step) -> None:
+        """What comes after the arithmetic: parts of one's own, and a note of what is left."""
+        for part in lane.after:
+            if part.during in (None, self.course.phase):
+                part.after(step, self.course)
+        if lane.keeps:
+            lane.leave(step.state)
+
+    def mean_of(self, lane: Lane, step: Step) -> tuple[Tensor, Tensor]:
         """The running mean, and with which count the mean of each row began."""
         param, state = step.param, step.state
         assert step.mean is not None
         began, _ = lane.rows(state, BEGAN, (len(param),))
         mean, _ = lane.rows(state, MEAN, tuple(param.shape))
         return mean, began
-
-    # -- optimizers that have a step of their own --------------------------------------------------
-
-    def _step_around(self, iteration: int, args: tuple[Any, ...], masks: dict[str, Any]) -> None:
-        """The parts around the step of gsplat's SelectiveAdam, or INRIA's SparseGaussianAdam."""
-        steps: list[tuple[Lane, Step, Tensor, Any]] = []
-        rates = [(group, group["lr"]) for group in self.param_groups]
-        with torch.no_grad():
-            for lane in self._present_lanes():
-                if lane.param.grad is None:
-                    continue
-                own = lane.param.grad
-                step = self._plan(lane, iteration)
-                steps.append((lane, step, own, self._prepare(step)))
-            try:
-                _unhooked(self._base)(self, *args, **masks)
-            finally:
-                for group, lr in rates:
-                    group["lr"] = lr
-                for lane, _, own, framed in steps:
-                    lane.param.grad = own
-                    if framed is not None:
-                        position, axes = framed
-                        moved, lane.param.data = lane.param.data, position
-                        lane.param.add_(out_of_frame(axes, moved))
-            for lane, step, _, _ in steps:
-                self._finish(lane, step)
-
-    def _prepare(self, step: Step) -> Any:
-        """Have the base's step find what the parts say; what is to be undone in an own frame."""
-        param, state = step.param, step.state
-        grad = torch.nan_to_num(step.grad, 0.0, 0.0, 0.0)
-        if step.fade is not None:
-            chosen = like_rows(chosen_rows(step.fade, len(param), param.device), param)
-            for key, factor in zip(MOMENTS, step.fade[2:], strict=True):
-                state[key].copy_(torch.where(chosen, state[key] * factor, state[key]))
-        framed = None
-        if step.frame is not None:
-            axes = axes_of(step.frame)
-            grad = into_frame(axes, grad)
-            framed = param.data, axes
-            param.data = torch.zeros_like(param.data)
-            step.group["lr"] = step.frame.rate * step.factor
-        elif not (isinstance(step.factor, float) and step.factor == 1.0):
-            step.group["lr"] = step.group["lr"] * float(step.factor)
-        param.grad = grad
-        return framed
-
-    def _finish(self, lane: Lane, step: Step) -> None:
-        if step.mean is not None:
-            mean, began = self._mean_of(lane, step)
-            take_into_mean(step.mean, step.param, mean, began)
-        for part in lane.after:
-            if part.during in (None, self.course.phase):
-                part.after(step, self.course)
-        if lane.keeps:
-            lane.leave(step.state)
 
     # -- rows and checkpoints ----------------------------------------------------------------------
 
@@ -493,7 +365,9 @@ class StepAdam(Adam):
                 first, second = codes
             state["exp_avg"], state["exp_avg_sq"] = first, second
         if found and self.coded != (bits == 16):
-            LOGGER.info("opt3dgs_optim: the moments that were there are now at %d bits", bits)
+            self.course.say_once(
+                f"opt3dgs_optim: the moments that were there are now at {bits} bits"
+            )
         self.coded = bits == 16
 
     def last_steps(self) -> tuple[int, ...]:
@@ -520,12 +394,6 @@ class StepAdam(Adam):
 def _made_again(kind: type[StepAdam] | None, base: type[Adam]) -> StepAdam:
     kind = upgraded_class(base) if kind is None else kind
     return kind.__new__(kind)
-
-
-def _unhooked(base: type[Adam]) -> Callable[..., Any]:
-    """The step of a class without torch's hooks, which the step around it runs already."""
-    step: Any = base.step
-    return step.__wrapped__ if getattr(step, "hooked", False) else step
 
 
 _CLASSES: dict[type[Adam], type[StepAdam]] = {}
@@ -558,78 +426,3 @@ def checked_gradient(part: Part, found: Any, grad: Tensor) -> Tensor:
             "needed, as the gradient has"
         )
     return found
-
-
-def check_tensors(call: str, state_dict: Any, groups: list[dict[str, Any]]) -> None:
-    """ValueError unless a state dict has torch's form, for these groups, and fitting tensors."""
-    if not isinstance(state_dict, Mapping) or not {"state", "param_groups"} <= set(state_dict):
-        raise ValueError(
-            f"{call}: needs a dict with 'state' and 'param_groups', as state_dict() has"
-        )
-    saved, states = state_dict["param_groups"], state_dict["state"]
-    if not isinstance(saved, list) or len(saved) != len(groups):
-        raise ValueError(
-            f"{call}: {len(saved) if isinstance(saved, list) else repr(saved)} parameter groups "
-            f"were saved, but this optimizer has {len(groups)}"
-        )
-    known: set[int] = set()
-    for at, (group, own) in enumerate(zip(saved, groups, strict=True)):
-        check_group(f"{call}: group {at}", group, len(own["params"]))
-        known.update(group["params"])
-    if not isinstance(states, Mapping) or not set(states) <= known:
-        raise ValueError(f"{call}: the state is not of the parameters {sorted(known)}")
-    for index, state in states.items():
-        check_moments(f"{call}: parameter {index}", state)
-
-
-def check_group(call: str, group: Any, count: int) -> None:
-    """ValueError unless a saved group has so many parameters, and options that Adam here takes."""
-    params = group.get("params") if isinstance(group, Mapping) else None
-    if not isinstance(params, list) or len(params) != count:
-        raise ValueError(f"{call} has params={params!r}, but a list of {count} is needed")
-    if not all(type(each) is int for each in params):
-        raise ValueError(f"{call} has params={params!r}, but integers are needed")
-    for option in REFUSED:
-        if group.get(option):
-            raise ValueError(f"{call} has {option}={group[option]!r}, which is not taken")
-    betas = group.get("betas")
-    if not isinstance(betas, (tuple, list)) or len(betas) != 2:
-        raise ValueError(f"{call} has betas={betas!r}, but two numbers are needed")
-    numbers = {name: group.get(name) for name in ("lr", "eps", "weight_decay")}
-    for name, value in {**numbers, "betas[0]": betas[0], "betas[1]": betas[1]}.items():
-        check_number(call, name, value, 0.0, 1.0 if "betas" in name else math.inf)
-
-
-def check_moments(call: str, state: Any) -> None:
-    """ValueError unless the state of a parameter is empty, or Adam's with what is kept for rows."""
-    if not isinstance(state, Mapping):
-        raise ValueError(f"{call} has the state {state!r}, but a dict is needed")
-    if not state:
-        return
-    missing = [key for key in ("step", *MOMENTS) if key not in state]
-    if missing:
-        raise ValueError(f"{call} has no {missing[0]}, but {sorted(map(str, state))}")
-    check_count(call, "step", whole(state["step"]), 0)
-    shapes: dict[str, tuple[int, ...]] = {}
-    for key in (*MOMENTS, *KEPT):
-        value: Any = state.get(key)
-        if value is None and key in KEPT:
-            continue
-        if not isinstance(value, Tensor) or not (
-            value.is_floating_point() or (key in MOMENTS and value.dtype == CODES)
-        ):
-            raise ValueError(f"{call} has {key}={value!r}, but a tensor of real numbers is needed")
-        shapes[key] = tuple(value.shape)
-    one = shapes["exp_avg"]
-    if any(shapes.get(key, one) != one for key in ("exp_avg_sq", MEAN)) or any(
-        shapes.get(key, one)[:1] != one[:1] for key in KEPT
-    ):
-        raise ValueError(f"{call} has shapes {shapes}, but the same rows are needed in all")
-    if (MEAN in shapes) != (BEGAN in shapes) or shapes.get(BEGAN, one[:1]) != one[:1]:
-        raise ValueError(f"{call} has shapes {shapes}, but {BEGAN} needs a number for each row")
-
-
-def whole(step: Any) -> Any:
-    """Adam's count of steps, a tensor or a number, as an int; anything else as it is."""
-    value = step.item() if isinstance(step, Tensor) and step.numel() == 1 else step
-    return int(value) if isinstance(value, float) and value.is_integer() else value

@@ -136,6 +136,12 @@ class Course:
             self._said.add(kind)
             warn_user(message)
 
+    def say_once(self, message: str) -> None:
+        """Say what has happened, once in a training, where six optimizers have the same to say."""
+        if message not in self._said:
+            self._said.add(message)
+            say(message)
+
     # -- numbers that are not finite -------------------------------------------------------------
 
     def count_nonfinite(self, numbers: int) -> None:
