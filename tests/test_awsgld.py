@@ -363,7 +363,7 @@ def test_the_options_defaults_are_adams() -> None:
 @pytest.mark.parametrize("option", ["amsgrad", "maximize", "foreach", "fused", "capturable"])
 def test_other_options_of_torch_are_type_errors(option: str) -> None:
     with pytest.raises(TypeError, match=option):
-        AWSGLD([Parameter(torch.zeros(1))], **{option: True})
+        AWSGLD([Parameter(torch.zeros(1))], **{option: True})  # pyright: ignore
 
 
 def test_wrong_options_are_named() -> None:

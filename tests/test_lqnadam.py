@@ -169,7 +169,7 @@ def test_the_options_defaults_are_adams() -> None:
 @pytest.mark.parametrize("option", ["amsgrad", "maximize", "foreach", "fused", "capturable"])
 def test_other_options_of_torch_are_type_errors(option: str) -> None:
     with pytest.raises(TypeError, match=option):
-        LQNAdam([points()], **{option: True})
+        LQNAdam([points()], **{option: True})  # pyright: ignore
 
 
 def test_what_is_outside_is_refused() -> None:

@@ -35,7 +35,7 @@ def moving(dtype: torch.dtype = torch.float64, zeta: float = 0.75) -> MovingPart
 
 def take(partitions: Partitions, energy: float, count: int, valid: bool = True) -> float:
     """Nu, unclamped, and the update, as `EnergyHistogram` has them made."""
-    like = {"dtype": partitions.state.dtype}
+    like: Any = {"dtype": partitions.state.dtype}
     value, number = torch.tensor(energy, **like), torch.tensor(float(count), **like)
     found = partitions.take(value, torch.tensor(valid), number)
     assert found.shape == ()

@@ -4,8 +4,9 @@ It is an independent implementation of Opt3DGS (AAAI 2026, whose authors had rel
 this was written): the optimizers AWSGLD and LQNAdam, and the PhaseScheduler that puts the paper's
 two phases into an existing trainer.
 
-What is on by default is this package's own, and not the paper's: fading of Adam's moments, a hold
-on points out of view, and the average of the last iterates.
+What is on by default is this package's own, and not the paper's: positions are stepped in each
+Gaussian's own frame, Adam's moments of the others are faded, points out of view are held, and the
+training ends at the mean of its last iterates.
 """
 
 from opt3dgs_optim.adam import StepAdam

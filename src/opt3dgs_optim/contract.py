@@ -44,7 +44,8 @@ def check_supported(optimizer: Any, slots: Slots, moments: int = 32) -> None:
     if owner is not None and owner.__name__ not in OWN_STEPS:
         raise TypeError(
             f"upgrade: {kind.__name__} has a step of its own; have the trainer make a "
-            "torch.optim.Adam (or AdamW) with the same groups, or gsplat's SelectiveAdam"
+            "torch.optim.Adam (or, from torch 2.7 on, AdamW) with the same groups, or gsplat's "
+            "SelectiveAdam"
         )
     _check_bits(optimizer, owner, moments)
     held = [slot for slot in slots if slot[1] is not None]

@@ -226,10 +226,10 @@ def test_without_the_other_tensors_it_says_which() -> None:
 def test_options() -> None:
     for options in ({}, {"temperature": 1.0, "std": 1.0}):
         with pytest.raises(ValueError, match="exactly one of the two"):
-            IsotropicNoise(**options)
+            IsotropicNoise(**options)  # pyright: ignore
     for name in ("temperature", "std"):
         with pytest.raises(ValueError, match=rf"IsotropicNoise: {name}=-0\.5"):
-            IsotropicNoise(**{name: -0.5})
+            IsotropicNoise(**{name: -0.5})  # pyright: ignore
     for scale in (0.5, 0.0):
         assert PositionNoise({}, scale=scale).scale == scale
     with pytest.raises(ValueError, match=r"scale=-0\.5"):

@@ -192,7 +192,7 @@ def test_wrong_arguments_name_call_value_and_what_is_allowed(tmp_path):
     with RunLog(tmp_path / "a" / "run.jsonl") as log:
         for wrong in (-1, 1.5, "1"):
             with pytest.raises(ValueError, match=rf"RunLog\.step: iteration={wrong!r}, but an int"):
-                log.step(wrong)
+                log.step(wrong)  # pyright: ignore
         with pytest.raises(ValueError, match=r"energy=tensor of \(2,\)"):
             log.step(1, energy=torch.zeros(2))
         for wrong in ("nan", None, 1j, np.str_("1")):
@@ -201,7 +201,7 @@ def test_wrong_arguments_name_call_value_and_what_is_allowed(tmp_path):
         for call, line in ((log.step, (1,)), (log.evaluation, (1,)), (log.event, ("a", 1))):
             for name in ("seconds", "metadata"):
                 with pytest.raises(ValueError, match="reserved"):
-                    call(*line, **{name: 1.0})
+                    call(*line, **{name: 1.0})  # pyright: ignore
     assert len(read_run(log.path).records) == 1
     with pytest.raises(ValueError, match="is closed"):
         log.step(1)
@@ -213,8 +213,8 @@ def test_numbers_of_numpy_are_numbers_everywhere(tmp_path, kind):
     path, one = tmp_path / "run.jsonl", kind(1)
     about = {"seed": one, "each": {"list": [one, math.nan], "path": Path("b")}}
     with RunLog(path, metadata=about) as log:
-        log.step(np.int64(3), loss=one, array=np.array(one), single=np.array([one]))
-        log.event("pruned", np.uint8(5), points=one, about=about)
+        log.step(int(np.int64(3)), loss=one, array=np.array(one), single=np.array([one]))
+        log.event("pruned", int(np.uint8(5)), points=one, about=about)
     strict_lines(path)
     run = read_run(path)
     assert [run.steps[name][0] for name in ("iteration", "loss", "array", "single")] == [3, 1, 1, 1]

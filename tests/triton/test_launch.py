@@ -113,7 +113,9 @@ def test_rows_are_read_four_numbers_at_a_time(
     long = options.pop("numbers", None)
     if long is not None:
         run = triton._run
-        monkeypatch.setattr(triton, "_run", lambda *a: run(*a[:3], (long, *a[3][1:]), a[4]))
+        monkeypatch.setattr(
+            triton, "_run", lambda *a: run(a[0], a[1], a[2], (long, *a[3][1:]), a[4])
+        )
     launched(driver, (64, 4), **options)
     ((key, made),) = triton._COMPILED.items()
     ptx = made.asm["ptx"]
