@@ -19,6 +19,7 @@ import logging
 import os
 import re
 import shutil
+import statistics
 import subprocess
 import sys
 import time
@@ -34,11 +35,17 @@ from splatting.stopping import check_folder, command
 from tqdm import tqdm
 
 from opt3dgs_optim.doctor import versions
+from opt3dgs_optim.lbfgs import two_loop
+from opt3dgs_optim.lbfgs.history import history_from_pairs
 
 ROOT = Path(__file__).resolve().parents[1]
 POINTS = {"cuda": (10_000, 100_000, 1_000_000, 5_000_000), "cpu": (1_000, 10_000)}
 PACKAGE = ("-m", "opt3dgs_optim")
 TESTS = ("-m", "pytest", "-o", "addopts=--import-mode=importlib", "-m", "cuda", "-q", "-rs")
+TESTS += ("tests/cuda", "tests/runs/test_log.py", "tests/test_doctor.py")  # where they are
+# What a step reads and writes of a number: parameter, gradient and moments, by bits of a moment.
+MOVED = {"defaults": 28, "defaults, moments of 16 bits": 20}
+NUMBERS, PAIRS = 59, 5  # of a Gaussian at degree 3; of curvature
 
 
 def run(words: Sequence[str], folder: Path = ROOT) -> tuple[int, str, float]:
@@ -87,6 +94,30 @@ def trainings(script: Path, scene: Path, out: Path, iterations: int) -> dict[str
     return {kind: training(s, scene, out / kind, iterations) for kind, s in scripts.items()}
 
 
+def recursion(device: torch.device, rounds: int, points: int = 10_000) -> str:
+    """What one `two_loop` takes, in a sentence."""
+    grad, pairs = torch.randn(points, 3, device=device), torch.randn(2, PAIRS, points, 3)
+    history = history_from_pairs(*pairs.to(device))
+
+    def call() -> None:
+        two_loop(grad, history, PAIRS)
+
+    for _ in range(steps.WARM_UP):
+        call()
+    taken = statistics.median(steps.timed(call, device) for _ in range(rounds))
+    return f"`two_loop` of {points:,} points with {PAIRS} pairs: {1e6 * taken:.0f} us."
+
+
+def bandwidth(results: dict[int, dict[str, steps.Row]]) -> str:
+    """How much memory a step moves in a second, in a sentence for each number of Gaussians."""
+    lines = []
+    for points, rows in results.items():
+        for name in (name for name in MOVED if name in rows):
+            speed = MOVED[name] * NUMBERS * points / rows[name]["ms"] / 1e6
+            lines.append(f"{points:,} Gaussians, {name}: {speed:,.0f} GB/s.")
+    return "\n".join(lines)
+
+
 def counts(results: dict[int, dict[str, steps.Row]]) -> str:
     """Markdown: what an iteration launches, waits for and takes, at the most Gaussians."""
     points, rows = max(results.items())
@@ -107,6 +138,7 @@ def report(made: dict[str, Any]) -> str:
         text = made[name]["output"][-8_000:].rstrip()
         lines += ["", f"## {name}: exit status {made[name]['code']}", "", "```text", text, "```"]
     lines += ["", "## A step", "", steps.table(made["steps"]), "", counts(made["steps"])]
+    lines += ["", bandwidth(made["steps"]), "", made["two_loop"]]
     said = json.dumps(made["training"], indent=1)
     return "\n".join([*lines, "", "## gsplat's own trainer", "", "```json", said, "```", ""])
 
@@ -143,6 +175,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     names = [n for n in steps.SUBJECTS if args.device == "cpu" or not n.endswith("fused")]
     for points in tqdm(args.points or POINTS[args.device], desc="steps", unit="size"):
         made["steps"][points] = steps.measure(points, device, names, args.rounds)
+    made["two_loop"] = recursion(device, args.rounds)
     if args.gsplat is not None:
         found = trainings(args.gsplat.resolve(), args.scene.resolve(), out, args.iterations)
         made["training"] = found

@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -60,6 +60,7 @@ def stepped(
     switch: float = 29 / 30,
     in_view: float = 1.0,
     fused: bool = False,
+    moments: Literal[32, 16] = 32,
 ) -> Callable[[int, torch.device], Subject]:
     """Six optimizers, of stock or upgraded to these parts; a call is an iteration."""
 
@@ -78,7 +79,7 @@ def stepped(
         losses = [x * torch.ones((), device=device) for x in (0.1, 0.12, 0.09, 0.11)]
         phases = None
         if parts is not None:
-            phases = PhaseScheduler(TOTAL, switch, [*parts()])
+            phases = PhaseScheduler(TOTAL, switch, [*parts()], moments=moments)
             optimizers = phases.upgrade(optimizers)
             phases.observe(iteration=round(at * TOTAL))
         count = 0
@@ -106,6 +107,7 @@ SUBJECTS: dict[str, Callable[[int, torch.device], Subject]] = {
     "defaults, fused": stepped(lambda: DEFAULTS, fused=True),
     "defaults, a tenth in view": stepped(lambda: DEFAULTS, in_view=0.1),
     "defaults, last thirtieth": stepped(lambda: DEFAULTS, at=0.975),
+    "defaults, moments of 16 bits": stepped(lambda: DEFAULTS, moments=16),
     "OwnFrame alone": stepped(lambda: [OwnFrame()]),
     "the paper's exploration": stepped(lambda: [EnergyHistogram.paper(warmup=4)]),
     "the paper's exploitation": stepped(lambda: [Curvature()], at=0.0, switch=0.0),

@@ -316,8 +316,8 @@ class StepAdam(Adam):
             self.course.check_state(call, groups[0][STATE_KEY])
             self.course.restore_parts(groups[0][STATE_KEY])
         own = [dict(group) for group in self.param_groups]
-        self.coded = False  # unless the course says so
         super().load_state_dict(state_dict)
+        self.coded = False  # unless the course's numbers say so
         for group, was in zip(self.param_groups, own, strict=True):
             for key, value in was.items():
                 group.setdefault(key, value)  # an option that older versions of torch did not have
