@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import check_choice, check_count, warn_user
+from opt3dgs_optim.checks import check_choice, check_count, say, warn_user
 from opt3dgs_optim.part import Part, Phase, overrides
 
 if TYPE_CHECKING:
