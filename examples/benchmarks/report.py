@@ -308,9 +308,14 @@ def draw(all_: Evidence, path: Path) -> None:
         }
         seeds = sorted(set.intersection(*map(set, found.values())))
         for (arm, count, colour), curves in found.items():
-            at = curves[seeds[0]]["iteration"]
-            values = zip(*(curves[seed]["psnr"] for seed in seeds), strict=True)
-            curve = [statistics.mean(each) for each in values]
+            # Some were evaluated twice as often as others.
+            pairs = [
+                dict(zip(c["iteration"], c["psnr"], strict=True))
+                for c in map(curves.get, seeds)
+                if c
+            ]
+            at = sorted(set.intersection(*map(set, pairs)))
+            curve = [statistics.mean(each[n] for each in pairs) for n in at]
             label = "stock" if arm == "mcmc" else f"own frame, planned for {count:,}"
             (entries[label],) = axis.plot([n / 1000 for n in at], curve, color=colour, lw=2)
             axis.plot(at[-1] / 1000, curve[-1], "o", color=colour, ms=6)
