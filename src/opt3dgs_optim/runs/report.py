@@ -163,7 +163,9 @@ def origin(runs: Sequence[Run]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line: 0, or 2 after one line that says what is wrong."""
     parser = argparse.ArgumentParser(
-        prog="opt3dgs report", description="Compare runs from their run logs."
+        prog="opt3dgs report",
+        description="Compare runs from their run logs, by error against run time, with a picture.",
+        epilog="A trainer writes them by RunLog; for example: opt3dgs report runs/ -o report",
     )
     add = parser.add_argument
     add("runs", nargs="+", metavar="RUN", help="run log, or folder of *.jsonl")
@@ -171,6 +173,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--metric", help="to compare by (default: psnr if logged, else the first that is known)")
     add("--better", choices=("higher", "lower"), help="direction of the metric (default: its name)")
     add("--baseline", metavar="ARM", help="reference arm (default: mcmc if there, else the first)")
+    if not arguments:
+        parser.print_help()
+        return 0
     options = parser.parse_args(arguments)
     try:
         logs = find_logs(options.runs)
