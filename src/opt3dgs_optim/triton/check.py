@@ -151,8 +151,16 @@ def combinations() -> Iterator[tuple[dict[str, Any], tuple[int, ...]]]:
         yield {"plain": True, "factor": torch.tensor(0.7), **options}, (257, 4)
 
 
+def interprets() -> bool:
+    """Whether this Triton's interpreter writes into tensors of a CPU: beside numpy 2, from 3.2."""
+    (_, hyper), (_, hyper2) = both({"steps": 1}, (1,))
+    return torch.allclose(hyper.exp_avg, hyper2.exp_avg)
+
+
 def main() -> None:
-    """Print the largest difference."""
+    """Print the largest difference, or nothing where this Triton's interpreter does nothing."""
+    if not interprets():
+        return
     print(max(difference(options, shape) for options, shape in combinations()))
 
 
