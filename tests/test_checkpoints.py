@@ -243,7 +243,7 @@ def test_a_longer_run_knows_nothing_of_the_first_ones_end() -> None:
         steps({"all": fresh}, params, 1, seed=iteration)
         if iteration >= 174:
             last.append(params["scales"].detach().clone())
-    assert fresh.state[params["scales"]]["averaging.began"].tolist() == [1.0] * ROWS
+    assert fresh.state[params["scales"]]["averaging.began"].tolist() == [175.0] * ROWS
 
 
 def test_a_stock_adam_loads_ours_and_goes_on() -> None:

@@ -350,3 +350,18 @@ def test_lqnadam_and_awsgld_step_on_16_bits() -> None:
             ends.append(x.detach())
         assert optimizer.state[x]["exp_avg"].dtype == CODES
         torch.testing.assert_close(*ends, rtol=0.0, atol=0.02)
+
+
+def test_a_checkpoint_of_16_bits_serves_a_stock_adam() -> None:
+    """What is saved is numbers, not codes, and the codes of them are the same again."""
+    adams = {k: Adam([Parameter(torch.ones(50, *s))], lr=1e-2) for k, s in SHAPES.items()}
+    PhaseScheduler(60, parts=[], moments=16).upgrade(adams)
+    iterate(adams, 0, 10)
+    for adam in adams.values():
+        state = adam.state_dict()["state"][0]
+        assert state["exp_avg"].dtype == state["exp_avg_sq"].dtype == torch.float32
+        own = adam.state[param_of(adam)]
+        assert torch.equal(decoded(own["exp_avg"], own["exp_avg_sq"])[1], state["exp_avg_sq"])
+        again = Adam([Parameter(param_of(adam).detach().clone())], lr=1e-2)
+        again.load_state_dict(adam.state_dict())
+        assert torch.equal(again.state[param_of(again)]["exp_avg_sq"], state["exp_avg_sq"])

@@ -36,12 +36,13 @@ class StepAdam(Adam):
     coded = False  # whether its moments are codes of 16 bits, see `moments`
     in_own_frame = False  # whether its moments of the positions are those of the own frame
     _base: type[Adam] = Adam  # the class whose optimizer it was
-    _lanes: list[Lane]
+    _lanes: list[Lane] = []  # noqa: RUF012  (made anew, never changed)
     _slots: Slots
     _last: tuple[int, ...] = ()  # of every parameter, the iteration of its last step before a load
 
     def follow(self, course: Course, slots: Slots) -> None:
         """Have the parts of `course` from now on; slots are, by group, set and name."""
+        self._last = self.last_steps()
         self.course, self._slots, self._lanes = course, slots, []
         self._masked = own_step(self._base) is not None
         self._step_supports_amp_scaling = False  # a GradScaler unscales, and leaves steps out
@@ -150,7 +151,8 @@ class StepAdam(Adam):
                     lane.last, lane.framed, lane.left = before.last, before.framed, before.left
                     self._tell_fewer_rows(before.param, lane)
                 new = before is not None and before.param is not param
-                lane.drop_moved(self.state.get(param, {}), new)
+                written = new and before is not None and before.param._version != before.version
+                lane.drop_moved(self.state.get(param, {}), new, written)
                 self._check_rows(lane)
                 self._lanes.append(lane)
         return self._lanes
@@ -205,6 +207,8 @@ class StepAdam(Adam):
             state["step"].zero_()
             for key in MOMENTS:
                 state[key].zero_()
+            for key in (MEAN, BEGAN):
+                state.pop(key, None)
         lane.framed, lane.last = framed, iteration
         if framed or lane.name == "means":
             self.in_own_frame = framed
@@ -228,7 +232,8 @@ class StepAdam(Adam):
                 hyper.shrink = 1 - lr * decay
             else:
                 hyper.decay = decay
-        if step.mean is not None:
+        if step.mean is not None:  # it counts the steps that are made, not the iterations
+            step.mean = step.mean._replace(number=int(t))
             hyper.mean, hyper.began = self.mean_of(lane, step)
         hyper.nonfinite = course.counter_on(step.param.device)
         if triton.takes(step):
@@ -279,6 +284,7 @@ class StepAdam(Adam):
     @torch.no_grad()
     def put_means(self) -> int:
         """Put the running means in the parameters' place now; of how many parameters."""
+        self.present_lanes()  # what was kept for rows that are others now is dropped
         found = 0
         for group in self.param_groups:
             for param in group["params"]:
@@ -297,9 +303,12 @@ class StepAdam(Adam):
             return super().state_dict()
         self.param_groups[0][STATE_KEY] = self.course.state_of(self)
         try:
-            return super().state_dict()
+            found = super().state_dict()
         finally:  # it is of this moment
             del self.param_groups[0][STATE_KEY]
+        if self.coded:  # any Adam may load it; the codes of these numbers are the same again
+            found["state"] = {at: as_numbers(state) for at, state in found["state"].items()}
+        return found
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """As torch's; the course goes on where the checkpoint was.
@@ -326,7 +335,7 @@ class StepAdam(Adam):
 
     def resume(self) -> None:
         """Go on where the state says that the training is: after a load."""
-        course, saved = self.course, self.param_groups[0].pop(STATE_KEY, None)
+        course, saved, missed = self.course, self.param_groups[0].pop(STATE_KEY, None), 0
         steps = [int(state["step"]) for state in self.state.values() if "step" in state]
         if saved is None:
             # One that is made anew under way steps first in the next iteration.
@@ -334,20 +343,38 @@ class StepAdam(Adam):
             self.in_own_frame, self._last = False, ()
         else:
             iteration, self.in_own_frame = saved["iteration"], saved["own_frame"]
-            self.coded = saved["moments"] == 16
             self._last = tuple(saved["last"])
-        if saved is None or saved["total_steps"] != course.total_steps:
+            missed = max(steps, default=0) - saved["steps"]
+            if missed:  # a stock Adam has loaded it, and gone on
+                iteration, self.in_own_frame = iteration + max(missed, 0), False
+                self._last = ()
+                course.say_once(
+                    f"opt3dgs_optim: a stock Adam has gone on for {missed} steps with this "
+                    "checkpoint; what was kept beside its moments begins anew"
+                )
+        if saved is None or missed or saved["total_steps"] != course.total_steps:
             for state in self.state.values():  # they belong to the end of another run
                 for key in KEPT:
                     state.pop(key, None)
         self.next_iteration, self._lanes = iteration, []
+        if saved is None and steps and not max(steps):
+            course.warn_once(
+                "uncounted",
+                f"{type(self).__name__}: it has moments, but does not count its steps, so that the "
+                "clock begins at 0; call phases.observe(iteration=...) where the training goes on",
+            )
         if saved is not None or steps:  # an optimizer that steps now and then lags behind the clock
             others = [each.next_iteration for each, _ in course.members.values()]
             course.restore(saved, max([iteration, *others]))
-        self._recode()
+        self._recode(tell=saved is None or saved["moments"] != course.moments)
+        if self.in_own_frame and not course.acts:
+            for lane in self.present_lanes():
+                if lane.name == "means":
+                    for key in MOMENTS:
+                        self.state[lane.param][key].zero_()
 
     @torch.no_grad()
-    def _recode(self) -> None:
+    def _recode(self, tell: bool) -> None:
         """Have the moments at as many bits as the course says; rounded where they had more."""
         bits, found = self.course.moments, False
         for param, state in self.state.items():
@@ -364,7 +391,7 @@ class StepAdam(Adam):
                 encode(first, second, *codes, key=NEAREST, at=0)
                 first, second = codes
             state["exp_avg"], state["exp_avg_sq"] = first, second
-        if found and self.coded != (bits == 16):
+        if tell and found and self.coded != (bits == 16):
             self.course.say_once(
                 f"opt3dgs_optim: the moments that were there are now at {bits} bits"
             )
@@ -405,6 +432,14 @@ def upgraded_class(base: type[Adam]) -> type[StepAdam]:
         made = type(base.__name__, (StepAdam, base), {"_base": base, "__module__": base.__module__})
         _CLASSES[base] = cast(type[StepAdam], made)
     return _CLASSES[base]
+
+
+def as_numbers(state: dict[str, Any]) -> dict[str, Any]:
+    """A parameter's state with float32 moments in the place of codes."""
+    if "exp_avg" not in state:
+        return state
+    codes = [state[key].to(CODES) for key in MOMENTS]
+    return {**state, **dict(zip(MOMENTS, decoded(codes[0], codes[1]), strict=True))}
 
 
 def take_back(state: dict[str, Any]) -> None:

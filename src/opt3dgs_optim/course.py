@@ -53,6 +53,7 @@ class Course:
         self._resumed = False  # whether the present iteration is over, for all optimizers
         self.finished = False  # whether the run has been ended early
         self._said: set[str] = set()
+        self._look_at = LOOK_INTERVAL  # the iteration of the next look
         self._bad = 0  # numbers of gradients that were not finite
         self._counters: dict[torch.device, Reading] = {}
         self.observers = [part for part in self.parts if overrides(part, "observe")]
@@ -92,7 +93,8 @@ class Course:
 
     def _advance(self) -> None:
         """Called once in each iteration, before its first step."""
-        if self.iteration % LOOK_INTERVAL == 0:
+        if self.iteration >= self._look_at:
+            self._look_at = self.iteration + LOOK_INTERVAL
             self._look()
 
     @property
@@ -159,7 +161,7 @@ class Course:
     def _look(self) -> None:
         """Say once that gradients have not been finite, without a wait for a device."""
         for reading in self._counters.values():
-            self._bad = max(self._bad, int(reading.take() or 0))
+            self._bad = max(self._bad, abs(int(reading.take() or 0)))  # int32 may wrap
             reading.ask()
         if self._bad:
             self.warn_once(
@@ -180,6 +182,9 @@ class Course:
             "iteration": max(optimizer.next_iteration, self.iteration),  # it may have been put on
             "total_steps": self.total_steps,
             "own_frame": optimizer.in_own_frame,
+            "steps": max(
+                (int(s["step"]) for s in optimizer.state.values() if "step" in s), default=0
+            ),
             "moments": self.moments,
             "last": list(optimizer.last_steps()),
             "notes": {name: dict(notes) for name, notes in self._notes.items()},
@@ -189,7 +194,7 @@ class Course:
     def check_state(self, call: str, state: Any) -> None:
         """ValueError unless `state` is what `state_of` gives; the one check of what is loaded."""
         needed = {"format", "iteration", "total_steps", "own_frame", "moments", "last", "notes"}
-        needed |= {"parts"}
+        needed |= {"parts", "steps"}
         if not isinstance(state, Mapping) or set(state) != needed or state["format"] != FORMAT:
             raise ValueError(
                 f"{call}: param_groups[0][{STATE_KEY!r}] is not of this version (format {FORMAT}); "
@@ -199,6 +204,7 @@ class Course:
         check_count(call, "iteration", state["iteration"], 0)
         if state["total_steps"] is not None:
             check_count(call, "total_steps", state["total_steps"], 1)
+        check_count(call, "steps", state["steps"], 0)
         check_choice(call, "moments", state["moments"], (32, 16))
         last = state["last"]
         if not isinstance(last, list) or not all(type(each) is int for each in last):

@@ -30,6 +30,7 @@ class Lane:
         self.framed: bool | None = None
         self.keeps = False  # whether parts keep something for its rows
         self.left: dict[str, tuple[Tensor, int]] = {}
+        self.version = param._version  # of the Parameter, after the step
         self.plans: dict[Phase, list[Part]] = {}
         self.before: list[Part] = []
         self.after: list[Part] = []
@@ -62,11 +63,12 @@ class Lane:
             return tensor, True
         return tensor, False
 
-    def drop_moved(self, state: dict[str, Any], new: bool) -> None:
+    def drop_moved(self, state: dict[str, Any], new: bool, written: bool) -> None:
         """Drop what is kept for rows that are others now, if the Parameter is new.
 
         Trainers that edit rows edit every tensor of the state so (gsplat's family), or none but
-        Adam's moments (INRIA's): what they have left as it was belongs to other rows.
+        Adam's moments (INRIA's): what they have left as it was belongs to other rows. gsplat's
+        relocation writes rows of the old Parameter, and edits the state of others: `written`.
         """
         rows = len(self.param) if self.param.dim() else 1
         for key in KEPT:
@@ -74,9 +76,10 @@ class Lane:
             if now is None:
                 continue
             as_it_was = was is not None and now is was[0] and now._version == was[1]
-            if len(now) != rows or (new and as_it_was):
+            if len(now) != rows or (new and (as_it_was or written)):
                 del state[key]
 
     def leave(self, state: dict[str, Any]) -> None:
         """Note what the step has left, by which edits of rows show at the next one."""
+        self.version = self.param._version
         self.left = {key: (state[key], state[key]._version) for key in KEPT if key in state}

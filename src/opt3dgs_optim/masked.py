@@ -18,6 +18,7 @@ from opt3dgs_optim.step import (
     Step,
     axes_of,
     chosen_rows,
+    finite,
     into_frame,
     like_rows,
     out_of_frame,
@@ -26,6 +27,7 @@ from opt3dgs_optim.step import (
 
 if TYPE_CHECKING:
     from opt3dgs_optim.adam import StepAdam
+    from opt3dgs_optim.course import Course
 
 
 @torch.no_grad()
@@ -42,7 +44,7 @@ def step_around(
                 axes = None if step.frame is None else axes_of(step.frame)
                 steps.append((lane, step))
                 undo.append((lane, lane.param.grad, lane.group["lr"], lane.param.data, axes))
-                _give(step, axes)
+                _give(step, axes, optimizer.course)
         optimizer.own_class_step(*args, **masks)
     finally:
         for lane, grad, lr, position, axes in undo:
@@ -56,10 +58,11 @@ def step_around(
         optimizer.finish_step(lane, step)
 
 
-def _give(step: Step, axes: Axes | None) -> None:
+def _give(step: Step, axes: Axes | None, course: Course) -> None:
     """Have the step find the gradient, the rate and the moments that the parts say."""
     param, state = step.param, step.state
-    grad = torch.nan_to_num(step.grad, 0.0, 0.0, 0.0)
+    grad, bad = finite(step.grad, course.counter_on(param.device))
+    course.count_nonfinite(bad)
     if step.fade is not None:
         chosen = like_rows(chosen_rows(step.fade, len(param), param.device), param)
         for key, factor in zip(MOMENTS, step.fade[2:], strict=True):

@@ -157,7 +157,7 @@ def _take_decoded(
     step: Step, hyper: Hyper, chosen: Tensor | None, rows: Any, exp_avg: Tensor, exp_avg_sq: Tensor
 ) -> int:
     param = step.param[rows]
-    grad, bad = _finite(step.grad[rows], hyper.nonfinite)
+    grad, bad = finite(step.grad[rows], hyper.nonfinite)
     if step.fade is not None and chosen is not None:
         faded = like_rows(chosen[rows], param)
         exp_avg.copy_(torch.where(faded, exp_avg * step.fade.exp_avg, exp_avg))
@@ -171,7 +171,7 @@ def _take_decoded(
         grad = into_frame(axes, grad)
     if step.hold is not None:
         least = (grad * step.hold.weight).square_()
-        least.mul_(like_rows(step.hold.rows[rows], grad))
+        least = torch.where(like_rows(step.hold.rows[rows], grad), least, 0.0)
         torch.maximum(exp_avg_sq, least, out=exp_avg_sq)
     if step.plain:
         param.sub_(grad * (hyper.lr * step.factor))
@@ -193,7 +193,7 @@ def _take_decoded(
     return bad
 
 
-def _finite(grad: Tensor, nonfinite: Tensor | None) -> tuple[Tensor, int]:
+def finite(grad: Tensor, nonfinite: Tensor | None) -> tuple[Tensor, int]:
     """The gradient with zeros for numbers that are not finite; on a CPU how many there were."""
     if grad.is_cpu:
         if math.isfinite(grad.sum().item()):  # a finite sum has finite terms

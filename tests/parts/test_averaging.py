@@ -66,7 +66,7 @@ def test_an_edit_of_rows_in_the_last_thirtieth(inria: bool) -> None:
             edit(optimizer)
         steps({"all": optimizer}, params, 1, seed=iteration)
     began = optimizer.state[params["sh0"]]["averaging.began"]
-    assert began.tolist() == [6.0 if inria else 1.0] * (ROWS - 1)
+    assert began.tolist() == [296.0 if inria else 291.0] * (ROWS - 1)  # steps
 
 
 @pytest.mark.parametrize("between", [0, 1, 3])
@@ -80,7 +80,9 @@ def test_new_rows_begin_with_their_first_iterate(between: int) -> None:
         optimizer.step()
     steps({"all": optimizer}, params, 1)
     state = optimizer.state[params["sh0"]]
-    assert state["averaging.began"].tolist() == [1.0] * ROWS + [4.0 + between] * 2
+    assert (
+        state["averaging.began"].tolist() == [291.0] * ROWS + [294.0] * 2
+    )  # steps, not iterations
     assert torch.equal(state["averaging.mean"][ROWS:], params["sh0"][ROWS:])
 
 
@@ -133,3 +135,40 @@ def test_finish_takes_the_mean_early_and_averages_no_more() -> None:
     assert torch.equal(params["sh0"], mean)
     steps(optimizers, params, 6)
     assert not torch.equal(params["sh0"], optimizers["sh0"].state[params["sh0"]]["averaging.mean"])
+
+
+def test_the_mean_is_of_the_steps_that_were_made() -> None:
+    """taming-3dgs steps its harmonics in every 16th iteration: each of those counts alike."""
+    params = parameters(ROWS, "means", "shN")
+    often, seldom = adam_of({"means": params["means"]}), adam_of({"shN": params["shN"]})
+    PhaseScheduler(3000, parts=[Averaging()]).upgrade([often, seldom])
+    iterates = []
+    for iteration in range(2985):
+        params["means"].grad = torch.ones_like(params["means"])
+        often.step()
+        if iteration % 16 == 15:
+            params["shN"].grad = torch.ones_like(params["shN"])
+            seldom.step()
+            if iteration >= 2900:
+                iterates.append(params["shN"].detach().clone())
+    mean = seldom.state[params["shN"]]["averaging.mean"]
+    torch.testing.assert_close(mean, torch.stack(iterates).mean(0))
+
+
+def test_rows_that_gsplat_teleports_forget_where_they_were() -> None:
+    """Its relocation writes the moved rows of the old Parameter, and zeroes the state of others."""
+    params = parameters(ROWS, "sh0")
+    optimizer = PhaseScheduler(TOTAL, parts=[Averaging()]).upgrade(adam_of(params))
+    steps({"all": optimizer}, params, 295)
+    old = params["sh0"]
+    with torch.no_grad():
+        old[0] = 50.0
+    state = optimizer.state.pop(old)
+    for key in state:
+        if key != "step":
+            state[key][3] = 0
+    params["sh0"] = Parameter(old.detach())
+    optimizer.param_groups[0]["params"] = [params["sh0"]]
+    optimizer.state[params["sh0"]] = state
+    steps({"all": optimizer}, params, 5)
+    assert (params["sh0"][0] - 50.0).abs().max() < 1.0

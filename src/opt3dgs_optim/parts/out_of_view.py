@@ -47,11 +47,11 @@ class OutOfView(Part):
         notes, place = course.notes_of(self), (self, step.set)
         seen = course.scratch.get(place)
         if seen is None:
-            seen = course.scratch[place] = _Seen()
+            seen = course.scratch[place] = _Seen("share" if not step.set else f"share {step.set}")
         if seen.iteration != step.iteration:
             seen.look(step, course, notes)
         if seen.rows is not None and step.name != "means" and len(seen.rows) == len(step.param):
-            step.hold = Hold(seen.rows, MAX_SEEN_SHARE / notes["share"])
+            step.hold = Hold(seen.rows, MAX_SEEN_SHARE / notes[seen.note])
 
     def settle(self, course: Course) -> None:
         """Take the share that is on its way."""
@@ -76,7 +76,8 @@ class _Seen:
         counted: the counter before the look whose `reading` is on its way to the host.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, note: str) -> None:
+        self.note = note  # under which the mean share of this set is kept
         self.iteration = -1
         self.rows: Tensor | None = None
         self.counter: Tensor | None = None
@@ -86,14 +87,14 @@ class _Seen:
 
     def look(self, step: Step, course: Course, notes: dict[str, Any]) -> None:
         """Look at the positions' gradient of this iteration."""
-        notes.setdefault("share", 1.0)
+        notes.setdefault(self.note, 1.0)
         self.iteration, self.rows = step.iteration, None
         self.take(notes)
         means = step.param if step.name == "means" else course.param_of(step.set, "means")
         grad = None if means is None else means.grad
         # Multiples of the golden ratio keep step with no order of views, as of a rig of cameras.
         looks = self.reading is None and step.iteration * GOLDEN_RATIO % 1.0 < SHARE_LOOKED_AT
-        holds = notes["share"] < MAX_SEEN_SHARE
+        holds = notes[self.note] < MAX_SEEN_SHARE
         if grad is None or not len(grad) or not (looks or holds):
             return
         state = course.state_of_param(step.set, "means") if looks else None
@@ -116,7 +117,7 @@ class _Seen:
         self.counted = int(counted)
         share = (new >> 32) / max(new % 2**32, 1)
         if share > 0:  # a gradient that is zero everywhere is of no view
-            notes["share"] += WEIGHT * (max(share, MIN_SEEN_SHARE) - notes["share"])
+            notes[self.note] += WEIGHT * (max(share, MIN_SEEN_SHARE) - notes[self.note])
 
     def _counter(self, device: torch.device) -> Tensor:
         if self.counter is None or self.counter.device != device:

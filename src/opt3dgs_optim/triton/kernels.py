@@ -107,7 +107,9 @@ def into_mean(value, mean, began, row, at, inside, number, put):
     moved = tl.where(weight < 0.5, start + way * weight, value - way * (1.0 - weight))
     moved = tl.where(known, moved, old)
     tl.store(mean + at, moved, inside)
-    return tl.where(known & (put > 0.0), moved, value)
+    if put > 0.0:
+        value = tl.where(known, moved, value)
+    return value
 
 
 @triton.jit
