@@ -62,8 +62,8 @@ class OutOfView(Part):
                 seen.take(course.notes_of(self))
 
     def numbers(self, course: Course) -> Mapping[str, float]:
-        """`visible_share`: the mean share of the points that a view sees."""
-        return {"visible_share": course.notes_of(self).get("share", 1.0)}
+        """`visible_share`: the mean share of the points that a view sees, the least of all sets."""
+        return {"visible_share": min(course.notes_of(self).values(), default=1.0)}
 
 
 class _Seen:
