@@ -252,3 +252,21 @@ def test_a_stock_adam_loads_ours_and_goes_on() -> None:
     stock.load_state_dict(through_a_file(optimizer.state_dict()))
     steps({"all": stock}, params, 3)
     assert all(int(state["step"]) == 62 for state in stock.state.values())
+
+
+def test_a_stock_adam_that_goes_on_with_a_checkpoint_of_ours_is_noticed() -> None:
+    """Its own steps say how far it has come, and its moments are no own frame's."""
+    params = parameters(ROWS, "means", "scales", "quats")
+    optimizer = PhaseScheduler(1000).upgrade(adam_of(params))
+    steps({"all": optimizer}, params, 30)
+    stock = adam_of(params)
+    stock.load_state_dict(optimizer.state_dict())
+    steps({"all": stock}, params, 20)
+    again = adam_of(params)
+    again.load_state_dict(stock.state_dict())
+    phases = PhaseScheduler(1000)
+    phases.upgrade(again)
+    steps({"all": again}, params, 1)
+    assert phases.iteration == 50
+    assert again.state[params["means"]]["step"] == 1  # they begin anew, in the own frame
+    assert again.state[params["scales"]]["step"] == 51

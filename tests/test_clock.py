@@ -185,3 +185,19 @@ def test_phase_progress_and_what_is_shown() -> None:
     assert "iteration 99 of 100, exploitation" in repr(phases)
     assert phases.part(Averaging) is DEFAULTS[3]
     assert phases.numbers()["own_frame_rate"] == pytest.approx(0.1 * 0.01**0.99)
+
+
+def test_nan_is_told_whatever_iterations_the_clock_is_put_to() -> None:
+    """Gradients are accumulated over four iterations, and no step falls on a round number."""
+    params = parameters(5, "means")
+    phases = PhaseScheduler(3000, parts=[Averaging()])
+    optimizer = phases.upgrade(adam_of(params))
+
+    def train() -> None:
+        for iteration in range(3, 208, 4):
+            params["means"].grad = torch.full_like(params["means"], float("nan"))
+            phases.observe(iteration=iteration)
+            optimizer.step()
+
+    with pytest.warns(UserWarning, match="have not been finite"):
+        train()

@@ -111,3 +111,19 @@ def test_a_save_and_a_copy_lose_no_look() -> None:
     _, phases = train(True, 0.05, 151)
     copied = copy.deepcopy(phases)
     assert copied.numbers()["visible_share"] == settled
+
+
+def test_each_set_of_gaussians_has_a_share_of_its_own() -> None:
+    """Vehicles that are always in view do not hide that a view sees little of the background."""
+    rows = {"Background#xyz": 200, "RigidNodes#xyz": 20}
+    params = {name: Parameter(torch.zeros(count, 3)) for name, count in rows.items()}
+    optimizer = torch.optim.Adam([{"params": [p], "name": name} for name, p in params.items()])
+    phases = PhaseScheduler(3000, parts=[OutOfView()])
+    phases.upgrade(optimizer)
+    draw = torch.Generator().manual_seed(0)
+    for _ in range(600):
+        seen = torch.rand(200, 1, generator=draw) < 0.05
+        params["Background#xyz"].grad = seen * torch.ones(200, 3)
+        params["RigidNodes#xyz"].grad = torch.ones(20, 3)
+        optimizer.step()
+    assert 0.03 < float(phases.numbers()["visible_share"]) < 0.15
