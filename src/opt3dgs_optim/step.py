@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -116,7 +116,7 @@ class Hyper:
     decay: float = 0.0  # the other kind: share of the parameter in the gradient
     mean: Tensor | None = None  # like the parameter
     began: Tensor | None = None  # [N] the `Mean.number` with which a row's mean began; 0: not yet
-    nonfinite: Tensor | None = field(default=None)  # [1] int32 on the device: counts numbers
+    nonfinite: Tensor | None = None  # [1] int32 on the device: counts numbers
     key: int = 0  # 32 bits on which this step's rounding of moments to codes depends
 
 
