@@ -47,12 +47,14 @@ class Arm:
     rates: float = 1.0  # factor on all of the trainer's learning rates
     beta1: float = 0.9
     decays: bool = True  # the positions' rate, to a hundredth
+    moments: Literal[32, 16] = 32  # bits of Adam's moments
 
     def scheduler(self, iterations: int) -> PhaseScheduler | None:
         """Of one training; None where the trainer's own Adam stays as it is."""
-        return (
-            None if self.parts is None else PhaseScheduler(iterations, parts=self.parts(iterations))
-        )
+        if self.parts is None:
+            return None
+        parts = self.parts(iterations)
+        return PhaseScheduler(iterations, parts=parts, moments=self.moments)
 
 
 def of(*parts: Part) -> Callable[[int], Sequence[Part]]:
@@ -71,6 +73,7 @@ _ARMS = (
     Arm(
         "own", "own frame, the others faded, a hold, averaged: the defaults since 2026-11-27", own()
     ),
+    Arm("own-16", "as own, Adam's moments in 16 bits", own(), moments=16),
     Arm("averaged", "the baseline, its last thirtieth averaged", of(Averaging())),
     Arm("x2", "the baseline, all steps times 2", of(Longer(2.0))),
     Arm("x3", "the baseline, all steps times 3", of(Longer(3.0))),
