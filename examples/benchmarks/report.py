@@ -1,8 +1,8 @@
-"""Make the tables and pictures of docs/evidence.md anew: python examples/benchmarks/report.py
+"""Make the tables and the picture of docs/evidence.md anew: python examples/benchmarks/report.py
 
-All of it comes from docs/results/evidence.jsonl, and the cost of a step from steps.json beside it.
-In the page a table stands between `<!-- evidence:NAME -->` and `<!-- end -->`, where NAME is a
-function of `TABLES`.
+All of it comes from docs/results/evidence.jsonl, and the cost of a step, which docs/performance.md
+has, from steps.json beside it. In a page a table stands between `<!-- evidence:NAME -->` and
+`<!-- end -->`, where NAME is a function of `TABLES`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import evidence, steps
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "evidence.md"
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGES = (DOCS / "evidence.md", DOCS / "performance.md")
 PICTURE = evidence.FILE.with_name("iterations.png")
 MAIN = ("bonsai", "lego", "plush")
 FEW = ("banana", "brighton_beach", "embedded", "lund_door")
@@ -339,7 +340,7 @@ def filled(page: str, all_: Evidence) -> str:
 
     def made(found: re.Match[str]) -> str:
         if found[1] not in TABLES:
-            raise ValueError(f"{PAGE.name}: evidence:{found[1]}, but there are {', '.join(TABLES)}")
+            raise ValueError(f"evidence:{found[1]}, but there are {', '.join(TABLES)}")
         return f"<!-- evidence:{found[1]} -->\n{TABLES[found[1]](all_)}\n<!-- end -->"
 
     return re.sub(r"<!-- evidence:(\w+) -->.*?<!-- end -->", made, page, flags=re.DOTALL)
@@ -349,9 +350,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command line."""
     argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0]).parse_args(arguments)
     all_ = Evidence()
-    PAGE.write_text(filled(PAGE.read_text(encoding="utf-8"), all_), encoding="utf-8")
+    for page in PAGES:
+        page.write_text(filled(page.read_text(encoding="utf-8"), all_), encoding="utf-8")
     draw(all_, PICTURE)
-    print(PAGE, PICTURE, sep="\n")
+    print(*PAGES, PICTURE, sep="\n")
     return 0
 
 
