@@ -68,4 +68,4 @@ def draw_comparison(
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png")
     # 256 colours: a third of the bytes.
-    Image.open(drawn).convert("RGB").quantize().save(path, format="png", optimize=True)
+    Image.open(drawn).convert("RGB").quantize(kmeans=1).save(path, format="png", optimize=True)
