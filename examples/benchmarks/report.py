@@ -317,21 +317,23 @@ def draw(all_: Evidence, path: Path) -> None:
             ]
             at = sorted(set.intersection(*map(set, pairs)))
             curve = [statistics.mean(each[n] for each in pairs) for n in at]
-            label = "stock" if arm == "mcmc" else f"own frame, planned for {count:,}"
+            label = "stock" if arm == "mcmc" else f"opt3dgs_optim, planned for {count:,}"
             (entries[label],) = axis.plot([n / 1000 for n in at], curve, color=colour, lw=2)
             axis.plot(at[-1] / 1000, curve[-1], "o", color=colour, ms=6)
             if arm == "mcmc":
                 axis.axhline(end := curve[-1], color=colour, lw=1, ls="--", zorder=0)
                 axis.set_ylim(end - 5, end + 1.6)
-        said = f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"
-        axis.set(title=f"{scene}, {said}", xlabel="thousand iterations", xlim=(0, 31))
+        count = len(seeds)
+        axis.set_title(f"{scene} ({count} seed{'s' * (count > 1)})", fontsize=13)
+        axis.set_xlabel("thousand iterations", fontsize=12)
+        axis.set_xlim(0, 31)
         axis.grid(color="#e4e4e4", lw=0.8)
-    axes[0].set_ylabel("PSNR of held-out views, dB")
-    order = dict.fromkeys(["stock", *(f"own frame, planned for {n:,}" for _, n, _ in DRAWN)])
+    axes[0].set_ylabel("PSNR of held-out photos, dB", fontsize=12)
+    order = ["stock", *(f"opt3dgs_optim, planned for {n:,}" for _, n, _ in DRAWN[1:])]
     names = [name for name in order if name in entries]
     handles = [entries[name] for name in names]
     place = "outside lower center"
-    figure.legend(handles, names, loc=place, ncols=len(names), frameon=False, fontsize=9)
+    figure.legend(handles, names, loc=place, ncols=min(len(names), 3), frameon=False, fontsize=11)
     figure.savefig(path)
 
 
