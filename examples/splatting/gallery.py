@@ -38,7 +38,7 @@ def draw_comparison(
     rows: list[Any] = [[f"{kind} {i}" for i in range(count)] for kind in ("whole", "middle")]
     axes = figure.subplot_mosaic([*rows, ["curves"] * count], height_ratios=[height, height, 3.1])
     colours = {arm.name: COLOURS[i % len(COLOURS)] for i, arm in enumerate(arms)}
-    seconds = {arm.name: arm.numbers["seconds"].mean for arm in arms}
+    seconds = {arm.name: arm.runs[0].series("psnr")[1][-1] for arm in arms}
     for i, (name, image) in enumerate([("", view.image), *renders]):
         title, shown = "photo that was\nheld out", image.clamp(0, 1).numpy()
         if name:
