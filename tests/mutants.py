@@ -21,7 +21,7 @@ import sys
 import time
 from collections import Counter
 from pathlib import Path
-from types import FunctionType
+from types import FunctionType, MemberDescriptorType
 from typing import Any
 
 import pytest
@@ -64,7 +64,8 @@ def change(module: Any, source: str) -> None:
 
 def _change_class(old: type, new: type) -> None:
     for key, value in vars(new).items():
-        if key not in ("__dict__", "__weakref__"):
+        # Slots lie in the old class as they did.
+        if key not in ("__dict__", "__weakref__") and not isinstance(value, MemberDescriptorType):
             setattr(old, key, value)
         for cell in getattr(value, "__closure__", None) or ():
             if cell.cell_contents is new:  # super()'s
