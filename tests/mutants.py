@@ -119,6 +119,7 @@ class Runner:
     def _run(self, items: list[Any], prepare: Any, limit: int | None) -> str | None:
         """The first of the tests that fails, in a fork of this process."""
         from _pytest.runner import runtestprotocol
+        from _pytest.warnings import catch_warnings_for_item
 
         reading, writing = os.pipe()
         child = os.fork()
@@ -135,7 +136,9 @@ class Runner:
                 failed = None
                 for item in items:
                     begin = time.perf_counter()
-                    if any(r.failed for r in runtestprotocol(item, nextitem=None, log=False)):
+                    with catch_warnings_for_item(item.config, item.ihook, "runtest", item=item):
+                        reports = runtestprotocol(item, nextitem=None, log=False)
+                    if any(report.failed for report in reports):
                         failed = item.nodeid
                         break
                     os.write(writing, f"{time.perf_counter() - begin} {item.nodeid}\n".encode())
