@@ -22,7 +22,10 @@ _BOTH = (
     "split and prune has the preset `DEFAULTS_ADC`."
 )
 _MASKED = (
-    "An Adam with a mask and a step of its own keeps both; its arithmetic has no bias correction."
+    "an Adam with a mask keeps its own step, which has no bias correction and is several times "
+    "longer than Adam's early on. With clone and split write `parts=DEFAULTS_ADC[1:]`, the preset "
+    "without `Annealing`, which makes these steps longer still and loses: see "
+    "[sparse Adams](index.md#sparse-adams)."
 )
 
 # -- gsplat and what is built on it ----------------------------------------------------------------
@@ -184,11 +187,7 @@ _TRAINERS_OF_INRIA = {
         ("54c035f (2024-10-30)", "472689c (2024-04-05)"),
         step=(_INRIA_STEP, _STEP),
         counts={"gaussians.optimizer.step(": (1, 2), "total_loss.backward()": 0},
-        notes={
-            "Options": f"Exposures stay plain Adam. `--optimizer_type sparse_adam`: {_MASKED} Its "
-            "early steps are several times longer than Adam's, and annealing makes them up to four "
-            "times longer still: 84 iterations on a CPU ended 4 dB below the unchanged trainer's."
-        },
+        notes={"Options": f"Exposures stay plain Adam. `--optimizer_type sparse_adam`: {_MASKED}"},
     ),
     "3dgs-mcmc": _inria(
         *("3dgs-mcmc", "ubc-vision/3dgs-mcmc", "7b4fc9f (2025-01-01)"),
