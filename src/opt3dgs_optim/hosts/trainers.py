@@ -86,10 +86,11 @@ _GSPLAT = Trainer(
         "plain iterates.",
         "Several ranks": "Each rank has a loss and Gaussians of its own. Give the scheduler "
         "`process_group=torch.distributed.group.WORLD if world_size > 1 else None`.",
-        "Options": "`--sparse_grad` is refused: torch's SparseAdam is no Adam. Cameras, appearance "
-        "networks and grids stay with gsplat's own optimizers. With `--post_processing ppisp` the "
-        "main branch freezes the Gaussians at `cfg.ppisp_controller_activation_num_steps`: give "
-        "the scheduler that number, which `steps_scaler` does not scale.",
+        "Options": f"`--visible_adam`: {_MASKED} `--sparse_grad` is refused: torch's SparseAdam is "
+        "no Adam. Cameras, appearance networks and grids stay with gsplat's own optimizers. With "
+        "`--post_processing ppisp` the main branch freezes the Gaussians at "
+        "`cfg.ppisp_controller_activation_num_steps`: give the scheduler that number, which "
+        "`steps_scaler` does not scale.",
     },
 )
 _GSPLAT_2DGS = Trainer(
