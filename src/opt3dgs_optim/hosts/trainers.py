@@ -199,7 +199,8 @@ _TRAINERS_OF_INRIA = {
             "--position_lr_max_steps 10000 --densify_from_iter 167 --densify_until_iter 8333 "
             "--densification_interval 33`. A degree of harmonics is still added every 1,000 "
             "iterations, a number that stands in train.py.",
-            "Noise": "The trainer adds its own noise to the positions: add no `PositionNoise`.",
+            "Noise": "The trainer adds its own noise to the positions after each step, to their "
+            "mean as well: add no `PositionNoise`.",
         },
     ),
     "2dgs": _inria(
