@@ -99,7 +99,6 @@ class PhaseScheduler(Course):
         self._group = process_group
         own = (part for part in self.parts if overrides(part, "pixel_loss"))
         self._squared: Part | None = next(own, None)
-        self._choose_pixel_loss()
         self._end = End(total_steps, self.part(Averaging))
         weakref.finalize(self, self._end.say)  # at exit, or where the function that trains ends
 
@@ -174,9 +173,6 @@ class PhaseScheduler(Course):
             optimizer.__class__ = upgraded_class(type(optimizer))
         optimizer.follow(self, slots)
         optimizer.resume()
-        for at, slot in enumerate(slots):
-            if slot[1] is not None:
-                self.members[(slot[0], slot[1])] = optimizer, at
 
     # -- the trainer's calls -----------------------------------------------------------------------
 
@@ -202,7 +198,8 @@ class PhaseScheduler(Course):
                     f"{2 * self.total_steps} at most; make a new PhaseScheduler for another run"
                 )
             if iteration > self.iteration:
-                self.iteration, self._resumed = iteration, False
+                self._go_to(iteration)
+                self._resumed = False
                 self._advance()
         if loss is None:
             return
@@ -232,7 +229,8 @@ class PhaseScheduler(Course):
             )
         error = render - target
         # Not by the iteration: torch.compile would compile a function anew for each.
-        return error.abs().mean() if self._pixel is None else self._pixel.pixel_loss(error)
+        squared = self._squared if self.exploits_next else None
+        return error.abs().mean() if squared is None else squared.pixel_loss(error)
 
     @torch.no_grad()
     def finish(self) -> None:
@@ -254,9 +252,7 @@ class PhaseScheduler(Course):
     # -- what it watches ---------------------------------------------------------------------------
 
     def _advance(self) -> None:
-        super()._advance()
         self._end.done = self.iteration + 1
-        self._choose_pixel_loss()
         if self.log is not None:
             numbers = self.numbers()
             if self._loss is not None:
@@ -275,16 +271,6 @@ class PhaseScheduler(Course):
                 f"{CALL}: {_num_ranks()} ranks train, but process_group=None: parts that read the "
                 "loss would differ between them; give process_group=torch.distributed.group.WORLD",
             )
-
-    def _choose_pixel_loss(self) -> None:
-        """Whose photometric term holds for the iteration after this one, whose loss comes next."""
-        assert self.switch_step is not None
-        self._pixel = self._squared if self.iteration + 1 >= self.switch_step else None
-
-    def restore(self, state: Mapping[str, Any] | None, iteration: int) -> None:
-        """As `Course.restore`."""
-        super().restore(state, iteration)
-        self._choose_pixel_loss()
 
     def rows_removed(self, count: int) -> None:
         """Gaussians have disappeared, under parts that are made for relocation."""

@@ -74,11 +74,12 @@ class Step:
         name: gsplat's name of the Gaussian parameter, or None.
         set: the set of Gaussians that it belongs to, "" where there is one.
         group, state: torch's parameter group and the optimizer's state of the parameter.
-        iteration: of the training, from 0. `last`: that of the parameter's step before this one.
-        kept: what a part keeps for the rows, see `adam.Lane.rows`.
+        iteration: of the training, from 0.
+        stepped_in: the iteration of the parameter's step before this one; -1: none.
+        keep: `keep(state, key, shape)` is what a part keeps for the rows, see `lane.Lane.keep`.
         factor: on the learning rate; on a device it may be a tensor of one element.
         fresh: Adam's moments begin anew before the step.
-        plain: no moments: the step is the gradient times the rate.
+        plain: no moments and no frame: the step is the gradient times the rate.
         fade, frame, hold, mean: see there; None: not in this step.
     """
 
@@ -89,8 +90,8 @@ class Step:
     group: dict[str, Any]
     state: dict[str, Any]
     iteration: int
-    last: int
-    kept: Any = None
+    stepped_in: int
+    keep: Any = None
     factor: Any = 1.0
     fresh: bool = False
     plain: bool = False
