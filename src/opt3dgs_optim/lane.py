@@ -63,8 +63,15 @@ class Lane:
 
     def mean_of(self, state: dict[str, Any]) -> tuple[Tensor, Tensor]:
         """The running mean, and with which count the mean of each row began."""
-        mean = self.keep(state, MEAN, tuple(self.param.shape))
-        return mean, self.keep(state, BEGAN, (len(self.param),))
+        param, mean, began = self.param, state.get(MEAN), state.get(BEGAN)
+        if (
+            mean is None or mean.numel() != param.numel()
+            or began is None or len(began) != param.size(0)
+        ):  # fmt: skip
+            mean = self.keep(state, MEAN, tuple(param.shape))
+            began = self.keep(state, BEGAN, tuple(param.shape[:1]))
+        self.keeps = True
+        return mean, began
 
     def drop_moved(self, state: dict[str, Any], new: bool, written: bool) -> None:
         """Drop what is kept for rows that are others now, if the Parameter is new.
