@@ -311,9 +311,8 @@ def pseudo_gradient(position: Tensor, grad: Tensor, own: dict) -> Tensor:
 
     # The pair between this visible step of a point and its last one, divided by |y|.
     new_s, new_y = position - x, grad - g
-    size = length(new_y)
-    new_s, new_y = new_s / size, new_y / size
-    cosine = dot(new_s / length(new_s), new_y)
+    cosine = dot(new_s / length(new_s), new_y / length(new_y))
+    new_s, new_y = new_s / length(new_y), new_y / length(new_y)
     accepted = (visible & before & (cosine > 1e-6))[:, None]
     s = [torch.where(accepted, new, old) for new, old in zip([new_s, *s], s, strict=False)]
     y = [torch.where(accepted, new, old) for new, old in zip([new_y, *y], y, strict=False)]
@@ -325,10 +324,9 @@ def pseudo_gradient(position: Tensor, grad: Tensor, own: dict) -> Tensor:
     scale = torch.where(scale > 0, scale, 1.0)[:, None]
     unit = grad / scale
     result = two_loop(unit, s, y)
-    size = length(result)
-    descends = dot(unit, result / size) > 0
-    result = result * (dot(unit, unit).sqrt()[:, None] / size) * scale  # graft
-    usable = descends & (dot(s[0], y[0]) > 0) & (largest(result) < torch.inf)
+    along = result / length(result)
+    result = along * length(grad)  # graft
+    usable = (dot(unit, along) > 0) & (dot(s[0], y[0]) > 0) & (largest(result) < torch.inf)
     return torch.where(usable[:, None], result, grad)
 
 
@@ -353,8 +351,8 @@ def two_loop(grad: Tensor, s: list[Tensor], y: list[Tensor]) -> Tensor:
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
     """The scalar product of every point's two vectors [N, 3], [N]."""
-    xy = torch.addcmul(a[:, 0] * b[:, 0], a[:, 1], b[:, 1])
-    return torch.addcmul(xy, a[:, 2], b[:, 2])
+    x, y, z = (a * b).unbind(1)
+    return x + y + z
 
 
 def largest(a: Tensor) -> Tensor:
@@ -364,7 +362,6 @@ def largest(a: Tensor) -> Tensor:
 
 def length(a: Tensor) -> Tensor:
     """The length of every point's vector [N, 3], [N, 1]; 1 for a zero vector, to divide by."""
-    size = largest(a)[:, None]
-    scaled = a / torch.where(size > 0, size, 1.0)
-    result = dot(scaled, scaled).sqrt()[:, None] * size
+    x, y, z = a.T.contiguous()
+    result = torch.hypot(torch.hypot(x, y), z)[:, None]
     return torch.where(result > 0, result, 1.0)

@@ -13,15 +13,17 @@ noticed most so far, with a limit on its processor time. Before that, all of the
 from __future__ import annotations
 
 import argparse
-import importlib
+import importlib.util
 import os
 import random
 import resource
 import sys
+import tempfile
 import time
 from collections import Counter
+from functools import partial
 from pathlib import Path
-from types import FunctionType
+from types import FunctionType, MemberDescriptorType
 from typing import Any
 
 import pytest
@@ -29,8 +31,12 @@ from mutations import Mutant, mutants
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src/opt3dgs_optim"
+KERNELS = PACKAGE / "triton/kernels.py"
 CHOSEN = "not slow and not hosts and not compiles and not processes and not thorough"
 ENERGY = ["test_partitions.py", "parts/test_histogram.py", "parts/test_histogram_extremes.py"]
+LBFGS = ["lbfgs/test_history.py", "lbfgs/test_two_loop.py", "lbfgs/test_lqn_direction.py"]
+STEP = ["parts/test_own_frame.py", "parts/test_fading.py", "parts/test_averaging.py"]
+STEP += ["parts/test_out_of_view.py", "test_moments.py", "test_adam.py", "test_reference_step.py"]
 TARGETS = {  # module: the tests that are meant to notice
     "partitions.py": ENERGY,
     "parts/histogram.py": ENERGY,
@@ -38,12 +44,22 @@ TARGETS = {  # module: the tests that are meant to notice
     "parts/annealing.py": ["parts/test_annealing.py"],
     "parts/last_phase.py": ["parts/test_last_phase.py"],
     "parts/curvature.py": ["parts/test_curvature.py"],
+    "parts/fading.py": ["parts/test_fading.py"],
+    "parts/averaging.py": ["parts/test_averaging.py"],
+    "parts/out_of_view.py": ["parts/test_out_of_view.py"],
+    "parts/own_frame.py": ["parts/test_own_frame.py"],
     "awsgld.py": ["test_awsgld.py"],
     "lqnadam.py": ["test_lqnadam.py"],
+    "lbfgs/pairs.py": LBFGS,
+    "lbfgs/history.py": LBFGS,
+    "lbfgs/two_loop.py": LBFGS,
+    "moments.py": ["test_moments.py"],
+    "step.py": STEP,
+    "triton/kernels.py": ["triton/test_kernels.py"],
 }
 
 
-def change(module: Any, source: str) -> None:
+def change_module(module: Any, source: str) -> None:
     """Have a module that others have imported from do what `source` says.
 
     Its functions and classes stay the objects that they are, with what the new ones have.
@@ -62,9 +78,24 @@ def change(module: Any, source: str) -> None:
         setattr(module, name, old)
 
 
+def change_kernels(source: str) -> None:
+    """Have the tests load kernels that do what `source` says: Triton reads them from a file."""
+    name, found = "opt3dgs_optim.triton.kernels", importlib.util.find_spec
+    file = Path(tempfile.mkdtemp(), "kernels.py")
+    file.write_text(source)
+
+    def find_spec(asked: str, package: str | None = None) -> Any:
+        if asked != name:
+            return found(asked, package)
+        return importlib.util.spec_from_file_location(name, file)
+
+    importlib.util.find_spec = find_spec
+
+
 def _change_class(old: type, new: type) -> None:
     for key, value in vars(new).items():
-        if key not in ("__dict__", "__weakref__"):
+        # Slots lie in the old class as they did.
+        if key not in ("__dict__", "__weakref__") and not isinstance(value, MemberDescriptorType):
             setattr(old, key, value)
         for cell in getattr(value, "__closure__", None) or ():
             if cell.cell_contents is new:  # super()'s
@@ -90,8 +121,9 @@ class Runner:
         module, source = importlib.import_module(self.name), self.path.read_text()
         if Path(str(module.__file__)) != self.path:
             raise pytest.UsageError(f"{self.name} is imported from {module.__file__}")
+        change = change_kernels if self.path == KERNELS else partial(change_module, module)
         begin = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
-        failed = self._run(session.items, lambda: change(module, source), None)
+        failed = self._run(session.items, lambda: change(source), None)
         if failed is not None:
             raise pytest.UsageError(f"{self.name}: {failed} fails without a mutant")
         used = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - begin
@@ -100,7 +132,7 @@ class Runner:
                 session.items, key=lambda i: (-self._kills[i.nodeid], self._seconds[i.nodeid])
             )
             killer = self._run(
-                order, lambda m=mutant: change(module, m.source), self.patience + 3 * int(used)
+                order, lambda m=mutant: change(m.source), self.patience + 3 * int(used)
             )
             self.found.append(killer)
             if killer is None:
@@ -118,6 +150,7 @@ class Runner:
     def _run(self, items: list[Any], prepare: Any, limit: int | None) -> str | None:
         """The first of the tests that fails, in a fork of this process."""
         from _pytest.runner import runtestprotocol
+        from _pytest.warnings import catch_warnings_for_item
 
         reading, writing = os.pipe()
         child = os.fork()
@@ -134,7 +167,9 @@ class Runner:
                 failed = None
                 for item in items:
                     begin = time.perf_counter()
-                    if any(r.failed for r in runtestprotocol(item, nextitem=None, log=False)):
+                    with catch_warnings_for_item(item.config, item.ihook, "runtest", item=item):
+                        reports = runtestprotocol(item, nextitem=None, log=False)
+                    if any(report.failed for report in reports):
                         failed = item.nodeid
                         break
                     os.write(writing, f"{time.perf_counter() - begin} {item.nodeid}\n".encode())

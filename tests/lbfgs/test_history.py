@@ -239,10 +239,8 @@ def test_pairs_and_header_lie_where_the_docstring_says(size: int, dim: int) -> N
     cells = Cells(cells_of(history), size)
     assert torch.equal(cells.counter, head.counter)
     assert torch.equal(cells.last, torch.stack([position.T, gradient.T]))
-    for kind, vectors in enumerate((cells.s, cells.y)):
-        assert torch.equal(torch.stack(vectors).mT, found[kind])
-        rows = [torch.stack(each, 1) for each in (cells.s_rows, cells.y_rows)[kind]]
-        assert torch.equal(torch.stack(rows), found[kind])
+    for kind in (0, 1):
+        assert torch.equal(cells.pairs[:, kind].mT, found[kind])
 
 
 @pytest.mark.parametrize("size", [1, 5])

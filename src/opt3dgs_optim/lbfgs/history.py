@@ -22,7 +22,7 @@ from torch import Tensor
 
 from opt3dgs_optim.backend import obstacle
 from opt3dgs_optim.checks import check_count
-from opt3dgs_optim.lbfgs.pairs import BITS, bits_of, columns, dot, normalised, overwrite
+from opt3dgs_optim.lbfgs.pairs import BITS, bits_of, columns, normalised, overwrite
 
 MAX_HISTORY = 16
 
@@ -105,39 +105,23 @@ class Cells:
 
     Attributes:
         dim, history_size: D and K.
-        lanes: of every lane, the numbers of the K pairs, [K, N].
-        s, y: of every pair, the vector [D, N], newest first.
-        s_rows, y_rows: of every pair, the D coordinates [N] of that vector.
-        pairs: all of them, [K, 2, D, N].
+        pairs: [K, 2, D, N], the newest first; of each s and y.
         last: position and gradient of the last visible step, [2, D, N].
         counter: [N], 0: never visible; c: holds c - 1 pairs.
     """
 
     def __init__(self, cells: Tensor, history_size: int) -> None:
-        slots, lanes, _ = cells.shape
-        dim = self.dim = lanes // 2 - 1
+        dim = self.dim = cells.shape[1] // 2 - 1
         self.history_size = history_size
-        rows = cells.flatten(0, 1).unbind()
         halves = cells.unflatten(1, (2, dim + 1))
-        kept = cells if slots == history_size else cells[:history_size]
-        self.lanes = kept.unbind(1)
         pairs = halves[:, :, :dim]
         if history_size > dim:
             self.pairs = pairs
             self.last = halves[:dim, :, dim].transpose(0, 1)
-            self.counter = rows[dim * lanes + dim]
+            self.counter = cells[dim, dim]
         else:
             self.pairs, self.last = pairs[:history_size], pairs[history_size]
-            self.counter = rows[history_size * lanes + dim]
-        vectors = self.pairs.flatten(0, 1).unbind()
-        self.s, self.y = vectors[::2], vectors[1::2]
-        first = range(0, history_size * lanes, lanes)
-        self.s_rows = [rows[i : i + dim] for i in first]
-        self.y_rows = [rows[i + dim + 1 : i + 2 * dim + 1] for i in first]
-
-    def curvatures(self) -> Tensor:
-        """s.y of every pair, [K, N]; 0 where there is none."""
-        return dot(self.lanes[: self.dim], self.lanes[self.dim + 1 : -1])
+            self.counter = cells[history_size, dim]
 
 
 def cells_of(history: Tensor, rows: slice = slice(None)) -> Tensor:

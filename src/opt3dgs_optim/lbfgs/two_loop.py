@@ -100,24 +100,20 @@ def recursion(grad: Tensor, cells: Cells) -> Tensor:
 
     |y| = 1 where there is a pair, and s = y = 0 where there is none.
     """
-    sy = cells.curvatures()
+    sy = dot(cells.pairs[:, 0], cells.pairs[:, 1])
     # |y| = 1, hence gamma = s.y / y.y = s.y. No pair: gamma = 1, and r stays the gradient.
     gamma = torch.threshold(sy[0], 0.0, 1.0)
     inverses = torch.threshold_(sy, 0.0, torch.inf).reciprocal_().unbind()  # no pair: 0
-    r, alphas = grad, []
-    rows = r.unbind()
-    for j in range(cells.history_size):  # newest to oldest
-        alpha = dot(cells.s_rows[j], rows).mul_(inverses[j])
-        if j == 0:  # the gradient stays as it is
-            r = torch.addcmul(grad, alpha, cells.y[0], value=-1)
-            rows = r.unbind()
-        else:
-            r.addcmul_(alpha, cells.y[j], value=-1)
-        alphas.append(alpha)
+    vectors = cells.pairs.flatten(0, 1).unbind()
+    pairs = list(zip(vectors[::2], vectors[1::2], inverses, strict=True))
+    r, alphas = grad.clone(), []
+    for s, y, inverse in pairs:  # newest to oldest
+        alphas.append(dot(s, r).mul_(inverse))
+        r.addcmul_(alphas[-1], y, value=-1)
     r.mul_(gamma)
-    for j in reversed(range(cells.history_size)):
-        beta = dot(cells.y_rows[j], rows).mul_(inverses[j])
-        r.addcmul_(alphas[j].sub_(beta), cells.s[j])
+    for s, y, inverse in reversed(pairs):
+        beta = dot(y, r).mul_(inverse)
+        r.addcmul_(alphas.pop().sub_(beta), s)
     return r
 
 
@@ -177,14 +173,11 @@ def direction(grad: Tensor, scale: Tensor, cells: Cells, graft: bool) -> Tensor:
     """What Adam is fed, [D, N] of gradients [D, N] and their largest component [N]."""
     scale = torch.threshold(scale, 0.0, 1.0)
     unit = grad / scale  # keeps s.q finite
-    rows = unit.unbind()
     result = recursion(unit, cells)
-    size = length(result)
+    along = result / length(result)
     # Zero where the gradient is, NaN where the result is not finite.
-    usable = dot(rows, (result / size).unbind()) > 0
+    usable = dot(unit, along) > 0
     usable &= cells.counter > 1
-    if graft:
-        result.mul_(dot(rows, rows).sqrt_().div_(size))
-    result.mul_(scale)
-    usable &= largest(result) < torch.inf
-    return torch.where(usable, result, grad)
+    found = along.mul_(length(grad)) if graft else result.mul_(scale)
+    usable &= largest(found) < torch.inf
+    return torch.where(usable, found, grad)
