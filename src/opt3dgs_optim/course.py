@@ -94,7 +94,9 @@ class Course:
         present = self.iteration + self._resumed
         iteration = max(optimizer.next_iteration, present, 0)
         if optimizer.has_means:
-            self._means_at, self._means_open = iteration, iteration > self.iteration
+            if iteration > self._means_at:  # of two sets' optimizers the first
+                self._means_open = iteration > self.iteration
+            self._means_at = iteration
         elif self.has_means and iteration > present:  # it has stepped in the present one
             begins = self._means_at >= present and not self._means_open
             iteration = max(present + begins, 0)

@@ -16,7 +16,7 @@ from opt3dgs_optim.checks import LOGGER, check_count, check_energy, check_number
 from opt3dgs_optim.contract import Slots, check_supported
 from opt3dgs_optim.course import STATE_KEY, Course
 from opt3dgs_optim.names import GAUSSIAN_NAMES, split_name
-from opt3dgs_optim.part import Part, overrides
+from opt3dgs_optim.part import Part, Phase, overrides
 from opt3dgs_optim.parts.averaging import Averaging
 from opt3dgs_optim.parts.curvature import Curvature
 from opt3dgs_optim.parts.fading import Fading
@@ -98,7 +98,7 @@ class PhaseScheduler(Course):
         self.log, self._loss = log, None
         self._group = process_group
         own = (part for part in self.parts if overrides(part, "pixel_loss"))
-        self._squared: Part | None = next(own, None)
+        self._pixel: Part | None = next(own, None)
         self._end = End(total_steps, self.part(Averaging))
         weakref.finalize(self, self._end.say)  # at exit, or where the function that trains ends
 
@@ -142,6 +142,13 @@ class PhaseScheduler(Course):
                 f"{CALL}.upgrade: no Gaussians among the groups {names}; name the groups, or the "
                 f"keys of a dict, as one of {', '.join(GAUSSIAN_NAMES)} (other trainers' names too)"
             )
+        for (_, optimizer), its in zip(given, slots, strict=True):
+            if self.moments == 16 and not any(name for _, name in its):
+                raise ValueError(
+                    f"{CALL}.upgrade: moments=16, but the {type(optimizer).__name__} of "
+                    f"{len(optimizer.param_groups)} other groups holds no Gaussians; upgrade those "
+                    "of the Gaussians alone, or take moments=32"
+                )
         doubled = sorted({name for name in held if held.count(name) > 1})
         if doubled:
             raise ValueError(
@@ -220,6 +227,8 @@ class PhaseScheduler(Course):
     def pixel_loss(self, render: Tensor, target: Tensor) -> Tensor:
         """The photometric term of two images in 0..1: mean |error|, unless a part says another.
 
+        It is that of the iteration after the last step.
+
         `SquaredLoss` has the paper's mean squared error, while exploiting.
         """
         if render.shape != target.shape:
@@ -229,8 +238,10 @@ class PhaseScheduler(Course):
             )
         error = render - target
         # Not by the iteration: torch.compile would compile a function anew for each.
-        squared = self._squared if self.exploits_next else None
-        return error.abs().mean() if squared is None else squared.pixel_loss(error)
+        part, phase = self._pixel, Phase.EXPLOITATION if self.exploits_next else Phase.EXPLORATION
+        if part is None or part.during not in (None, phase):
+            return error.abs().mean()
+        return part.pixel_loss(error)
 
     @torch.no_grad()
     def finish(self) -> None:
@@ -264,6 +275,12 @@ class PhaseScheduler(Course):
                 "overrun",
                 f"{CALL}: iteration {self.iteration} of total_steps={self.total_steps}: the "
                 "schedule came too early for this run; pass the training's number of iterations",
+            )
+        if self.finished:
+            self.warn_once(
+                "finished",
+                f"{CALL}: iteration {self.iteration} comes after finish(): the parameters are no "
+                "mean any more; call it after the last step",
             )
         if self.iteration == 0 and self._group is None and _num_ranks() > 1:
             self.warn_once(
