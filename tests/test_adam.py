@@ -374,7 +374,7 @@ def test_a_group_that_was_taken_away_is_not_stepped() -> None:
 
 @pytest.mark.parametrize("rows", [ROWS - 3, ROWS + 3])
 def test_other_rows_in_the_same_parameter_are_named(rows: int) -> None:
-    """A trainer that writes `param.data`, and leaves the moments, or the gradient, of the others."""
+    """A trainer that writes `param.data`, and leaves the moments or the gradient behind."""
     params = parameters(ROWS, "sh0")
     optimizers = PhaseScheduler(TOTAL, parts=[Averaging()]).upgrade(adams_of(params))
     steps(optimizers, params, TOTAL - 2)

@@ -279,7 +279,7 @@ def test_notes_that_no_checkpoint_holds_are_refused_at_the_first_save(noted: Any
     phases = PhaseScheduler(60, parts=[Averaging()])
     optimizer = phases.upgrade(adam_of(params))
     phases.notes_of(phases.parts[0])["mine"] = noted
-    with pytest.raises(ValueError, match="notes of Averaging are .*but finite numbers are needed"):
+    with pytest.raises(ValueError, match=r"notes of Averaging are .*but finite numbers are needed"):
         optimizer.state_dict()
     phases.notes_of(phases.parts[0])["mine"] = True
     optimizer.load_state_dict(optimizer.state_dict())

@@ -52,10 +52,10 @@ class StepAdam(Adam):
 
     def _name_groups(self) -> None:
         """Say in each group which Gaussian parameter it holds, by gsplat's name, or None."""
-        for at, (group, (which, name)) in enumerate(zip(self.param_groups, self._slots, strict=True)):
-            group["gaussian"] = name
+        for at, (which, name) in enumerate(self._slots):
+            self.param_groups[at]["gaussian"] = name
             if name is not None:
-                self.course.members[(which, name)] = self, at
+                self.course.members[which, name] = self, at
         self.has_means = any(name == "means" for _, name in self._slots)
         self.course.has_means |= self.has_means
 
@@ -364,33 +364,24 @@ class StepAdam(Adam):
         """Go on where the state says that the training is: after a load."""
         course, saved = self.course, self.param_groups[0].pop(STATE_KEY, None)
         counts = [int(state["step"]) for state in self.state.values() if "step" in state]
-        made, missed = max(counts, default=0), 0
-        if saved is not None:
-            missed = made - saved["steps"]  # of a stock Adam, which has loaded it and gone on
-            iteration = saved["iteration"] + max(missed, 0)
-        elif counts:
-            iteration = made
-        else:  # one that is made anew under way steps first in the next iteration
-            iteration = course.iteration + 1
+        missed = 0 if saved is None else max(counts, default=0) - saved["steps"]
         if missed:
             course.say_once(
                 f"opt3dgs_optim: a stock Adam has gone on for {missed} steps with this checkpoint; "
                 "what was kept beside its moments begins anew"
             )
-        if counts and not made and saved is None:
-            course.warn_once(
-                "uncounted",
-                f"{type(self).__name__}: it has moments, but does not count its steps, so that the "
-                "clock begins at 0; call phases.observe(iteration=...) where the training goes on",
-            )
-        ours = saved is not None and not missed
-        self.in_own_frame = frozenset(saved["own_frame"] if ours else ())
-        self._last = tuple(saved["last"]) if ours else ()
-        self._lanes, self.next_iteration = [], iteration
-        if not ours or saved["total_steps"] != course.total_steps:
+        ours = None if missed else saved  # what it says of the moments holds
+        self.in_own_frame = frozenset(() if ours is None else ours["own_frame"])
+        self._last = () if ours is None else tuple(ours["last"])
+        if ours is None or ours["total_steps"] != course.total_steps:
             for state in self.state.values():  # they belong to the end of another run
                 for key in KEPT:
                     state.pop(key, None)
+        if saved is not None:
+            iteration = saved["iteration"] + max(missed, 0)
+        else:
+            iteration = self._iteration_by_counts(counts)
+        self._lanes, self.next_iteration = [], iteration
         clocks = course.clocks()
         if saved is not None or (counts and (self.has_means or not any(clocks))):
             course.restore(saved, max(iteration, *clocks))  # one that steps now and then lags
@@ -400,6 +391,18 @@ class StepAdam(Adam):
                 if lane.framed:
                     for key in MOMENTS:
                         self.state[lane.param][key].zero_()
+
+    def _iteration_by_counts(self, counts: list[int]) -> int:
+        """The iteration that comes next, by Adam's own counts of steps."""
+        if not counts:  # one that is made anew under way steps first in the next iteration
+            return self.course.iteration + 1
+        if not any(counts):
+            self.course.warn_once(
+                "uncounted",
+                f"{type(self).__name__}: it has moments, but does not count its steps, so that the "
+                "clock begins at 0; call phases.observe(iteration=...) where the training goes on",
+            )
+        return max(counts)
 
     @torch.no_grad()
     def _recode(self, tell: bool) -> None:

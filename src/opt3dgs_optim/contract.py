@@ -88,10 +88,11 @@ def _check_bits(optimizer: Any, owner: type | None, slots: Slots, moments: int) 
             f"upgrade: moments=16, but {type(optimizer).__name__} makes its own step, on moments "
             "of 32 bits; take torch.optim.Adam, or moments=32"
         )
-    others = [group for group, slot in zip(optimizer.param_groups, slots, strict=True) if not slot[1]]
+    others = [at for at, (_, name) in enumerate(slots) if name is None]
     if 0 < len(others) < len(slots):
+        shown = optimizer.param_groups[others[0]].get("name")
         raise ValueError(
-            f"upgrade: moments=16, but the group {others[0].get('name')!r} beside the Gaussians is "
+            f"upgrade: moments=16, but the group {shown!r} beside the Gaussians is "
             "none of theirs; give it an optimizer of its own, or take moments=32"
         )
     dtypes = {param.dtype for group in optimizer.param_groups for param in group["params"]}

@@ -229,8 +229,9 @@ class Course:
         check_count(call, "steps", state["steps"], 0)
         check_choice(call, "moments", state["moments"], (32, 16))
         for key, kind in (("last", int), ("own_frame", str)):
-            if not isinstance(state[key], list) or any(type(each) is not kind for each in state[key]):
-                raise ValueError(f"{call}: {key}={state[key]!r}, but a list of {kind} is needed")
+            found = state[key]
+            if not isinstance(found, list) or any(type(each) is not kind for each in found):
+                raise ValueError(f"{call}: {key}={found!r}, but a list of {kind} is needed")
         for kind in ("notes", "parts"):
             if not isinstance(state[kind], Mapping) or not all(
                 isinstance(each, Mapping) for each in state[kind].values()

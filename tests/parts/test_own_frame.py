@@ -198,8 +198,8 @@ def test_of_two_sets_the_one_in_own_frames_is_known_after_a_load() -> None:
         groups = [{"params": [param], "name": name} for name, param in params.items()]
         return params, PhaseScheduler(60, parts=[OwnFrame()]).upgrade(Adam(groups, lr=0.01))
 
+    params, optimizer = made()
     with pytest.warns(UserWarning, match="Adam steps them"):
-        params, optimizer = made()
         steps({"all": optimizer}, params, 10)
     others, resumed = made()
     with torch.no_grad():

@@ -40,7 +40,7 @@ class EnergyHistogram(Part):
     that of the noise (`IsotropicNoise`), and `warmup=0`. The default's partitions follow the walk,
     so that the well in which it began looks like all there is. In a double well whose barrier is
     six times the temperature, a walk of 20,000 steps of 0.006 crossed it once without a histogram,
-    5 times with the default, and 39 times with a range and a temperature
+    5 times with the default, and some 40 times with a range and a temperature
     (`python tests/test_lqnadam_claims.py`).
 
     Args:
