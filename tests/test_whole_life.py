@@ -331,6 +331,7 @@ def edit_own(edit: row_edits.Edit, own: dict[str, Any], inria: bool) -> None:
     "ignore:opt3dgs_optim. iteration .* not been finite",
     "ignore:PhaseScheduler. . Gaussians were removed",
     "ignore:PhaseScheduler. iteration .* of total_steps",
+    "ignore:PhaseScheduler. iteration .* comes after finish",
 )
 def test_whole_life() -> None:
     run_state_machine_as_test(
