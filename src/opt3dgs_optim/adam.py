@@ -151,7 +151,6 @@ class StepAdam(Adam):
                 f"{len(self._slots)} when it was upgraded; upgrade it again where they change"
             )
         old, made, course = self._lanes, [], self.course
-        self._name_groups()
         for group, slot in zip(self.param_groups, self._slots, strict=True):
             for param in group["params"]:
                 i = len(made)

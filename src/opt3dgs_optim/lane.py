@@ -92,4 +92,6 @@ class Lane:
     def note(self, state: dict[str, Any]) -> None:
         """Note how the step leaves the rows, by which edits of them show at the next one."""
         self.version = self.param._version
-        self.noted = {key: (state[key], state[key]._version) for key in KEPT if key in state}
+        for key in KEPT:
+            if key in state:
+                self.noted[key] = state[key], state[key]._version

@@ -38,16 +38,17 @@ class PhaseScheduler(Course):
     By default `DEFAULTS`, for 3DGS-MCMC's relocation; `DEFAULTS_ADC` is for clone, split and prune,
     and `PhaseScheduler.paper` is Opt3DGS.
 
-    The optimizers count their own steps, so that nothing else need be called. The state travels
-    with their `state_dict()`.
+    The optimizers count their own steps, so that nothing else need be called: the clock is that of
+    the positions' optimizer, whatever others step between. The state travels with their
+    `state_dict()`.
 
     Args:
         total_steps: iterations of the training, each with one step of the positions' optimizer.
         switch: where exploitation starts: a fraction of `total_steps` in (0, 1] if a float, an
             iteration if an int (`total_steps`: never). The paper: 29/30.
         parts: what the steps have, in order; None: `DEFAULTS`.
-        moments: bits of each of Adam's two moments of a number; 16 take half of Adam's memory
-            (see docs/algorithms).
+        moments: bits of each of Adam's two moments of a number; 16 take half of Adam's memory, and
+            are for the Gaussians alone (see docs/performance.md).
         log: a `RunLog` that gets one line an iteration, with what the parts say of themselves.
         process_group: a `torch.distributed` process group over whose ranks the loss is averaged,
             for parts that read it.

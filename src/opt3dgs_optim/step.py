@@ -1,18 +1,22 @@
 """The step of one parameter: what it has (`Step`), and how it is made (`take_step`).
 
-Parts of a training fill in a `Step` with plain values. The arithmetic is here, once: in plain torch
-operations, the reference, which runs on every device, and as one Triton launch on a GPU, in
-`opt3dgs_optim.triton`. Without any of the parts it is `torch.optim.Adam`, bit for bit on a CPU.
+Parts of a training fill in a `Step` with plain values, and may put another gradient in the place of
+the parameter's (`Part.before`). The arithmetic is here, once: in plain torch operations, the
+reference, which runs on every device, and as one Triton launch on a GPU, in `opt3dgs_optim.triton`.
+Without any of the parts it is `torch.optim.Adam`, bit for bit on a CPU.
 
 A row is one Gaussian: dimension 0 of a parameter. In the order in which it is made:
 
     gradient    numbers that are not finite count as zero
     fade        moments of random rows are shrunk
+    decay       the trainer's weight decay: off the parameter (AdamW), or onto the gradient (Adam)
     frame       the gradient is turned into each Gaussian's own axes, B^T g
     hold        second moments of rows out of view are kept large
     Adam        m, v, and the step m / (sqrt(v) + eps), with bias correction
     frame       the step is turned back, B z
     mean        the iterate goes into the running mean; at the end the mean takes its place
+
+`Part.after` comes last.
 """
 
 from __future__ import annotations
