@@ -383,7 +383,7 @@ class StepAdam(Adam):
         self._lanes, self.next_iteration = [], iteration
         clocks = course.clocks()
         if saved is not None or (counts and (self.has_means or not any(clocks))):
-            course.restore(saved, max(iteration, *clocks))  # one that steps now and then lags
+            course.restore(saved, max([iteration, *clocks]))  # one that steps now and then lags
         self._recode(tell=saved is None or saved["moments"] != course.moments)
         if self.in_own_frame and not course.acts:
             for lane in self.present_lanes():

@@ -180,11 +180,6 @@ class EnergyHistogram(Part):
         count, total, squares = self._sums
         return (squares / count - (total / count) ** 2).nan_to_num(0.0).clamp(min=0).sqrt()
 
-    @property
-    def coordinates(self) -> tuple[float, float, float]:
-        """Low and high end of the partitions, and tau, now, in units of the loss. Synchronises."""
-        return self._partitions.coordinates()
-
     def numbers(self, course: Course | None = None) -> dict[str, float | Tensor]:
         """`nu`, after as many energies as the warm-up has, while it acts."""
         acts = course is None or course.phase is self.during
