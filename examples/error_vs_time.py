@@ -42,7 +42,7 @@ class Training:
     def __init__(self, fit: Fit, folder: Path, looks: int) -> None:
         self.fit, self.seconds = fit, 0.0
         self.path = folder / fit.arm.name / f"seed-{fit.options.seed}.jsonl"
-        self.every = max(fit.options.iterations // looks, 1)
+        self.looks = looks
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self.path.unlink(missing_ok=True)
         about = {"arm": fit.arm.name, "scene": fit.scene.name, "seed": fit.options.seed}
@@ -62,7 +62,7 @@ class Training:
             fit.step()
             self.seconds += time.process_time() - begin
             bar.update()
-            if fit.iteration % self.every == 0 or fit.iteration == fit.options.iterations:
+            if fit.iteration * self.looks % fit.options.iterations < self.looks:
                 psnr = self.look()
                 bar.set_postfix_str(f"{fit.arm.name} #{fit.options.seed}: {psnr:.2f} dB")
         return fit.iteration < fit.options.iterations

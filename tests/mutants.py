@@ -55,7 +55,7 @@ TARGETS = {  # module: the tests that are meant to notice
     "lbfgs/two_loop.py": LBFGS,
     "moments.py": ["test_moments.py"],
     "step.py": STEP,
-    "triton/kernels.py": ["triton/test_kernels.py"],
+    "triton/kernels.py": ["triton/test_kernels.py", "triton/test_simulated_training.py"],
 }
 
 

@@ -139,9 +139,13 @@ def test_links_and_pictures_lead_somewhere(page: Path) -> None:
 
 
 def test_tests_that_pages_name_exist() -> None:
+    """Files, and functions in one of the files that the section names."""
     for page in PAGES:
-        for path in re.findall(r"`(tests/[\w/.]+\.py)`", page.read_text(encoding="utf-8")):
-            assert (ROOT / path).is_file(), f"{name(page)}: {path}"
+        for section in page.read_text(encoding="utf-8").split("\n## "):
+            files = [ROOT / path for path in re.findall(r"`(tests/[\w/.]+\.py)`", section)]
+            code = "".join(path.read_text(encoding="utf-8") for path in files)
+            for test in re.findall(r"`(test_\w+)`", section):
+                assert f"\ndef {test}(" in code, f"{name(page)}: {test}"
 
 
 def test_every_public_name_is_in_the_reference() -> None:

@@ -120,7 +120,7 @@ def measure(bits: int, steps: int) -> list[str]:
     curvature = torch.logspace(0, 4, 8)
     run(rows, noisy_quadratic, bits, 0.01, steps, lambda x, _: note(
         noisy=(curvature * x * x).sum(1).mean() / 2))  # fmt: skip
-    run(rows, quadratic, bits, 0.01, steps // 10, lambda x, _: note(
+    run(rows, quadratic, bits, 0.01, steps // 200, lambda x, _: note(
         deep=(torch.logspace(0, 2, 8) * x * x).sum(1).mean() / 2))  # fmt: skip
     run(torch.ones(1000, 1), double_well, bits, 0.05, steps, lambda x, _: note(
         right=(x > 0).float().mean()))  # fmt: skip
@@ -141,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "mean second moment over the true one, noise on quaternions, 100,000 steps",
         "mean drift of the quaternions there, with a rate of 0.001",
         "mean energy, quadratic of condition 10,000 with noise, 100,000 steps",
-        "energy, quadratic of condition 100 without noise, 10,000 steps",
+        "energy, quadratic of condition 100 without noise, 500 steps",
         "double well with noise, share of the time in the right well, 100,000 steps",
     )
     print("|  | 32 bits | 16 bits | 8 bits, simulated |\n|---|---:|---:|---:|")

@@ -1,8 +1,8 @@
 """What a step costs beside six Adams, on a CPU or a GPU: python examples/benchmarks/steps.py
 
 Everything is stepped in turns, so that a busy machine slows all alike. Writes the medians to
-`--out`, from which `report.py` makes the table of docs/evidence.md. `examples/gpu.py` measures the
-same on a GPU. Five minutes on a CPU.
+`--out`, from which `report.py` makes the table of docs/performance.md. `examples/gpu.py` measures
+the same on a GPU. Five minutes on a CPU.
 """
 
 from __future__ import annotations

@@ -172,13 +172,16 @@ def test_what_cannot_be_read(
     elif content:
         path.mkdir()
     assert diff.main(["diff", str(path), "--write"]) == 1
-    assert str(path) in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert str(path) in said
+    assert ("there is no such file" in said) == (not path.is_file())
 
 
 def test_the_command_says_what_it_can_do(capsys: pytest.CaptureFixture[str]) -> None:
     for words in ([], ["--help"], ["diff"]):
         assert diff.main(words) == 0
         printed = capsys.readouterr().out
-        assert all(TRAINERS[name].title in printed for name in EDITED)
+        known = [f"  {TRAINERS[name].title}: {TRAINERS[name].file}" for name in EDITED]
+        assert printed.splitlines()[-len(EDITED) :] == known
     for words in (["apply", "x"], ["diff", "a", "b"], ["diff", "--no-such-option"]):
         assert diff.main(words) == 2

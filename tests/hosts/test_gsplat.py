@@ -9,16 +9,17 @@ from typing import Any
 
 import pytest
 import torch
-from gsplat_host import ORDERS, POINTS, RATES, VERSIONS, Trainer
+from gaussians import RATES, same_tensors
+from gsplat_host import ORDERS, POINTS, TOTAL, VERSIONS, Trainer
 
 from opt3dgs_optim import DEFAULTS_ADC, PhaseScheduler
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "hosts" / "gsplat.md"
-TOTAL, HALF = 60, 30
 KINDS = {"mcmc": None, "default": DEFAULTS_ADC}
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 each_kind = pytest.mark.parametrize("kind", KINDS)
+each_version = pytest.mark.parametrize("version", VERSIONS)
 
 
 def at_the_mean(trainer: Trainer, phases: PhaseScheduler) -> bool:
@@ -31,54 +32,63 @@ def at_the_mean(trainer: Trainer, phases: PhaseScheduler) -> bool:
     )
 
 
-@pytest.mark.hosts
 @each_kind
-def test_without_parts_it_is_the_main_branchs_trainer(kind: str) -> None:
-    ours, theirs = (Trainer("main", kind, total=TOTAL) for _ in range(2))
-    ours.upgrade(TOTAL, parts=[])
+@each_version
+def test_without_parts_it_is_gsplats_own_training(version: str, kind: str) -> None:
+    ours, theirs = (Trainer(version, kind) for _ in range(2))
+    ours.upgrade(parts=[])
     for trainer in (ours, theirs):
         trainer.run(0, TOTAL)
-    assert len(ours.splats["means"]) != POINTS
-    for name in RATES:
-        assert torch.equal(ours.splats[name], theirs.splats[name]), name
+    assert len(ours.sizes) > 3
+    assert same_tensors(dict(ours.splats), dict(theirs.splats))
 
 
 @pytest.mark.parametrize(
     ("kind", "order"), [("mcmc", ORDERS[0]), ("mcmc", ORDERS[1]), ("default", ORDERS[0])]
 )
-@pytest.mark.parametrize("version", VERSIONS)
+@each_version
 def test_a_training_ends_at_the_mean(version: str, kind: str, order: str) -> None:
     """Rows stay rows through every edit, the learning rates are the trainer's."""
-    trainer = Trainer(version, kind, order, total=TOTAL)
-    phases = trainer.upgrade(TOTAL, KINDS[kind])
-    sizes = set()
+    trainer = Trainer(version, kind, order)
+    phases = trainer.upgrade(KINDS[kind])
+    rate = RATES["means"]
     for step in range(TOTAL):
         trainer.run(step, step + 1)
-        sizes.add(len(trainer.splats["means"]))
+        rate *= 0.01 ** (1 / TOTAL)
         for name, optimizer in trainer.optimizers.items():
             state = optimizer.state[trainer.splats[name]]
             for key in set(state) - {"step"}:
                 assert len(state[key]) == len(trainer.splats["means"]), (name, key)
                 assert state[key].dtype == torch.float32
-            decay = 0.01 ** ((step + 1) / TOTAL) if name == "means" else 1.0
-            assert optimizer.param_groups[0]["lr"] == pytest.approx(RATES[name] * decay)
+            lr = optimizer.param_groups[0]["lr"]
+            assert lr == pytest.approx(rate if name == "means" else RATES[name])
         assert phases.iteration == step
-    assert len(sizes) > 3
-    assert min(sizes) > 20
+    assert len(trainer.sizes) > 3
     assert all(bool(torch.isfinite(p).all()) for p in trainer.splats.values())
     assert phases.end_line() is None
     assert at_the_mean(trainer, phases)
 
 
 def test_finish_ends_early_at_the_mean() -> None:
-    trainer = Trainer("1.5.3", "mcmc", total=TOTAL)
-    phases = trainer.upgrade(2 * TOTAL)
-    trainer.run(0, 2 * TOTAL - 2)  # two iterates of the last thirtieth
+    trainer = Trainer("1.5.3", "mcmc")
+    phases = trainer.upgrade(total=2 * TOTAL)
+    trainer.run(0, 2 * TOTAL - 2)  # four iterates of the last thirtieth
     assert phases.end_line() is not None
     assert not at_the_mean(trainer, phases)
     phases.finish()
     assert phases.end_line() is None
     assert at_the_mean(trainer, phases)
+
+
+def test_rows_are_edited_before_the_first_step() -> None:
+    """Optimizers without any state."""
+    trainer = Trainer("1.5.3", "mcmc")
+    trainer.upgrade()
+    edited = (trainer.splats, trainer.optimizers, trainer.strategy_state["binoms"])
+    trainer.strategy._relocate_gs(*edited)
+    trainer.strategy._add_new_gs(*edited)
+    trainer.run(0, 4)
+    assert len(trainer.splats["means"]) > POINTS
 
 
 def lines_that_resume() -> dict[str, str]:
@@ -88,21 +98,30 @@ def lines_that_resume() -> dict[str, str]:
     return {"resume": resume, "save": save}
 
 
-@each_kind
-def test_the_pages_lines_save_and_resume_bit_for_bit(kind: str, tmp_path: Path) -> None:
+STALE = pytest.mark.xfail(
+    strict=True, reason="state_dict() keeps the means of rows that were relocated since the step"
+)
+
+
+@pytest.mark.parametrize(
+    ("kind", "at"),
+    [("mcmc", TOTAL // 2), pytest.param("mcmc", TOTAL - 1, marks=STALE),
+     ("default", TOTAL // 2), ("default", TOTAL - 1)],
+)  # fmt: skip
+def test_the_pages_lines_save_and_resume_bit_for_bit(kind: str, at: int, tmp_path: Path) -> None:
+    """Also where the mean is in the parameters' place, and rows were edited since the last step."""
     lines = lines_that_resume()
-    whole, half = (Trainer("1.5.3", kind, total=TOTAL) for _ in range(2))
-    for trainer, end in ((whole, TOTAL), (half, HALF)):
-        trainer.upgrade(TOTAL, KINDS[kind])
+    whole, first = (Trainer("1.5.3", kind) for _ in range(2))
+    for trainer, end in ((whole, TOTAL), (first, at)):
+        trainer.upgrade(KINDS[kind])
         trainer.run(0, end)
     names: dict[str, Any] = {"torch": torch, "os": os, "PATH": tmp_path / "resume.pt"}
-    exec(lines["save"], {**names, "self": half, "step": 4_999})  # an iteration in which it saves
-    resumed = Trainer("1.5.3", kind, total=TOTAL, seed=1)  # all must come from the file
-    phases = resumed.upgrade(TOTAL, KINDS[kind])
+    exec(lines["save"], {**names, "self": first, "step": 4_999})  # an iteration in which it saves
+    resumed = Trainer("1.5.3", kind, seed=1)  # all must come from the file
+    phases = resumed.upgrade(KINDS[kind])
     names |= {"self": resumed, "device": "cpu", "phases": phases}
     exec(lines["resume"], names)
-    assert names["init_step"] == HALF
-    resumed.run(HALF, TOTAL)
+    assert names["init_step"] == at
+    resumed.run(at, TOTAL)
     assert len(whole.splats["means"]) != POINTS
-    for name in RATES:
-        assert torch.equal(resumed.splats[name], whole.splats[name]), name
+    assert same_tensors(dict(resumed.splats), dict(whole.splats))

@@ -38,6 +38,7 @@ def test_a_trainers_page_has_what_is_printed(name: str, capsys: pytest.CaptureFi
     trainer, relocates = lines.known()[name]
     block = lines.block(trainer, relocates)
     assert block in printed
+    assert "](" not in printed  # a link is for a page
     pages = [page.read_text(encoding="utf-8") for page in sorted(DOCS.glob("*.md"))]
     found = [page for page in pages if f"\n{block}\n```" in page]
     assert len(found) == 1

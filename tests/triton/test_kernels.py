@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import nullcontext
 from typing import Any
 
 import pytest
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from interpreted import interpreted_kernels
 
 from opt3dgs_optim import triton
+from opt3dgs_optim.parts.out_of_view import look_at_positions
 from opt3dgs_optim.step import Fade, Hyper, Step, chosen_rows, take_step
 from opt3dgs_optim.triton.check import both, case, difference, tensors
 
@@ -183,3 +185,25 @@ def test_what_it_takes() -> None:
                 setattr(owner, name, change(getattr(owner, name)))
             assert not triton.fits(step), name
     assert not triton.takes(case((8, 3), draw)[0])  # of a CPU
+
+
+@pytest.mark.parametrize("rows", [1, 8, 1025])
+@pytest.mark.parametrize("coded", [False, True])
+def test_it_looks_at_positions_as_torch_does(
+    rows: int, coded: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One coordinate of a gradient, or of a second moment, is enough."""
+    monkeypatch.setattr(triton, "_device_of", lambda _: nullcontext())  # the CPU
+    draw = torch.Generator().manual_seed(rows)
+    grad = torch.randn(rows, 3, generator=draw) * torch.eye(3)[torch.arange(rows) % 3]
+    second = grad.roll(1, 1).square() if not coded else (grad.roll(1, 1) * 1e4).to(torch.int16)
+    grad[torch.rand(rows, generator=draw) < 0.4] = 0.0
+    second[torch.rand(rows, generator=draw) < 0.4] = 0
+    for moments in (second, None):
+        found = []
+        for look in (triton.look, look_at_positions):
+            out_of_view = torch.empty(rows, dtype=torch.bool)
+            counter = torch.full((1,), 5, dtype=torch.int64)
+            look(grad, moments, out_of_view, counter)
+            found.append((out_of_view.tolist(), counter.item()))
+        assert found[0] == found[1]

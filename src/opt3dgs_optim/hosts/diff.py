@@ -22,8 +22,8 @@ from opt3dgs_optim.hosts.trainers import ANY, TRAINERS
 USAGE = """opt3dgs hosts diff FILE           the lines that FILE would get, as a diff
 opt3dgs hosts diff FILE --write   writes them, and keeps the old file as FILE.orig
 
-It knows the files of: {known}.
-For every other trainer, `opt3dgs lines` prints the lines to write by hand."""
+The files that it knows; for every other one `opt3dgs lines` prints the lines to write by hand:
+{known}"""
 
 
 def misses(trainer: Trainer, text: str) -> list[str]:
@@ -120,8 +120,8 @@ def main(arguments: Sequence[str]) -> int:
     """Print the diff or write it: 0; 1 where the file is refused, 2 for a wrong command."""
     words = [word for word in arguments if word != "--write"]
     if not words or words[0] in ("-h", "--help") or words == ["diff"]:
-        files = (f"{each.title} ({each.file})" for each in TRAINERS.values() if each.inserted)
-        print(USAGE.format(known=", ".join(files)))
+        files = (f"  {each.title}: {each.file}" for each in TRAINERS.values() if each.inserted)
+        print(USAGE.format(known="\n".join(files)))
         return 0
     if words[0] != "diff" or len(words) > 2 or words[1].startswith("-"):
         print(
@@ -131,6 +131,8 @@ def main(arguments: Sequence[str]) -> int:
     path = Path(words[1])
     kept = path.with_name(f"{path.name}.orig")
     try:
+        if not path.is_file():
+            raise ValueError("there is no such file; give the path of the trainer's script")
         old = path.read_bytes().decode()
         trainer, new = edited(old)
         if "--write" in arguments:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import sys
 import textwrap
 from collections.abc import Sequence
@@ -51,11 +52,18 @@ def text(name: str) -> str:
     read = ", ".join(trainer.read)
     head = f"{trainer.title}: {trainer.file}\ngithub.com/{trainer.repository}, read at {read}"
     notes = (
-        textwrap.fill(f"{topic}: {said}", WIDTH, subsequent_indent="  ", break_on_hyphens=False)
+        textwrap.fill(
+            f"{topic}: {_plain(said)}", WIDTH, subsequent_indent="  ", break_on_hyphens=False
+        )
         for topic, said in trainer.notes.items()
         if not (topic == "Density control" and isinstance(relocates, bool) and trainer.variants)
     )
     return "\n\n".join([head, block(trainer, relocates), "\n".join(notes)])
+
+
+def _plain(said: str) -> str:
+    """A page's link, `[title](page)`, as words for a terminal."""
+    return re.sub(r"\[(.+?)\]\((.+?)\)", r'"\1" (docs/hosts/\2)', said)
 
 
 def main(arguments: Sequence[str]) -> int:

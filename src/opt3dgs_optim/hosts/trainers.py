@@ -53,10 +53,16 @@ _GSPLAT_PLACES = (
         ("phases = PhaseScheduler(max_steps{parts})", "phases.upgrade(self.optimizers)"),
     ),
 )
-_GSPLAT_RESUME = (
-    "gsplat saves no optimizers, and its script only evaluates a checkpoint. Lines that save and "
-    "resume a training stand on the page docs/hosts/gsplat.md; they go below these."
-)
+_GSPLAT_NOTES = {
+    "Length": "`--steps_scaler 0.33334` makes 10,000 of gsplat's 30,000 iterations. It scales "
+    "`max_steps`, after which the rate of the positions falls, the iterations at which gsplat "
+    "evaluates, saves, refines and resets, and the interval at which it adds a degree of "
+    "harmonics. `--max_steps 10000` alone leaves all of these but the rate as they are, so that "
+    "refinement goes on to the end. So short a training was measured with relocation only.",
+    "Resume": "gsplat saves no optimizers, and its script only evaluates a checkpoint. "
+    "[Save and resume](gsplat.md#save-and-resume) has the lines that go on with a training; they "
+    "go below these.",
+}
 _GSPLAT = Trainer(
     title="gsplat, simple_trainer.py",
     repository="nerfstudio-project/gsplat",
@@ -69,13 +75,18 @@ _GSPLAT = Trainer(
     variants={"gsplat-mcmc": True, "gsplat-default": False},
     notes={
         "Density control": f"`mcmc` relocates, `default` clones, splits and prunes. {_BOTH}",
+        **_GSPLAT_NOTES,
+        "Saved": "gsplat writes `ckpts/ckpt_*_rank0.pt` and, with `--save_ply`, `ply/*.ply` of its "
+        "last iteration before that iteration's step. The mean is in the parameters' place by "
+        "then, so that both hold it, of all iterates but the last; `mcmc` has added its noise to "
+        "the positions. The last evaluation comes after the step. Files of earlier iterations hold "
+        "plain iterates.",
         "Several ranks": "Each rank has a loss and Gaussians of its own. Give the scheduler "
         "`process_group=torch.distributed.group.WORLD if world_size > 1 else None`.",
-        "Resume": _GSPLAT_RESUME,
         "Options": "`--sparse_grad` is refused: torch's SparseAdam is no Adam. Cameras, appearance "
         "networks and grids stay with gsplat's own optimizers. With `--post_processing ppisp` the "
         "main branch freezes the Gaussians at `cfg.ppisp_controller_activation_num_steps`: give "
-        "the scheduler that number.",
+        "the scheduler that number, which `steps_scaler` does not scale.",
     },
 )
 _GSPLAT_2DGS = Trainer(
@@ -89,9 +100,12 @@ _GSPLAT_2DGS = Trainer(
     counts=_GSPLAT_COUNTS,
     notes={
         "Density control": _ADC,
-        "Flat Gaussians": "They have three scales, of which the renderer never reads the third. So "
-        "leave `OwnFrame` out here, which makes steps by sizes: nothing trains that one.",
-        "Resume": _GSPLAT_RESUME,
+        "Flat Gaussians": "`DEFAULTS_ADC` takes them as they are. Add no `OwnFrame` to it, which "
+        "makes steps by sizes: the Gaussians have three scales, and nothing trains the third, "
+        "which the renderer never reads.",
+        **_GSPLAT_NOTES,
+        "Saved": "`ckpts/ckpt_*.pt` of the last iteration is written after its step, and holds the "
+        "mean.",
     },
 )
 
@@ -112,7 +126,10 @@ _INRIA_RESUME = (
     "lines write `phases.observe(iteration=first_iter - 1)`. These checkpoints hold a number of "
     "numpy's type, which PyTorch 2.6 and newer load with TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD=1 only."
 )
-_INRIA_TOTAL = "The trainer makes no step in its last iteration: hence `opt.iterations - 1`."
+_INRIA_TOTAL = (
+    "The trainer makes no step in its last iteration: hence `opt.iterations - 1`, and what it "
+    "saves in that iteration is the mean."
+)
 
 
 def _inria(
@@ -177,14 +194,20 @@ _TRAINERS_OF_INRIA = {
         *("3dgs-mcmc", "ubc-vision/3dgs-mcmc", "7b4fc9f (2025-01-01)"),
         relocates=True,
         counts={"break": 0},
-        notes={"Noise": "The trainer adds its own noise to the positions: add no `PositionNoise`."},
+        notes={
+            "Fewer iterations": "10,000 of its 30,000 are `--iterations 10000 "
+            "--position_lr_max_steps 10000 --densify_from_iter 167 --densify_until_iter 8333 "
+            "--densification_interval 33`. A degree of harmonics is still added every 1,000 "
+            "iterations, a number that stands in train.py.",
+            "Noise": "The trainer adds its own noise to the positions: add no `PositionNoise`.",
+        },
     ),
     "2dgs": _inria(
         *("2D Gaussian Splatting", "hbb1/2d-gaussian-splatting", "1920a23 (2025-07-15)"),
         counts={"total_loss.backward()": 1},
         notes={
-            "Flat Gaussians": "They have two scales. `OwnFrame`, which takes three, leaves them to "
-            "plain Adam."
+            "Flat Gaussians": "`DEFAULTS_ADC` takes them as they are. `OwnFrame`, which it does "
+            "not have, would do nothing here: it takes three scales, and they have two."
         },
     ),
     "taming-3dgs": _inria(

@@ -89,10 +89,11 @@ def test_gains_are_of_seeds_that_both_have() -> None:
     assert report.shown(closed) == "26.00 / 0.9000 / 0.1000 (2 seeds)"
 
 
-def test_the_page_is_made_of_the_evidence() -> None:
-    """What stands in docs/evidence.md is what `report.py` writes."""
-    page = report.PAGE.read_text(encoding="utf-8")
-    assert report.filled(page, report.Evidence()) == page
+def test_the_pages_are_made_of_the_evidence() -> None:
+    """What stands in their tables is what `report.py` writes."""
+    for path in report.PAGES:
+        page = path.read_text(encoding="utf-8")
+        assert report.filled(page, report.Evidence()) == page
     with pytest.raises(ValueError, match="evidence:nothing, but there are"):
         report.filled("<!-- evidence:nothing --><!-- end -->", report.Evidence())
 
