@@ -327,6 +327,7 @@ class StepAdam(Adam):
         """As torch's, with the course's numbers in `param_groups[0]["opt3dgs"]`."""
         if not self.course.acts:
             return super().state_dict()
+        self._drop_moved()
         self.param_groups[0][STATE_KEY] = self.course.state_of(self)
         try:
             found = super().state_dict()
@@ -335,6 +336,11 @@ class StepAdam(Adam):
         if self.coded:  # any Adam may load it; the codes of these numbers are the same again
             found["state"] = {at: as_numbers(state) for at, state in found["state"].items()}
         return found
+
+    def _drop_moved(self) -> None:
+        """Drop what was kept for rows that are others since the last step: a copy knows no more."""
+        if self._lanes:
+            self.present_lanes()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """As torch's; the course goes on where the checkpoint was.
@@ -434,6 +440,7 @@ class StepAdam(Adam):
     # -- copies ------------------------------------------------------------------------------------
 
     def __getstate__(self) -> dict[str, Any]:
+        self._drop_moved()
         kept = ("course", "_slots", "_masked", "in_own_frame", "next_iteration", "coded")
         kept += ("has_means",)
         own = {key: getattr(self, key) for key in kept}
