@@ -39,6 +39,8 @@ def test_a_trainers_page_has_what_is_printed(name: str, capsys: pytest.CaptureFi
     block = lines.block(trainer, relocates)
     assert block in printed
     assert "](" not in printed  # a link is for a page
+    for said in (said for topic, said in trainer.notes.items() if topic != "Density control"):
+        assert set(re.findall("`.+?`", said)) <= set(re.findall("`.+?`", words(printed))), said
     pages = [page.read_text(encoding="utf-8") for page in sorted(DOCS.glob("*.md"))]
     found = [page for page in pages if f"\n{block}\n```" in page]
     assert len(found) == 1

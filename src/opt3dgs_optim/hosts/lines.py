@@ -63,7 +63,7 @@ def text(name: str) -> str:
 
 def _plain(said: str) -> str:
     """A page's link, `[title](page)`, as words for a terminal."""
-    return re.sub(r"\[(.+?)\]\((.+?)\)", r'"\1" (docs/hosts/\2)', said)
+    return re.sub(r"\[([^][]+)\]\(([^)]+)\)", r'"\1" (docs/hosts/\2)', said)
 
 
 def main(arguments: Sequence[str]) -> int:

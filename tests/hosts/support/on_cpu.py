@@ -60,17 +60,19 @@ def prepare(script: Path) -> None:
 def seed_each_iteration(package: Path) -> None:
     """Random numbers follow from the iteration, so that a resumed run can be compared.
 
-    INRIA's trainers call `update_learning_rate(iteration)` where an iteration begins.
+    INRIA's trainers call `update_learning_rate(iteration)` where an iteration begins. OPT3DGS_SEED
+    is of the whole run.
     """
     import torch
 
     sys.path.insert(0, str(package))
     model: Any = importlib.import_module("scene.gaussian_model").GaussianModel
     stock = model.update_learning_rate
+    first = 1_000_003 * int(os.environ.get("OPT3DGS_SEED", "0"))
 
     def seeded(self: Any, iteration: int) -> Any:
-        random.seed(iteration)
-        torch.manual_seed(iteration)
+        random.seed(first + iteration)
+        torch.manual_seed(first + iteration)
         return stock(self, iteration)
 
     model.update_learning_rate = seeded
