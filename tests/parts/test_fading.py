@@ -13,7 +13,6 @@ from torch.nn import Parameter
 from torch.optim import Adam
 
 from opt3dgs_optim import Fading, PhaseScheduler
-from opt3dgs_optim.step import chosen_rows
 
 CPU = torch.device("cpu")
 
@@ -25,11 +24,11 @@ def test_a_share_of_the_points_is_chosen(event: int, seed: int, share: float) ->
     """By a hash: within five deviations of the share; other events and seeds choose others."""
     count = 20_000
     part = Fading(share=share, seed=seed)
-    chosen = chosen_rows(part.fade(event), count, CPU)
+    chosen = part.chosen(event, count, CPU)
     assert abs(int(chosen.sum()) - share * count) < 5 * (count * share * (1 - share)) ** 0.5
     for other in (
-        chosen_rows(part.fade(event + 1), count, CPU),
-        chosen_rows(Fading(share, seed=seed + 1).fade(event), count, CPU),
+        part.chosen(event + 1, count, CPU),
+        Fading(share, seed=seed + 1).chosen(event, count, CPU),
     ):
         both = float((chosen & other).sum()) / count
         assert abs(both - share**2) < 0.03
@@ -40,10 +39,7 @@ def test_a_points_fate_does_not_depend_on_how_many_there_are(
     event: int, few: int, more: int
 ) -> None:
     part = Fading()
-    assert torch.equal(
-        chosen_rows(part.fade(event), few, CPU),
-        chosen_rows(part.fade(event), few + more, CPU)[:few],
-    )
+    assert torch.equal(part.chosen(event, few, CPU), part.chosen(event, few + more, CPU)[:few])
 
 
 @given(
@@ -89,7 +85,7 @@ def test_a_faded_step_is_as_long_as_before_then_up_to_five_times() -> None:
         lengths.append((before - param.detach()).abs())
     at = next(i for i, each in enumerate(lengths) if each.amax() > each.amin() * 1.01)
     faded = (lengths[at + 5] > 2 * lengths[at - 1]).flatten()
-    assert torch.equal(faded, chosen_rows(part.fade(0), 1000, CPU))
+    assert torch.equal(faded, part.chosen(0, 1000, CPU))
     assert max(float(each.amax()) for each in lengths) <= 5.0
     assert max(float(each.amax()) for each in lengths) > 3.0
 
@@ -108,7 +104,7 @@ def test_all_parameters_fade_the_same_points() -> None:
     for name, param in params.items():
         now = optimizers[name].state[param]["exp_avg_sq"]
         rows.add(tuple((now < 0.5 * before[name]).reshape(500, -1).all(1).tolist()))
-    assert rows == {tuple(chosen_rows(part.fade(0), 500, CPU).tolist())}
+    assert rows == {tuple(part.chosen(0, 500, CPU).tolist())}
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,14 @@ import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import torch
+from torch import Tensor
+
 from opt3dgs_optim.checks import check_count, check_number, set_options
 from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import GAUSSIAN, check_names
 from opt3dgs_optim.part import Part
-from opt3dgs_optim.step import Fade, Step, mixed
+from opt3dgs_optim.step import Fade, Step, chosen_rows, mixed
 
 CALL = "Fading"
 MAX_POINTS_OF_ALL_EVENTS = 10_000  # of more points, fewer of the events happen
@@ -98,6 +101,10 @@ class Fading(Part):
         """What an event does."""
         key = mixed((event + self.seed * 0x9E3779B1) & 0xFFFFFFFF)
         return Fade(key, self.share, self.exp_avg, self.exp_avg_sq)
+
+    def chosen(self, event: int, num_points: int, device: torch.device) -> Tensor:
+        """Which points an event fades, [num_points] bool: the same in every parameter."""
+        return chosen_rows(self.fade(event), num_points, device)
 
     def numbers(self, course: Course) -> Mapping[str, float]:
         """`faded`: the share of up to 10,000 points that the present iteration's event fades."""
