@@ -340,3 +340,109 @@ def test_a_gradient_of_another_shape_is_refused(found: Any) -> None:
         ValueError, match=r"Wrong.before: returned .*a tensor of \(8, 1, 3\) is needed"
     ):
         steps(optimizers, params, 1)
+
+
+class Plain(Part):
+    names = None
+
+    def plan(self, step: Step, course: Any) -> None:
+        step.plain = True
+
+
+def test_a_plain_step_is_in_world_units() -> None:
+    params = parameters(ROWS, "means", "scales", "quats")
+    optimizers = PhaseScheduler(TOTAL, parts=[OwnFrame(), Plain()]).upgrade(adams_of(params))
+    start = params["means"].detach().clone()
+    steps(optimizers, params, 1)
+    assert params["means"].grad is not None
+    assert torch.equal(params["means"], start - params["means"].grad * RATES["means"])
+
+
+# -- what changes without a new Parameter ----------------------------------------------------------
+
+
+def test_a_group_that_was_taken_away_is_not_stepped() -> None:
+    params = parameters(ROWS)
+    optimizer = PhaseScheduler(TOTAL).upgrade(adam_of(params))
+    steps({"all": optimizer}, params, 2)
+    optimizer.param_groups.pop()
+    start = params["shN"].detach().clone()
+    with pytest.raises(ValueError, match="5 parameter groups, but 6 when it was upgraded"):
+        steps({"all": optimizer}, params, 1)
+    assert torch.equal(params["shN"], start)
+
+
+@pytest.mark.parametrize("rows", [ROWS - 3, ROWS + 3])
+def test_other_rows_in_the_same_parameter_are_named(rows: int) -> None:
+    """A trainer that writes `param.data`, and leaves the moments or the gradient behind."""
+    params = parameters(ROWS, "sh0")
+    optimizers = PhaseScheduler(TOTAL, parts=[Averaging()]).upgrade(adams_of(params))
+    steps(optimizers, params, TOTAL - 2)
+    param, state = params["sh0"], optimizers["sh0"].state[params["sh0"]]
+    param.data = torch.ones(rows, 1, 3)
+    param.grad = torch.ones(rows, 1, 3)
+    with pytest.raises(ValueError, match=f"{ROWS} rows for {rows}"):
+        optimizers["sh0"].step()
+    state["exp_avg"], state["exp_avg_sq"] = torch.zeros(2, rows, 1, 3)
+    optimizers["sh0"].step()
+    assert torch.equal(state["averaging.mean"], param)  # it began with this step
+    param.data = torch.ones(ROWS, 1, 3)
+    with pytest.raises(ValueError, match="have the trainer make dense gradients of these rows"):
+        optimizers["sh0"].step()
+
+
+# -- masks -----------------------------------------------------------------------------------------
+
+
+def test_a_mask_that_is_missing_or_too_much_changes_nothing() -> None:
+    for kind in (SelectiveAdam, SparseGaussianAdam, Adam):
+        calls: list[str] = []
+        params = parameters(ROWS)
+        phases = PhaseScheduler(TOTAL)
+        optimizer = phases.upgrade(adam_of(params, kind))
+        optimizer.register_step_pre_hook(lambda *_, to=calls: to.append("before"))
+        for param in params.values():
+            param.grad = torch.ones_like(param)
+        start = {name: param.detach().clone() for name, param in params.items()}
+        wrong = (torch.ones(ROWS, dtype=torch.bool),) if kind is not SelectiveAdam else ()
+        with pytest.raises(TypeError, match="mask"):
+            optimizer.step(*wrong)
+        assert same_tensors(params, start)
+        assert phases.iteration == -1
+        assert calls == []
+        assert not optimizer.state
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_nan_is_told_where_masked_steps_are_made(kind: Any) -> None:
+    """And counts as zero: no row becomes NaN."""
+    params = parameters(ROWS)
+    phases = PhaseScheduler(1000)
+    optimizer = phases.upgrade(adam_of(params, kind))
+    mask = masked(kind, torch.ones(ROWS, dtype=torch.bool))
+    for param in params.values():
+        param.grad = torch.ones_like(param)
+        param.grad[0] = torch.nan
+    optimizer.step(*mask)
+    assert all(bool(torch.isfinite(param).all()) for param in params.values())
+    with pytest.warns(UserWarning, match="23 numbers of gradients have not been finite"):
+        phases.observe(iteration=100)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_checkpoint_of_an_adam_that_counts_no_steps_is_told(kind: Any) -> None:
+    """gsplat's SelectiveAdam keeps its step at zero: the clock would begin again, unnoticed."""
+    params = parameters(ROWS)
+    optimizer = adam_of(params, kind)
+    for param in params.values():
+        param.grad = torch.ones_like(param)
+    for _ in range(3):
+        optimizer.step(*masked(kind, torch.ones(ROWS, dtype=torch.bool)))
+    for state in optimizer.state.values():
+        state["step"].zero_()
+    phases = PhaseScheduler(1000)
+    with pytest.warns(UserWarning, match="does not count its steps.*observe"):
+        phases.upgrade(optimizer)
+    phases.observe(iteration=3)
+    optimizer.step(*masked(kind, torch.ones(ROWS, dtype=torch.bool)))
+    assert phases.iteration == 3

@@ -8,6 +8,7 @@ import math
 from typing import Any
 
 import pytest
+import row_edits
 import torch
 from gaussians import adam_of, adams_of, parameters, same_tensors, steps
 from hypothesis import given, settings
@@ -270,3 +271,45 @@ def test_a_stock_adam_that_goes_on_with_a_checkpoint_of_ours_is_noticed() -> Non
     assert phases.iteration == 50
     assert again.state[params["means"]]["step"] == 1  # they begin anew, in the own frame
     assert again.state[params["scales"]]["step"] == 51
+
+
+@pytest.mark.parametrize("noted", [[1.0, 2.0], math.nan, torch.ones(()), "text", None])
+def test_notes_that_no_checkpoint_holds_are_refused_at_the_first_save(noted: Any) -> None:
+    """And not when the run is to go on from it."""
+    params = parameters(5, "means")
+    phases = PhaseScheduler(60, parts=[Averaging()])
+    optimizer = phases.upgrade(adam_of(params))
+    phases.notes_of(phases.parts[0])["mine"] = noted
+    with pytest.raises(ValueError, match=r"notes of Averaging are .*but finite numbers are needed"):
+        optimizer.state_dict()
+    phases.notes_of(phases.parts[0])["mine"] = True
+    optimizer.load_state_dict(optimizer.state_dict())
+    assert phases.notes_of(phases.parts[0]) == {"mine": True}
+
+
+@pytest.mark.parametrize("copied", [False, True])
+def test_rows_that_moved_since_the_last_step_are_not_saved_with_their_old_mean(
+    copied: bool,
+) -> None:
+    """gsplat's relocation, and then a save, or a copy, before the next step."""
+    ends = []
+    for save in (False, True):
+        params: Any = parameters(8, "means", "sh0")
+        optimizers = PhaseScheduler(90, parts=[Averaging()]).upgrade(adams_of(params))
+        steps(optimizers, params, 88)
+        dead, alive = torch.tensor([1, 2]), torch.tensor([5, 6])
+        with torch.no_grad():
+            for param in params.values():
+                param[dead] = param[alive]
+        edit = row_edits.relocated(dead, alive)
+        row_edits.apply(edit, params, list(optimizers.values()), ("means", "sh0"), False)
+        if save and copied:
+            params, optimizers = copy.deepcopy((params, optimizers))
+        elif save:
+            saved = {n: copy.deepcopy(each.state_dict()) for n, each in optimizers.items()}
+            optimizers = PhaseScheduler(90, parts=[Averaging()]).upgrade(adams_of(params))
+            for name, each in optimizers.items():
+                each.load_state_dict(saved[name])
+        steps(optimizers, params, 2, seed=1)
+        ends.append({name: param.detach().clone() for name, param in params.items()})
+    assert same_tensors(*ends)

@@ -201,3 +201,65 @@ def test_nan_is_told_whatever_iterations_the_clock_is_put_to() -> None:
 
     with pytest.warns(UserWarning, match="have not been finite"):
         train()
+
+
+ORDERS = ("m", "mo", "om", "moo", "oom", "omo", "mabab", "abmab")
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_the_clock_is_that_of_the_positions(order: str) -> None:
+    """Whatever other optimizers step before and after them, once or several times."""
+    phases, part = clocked()
+    params = parameters(5, *(("means", "sh0", "shN") if "a" in order else ("means", "sh0")))
+    named = dict(zip("mab" if "a" in order else "mo", params, strict=True))
+    adams = phases.upgrade(adams_of(params))
+    for _ in range(20):
+        for letter in order:
+            steps({"": adams[named[letter]]}, params, 1)
+    assert part.seen["means"] == list(range(20))
+    if order == "m":
+        return
+    others = part.seen["sh0"]
+    times = order.count("o") or order.count("a")
+    assert len(others) == 20 * times
+    # One that steps on both sides of the positions may be an iteration ahead in its second step.
+    ahead = 1 if order in ("omo", "abmab") else 0
+    for at, found in enumerate(others):
+        assert found - at // times in (0, ahead)
+
+
+@pytest.mark.parametrize("means_first", [True, False])
+def test_a_stock_checkpoint_of_an_optimizer_that_steps_twice(means_first: bool) -> None:
+    params = parameters(5, "means", "sh0")
+    stock = adams_of(params)
+    steps(stock, params, 10)
+    steps({"sh0": stock["sh0"]}, params, 10)
+    names = ["means", "sh0"] if means_first else ["sh0", "means"]
+    phases, part = clocked()
+    phases.upgrade({name: stock[name] for name in names})
+    assert phases.iteration == 9
+    steps({name: stock[name] for name in names}, params, 1)
+    assert part.seen == {"means": [10], "sh0": [10]}
+
+
+def test_two_sets_of_gaussians_count_once() -> None:
+    phases, part = clocked()
+    params = {f"{which}#{name}": Parameter(torch.ones(4, 3)) for which in "ab" for name in
+              ("means", "scales")}  # fmt: skip
+    adams = phases.upgrade(adams_of(params))
+    for _ in range(10):
+        steps({n: adams[n] for n in ("a#means", "b#means", "a#scales")}, params, 1)
+        adams["a#scales"].step()
+    assert part.seen["means"] == [i for i in range(10) for _ in "ab"]
+    assert part.seen["scales"] == [i for i in range(10) for _ in "ab"]
+    assert phases.iteration == 9
+
+
+def test_steps_after_the_end_are_told() -> None:
+    params = parameters(5)
+    phases = PhaseScheduler(TOTAL)
+    adams = phases.upgrade(adams_of(params))
+    steps(adams, params, TOTAL - 3)
+    phases.finish()
+    with pytest.warns(UserWarning, match=r"iteration 117 comes after finish\(\)"):
+        steps(adams, params, 2)

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from gaussians import adam_of, adams_of, parameters
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
@@ -365,3 +366,20 @@ def test_a_checkpoint_of_16_bits_serves_a_stock_adam() -> None:
         again = Adam([Parameter(param_of(adam).detach().clone())], lr=1e-2)
         again.load_state_dict(adam.state_dict())
         assert torch.equal(again.state[param_of(again)]["exp_avg_sq"], state["exp_avg_sq"])
+
+
+def test_groups_that_are_no_gaussians_are_refused() -> None:
+    """Poses and networks: a group beside them, an optimizer beside theirs, one that comes later."""
+    pose = {"params": [Parameter(torch.ones(4, 9))], "name": "pose"}
+    beside = adam_of(parameters(4))
+    beside.add_param_group(dict(pose))
+    with pytest.raises(ValueError, match="the group 'pose' beside the Gaussians"):
+        PhaseScheduler(60, moments=16).upgrade(beside)
+    assert type(beside) is Adam
+    both = {**adams_of(parameters(4)), "camera_opt": Adam(pose["params"])}
+    with pytest.raises(ValueError, match="holds no Gaussians; upgrade those of the Gaussians"):
+        PhaseScheduler(60, moments=16).upgrade(both)
+    optimizer = PhaseScheduler(60, moments=16).upgrade(adam_of(parameters(4)))
+    with pytest.raises(ValueError, match="the group 'pose' beside the Gaussians"):
+        optimizer.add_param_group(dict(pose))
+    assert len(optimizer.param_groups) == 6

@@ -14,11 +14,11 @@ from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.contract import Slots, check_supported, own_step
 from opt3dgs_optim.course import STATE_KEY, Course
 from opt3dgs_optim.lane import BEGAN, KEPT, MEAN, MOMENTS, Lane
-from opt3dgs_optim.masked import step_around
+from opt3dgs_optim.masked import check_arguments, step_around
 from opt3dgs_optim.moments import CODES, NEAREST, decoded, encode
 from opt3dgs_optim.names import split_name
 from opt3dgs_optim.part import Part
-from opt3dgs_optim.step import Hyper, Step, mixed, take_step
+from opt3dgs_optim.step import Hyper, Mean, Step, like_rows, mixed, take_step
 
 
 class StepAdam(Adam):
@@ -33,8 +33,9 @@ class StepAdam(Adam):
 
     course: Course
     next_iteration = 0
+    has_means = False  # whether it holds positions: its steps are counted by the course's clock
     coded = False  # whether its moments are codes of 16 bits, see `moments`
-    in_own_frame = False  # whether its moments of the positions are those of the own frame
+    in_own_frame: frozenset[str] = frozenset()  # sets whose positions' moments are the own frame's
     _base: type[Adam] = Adam  # the class whose optimizer it was
     _lanes: list[Lane] = []  # noqa: RUF012  (made anew, never changed)
     _slots: Slots
@@ -46,12 +47,20 @@ class StepAdam(Adam):
         self.course, self._slots, self._lanes = course, slots, []
         self._masked = own_step(self._base) is not None
         self._step_supports_amp_scaling = False  # a GradScaler unscales, and leaves steps out
-        self._use_host_steps()
+        self._name_groups()
+        self._count_on_host()
 
-    def _use_host_steps(self) -> None:
-        """Name the groups; keep Adam's count of steps on the host, which reads it in every step."""
-        for group, (_, name) in zip(self.param_groups, self._slots, strict=True):
-            group["gaussian"] = name  # gsplat's name of what it holds, or None
+    def _name_groups(self) -> None:
+        """Say in each group which Gaussian parameter it holds, by gsplat's name, or None."""
+        for at, (which, name) in enumerate(self._slots):
+            self.param_groups[at]["gaussian"] = name
+            if name is not None:
+                self.course.members[which, name] = self, at
+        self.has_means = any(name == "means" for _, name in self._slots)
+        self.course.has_means |= self.has_means
+
+    def _count_on_host(self) -> None:
+        """Keep Adam's count of steps on the host, which reads it in every step of ours."""
         if not self.course.acts:
             return
         for group in self.param_groups:
@@ -65,15 +74,15 @@ class StepAdam(Adam):
         super().add_param_group(param_group)
         if "course" not in vars(self):
             return
-        group = self.param_groups[-1]
+        slots = [*self._slots, split_name(self.param_groups[-1].get("name"))]
         try:
-            slots = [*self._slots, split_name(group.get("name"))]
             check_supported(self, slots, self.course.moments)
         except ValueError:
             self.param_groups.pop()
             raise
-        self._slots.append(split_name(group.get("name")))
-        self._use_host_steps()
+        self._slots = slots
+        self._name_groups()
+        self._count_on_host()
 
     # -- a step ----------------------------------------------------------------------------------
 
@@ -84,6 +93,15 @@ class StepAdam(Adam):
             closure: evaluates the model and returns the loss, or None. gsplat's SelectiveAdam and
                 INRIA's SparseGaussianAdam get their mask, and what goes with it, unchanged.
         """
+        given: tuple[Any, ...] = ()
+        if self._masked:
+            given = () if closure is None and not masked else (closure, *masked)
+            check_arguments(type(self).__name__, self._base.step, self, *given, masks)
+        elif masked or masks or isinstance(closure, Tensor):
+            raise TypeError(
+                f"{type(self).__name__}.step: a mask was given, but torch's Adam steps all rows; "
+                "use gsplat's SelectiveAdam or INRIA's SparseGaussianAdam for masked steps"
+            )
         self._opt_called = True  # what learning-rate schedulers would note by wrapping this method
         for hook in self._optimizer_step_pre_hooks.values():
             hook(self, (closure, *masked), masks)
@@ -93,22 +111,20 @@ class StepAdam(Adam):
                 loss = closure()
             if loss is not None and course.observers:
                 course.observe(loss)  # pyright: ignore[reportAttributeAccessIssue]
-        if not self._masked and (masked or masks or isinstance(closure, Tensor)):
-            raise TypeError(
-                f"{type(self).__name__}.step: a mask was given, but torch's Adam steps all rows; "
-                "use gsplat's SelectiveAdam or INRIA's SparseGaussianAdam for masked steps"
-            )
         iteration = course.begin(self)
-        given = () if not self._masked or (closure is None and not masked) else (closure, *masked)
         if not course.acts:
             self.own_class_step(*given, **masks)
         elif self._masked:
             step_around(self, iteration, given, masks)
         else:
-            with torch.no_grad():
+            with_grad = torch.is_grad_enabled()
+            torch.set_grad_enabled(False)  # in half the time of `with torch.no_grad()`
+            try:
                 for lane in self.present_lanes():
                     if lane.param.grad is not None:
                         self._step_lane(lane, iteration)
+            finally:
+                torch.set_grad_enabled(with_grad)
         for hook in self._optimizer_step_post_hooks.values():
             hook(self, (closure, *masked), masks)
         return loss
@@ -126,7 +142,7 @@ class StepAdam(Adam):
                 if i == len(lanes) or lanes[i].param is not param or lanes[i].group is not group:
                     return self._new_lanes()
                 i += 1
-        return lanes
+        return lanes if i == len(lanes) else self._new_lanes()
 
     def _new_lanes(self) -> list[Lane]:
         if len(self._slots) != len(self.param_groups):
@@ -134,37 +150,39 @@ class StepAdam(Adam):
                 f"{type(self).__name__}.step: {len(self.param_groups)} parameter groups, but "
                 f"{len(self._slots)} when it was upgraded; upgrade it again where they change"
             )
-        old, self._lanes = self._lanes, []
-        course = self.course
-        for at, (group, slot) in enumerate(zip(self.param_groups, self._slots, strict=True)):
-            if slot[1] is not None:
-                course.members[(slot[0], slot[1])] = self, at
+        old, made, course = self._lanes, [], self.course
+        for group, slot in zip(self.param_groups, self._slots, strict=True):
             for param in group["params"]:
-                i = len(self._lanes)
-                lane = Lane(group, param, slot).ask(course.parts)
-                before = old[i] if i < len(old) else None
-                if before is None:
-                    lane.last = self._last[i] if i < len(self._last) else self.next_iteration - 2
-                    if self.state.get(param):
-                        lane.framed = self.in_own_frame and lane.name == "means"
+                i = len(made)
+                lane = Lane(group, param, slot, course.parts, course.counter_on(param.device))
+                state = self.state.get(param, {})
+                if i < len(old):
+                    self._succeed(lane, old[i], state)
                 else:
-                    lane.last, lane.framed, lane.left = before.last, before.framed, before.left
-                    self._tell_fewer_rows(before.param, lane)
-                new = before is not None and before.param is not param
-                written = new and before is not None and before.param._version != before.version
-                lane.drop_moved(self.state.get(param, {}), new, written)
-                self._check_rows(lane)
-                self._lanes.append(lane)
-        return self._lanes
+                    # One that has not stepped yet counts as having stepped in the iteration before
+                    # the present one: events of earlier ones are not made up for.
+                    now = self.next_iteration - 1
+                    lane.stepped_in = self._last[i] if i < len(self._last) else now - 1
+                    if state:
+                        lane.framed = lane.name == "means" and lane.set in self.in_own_frame
+                    lane.drop_moved(state, False, False)
+                self._check_rows(lane, state)
+                made.append(lane)
+        self._lanes = made
+        return made
 
-    def _tell_fewer_rows(self, old: Tensor, lane: Lane) -> None:
-        if lane.name == "means" and len(lane.param) < len(old):
-            self.course.rows_removed(len(old) - len(lane.param))
+    def _succeed(self, lane: Lane, before: Lane, state: dict[str, Any]) -> None:
+        """Have a lane go on where the one before it was, whose Parameter may be another."""
+        lane.stepped_in, lane.framed, lane.noted = before.stepped_in, before.framed, before.noted
+        new = before.param is not lane.param
+        lane.drop_moved(state, new, new and before.param._version != before.version)
+        if lane.name == "means" and len(lane.param) < len(before.param):
+            self.course.rows_removed(len(before.param) - len(lane.param))
 
-    def _check_rows(self, lane: Lane) -> None:
+    def _check_rows(self, lane: Lane, state: dict[str, Any]) -> None:
         """Refuse moments of other rows than the parameter has, as a checkpoint may bring them."""
         for key in MOMENTS:
-            moment = self.state.get(lane.param, {}).get(key)
+            moment = state.get(key)
             if moment is not None and moment.shape != lane.param.shape:
                 raise ValueError(
                     f"{type(self).__name__}.step: {lane.name or 'a parameter'} is "
@@ -175,44 +193,62 @@ class StepAdam(Adam):
 
     def plan(self, lane: Lane, iteration: int) -> Step:
         """What the lane's step has, as its parts say."""
-        param, group, course = lane.param, lane.group, self.course
+        param, course, state = lane.param, self.course, self.state[lane.param]
         grad = cast(Tensor, param.grad)
-        if grad.layout != torch.strided:
+        rows = param.numel()  # shapes take five times as long to compare
+        if grad.layout is not torch.strided or grad.numel() != rows:
             raise ValueError(
-                f"{type(self).__name__}.step: the gradient of {lane.name or 'a parameter'} is "
-                f"{grad.layout}; have the trainer make dense gradients (gsplat: no sparse_grad)"
+                f"{type(self).__name__}.step: the gradient of {lane.name or 'a parameter'} "
+                f"{tuple(param.shape)} is {tuple(grad.shape)}, {grad.layout}; have the trainer "
+                "make dense gradients of these rows (gsplat: no sparse_grad)"
             )
-        state = self.state[param]
         if not state:
-            state["step"] = torch.zeros((), dtype=torch.float32, device="cpu")
-            for key in MOMENTS:
-                state[key] = torch.zeros_like(
-                    param, dtype=CODES if course.moments == 16 else None,
-                    memory_format=torch.preserve_format,
-                )  # fmt: skip
-        step = Step(param, grad, lane.name, lane.set, group, state, iteration, lane.last, lane.rows)
-        for part in lane.plans[course.phase]:
+            self._begin_state(param, state)
+        elif state["exp_avg"].numel() != rows or state["exp_avg_sq"].numel() != rows:
+            self._check_rows(lane, state)
+        step = Step(
+            param, grad, lane.name, lane.set, lane.group, state, iteration, lane.stepped_in,
+            lane.keep,
+        )  # fmt: skip
+        plans, befores, _ = lane.acting[course.exploiting]
+        for part in plans:
             part.plan(step, course)
-        for part in lane.before:
-            if part.during in (None, course.phase):
-                step.grad = checked_gradient(part, part.before(step, course), grad)
+        for part in befores:
+            step.grad = checked_gradient(part, part.before(step, course), grad)
+        if step.plain:
+            step.frame = None  # the rate of a plain step is the trainer's
         framed = step.frame is not None
         if framed:
             step.fade = None  # a faded step would be half a standard deviation long
-        if lane.framed is not None and lane.framed != framed:
-            step.fresh = True
-            LOGGER.info("iteration %d: moments of the positions begin anew, in %s units", iteration,
-                        "the own frame's" if framed else "world")  # fmt: skip
+        if framed is not lane.framed:
+            self._change_units(lane, step, framed)
         if step.fresh:
             state["step"].zero_()
             for key in MOMENTS:
                 state[key].zero_()
             for key in (MEAN, BEGAN):
                 state.pop(key, None)
-        lane.framed, lane.last = framed, iteration
-        if framed or lane.name == "means":
-            self.in_own_frame = framed
+        lane.stepped_in = iteration
         return step
+
+    def _begin_state(self, param: Tensor, state: dict[str, Any]) -> None:
+        state["step"] = torch.zeros((), dtype=torch.float32, device="cpu")
+        for key in MOMENTS:
+            state[key] = torch.zeros_like(
+                param, dtype=CODES if self.course.moments == 16 else None,
+                memory_format=torch.preserve_format,
+            )  # fmt: skip
+
+    def _change_units(self, lane: Lane, step: Step, framed: bool) -> None:
+        """Have the moments in the own frame's units from now on, or in the world's."""
+        if lane.framed is not None:
+            step.fresh = True
+            LOGGER.info("iteration %d: moments of the positions begin anew, in %s units",
+                        step.iteration, "the own frame's" if framed else "world")  # fmt: skip
+        lane.framed = framed
+        if lane.name == "means":
+            others = self.in_own_frame - {lane.set}
+            self.in_own_frame = others | {lane.set} if framed else others
 
     def _step_lane(self, lane: Lane, iteration: int) -> None:
         step, course = self.plan(lane, iteration), self.course
@@ -222,10 +258,11 @@ class StepAdam(Adam):
         t, (beta1, beta2) = count.item(), group["betas"]
         lr, decay = group["lr"], group["weight_decay"]
         if course.moments == 16:
-            take_back(state)
+            as_codes(state)
         hyper = Hyper(
             lr, beta1, beta2, group["eps"], 1 - beta1**t, (1 - beta2**t) ** 0.5,
-            state["exp_avg"], state["exp_avg_sq"], key=mixed(int(t)) if course.moments == 16 else 0,
+            state["exp_avg"], state["exp_avg_sq"], nonfinite=lane.counter,
+            key=mixed(int(t)) if course.moments == 16 else 0,
         )  # fmt: skip
         if decay:
             if group.get("decoupled_weight_decay"):
@@ -233,16 +270,14 @@ class StepAdam(Adam):
             else:
                 hyper.decay = decay
         if step.mean is not None:  # it counts the steps that are made, not the iterations
-            step.mean = step.mean._replace(number=int(t))
-            hyper.mean, hyper.began = self.mean_of(lane, step)
-        hyper.nonfinite = course.counter_on(step.param.device)
-        if triton.takes(step):
+            step.mean = Mean(int(t), step.mean.put)
+            hyper.mean, hyper.began = lane.mean_of(state)
+        if lane.counter is not None and triton.takes(step):
             triton.take_step(step, hyper)
-        else:
-            bad = take_step(step, hyper)
-            if bad:
-                course.count_nonfinite(bad)
-        self.finish_step(lane, step)
+        elif bad := take_step(step, hyper):
+            course.count_nonfinite(bad)
+        if lane.keeps or lane.acting[course.exploiting][2]:
+            self.finish_step(lane, step)
 
     def own_class_step(self, *args: Any, **options: Any) -> Any:
         """The step of the class that it had, without torch's hooks, which `step` runs already."""
@@ -253,19 +288,10 @@ class StepAdam(Adam):
 
     def finish_step(self, lane: Lane, step: Step) -> None:
         """What comes after the arithmetic: parts of one's own, and a note of what is left."""
-        for part in lane.after:
-            if part.during in (None, self.course.phase):
-                part.after(step, self.course)
+        for part in lane.acting[self.course.exploiting][2]:
+            part.after(step, self.course)
         if lane.keeps:
-            lane.leave(step.state)
-
-    def mean_of(self, lane: Lane, step: Step) -> tuple[Tensor, Tensor]:
-        """The running mean, and with which count the mean of each row began."""
-        param, state = step.param, step.state
-        assert step.mean is not None
-        began, _ = lane.rows(state, BEGAN, (len(param),))
-        mean, _ = lane.rows(state, MEAN, tuple(param.shape))
-        return mean, began
+            lane.note(step.state)
 
     # -- rows and checkpoints ----------------------------------------------------------------------
 
@@ -292,7 +318,7 @@ class StepAdam(Adam):
                 if mean is not None and mean.shape == param.shape:
                     began = self.state[param][BEGAN] > 0
                     known = torch.isfinite(param) & torch.isfinite(mean)
-                    known &= began.view(-1, *[1] * (param.dim() - 1))
+                    known &= like_rows(began, param)
                     param.copy_(torch.where(known, mean, param))
                     found += 1
         return found
@@ -301,6 +327,7 @@ class StepAdam(Adam):
         """As torch's, with the course's numbers in `param_groups[0]["opt3dgs"]`."""
         if not self.course.acts:
             return super().state_dict()
+        self._drop_moved()
         self.param_groups[0][STATE_KEY] = self.course.state_of(self)
         try:
             found = super().state_dict()
@@ -309,6 +336,11 @@ class StepAdam(Adam):
         if self.coded:  # any Adam may load it; the codes of these numbers are the same again
             found["state"] = {at: as_numbers(state) for at, state in found["state"].items()}
         return found
+
+    def _drop_moved(self) -> None:
+        """Drop what was kept for rows that are others since the last step: a copy knows no more."""
+        if self._lanes:
+            self.present_lanes()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """As torch's; the course goes on where the checkpoint was.
@@ -330,48 +362,52 @@ class StepAdam(Adam):
         for group, was in zip(self.param_groups, own, strict=True):
             for key, value in was.items():
                 group.setdefault(key, value)  # an option that older versions of torch did not have
-        self._use_host_steps()
+        self._count_on_host()
         self.resume()
 
     def resume(self) -> None:
         """Go on where the state says that the training is: after a load."""
-        course, saved, missed = self.course, self.param_groups[0].pop(STATE_KEY, None), 0
-        steps = [int(state["step"]) for state in self.state.values() if "step" in state]
-        if saved is None:
-            # One that is made anew under way steps first in the next iteration.
-            iteration = max(steps) if steps else course.iteration + 1
-            self.in_own_frame, self._last = False, ()
-        else:
-            iteration, self.in_own_frame = saved["iteration"], saved["own_frame"]
-            self._last = tuple(saved["last"])
-            missed = max(steps, default=0) - saved["steps"]
-            if missed:  # a stock Adam has loaded it, and gone on
-                iteration, self.in_own_frame = iteration + max(missed, 0), False
-                self._last = ()
-                course.say_once(
-                    f"opt3dgs_optim: a stock Adam has gone on for {missed} steps with this "
-                    "checkpoint; what was kept beside its moments begins anew"
-                )
-        if saved is None or missed or saved["total_steps"] != course.total_steps:
+        course, saved = self.course, self.param_groups[0].pop(STATE_KEY, None)
+        counts = [int(state["step"]) for state in self.state.values() if "step" in state]
+        missed = 0 if saved is None else max(counts, default=0) - saved["steps"]
+        if missed:
+            course.say_once(
+                f"opt3dgs_optim: a stock Adam has gone on for {missed} steps with this checkpoint; "
+                "what was kept beside its moments begins anew"
+            )
+        ours = None if missed else saved  # what it says of the moments holds
+        self.in_own_frame = frozenset(() if ours is None else ours["own_frame"])
+        self._last = () if ours is None else tuple(ours["last"])
+        if ours is None or ours["total_steps"] != course.total_steps:
             for state in self.state.values():  # they belong to the end of another run
                 for key in KEPT:
                     state.pop(key, None)
-        self.next_iteration, self._lanes = iteration, []
-        if saved is None and steps and not max(steps):
-            course.warn_once(
+        if saved is not None:
+            iteration = saved["iteration"] + max(missed, 0)
+        else:
+            iteration = self._iteration_by_counts(counts)
+        self._lanes, self.next_iteration = [], iteration
+        clocks = course.clocks()
+        if saved is not None or (counts and (self.has_means or not any(clocks))):
+            course.restore(saved, max([iteration, *clocks]))  # one that steps now and then lags
+        self._recode(tell=saved is None or saved["moments"] != course.moments)
+        if self.in_own_frame and not course.acts:
+            for lane in self.present_lanes():
+                if lane.framed:
+                    for key in MOMENTS:
+                        self.state[lane.param][key].zero_()
+
+    def _iteration_by_counts(self, counts: list[int]) -> int:
+        """The iteration that comes next, by Adam's own counts of steps."""
+        if not counts:  # one that is made anew under way steps first in the next iteration
+            return self.course.iteration + 1
+        if not any(counts):
+            self.course.warn_once(
                 "uncounted",
                 f"{type(self).__name__}: it has moments, but does not count its steps, so that the "
                 "clock begins at 0; call phases.observe(iteration=...) where the training goes on",
             )
-        if saved is not None or steps:  # an optimizer that steps now and then lags behind the clock
-            others = [each.next_iteration for each, _ in course.members.values()]
-            course.restore(saved, max([iteration, *others]))
-        self._recode(tell=saved is None or saved["moments"] != course.moments)
-        if self.in_own_frame and not course.acts:
-            for lane in self.present_lanes():
-                if lane.name == "means":
-                    for key in MOMENTS:
-                        self.state[lane.param][key].zero_()
+        return max(counts)
 
     @torch.no_grad()
     def _recode(self, tell: bool) -> None:
@@ -382,7 +418,7 @@ class StepAdam(Adam):
                 continue
             found = True
             if self.coded:
-                take_back(state)
+                as_codes(state)
             first, second = (state[key] for key in MOMENTS)
             if self.coded and bits == 32:
                 first, second = (each.to(param.dtype) for each in decoded(first, second))
@@ -399,12 +435,14 @@ class StepAdam(Adam):
 
     def last_steps(self) -> tuple[int, ...]:
         """Of every parameter, the iteration of its last step."""
-        return tuple(lane.last for lane in self._lanes) or self._last
+        return tuple(lane.stepped_in for lane in self._lanes) or self._last
 
     # -- copies ------------------------------------------------------------------------------------
 
     def __getstate__(self) -> dict[str, Any]:
+        self._drop_moved()
         kept = ("course", "_slots", "_masked", "in_own_frame", "next_iteration", "coded")
+        kept += ("has_means",)
         own = {key: getattr(self, key) for key in kept}
         return {**super().__getstate__(), **own, "_lanes": [], "_last": self.last_steps()}
 
@@ -442,8 +480,8 @@ def as_numbers(state: dict[str, Any]) -> dict[str, Any]:
     return {**state, **dict(zip(MOMENTS, decoded(codes[0], codes[1]), strict=True))}
 
 
-def take_back(state: dict[str, Any]) -> None:
-    """Have codes as integers again.
+def as_codes(state: dict[str, Any]) -> None:
+    """Have the codes of a parameter's moments as integers again.
 
     An edit of rows, and torch's loading, make them float32, with the same values.
     """

@@ -47,7 +47,7 @@ def check_supported(optimizer: Any, slots: Slots, moments: int = 32) -> None:
             "torch.optim.Adam (or, from torch 2.7 on, AdamW) with the same groups, or gsplat's "
             "SelectiveAdam"
         )
-    _check_bits(optimizer, owner, moments)
+    _check_bits(optimizer, owner, slots, moments)
     held = [slot for slot in slots if slot[1] is not None]
     if len(set(held)) < len(held):
         raise ValueError(
@@ -79,7 +79,7 @@ def check_supported(optimizer: Any, slots: Slots, moments: int = 32) -> None:
         raise ValueError(f"upgrade: its parameters lie on {sorted(devices)}; one device is needed")
 
 
-def _check_bits(optimizer: Any, owner: type | None, moments: int) -> None:
+def _check_bits(optimizer: Any, owner: type | None, slots: Slots, moments: int) -> None:
     """ValueError where moments of 16 bits are not for an optimizer."""
     if moments == 32:
         return
@@ -87,6 +87,13 @@ def _check_bits(optimizer: Any, owner: type | None, moments: int) -> None:
         raise ValueError(
             f"upgrade: moments=16, but {type(optimizer).__name__} makes its own step, on moments "
             "of 32 bits; take torch.optim.Adam, or moments=32"
+        )
+    others = [at for at, (_, name) in enumerate(slots) if name is None]
+    if 0 < len(others) < len(slots):
+        shown = optimizer.param_groups[others[0]].get("name")
+        raise ValueError(
+            f"upgrade: moments=16, but the group {shown!r} beside the Gaussians is "
+            "none of theirs; give it an optimizer of its own, or take moments=32"
         )
     dtypes = {param.dtype for group in optimizer.param_groups for param in group["params"]}
     if dtypes - {torch.float32}:

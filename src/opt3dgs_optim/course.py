@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import check_choice, check_count, say, warn_user
+from opt3dgs_optim.checks import as_float, check_choice, check_count, say, warn_user
 from opt3dgs_optim.part import Part, Phase, overrides
 
 if TYPE_CHECKING:
     from opt3dgs_optim.adam import StepAdam
 
 STATE_KEY = "opt3dgs"  # in `param_groups[0]`: what a checkpoint needs beside tensors
-FORMAT = 1
+FORMAT = 2
 LOOK_INTERVAL = 100  # iterations between two looks at the numbers that were not finite
 AnyPart = TypeVar("AnyPart", bound=Part)
 
@@ -46,9 +46,14 @@ class Course:
         self.parts = tuple(parts)
         self.total_steps, self.switch_step = total_steps, switch_step
         self.moments = check_choice(type(self).__name__, "moments", moments, (32, 16))
-        self.iteration = -1
+        self.acts = bool(self.parts) or moments != 32  # whether the steps are others than torch's
+        self._switch = math.inf if switch_step is None else switch_step
+        self.iteration, self.exploiting, self.exploits_next = -1, False, self._switch <= 0
         self._notes: dict[str, dict[str, Any]] = {type(part).__name__: {} for part in self.parts}
         self.members: dict[tuple[str, str], tuple[StepAdam, int]] = {}
+        self.has_means = False  # whether one of the optimizers holds positions: it counts
+        self._means_at = -1  # the iteration of its last step
+        self._means_open = False  # whether it stepped first there
         self.scratch: dict[Any, Any] = {}  # what parts keep from step to step, and never save
         self._resumed = False  # whether the present iteration is over, for all optimizers
         self.finished = False  # whether the run has been ended early
@@ -78,29 +83,40 @@ class Course:
     @property
     def phase(self) -> Phase:
         """Of the present iteration."""
-        exploiting = self.switch_step is not None and self.iteration >= self.switch_step
-        return Phase.EXPLOITATION if exploiting else Phase.EXPLORATION
+        return Phase.EXPLOITATION if self.exploiting else Phase.EXPLORATION
 
     def begin(self, optimizer: StepAdam) -> int:
-        """The iteration of a step that an optimizer is about to make."""
-        iteration = max(optimizer.next_iteration, self.iteration + self._resumed, 0)
+        """The iteration of a step that an optimizer is about to make.
+
+        Another optimizer than that of the positions may step first in an iteration, never or
+        several times: it begins one only if the positions have been stepped in the one before.
+        """
+        present = self.iteration + self._resumed
+        iteration = max(optimizer.next_iteration, present, 0)
+        if optimizer.has_means:
+            if iteration > self._means_at:  # of two sets' optimizers the first
+                self._means_open = iteration > self.iteration
+            self._means_at = iteration
+        elif self.has_means and iteration > present:  # it has stepped in the present one
+            begins = self._means_at >= present and not self._means_open
+            iteration = max(present + begins, 0)
         self._resumed = False
         optimizer.next_iteration = iteration + 1
         if iteration > self.iteration:
-            self.iteration = iteration
+            self._go_to(iteration)
             self._advance()
         return iteration
 
-    def _advance(self) -> None:
-        """Called once in each iteration, before its first step."""
-        if self.iteration >= self._look_at:
-            self._look_at = self.iteration + LOOK_INTERVAL
+    def _go_to(self, iteration: int) -> None:
+        """Put the clock there."""
+        self.iteration, self.exploiting = iteration, iteration >= self._switch
+        self.exploits_next = iteration + 1 >= self._switch
+        if iteration >= self._look_at:
+            self._look_at = iteration + LOOK_INTERVAL
             self._look()
 
-    @property
-    def acts(self) -> bool:
-        """Whether the steps are others than torch's."""
-        return bool(self.parts) or self.moments != 32
+    def _advance(self) -> None:
+        """Called once in each iteration, before its first step."""
 
     # -- what the parts share --------------------------------------------------------------------
 
@@ -109,7 +125,7 @@ class Course:
         return next((part for part in self.parts if isinstance(part, kind)), None)
 
     def notes_of(self, part: Part) -> dict[str, Any]:
-        """What a part knows of this training: plain numbers and lists, saved with optimizers."""
+        """What a part knows of this training: plain numbers by name, saved with the optimizers."""
         return self._notes[type(part).__name__]
 
     def param_of(self, set_name: str, name: str) -> Tensor | None:
@@ -121,6 +137,11 @@ class Course:
         """The optimizer's state of a Gaussian parameter; None before its first step."""
         member, param = self.members.get((set_name, name)), self.param_of(set_name, name)
         return None if member is None or param is None else member[0].state.get(param) or None
+
+    def clocks(self) -> list[int]:
+        """Of each optimizer whose steps are counted, the iteration that it steps next."""
+        found = [each for each, _ in self.members.values()]
+        return [each.next_iteration for each in found if each.has_means or not self.has_means]
 
     def rows_removed(self, count: int) -> None:
         """Gaussians have disappeared since the last step."""
@@ -177,11 +198,12 @@ class Course:
         """What a checkpoint of an optimizer has beside tensors: plain numbers and lists."""
         for part in self.parts:
             part.settle(self)
+        check_notes("state_dict", self._notes)
         return {
             "format": FORMAT,
             "iteration": max(optimizer.next_iteration, self.iteration),  # it may have been put on
             "total_steps": self.total_steps,
-            "own_frame": optimizer.in_own_frame,
+            "own_frame": sorted(optimizer.in_own_frame),
             "steps": max(
                 (int(s["step"]) for s in optimizer.state.values() if "step" in s), default=0
             ),
@@ -206,19 +228,16 @@ class Course:
             check_count(call, "total_steps", state["total_steps"], 1)
         check_count(call, "steps", state["steps"], 0)
         check_choice(call, "moments", state["moments"], (32, 16))
-        last = state["last"]
-        if not isinstance(last, list) or not all(type(each) is int for each in last):
-            raise ValueError(f"{call}: last={last!r}, but a list of integers is needed")
+        for key, kind in (("last", int), ("own_frame", str)):
+            found = state[key]
+            if not isinstance(found, list) or any(type(each) is not kind for each in found):
+                raise ValueError(f"{call}: {key}={found!r}, but a list of {kind} is needed")
         for kind in ("notes", "parts"):
             if not isinstance(state[kind], Mapping) or not all(
                 isinstance(each, Mapping) for each in state[kind].values()
             ):
                 raise ValueError(f"{call}: {kind}={state[kind]!r}, but a dict of dicts is needed")
-        for name, notes in state["notes"].items():
-            if not all(isinstance(v, (int, float)) and math.isfinite(v) for v in notes.values()):
-                raise ValueError(
-                    f"{call}: notes of {name} are {dict(notes)!r}, but numbers are needed"
-                )
+        check_notes(call, state["notes"])
 
     def restore_parts(self, state: Mapping[str, Any]) -> None:
         """Give parts that learn what they had learnt; they refuse what is damaged."""
@@ -228,7 +247,8 @@ class Course:
 
     def restore(self, state: Mapping[str, Any] | None, iteration: int) -> None:
         """Go on at an iteration, with what was noted there."""
-        self.iteration, self._resumed = iteration - 1, True
+        self._go_to(iteration - 1)
+        self._means_at, self._means_open, self._resumed = iteration - 1, False, True
         for name, notes in () if state is None else state["notes"].items():
             if name in self._notes:
                 self._notes[name].clear()
@@ -238,6 +258,15 @@ class Course:
         for part in self.parts:  # what is on its way from a device does not reach a copy
             part.settle(self)
         return {**vars(self), "_counters": {}, "scratch": {}}
+
+
+def check_notes(call: str, notes: Mapping[str, Mapping[str, Any]]) -> None:
+    """ValueError unless what parts have noted is finite numbers, as a checkpoint holds them."""
+    for name, found in notes.items():
+        if not all(type(v) is bool or math.isfinite(as_float(v)) for v in found.values()):
+            raise ValueError(
+                f"{call}: notes of {name} are {dict(found)!r}, but finite numbers are needed"
+            )
 
 
 class Reading:

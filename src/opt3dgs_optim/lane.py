@@ -15,53 +15,63 @@ KEPT = (MEAN, BEGAN, "curvature.history")  # what a checkpoint may hold for rows
 
 
 class Lane:
-    """One parameter of an optimizer: what acts on it, and what was left for it at the last step.
+    """One parameter of an optimizer: what acts on it, and how its last step has left it.
 
     Attributes:
         name, set: which Gaussian parameter it is, and of which set of Gaussians.
-        last: the iteration of its last step; -1: none.
+        acting: by `Course.exploiting`: the parts with a `plan`, with a `before`, with an `after`.
+        counter: where its device counts numbers that are not finite; None on a CPU.
+        stepped_in: the iteration of its last step; -1: none.
         framed: whether its moments are those of the own frame; None: it has none yet.
+        keeps: whether parts keep something for its rows.
+        noted: what they keep, by name, with the version of the tensor after the last step.
+        version: of the Parameter then.
     """
 
-    def __init__(self, group: dict[str, Any], param: Tensor, slot: tuple[str, str | None]) -> None:
-        self.group, self.param = group, param
+    def __init__(
+        self,
+        group: dict[str, Any],
+        param: Tensor,
+        slot: tuple[str, str | None],
+        parts: tuple[Part, ...],
+        counter: Tensor | None,
+    ) -> None:
+        self.group, self.param, self.counter = group, param, counter
         self.set, self.name = slot
-        self.last = -1
-        self.framed: bool | None = None
-        self.keeps = False  # whether parts keep something for its rows
-        self.left: dict[str, tuple[Tensor, int]] = {}
-        self.version = param._version  # of the Parameter, after the step
-        self.plans: dict[Phase, list[Part]] = {}
-        self.before: list[Part] = []
-        self.after: list[Part] = []
-
-    def ask(self, parts: tuple[Part, ...]) -> Lane:
-        """Take the parts that act on this parameter."""
         mine = [p for p in parts if p.names is None or (self.name and self.name in p.names)]
-        for phase in Phase:
-            self.plans[phase] = [
-                p for p in mine if overrides(p, "plan") and p.during in (None, phase)
-            ]
-        self.before = [p for p in mine if overrides(p, "before")]
-        self.after = [p for p in mine if overrides(p, "after")]
-        return self
+        self.acting = tuple(
+            tuple(
+                [p for p in mine if overrides(p, hook) and p.during in (None, phase)]
+                for hook in ("plan", "before", "after")
+            )
+            for phase in (Phase.EXPLORATION, Phase.EXPLOITATION)
+        )
+        self.stepped_in = -1
+        self.framed: bool | None = None
+        self.keeps = False
+        self.noted: dict[str, tuple[Tensor, int]] = {}
+        self.version = param._version
 
-    def rows(self, state: dict[str, Any], key: str, shape: tuple[int, ...]) -> tuple[Tensor, bool]:
-        """What is kept for the rows under a name, and whether rows may be new since the last step.
-
-        A row of zeros is one for which nothing is kept.
-        """
-        tensor, was, self.keeps = state.get(key), self.left.get(key), True
+    def keep(self, state: dict[str, Any], key: str, shape: tuple[int, ...]) -> Tensor:
+        """What is kept for the rows under a name; a row of zeros: nothing is kept for it."""
+        tensor, self.keeps = state.get(key), True
         if tensor is None or tensor.shape != shape:
             tensor = state[key] = torch.zeros(
                 shape, dtype=self.param.dtype, device=self.param.device
             )
-            return tensor, True
-        if was is None:  # loaded
-            return tensor, True
-        if tensor is not was[0] or tensor._version != was[1]:
-            return tensor, True
-        return tensor, False
+        return tensor
+
+    def mean_of(self, state: dict[str, Any]) -> tuple[Tensor, Tensor]:
+        """The running mean, and with which count the mean of each row began."""
+        param, mean, began = self.param, state.get(MEAN), state.get(BEGAN)
+        if (
+            mean is None or mean.numel() != param.numel()
+            or began is None or len(began) != param.size(0)
+        ):  # fmt: skip
+            mean = self.keep(state, MEAN, tuple(param.shape))
+            began = self.keep(state, BEGAN, tuple(param.shape[:1]))
+        self.keeps = True
+        return mean, began
 
     def drop_moved(self, state: dict[str, Any], new: bool, written: bool) -> None:
         """Drop what is kept for rows that are others now, if the Parameter is new.
@@ -72,14 +82,16 @@ class Lane:
         """
         rows = len(self.param) if self.param.dim() else 1
         for key in KEPT:
-            now, was = state.get(key), self.left.get(key)
+            now, was = state.get(key), self.noted.get(key)
             if now is None:
                 continue
             as_it_was = was is not None and now is was[0] and now._version == was[1]
             if len(now) != rows or (new and (as_it_was or written)):
                 del state[key]
 
-    def leave(self, state: dict[str, Any]) -> None:
-        """Note what the step has left, by which edits of rows show at the next one."""
+    def note(self, state: dict[str, Any]) -> None:
+        """Note how the step leaves the rows, by which edits of them show at the next one."""
         self.version = self.param._version
-        self.left = {key: (state[key], state[key]._version) for key in KEPT if key in state}
+        for key in KEPT:
+            if key in state:
+                self.noted[key] = state[key], state[key]._version

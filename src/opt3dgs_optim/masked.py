@@ -2,11 +2,13 @@
 
 Their arithmetic and their mask stay theirs. They are given another gradient and another rate for
 the time of their step, and in the own frame zeros to step from, so that what they have moved is the
-step in standard deviations. Points out of view are held by the mask already.
+step in standard deviations. Of what a step may have, `hold` and `plain` are not for them: points
+out of view are held by the mask already, and moments are theirs.
 """
 
 from __future__ import annotations
 
+import inspect
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -28,6 +30,15 @@ from opt3dgs_optim.step import (
 if TYPE_CHECKING:
     from opt3dgs_optim.adam import StepAdam
     from opt3dgs_optim.course import Course
+
+
+def check_arguments(call: str, step: Any, *args: Any) -> None:
+    """TypeError unless a step takes these arguments: self, the others, and a dict of named ones."""
+    *given, named = args
+    try:
+        inspect.signature(step).bind(*given, **named)
+    except TypeError as error:
+        raise TypeError(f"{call}.step: {error}; it needs its mask, as before the upgrade") from None
 
 
 @torch.no_grad()
@@ -54,7 +65,7 @@ def step_around(
                 lane.param.add_(out_of_frame(axes, moved))
     for lane, step in steps:
         if step.mean is not None:
-            take_into_mean(step.mean, step.param, *optimizer.mean_of(lane, step))
+            take_into_mean(step.mean, step.param, *lane.mean_of(step.state))
         optimizer.finish_step(lane, step)
 
 

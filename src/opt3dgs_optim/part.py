@@ -30,8 +30,8 @@ class Part:
     the step of them (`opt3dgs_optim.step`), on a GPU in one launch. A part that needs its own
     arithmetic has `before` and `after`, in torch operations, at a launch for each of them.
 
-    What a part learns of a training goes into `course.notes_of(self)`, a dict of plain numbers and
-    lists, which is saved with the optimizers; a part object whose state lives in itself sets
+    What a part learns of a training goes into `course.notes_of(self)`, a dict of plain numbers by
+    name, which is saved with the optimizers; a part object whose state lives in itself sets
     `learns`, and serves one training.
 
     `docs/write-a-part.md` has examples.

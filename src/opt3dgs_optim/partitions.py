@@ -73,10 +73,6 @@ class FixedPartitions:
         """As in `MovingPartitions`."""
         return self.state
 
-    def coordinates(self) -> tuple[float, float, float]:
-        """As in `MovingPartitions`."""
-        return *self.energy_range, self.tau
-
     def fits(self, state: Sequence[float]) -> bool:
         """As in `MovingPartitions`: positive weights with sum 1."""
         return min(state) > 0 and abs(math.fsum(state) - 1) < 1e-3
@@ -156,13 +152,6 @@ class MovingPartitions:
         """Theta, [num_partitions], positive, sum 1."""
         q = (1 - EVEN) * self.state[3:] + EVEN / self.num_partitions
         return torch.softmax(q.log() / (1 - self.zeta), 0)
-
-    def coordinates(self) -> tuple[float, float, float]:
-        """Low and high end of the range, and tau, in units of the energy. Synchronises."""
-        mean, deviation = self.state[:2].tolist()
-        deviation /= MEAN_ABS
-        tau = (1 - self.zeta) / (2 * self.zeta) * deviation
-        return mean - REACH * deviation, mean + REACH * deviation, tau
 
     def fits(self, state: Sequence[float]) -> bool:
         """Whether so many numbers may be a state: a deviation, and a density."""

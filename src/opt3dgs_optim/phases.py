@@ -16,7 +16,7 @@ from opt3dgs_optim.checks import LOGGER, check_count, check_energy, check_number
 from opt3dgs_optim.contract import Slots, check_supported
 from opt3dgs_optim.course import STATE_KEY, Course
 from opt3dgs_optim.names import GAUSSIAN_NAMES, split_name
-from opt3dgs_optim.part import Part, overrides
+from opt3dgs_optim.part import Part, Phase, overrides
 from opt3dgs_optim.parts.averaging import Averaging
 from opt3dgs_optim.parts.curvature import Curvature
 from opt3dgs_optim.parts.fading import Fading
@@ -38,16 +38,17 @@ class PhaseScheduler(Course):
     By default `DEFAULTS`, for 3DGS-MCMC's relocation; `DEFAULTS_ADC` is for clone, split and prune,
     and `PhaseScheduler.paper` is Opt3DGS.
 
-    The optimizers count their own steps, so that nothing else need be called. The state travels
-    with their `state_dict()`.
+    The optimizers count their own steps, so that nothing else need be called: the clock is that of
+    the positions' optimizer, whatever others step between. The state travels with their
+    `state_dict()`.
 
     Args:
         total_steps: iterations of the training, each with one step of the positions' optimizer.
         switch: where exploitation starts: a fraction of `total_steps` in (0, 1] if a float, an
             iteration if an int (`total_steps`: never). The paper: 29/30.
         parts: what the steps have, in order; None: `DEFAULTS`.
-        moments: bits of each of Adam's two moments of a number; 16 take half of Adam's memory
-            (see docs/algorithms).
+        moments: bits of each of Adam's two moments of a number; 16 take half of Adam's memory, and
+            are for the Gaussians alone (see docs/performance.md).
         log: a `RunLog` that gets one line an iteration, with what the parts say of themselves.
         process_group: a `torch.distributed` process group over whose ranks the loss is averaged,
             for parts that read it.
@@ -98,8 +99,7 @@ class PhaseScheduler(Course):
         self.log, self._loss = log, None
         self._group = process_group
         own = (part for part in self.parts if overrides(part, "pixel_loss"))
-        self._squared: Part | None = next(own, None)
-        self._choose_pixel_loss()
+        self._pixel: Part | None = next(own, None)
         self._end = End(total_steps, self.part(Averaging))
         weakref.finalize(self, self._end.say)  # at exit, or where the function that trains ends
 
@@ -143,6 +143,13 @@ class PhaseScheduler(Course):
                 f"{CALL}.upgrade: no Gaussians among the groups {names}; name the groups, or the "
                 f"keys of a dict, as one of {', '.join(GAUSSIAN_NAMES)} (other trainers' names too)"
             )
+        for (_, optimizer), its in zip(given, slots, strict=True):
+            if self.moments == 16 and not any(name for _, name in its):
+                raise ValueError(
+                    f"{CALL}.upgrade: moments=16, but the {type(optimizer).__name__} of "
+                    f"{len(optimizer.param_groups)} other groups holds no Gaussians; upgrade those "
+                    "of the Gaussians alone, or take moments=32"
+                )
         doubled = sorted({name for name in held if held.count(name) > 1})
         if doubled:
             raise ValueError(
@@ -174,9 +181,6 @@ class PhaseScheduler(Course):
             optimizer.__class__ = upgraded_class(type(optimizer))
         optimizer.follow(self, slots)
         optimizer.resume()
-        for at, slot in enumerate(slots):
-            if slot[1] is not None:
-                self.members[(slot[0], slot[1])] = optimizer, at
 
     # -- the trainer's calls -----------------------------------------------------------------------
 
@@ -202,7 +206,8 @@ class PhaseScheduler(Course):
                     f"{2 * self.total_steps} at most; make a new PhaseScheduler for another run"
                 )
             if iteration > self.iteration:
-                self.iteration, self._resumed = iteration, False
+                self._go_to(iteration)
+                self._resumed = False
                 self._advance()
         if loss is None:
             return
@@ -223,6 +228,8 @@ class PhaseScheduler(Course):
     def pixel_loss(self, render: Tensor, target: Tensor) -> Tensor:
         """The photometric term of two images in 0..1: mean |error|, unless a part says another.
 
+        It is that of the iteration after the last step.
+
         `SquaredLoss` has the paper's mean squared error, while exploiting.
         """
         if render.shape != target.shape:
@@ -232,7 +239,10 @@ class PhaseScheduler(Course):
             )
         error = render - target
         # Not by the iteration: torch.compile would compile a function anew for each.
-        return error.abs().mean() if self._pixel is None else self._pixel.pixel_loss(error)
+        part, phase = self._pixel, Phase.EXPLOITATION if self.exploits_next else Phase.EXPLORATION
+        if part is None or part.during not in (None, phase):
+            return error.abs().mean()
+        return part.pixel_loss(error)
 
     @torch.no_grad()
     def finish(self) -> None:
@@ -254,9 +264,7 @@ class PhaseScheduler(Course):
     # -- what it watches ---------------------------------------------------------------------------
 
     def _advance(self) -> None:
-        super()._advance()
         self._end.done = self.iteration + 1
-        self._choose_pixel_loss()
         if self.log is not None:
             numbers = self.numbers()
             if self._loss is not None:
@@ -269,22 +277,18 @@ class PhaseScheduler(Course):
                 f"{CALL}: iteration {self.iteration} of total_steps={self.total_steps}: the "
                 "schedule came too early for this run; pass the training's number of iterations",
             )
+        if self.finished:
+            self.warn_once(
+                "finished",
+                f"{CALL}: iteration {self.iteration} comes after finish(): the parameters are no "
+                "mean any more; call it after the last step",
+            )
         if self.iteration == 0 and self._group is None and _num_ranks() > 1:
             self.warn_once(
                 "ranks",
                 f"{CALL}: {_num_ranks()} ranks train, but process_group=None: parts that read the "
                 "loss would differ between them; give process_group=torch.distributed.group.WORLD",
             )
-
-    def _choose_pixel_loss(self) -> None:
-        """Whose photometric term holds for the iteration after this one, whose loss comes next."""
-        assert self.switch_step is not None
-        self._pixel = self._squared if self.iteration + 1 >= self.switch_step else None
-
-    def restore(self, state: Mapping[str, Any] | None, iteration: int) -> None:
-        """As `Course.restore`."""
-        super().restore(state, iteration)
-        self._choose_pixel_loss()
 
     def rows_removed(self, count: int) -> None:
         """Gaussians have disappeared, under parts that are made for relocation."""

@@ -1,18 +1,22 @@
 """The step of one parameter: what it has (`Step`), and how it is made (`take_step`).
 
-Parts of a training fill in a `Step` with plain values. The arithmetic is here, once: in plain torch
-operations, the reference, which runs on every device, and as one Triton launch on a GPU, in
-`opt3dgs_optim.triton`. Without any of the parts it is `torch.optim.Adam`, bit for bit on a CPU.
+Parts of a training fill in a `Step` with plain values, and may put another gradient in the place of
+the parameter's (`Part.before`). The arithmetic is here, once: in plain torch operations, the
+reference, which runs on every device, and as one Triton launch on a GPU, in `opt3dgs_optim.triton`.
+Without any of the parts it is `torch.optim.Adam`, bit for bit on a CPU.
 
 A row is one Gaussian: dimension 0 of a parameter. In the order in which it is made:
 
     gradient    numbers that are not finite count as zero
     fade        moments of random rows are shrunk
+    decay       the trainer's weight decay: off the parameter (AdamW), or onto the gradient (Adam)
     frame       the gradient is turned into each Gaussian's own axes, B^T g
     hold        second moments of rows out of view are kept large
     Adam        m, v, and the step m / (sqrt(v) + eps), with bias correction
     frame       the step is turned back, B z
     mean        the iterate goes into the running mean; at the end the mean takes its place
+
+`Part.after` comes last.
 """
 
 from __future__ import annotations
@@ -74,11 +78,12 @@ class Step:
         name: gsplat's name of the Gaussian parameter, or None.
         set: the set of Gaussians that it belongs to, "" where there is one.
         group, state: torch's parameter group and the optimizer's state of the parameter.
-        iteration: of the training, from 0. `last`: that of the parameter's step before this one.
-        kept: what a part keeps for the rows, see `adam.Lane.rows`.
+        iteration: of the training, from 0.
+        stepped_in: the iteration of the parameter's step before this one; -1: none.
+        keep: `keep(state, key, shape)` is what a part keeps for the rows, see `lane.Lane.keep`.
         factor: on the learning rate; on a device it may be a tensor of one element.
         fresh: Adam's moments begin anew before the step.
-        plain: no moments: the step is the gradient times the rate.
+        plain: no moments and no frame: the step is the gradient times the rate.
         fade, frame, hold, mean: see there; None: not in this step.
     """
 
@@ -89,8 +94,8 @@ class Step:
     group: dict[str, Any]
     state: dict[str, Any]
     iteration: int
-    last: int
-    kept: Any = None
+    stepped_in: int
+    keep: Any = None
     factor: Any = 1.0
     fresh: bool = False
     plain: bool = False

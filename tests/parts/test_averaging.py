@@ -133,7 +133,8 @@ def test_finish_takes_the_mean_early_and_averages_no_more() -> None:
     assert not torch.equal(params["sh0"], mean)
     phases.finish()
     assert torch.equal(params["sh0"], mean)
-    steps(optimizers, params, 6)
+    with pytest.warns(UserWarning, match="comes after finish"):
+        steps(optimizers, params, 6)
     assert not torch.equal(params["sh0"], optimizers["sh0"].state[params["sh0"]]["averaging.mean"])
 
 

@@ -65,12 +65,12 @@ def test_moments_of_nu_before_there_are_any() -> None:
 
 def test_the_papers_settings() -> None:
     histogram = EnergyHistogram.paper()
-    assert histogram.coordinates == (0.0, 0.2, 2e-3)
+    assert (histogram.energy_range, histogram.temperature) == ((0.0, 0.2), 2e-3)
     assert (histogram.num_partitions, histogram.zeta, histogram.warmup) == (200, 0.75, 2500)
     assert histogram.clamp == (-5.0, 5.0)
     assert histogram.weights.tolist() == [1 / 200] * 200
     width = 0.2 / 200
-    assert histogram.zeta * histogram.coordinates[2] / width == pytest.approx(1.5)
+    assert histogram.zeta * 2e-3 / width == pytest.approx(1.5)
     assert EnergyHistogram.paper(zeta=0.5).zeta == 0.5
 
 

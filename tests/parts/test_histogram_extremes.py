@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from opt3dgs_optim import EnergyHistogram
+from opt3dgs_optim.partitions import MEAN_ABS
 
 COUNT, FIRST = 1_000, 250
 K = np.arange(COUNT)
@@ -67,10 +68,9 @@ def test_two_deviations_out_nu_is_one_off() -> None:
     slope, _ = np.polyfit(Z[FIRST:], nus, 1)
     assert slope == pytest.approx(-0.5, rel=0.2)
     # Mean and deviation of about 100 energies: known to 10 and 7 %.
-    low, high, tau = histogram.coordinates
-    assert (low + high) / 2 == pytest.approx(0.3, abs=0.01)
-    assert (high - low) / 12 == pytest.approx(0.02, rel=0.35)
-    assert tau == pytest.approx((high - low) / 12 / 6)
+    mean, deviation = histogram._partitions.state[:2].tolist()
+    assert mean == pytest.approx(0.3, abs=0.01)
+    assert deviation / MEAN_ABS == pytest.approx(0.02, rel=0.35)
 
 
 @pytest.mark.parametrize("unit", [2.0**-40, 2.0**40])

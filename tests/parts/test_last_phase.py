@@ -7,9 +7,10 @@ from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 from torch.nn import Parameter
 
-from opt3dgs_optim import FreshMoments, PhaseScheduler, SquaredLoss
+from opt3dgs_optim import FreshMoments, Part, PhaseScheduler, SquaredLoss
 
 TOTAL, SWITCH = 12, 8
 
@@ -92,3 +93,29 @@ def test_the_photometric_term_is_squared_from_the_switch_on() -> None:
         expected = 0.2 if i < SWITCH else 0.08
         assert float(phases.pixel_loss(render, target)) == pytest.approx(expected)
         step(x, optimizer, i)
+
+
+class Fourth(Part):
+    """A stranger's photometric term."""
+
+    def pixel_loss(self, error: Tensor) -> Tensor:
+        return error.pow(4).sum()
+
+
+@pytest.mark.compiles
+@pytest.mark.parametrize(("part", "late"), [(SquaredLoss(), 0.08), (Fourth(), 0.0256), (None, 0.2)])
+def test_a_compiled_loss_changes_its_kind_at_the_switch(part: Any, late: float) -> None:
+    """It is compiled once for each kind, and not for each iteration."""
+    x, optimizer, phases = made(SWITCH, part or FreshMoments())
+    compiled: list[Any] = []
+
+    def backend(graph: Any, _: Any) -> Any:
+        compiled.append(graph)
+        return graph.forward
+
+    loss_of = torch.compile(lambda error: phases.pixel_loss(error, torch.zeros(2)), backend=backend)
+    for i in range(TOTAL):
+        expected = 0.2 if i < SWITCH and not isinstance(part, Fourth) else late
+        assert float(loss_of(torch.tensor([0.4, 0.0]))) == pytest.approx(expected)
+        step(x, optimizer, i)
+    assert len(compiled) <= 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
@@ -12,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import Parameter
+from torch.optim import Adam
 
 from opt3dgs_optim import OwnFrame, PhaseScheduler
 from opt3dgs_optim.step import Frame, axes_of, into_frame, out_of_frame
@@ -184,3 +186,27 @@ def test_options_that_are_refused(option: dict) -> None:
     (name, value), *_ = option.items()
     with pytest.raises(ValueError, match=f"OwnFrame: {name}={value}, but a finite number in"):
         OwnFrame(**option)
+
+
+def test_of_two_sets_the_one_in_own_frames_is_known_after_a_load() -> None:
+    """Of the other, whose Gaussians have no quaternions, the moments are in world units."""
+    shapes = {"a#means": 3, "a#scales": 3, "a#quats": 4, "b#means": 3}
+
+    def made() -> tuple[dict[str, Any], Any]:
+        torch.manual_seed(0)
+        params = {name: Parameter(torch.randn(6, width)) for name, width in shapes.items()}
+        groups = [{"params": [param], "name": name} for name, param in params.items()]
+        return params, PhaseScheduler(60, parts=[OwnFrame()]).upgrade(Adam(groups, lr=0.01))
+
+    params, optimizer = made()
+    with pytest.warns(UserWarning, match="Adam steps them"):
+        steps({"all": optimizer}, params, 10)
+    others, resumed = made()
+    with torch.no_grad():
+        for name, param in others.items():
+            param.copy_(params[name])
+    resumed.load_state_dict(copy.deepcopy(optimizer.state_dict()))
+    with pytest.warns(UserWarning, match="Adam steps them"):
+        steps({"all": resumed}, others, 10, seed=1)
+    steps({"all": optimizer}, params, 10, seed=1)
+    assert all(torch.equal(params[name], others[name]) for name in params)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -29,15 +30,25 @@ class Averaging(Part):
     @staticmethod
     def start(total_steps: int) -> int:
         """The first iteration that is averaged."""
-        return total_steps - math.floor(SHARE * total_steps)
+        return _window(total_steps)[0]
 
-    @classmethod
-    def put_from(cls, total_steps: int) -> int:
+    @staticmethod
+    def put_from(total_steps: int) -> int:
         """The first iteration after which the mean is in the parameters' place."""
-        return total_steps - math.floor(max(2, (total_steps - cls.start(total_steps)) / 10))
+        return _window(total_steps)[1]
 
     def plan(self, step: Step, course: Course) -> None:
         """Take the iterate into the mean."""
         total, now = course.total_steps, step.iteration
-        if total is not None and self.start(total) <= now < total and not course.finished:
-            step.mean = Mean(now - self.start(total) + 1, now >= self.put_from(total))
+        if total is None or course.finished:
+            return
+        start, put = _window(total)
+        if start <= now < total:
+            step.mean = Mean(now - start + 1, now >= put)
+
+
+@functools.lru_cache(maxsize=8)  # every step asks
+def _window(total_steps: int) -> tuple[int, int]:
+    """The first iteration that is averaged, and the first after which the mean is put."""
+    length = math.floor(SHARE * total_steps)
+    return total_steps - length, total_steps - math.floor(max(2, length / 10))

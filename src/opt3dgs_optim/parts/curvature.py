@@ -82,7 +82,7 @@ class Curvature(Part):
         rows = len(param) if param.dim() else 1
         position = param.detach().reshape(rows, math.prod(param.shape[1:]))
         gradient = step.grad.reshape(position.shape)
-        history, _ = step.kept(step.state, HISTORY, history_shape(position, self.history_size))
+        history = step.keep(step.state, HISTORY, history_shape(position, self.history_size))
         fed, accepted, candidates = lqn_direction(
             position,
             gradient,

@@ -77,8 +77,9 @@ class Fading(Part):
         total = course.total_steps
         if total is None:
             return
-        done = self.events_before(step.last + 1, total)
-        now = self.events_before(step.iteration + 1, total)
+        options = total, self.start, self.stop, self.events
+        done = _events_before(step.stepped_in + 1, *options)
+        now = _events_before(step.iteration + 1, *options)
         # Several are due where the trainer has left steps out; they are one.
         if now > done and any(self.happens(e, len(step.param)) for e in range(done, now)):
             step.fade = self.fade(now - 1)
@@ -89,13 +90,12 @@ class Fading(Part):
 
     def happens(self, event: int, num_points: int) -> bool:
         """Whether an event fades any of so many points: of more than 10,000, some do."""
-        share = min(1.0, MAX_POINTS_OF_ALL_EVENTS / num_points) ** (2 / 3) if num_points else 0.0
+        share = share_of_events(num_points)
         return int((event + 1) * share) > int(event * share)
 
     def num_events(self, total_steps: int, num_points: int) -> int:
         """How many events a run of so many points has."""
-        most = self.events_before(total_steps, total_steps)
-        return sum(self.happens(event, num_points) for event in range(most))
+        return int(self.events_before(total_steps, total_steps) * share_of_events(num_points))
 
     def fade(self, event: int) -> Fade:
         """What an event does."""
@@ -111,6 +111,11 @@ class Fading(Part):
         now, total = course.iteration, course.total_steps or 1
         happened = self.events_before(now + 1, total) > self.events_before(now, total)
         return {"faded": self.share * happened}
+
+
+def share_of_events(num_points: int) -> float:
+    """Of all events, those that fade any of so many points."""
+    return min(1.0, MAX_POINTS_OF_ALL_EVENTS / num_points) ** (2 / 3) if num_points else 0.0
 
 
 @functools.lru_cache(maxsize=64)  # every parameter asks for the same two iterations

@@ -40,7 +40,7 @@ class EnergyHistogram(Part):
     that of the noise (`IsotropicNoise`), and `warmup=0`. The default's partitions follow the walk,
     so that the well in which it began looks like all there is. In a double well whose barrier is
     six times the temperature, a walk of 20,000 steps of 0.006 crossed it once without a histogram,
-    5 times with the default, and 39 times with a range and a temperature
+    5 times with the default, and some 40 times with a range and a temperature
     (`python tests/test_lqnadam_claims.py`).
 
     Args:
@@ -179,11 +179,6 @@ class EnergyHistogram(Part):
         """Standard deviation of nu over all energies after the warm-up, 0-d."""
         count, total, squares = self._sums
         return (squares / count - (total / count) ** 2).nan_to_num(0.0).clamp(min=0).sqrt()
-
-    @property
-    def coordinates(self) -> tuple[float, float, float]:
-        """Low and high end of the partitions, and tau, now, in units of the loss. Synchronises."""
-        return self._partitions.coordinates()
 
     def numbers(self, course: Course | None = None) -> dict[str, float | Tensor]:
         """`nu`, after as many energies as the warm-up has, while it acts."""

@@ -38,5 +38,5 @@ class FreshMoments(Part):
     def plan(self, step: Step, course: Course) -> None:
         """Begin anew in the parameter's first step after the switch."""
         switch = course.switch_step
-        if switch is not None and step.last < switch <= step.iteration:
+        if switch is not None and step.stepped_in < switch <= step.iteration:
             step.fresh = True

@@ -44,22 +44,22 @@ class OutOfView(Part):
 
     def plan(self, step: Step, course: Course) -> None:
         """See at the positions [N, 3] who is out of view; hold the others' second moments."""
-        notes, place = course.notes_of(self), (self, step.set)
-        seen = course.scratch.get(place)
+        seen = course.scratch.get((OutOfView, step.set))
         if seen is None:
-            seen = course.scratch[place] = _Seen("share" if not step.set else f"share {step.set}")
+            seen = _Seen(f"share {step.set}".rstrip(), course.notes_of(self))
+            course.scratch[OutOfView, step.set] = seen
         if seen.iteration != step.iteration:
-            seen.look(step, course, notes)
+            seen.look(step, course)
         if seen.rows is not None and step.name != "means" and len(seen.rows) == len(step.param):
-            step.hold = Hold(seen.rows, MAX_SEEN_SHARE / notes[seen.note])
+            step.hold = Hold(seen.rows, MAX_SEEN_SHARE / seen.notes[seen.note])
 
     def settle(self, course: Course) -> None:
         """Take the share that is on its way."""
         for place, seen in course.scratch.items():
-            if place[0] is self and seen.reading is not None:
+            if place[0] is OutOfView and seen.reading is not None:
                 if seen.reading.source.is_cuda:
                     torch.cuda.synchronize()
-                seen.take(course.notes_of(self))
+                seen.take()
 
     def numbers(self, course: Course) -> Mapping[str, float]:
         """`visible_share`: the mean share of the points that a view sees, the least of all sets."""
@@ -70,14 +70,15 @@ class _Seen:
     """What was found of a set of Gaussians.
 
     Attributes:
+        notes: of the part, with the mean share of this set under the name `note`.
         iteration: in which it was looked at last.
         rows: [N] bool, out of view; None where views see enough.
         counter: [1] int64, 2^32 for each point in view and 1 for each that is or was, of all looks.
         counted: the counter before the look whose `reading` is on its way to the host.
     """
 
-    def __init__(self, note: str) -> None:
-        self.note = note  # under which the mean share of this set is kept
+    def __init__(self, note: str, notes: dict[str, Any]) -> None:
+        self.note, self.notes = note, notes
         self.iteration = -1
         self.rows: Tensor | None = None
         self.counter: Tensor | None = None
@@ -85,16 +86,16 @@ class _Seen:
         self.reading: Reading | None = None
         self._mask: Tensor | None = None
 
-    def look(self, step: Step, course: Course, notes: dict[str, Any]) -> None:
+    def look(self, step: Step, course: Course) -> None:
         """Look at the positions' gradient of this iteration."""
-        notes.setdefault(self.note, 1.0)
         self.iteration, self.rows = step.iteration, None
-        self.take(notes)
+        if self.reading is not None:
+            self.take()
         means = step.param if step.name == "means" else course.param_of(step.set, "means")
         grad = None if means is None else means.grad
         # Multiples of the golden ratio keep step with no order of views, as of a rig of cameras.
         looks = self.reading is None and step.iteration * GOLDEN_RATIO % 1.0 < SHARE_LOOKED_AT
-        holds = notes[self.note] < MAX_SEEN_SHARE
+        holds = self.notes.setdefault(self.note, 1.0) < MAX_SEEN_SHARE
         if grad is None or not len(grad) or not (looks or holds):
             return
         state = course.state_of_param(step.set, "means") if looks else None
@@ -108,7 +109,7 @@ class _Seen:
             self.reading = Reading(counter)
             self.reading.ask()
 
-    def take(self, notes: dict[str, Any]) -> None:
+    def take(self) -> None:
         """Take the share of a view into the mean, if it has come."""
         counted = None if self.reading is None else self.reading.take()
         if counted is None:
@@ -117,7 +118,8 @@ class _Seen:
         self.counted = int(counted)
         share = (new >> 32) / max(new % 2**32, 1)
         if share > 0:  # a gradient that is zero everywhere is of no view
-            notes[self.note] += WEIGHT * (max(share, MIN_SEEN_SHARE) - notes[self.note])
+            mean = self.notes.setdefault(self.note, 1.0)  # a load has none before its first look
+            self.notes[self.note] = mean + WEIGHT * (max(share, MIN_SEEN_SHARE) - mean)
 
     def _counter(self, device: torch.device) -> Tensor:
         if self.counter is None or self.counter.device != device:

@@ -73,11 +73,9 @@ def takes(step: Step) -> bool:
 def fits(step: Step) -> bool:
     """`takes`, wherever the tensors lie."""
     state, frame = step.state, step.frame
-    if not (
-        _plain(step.param) and _plain(step.grad)
-        and _moment(state["exp_avg"]) and _moment(state["exp_avg_sq"])
-    ):  # fmt: skip
-        return False
+    for tensor in (step.param, step.grad, state["exp_avg"], state["exp_avg_sq"]):
+        if tensor.dtype not in (torch.float32, CODES) or not tensor.is_contiguous():
+            return False
     if frame is None:
         return not step.plain or (step.fade is None and step.hold is None)
     if step.plain or step.fade is not None or step.hold is not None:
@@ -87,10 +85,6 @@ def fits(step: Step) -> bool:
 
 def _plain(tensor: Tensor) -> bool:
     return tensor.dtype is torch.float32 and tensor.is_contiguous()
-
-
-def _moment(tensor: Tensor) -> bool:
-    return tensor.dtype in (torch.float32, CODES) and tensor.is_contiguous()
 
 
 def take_step(step: Step, hyper: Hyper) -> None:
