@@ -52,6 +52,7 @@ class Course:
         self._notes: dict[str, dict[str, Any]] = {type(part).__name__: {} for part in self.parts}
         self.members: dict[tuple[str, str], tuple[StepAdam, int]] = {}
         self.has_means = False  # whether one of the optimizers holds positions: it counts
+        self.progress = 0.0  # the share of the run that is over, 0..1; 0 where it has no end
         self._means_at = -1  # the iteration of its last step
         self._means_open = False  # whether it stepped first there
         self.scratch: dict[Any, Any] = {}  # what parts keep from step to step, and never save
@@ -72,13 +73,6 @@ class Course:
                 part._course = self  # pyright: ignore[reportAttributeAccessIssue]
 
     # -- where the training is -------------------------------------------------------------------
-
-    @property
-    def progress(self) -> float:
-        """The share of the run that is over, 0..1; 0 where it has no end."""
-        return (
-            0.0 if not self.total_steps else min(max(self.iteration / self.total_steps, 0.0), 1.0)
-        )
 
     @property
     def phase(self) -> Phase:
@@ -111,6 +105,8 @@ class Course:
         """Put the clock there."""
         self.iteration, self.exploiting = iteration, iteration >= self._switch
         self.exploits_next = iteration + 1 >= self._switch
+        if self.total_steps:
+            self.progress = min(max(iteration / self.total_steps, 0.0), 1.0)
         if iteration >= self._look_at:
             self._look_at = iteration + LOOK_INTERVAL
             self._look()

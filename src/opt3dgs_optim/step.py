@@ -22,7 +22,7 @@ A row is one Gaussian: dimension 0 of a parameter. In the order in which it is m
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -130,71 +130,55 @@ def take_step(step: Step, hyper: Hyper) -> int:
 
     On other devices they are added to `hyper.nonfinite`, so that nothing waits.
     """
-    fade = step.fade
-    chosen = None if fade is None else chosen_rows(fade, len(step.param), step.param.device)
-    return sum(_take_rows(step, hyper, chosen, rows) for rows in _chunks(step.param))
-
-
-def _chunks(param: Tensor) -> Iterator[Any]:
-    """Rows to work on at a time: all of them on a device, as many as fit a CPU's cache there."""
-    numbers, count = param.numel(), param.shape[0] if param.dim() else 1
-    if numbers <= 2 * CHUNK or not param.is_cpu:
-        yield ...
-        return
-    size = max(1, CHUNK * count // numbers)
-    for start in range(0, count, size):
-        yield slice(start, start + size)
-
-
-def _take_rows(step: Step, hyper: Hyper, chosen: Tensor | None, rows: Any) -> int:
-    exp_avg, exp_avg_sq = hyper.exp_avg[rows], hyper.exp_avg_sq[rows]
-    if exp_avg.dtype != CODES:
-        return _take_decoded(step, hyper, chosen, rows, exp_avg, exp_avg_sq)
-    first, second = decoded(exp_avg, exp_avg_sq)
-    bad = _take_decoded(step, hyper, chosen, rows, first, second)
-    if not step.plain:
-        at = 0 if rows is ... else rows.start * (step.param.numel() // step.param.shape[0])
-        encode(first, second, exp_avg, exp_avg_sq, hyper.key, at)
-    return bad
-
-
-def _take_decoded(
-    step: Step, hyper: Hyper, chosen: Tensor | None, rows: Any, exp_avg: Tensor, exp_avg_sq: Tensor
-) -> int:
-    param = step.param[rows]
-    grad, bad = finite(step.grad[rows], hyper.nonfinite)
-    if step.fade is not None and chosen is not None:
-        faded = like_rows(chosen[rows], param)
-        exp_avg.copy_(torch.where(faded, exp_avg * step.fade.exp_avg, exp_avg))
-        exp_avg_sq.copy_(torch.where(faded, exp_avg_sq * step.fade.exp_avg_sq, exp_avg_sq))
-    if hyper.shrink != 1.0:
-        param.mul_(hyper.shrink)
-    if hyper.decay:
-        grad = grad.add(param, alpha=hyper.decay)
-    axes = None if step.frame is None else axes_of(step.frame, rows)
-    if axes is not None:
-        grad = into_frame(axes, grad)
-    if step.hold is not None:
-        least = (grad * step.hold.weight).square_()
-        least = torch.where(like_rows(step.hold.rows[rows], grad), least, 0.0)
-        torch.maximum(exp_avg_sq, least, out=exp_avg_sq)
-    if step.plain:
-        param.sub_(grad * (hyper.lr * step.factor))
-    else:
-        exp_avg.lerp_(grad, 1 - hyper.beta1)
-        exp_avg_sq.mul_(hyper.beta2).addcmul_(grad, grad, value=1 - hyper.beta2)
-        root = exp_avg_sq.sqrt().div_(hyper.root2).add_(hyper.eps)
-        if step.frame is not None and axes is not None:
-            rate = step.frame.rate * step.factor / hyper.correction1
-            param.sub_(out_of_frame(axes, (exp_avg / root).mul_(rate)))
-        elif isinstance(step.factor, Tensor):  # a device's number, which the host does not know
-            param.sub_((exp_avg / root).mul_(step.factor * (hyper.lr / hyper.correction1)))
+    fade, all_rows, bad = step.fade, step.param, 0
+    chosen = None if fade is None else chosen_rows(fade, len(all_rows), all_rows.device)
+    chunks: Sequence[Any] = (...,)
+    if all_rows.is_cpu and all_rows.numel() > 2 * CHUNK:
+        size = max(1, CHUNK * len(all_rows) // all_rows.numel())
+        chunks = [slice(i, i + size) for i in range(0, len(all_rows), size)]
+    for rows in chunks:
+        exp_avg, exp_avg_sq = codes = hyper.exp_avg[rows], hyper.exp_avg_sq[rows]
+        coded = exp_avg.dtype == CODES
+        if coded:
+            exp_avg, exp_avg_sq = decoded(exp_avg, exp_avg_sq)
+        param = all_rows[rows]
+        grad, found = finite(step.grad[rows], hyper.nonfinite)
+        bad += found
+        if fade is not None and chosen is not None:
+            faded = like_rows(chosen[rows], param)
+            exp_avg.copy_(torch.where(faded, exp_avg * fade.exp_avg, exp_avg))
+            exp_avg_sq.copy_(torch.where(faded, exp_avg_sq * fade.exp_avg_sq, exp_avg_sq))
+        if hyper.shrink != 1.0:
+            param.mul_(hyper.shrink)
+        if hyper.decay:
+            grad = grad.add(param, alpha=hyper.decay)
+        axes = None if step.frame is None else axes_of(step.frame, rows)
+        if axes is not None:
+            grad = into_frame(axes, grad)
+        if step.hold is not None:
+            least = (grad * step.hold.weight).square_()
+            least = torch.where(like_rows(step.hold.rows[rows], grad), least, 0.0)
+            torch.maximum(exp_avg_sq, least, out=exp_avg_sq)
+        if step.plain:
+            param.sub_(grad * (hyper.lr * step.factor))
         else:
-            param.addcdiv_(exp_avg, root, value=-(hyper.lr * step.factor / hyper.correction1))
-    if step.mean is not None:
-        assert hyper.mean is not None
-        assert hyper.began is not None
-        take_into_mean(step.mean, param, hyper.mean[rows], hyper.began[rows])
+            exp_avg.lerp_(grad, 1 - hyper.beta1)
+            exp_avg_sq.mul_(hyper.beta2).addcmul_(grad, grad, value=1 - hyper.beta2)
+            root = exp_avg_sq.sqrt().div_(hyper.root2).add_(hyper.eps)
+            if step.frame is not None and axes is not None:
+                rate = step.frame.rate * step.factor / hyper.correction1
+                param.sub_(out_of_frame(axes, (exp_avg / root).mul_(rate)))
+            elif isinstance(step.factor, Tensor):  # a device's number, which the host does not know
+                param.sub_((exp_avg / root).mul_(step.factor * (hyper.lr / hyper.correction1)))
+            else:
+                param.addcdiv_(exp_avg, root, value=-(hyper.lr * step.factor / hyper.correction1))
+        if step.mean is not None:
+            assert hyper.mean is not None
+            assert hyper.began is not None
+            take_into_mean(step.mean, param, hyper.mean[rows], hyper.began[rows])
+        if coded and not step.plain:
+            at = 0 if rows is ... else rows.start * (all_rows.numel() // len(all_rows))
+            encode(exp_avg, exp_avg_sq, *codes, hyper.key, at)
     return bad
 
 
@@ -278,15 +262,16 @@ def axes_of(frame: Frame, rows: Any = ...) -> Axes:
 
 def into_frame(axes: Axes, vectors: Tensor) -> Tensor:
     """B^T v [n, 3]; zero where that is no number that Adam can square."""
-    turned = turn(axes.quaternion, vectors.unbind(1), -1)
-    found = [each.mul_(s) for each, s in zip(turned, axes.deviations, strict=True)]
-    return _within(LARGEST[vectors.dtype], torch.stack(found, 1))
+    x, y, z = turn(axes.quaternion, vectors.unbind(1), -1)
+    a, b, c = axes.deviations
+    found = torch.stack((x.mul_(a), y.mul_(b), z.mul_(c)), 1)
+    return _within(LARGEST[vectors.dtype], found)
 
 
 def out_of_frame(axes: Axes, vectors: Tensor) -> Tensor:
     """B v [n, 3]; zero where that is not finite."""
-    scaled = [each * s for each, s in zip(vectors.unbind(1), axes.deviations, strict=True)]
-    found = torch.stack(turn(axes.quaternion, scaled, 1), 1)
+    (x, y, z), (a, b, c) = vectors.unbind(1), axes.deviations
+    found = torch.stack(turn(axes.quaternion, (x * a, y * b, z * c), 1), 1)
     return _within(torch.finfo(vectors.dtype).max, found)
 
 
@@ -295,16 +280,23 @@ def turn(quaternion: Sequence[Tensor], vector: Sequence[Tensor], direction: int)
 
     The quaternion is w and u = (x, y, z). The other direction is that of -u.
     """
-    (w, *u), v = quaternion, vector
-    t = [each.mul_(2 * direction) for each in cross(u, v)]
+    w, *u = quaternion
+    t, found = cross(u, vector), list(vector)
+    for each in t:
+        each.mul_(2 * direction)
     across = cross(u, t)
-    return [torch.addcmul(v[i], w, t[i]).add_(across[i], alpha=direction) for i in range(3)]
+    for i in range(3):
+        found[i] = torch.addcmul(found[i], w, t[i]).add_(across[i], alpha=direction)
+    return found
 
 
-def cross(a: Sequence[Tensor], b: Sequence[Tensor]) -> list[Tensor]:
+def cross(a: Sequence[Tensor], b: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     """The cross product of vectors, by columns."""
-    pairs = ((1, 2), (2, 0), (0, 1))
-    return [torch.addcmul(a[i] * b[j], a[j], b[i], value=-1) for i, j in pairs]
+    return (
+        torch.addcmul(a[1] * b[2], a[2], b[1], value=-1),
+        torch.addcmul(a[2] * b[0], a[0], b[2], value=-1),
+        torch.addcmul(a[0] * b[1], a[1], b[0], value=-1),
+    )
 
 
 def _within(largest: float, numbers: Tensor) -> Tensor:
