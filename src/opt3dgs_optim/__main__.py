@@ -1,6 +1,7 @@
 """The commands: `opt3dgs`, or `python -m opt3dgs_optim`."""
 
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 
@@ -40,6 +41,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return importlib.import_module(f"opt3dgs_optim.{MODULES[words[0]]}").main(words[1:])
     except KeyboardInterrupt:
         return 130
+    except BrokenPipeError:  # `| head` has read enough
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+        return 0
 
 
 if __name__ == "__main__":

@@ -120,4 +120,5 @@ def say(message: str) -> None:
     """Tell the user, by the logger, or on stderr where nothing has been set up to show INFO."""
     LOGGER.info(message)
     if not LOGGER.hasHandlers():
-        print(message, file=sys.stderr)
+        bars = getattr(sys.modules.get("tqdm"), "tqdm", None)  # a trainer's would share the line
+        getattr(bars, "write", print)(message, file=sys.stderr)

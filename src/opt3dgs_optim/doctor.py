@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.metadata
+import logging
 import math
 import platform
 import sys
@@ -17,6 +18,7 @@ from torch.nn import Parameter
 from opt3dgs_optim import triton
 from opt3dgs_optim.awsgld import AWSGLD
 from opt3dgs_optim.backend import Backend, backend_info
+from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, two_loop
 from opt3dgs_optim.lqnadam import LQNAdam
 from opt3dgs_optim.phases import PhaseScheduler
@@ -178,6 +180,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description="Versions, backend and self-test of opt3dgs_optim on this machine.",
     )
     parser.add_argument("--device", help="where to look (default: the GPU, if torch sees one)")
+    LOGGER.addHandler(logging.NullHandler())  # the self-test's trainings say nothing
     name = parser.parse_args(arguments).device or ("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.zeros(1, device=name).device

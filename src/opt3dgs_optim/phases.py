@@ -100,7 +100,9 @@ class PhaseScheduler(Course):
         self._group = process_group
         own = (part for part in self.parts if overrides(part, "pixel_loss"))
         self._pixel: Part | None = next(own, None)
-        self._end = End(total_steps, self.part(Averaging))
+        averaging = self.part(Averaging)
+        self._end = End(total_steps, averaging)
+        self._mean_at = -1 if averaging is None else averaging.put_from(total_steps)
         weakref.finalize(self, self._end.say)  # at exit, or where the function that trains ends
 
     @classmethod
@@ -164,11 +166,12 @@ class PhaseScheduler(Course):
     def _say_upgraded(self, names: str) -> None:
         """One line, so that a user sees that something has happened."""
         means, fading = self.param_of("", "means"), self.part(Fading)
-        line = f"opt3dgs_optim: {self.total_steps} iterations, "
-        line += ", ".join(type(part).__name__ for part in self.parts) or "no parts"
+        parts = [type(part).__name__ for part in self.parts]
         if means is not None and fading is not None:
-            line += f" ({fading.num_events(self.total_steps or 0, len(means))} events)"
-        say(f"{line}, in the steps of {names}")
+            events = fading.num_events(self.total_steps or 0, len(means))
+            parts[self.parts.index(fading)] += f" ({events} times)"
+        listed = ", ".join(parts) or "no parts"
+        say(f"opt3dgs_optim: {self.total_steps} iterations, {listed}, in the steps of {names}")
 
     def _upgrade(self, optimizer: Any, slots: Slots) -> None:
         if isinstance(optimizer, StepAdam):
@@ -271,6 +274,11 @@ class PhaseScheduler(Course):
                 numbers["loss"], self._loss = self._loss, None
             self.log.step(self.iteration, phase=self.phase.value, **numbers)
         assert self.total_steps is not None
+        if self.iteration == self._mean_at:
+            say(
+                f"opt3dgs_optim: iteration {self.iteration + 1} of {self.total_steps}: from this "
+                "step on the parameters are the mean of the last thirtieth's iterates"
+            )
         if self.iteration > self.total_steps:  # trainers that count from 1 end at total_steps
             self.warn_once(
                 "overrun",
@@ -309,7 +317,9 @@ class PhaseScheduler(Course):
         return {**super().__getstate__(), "log": None, "_group": None}
 
     def __repr__(self) -> str:
-        clock = f"iteration {self.iteration} of {self.total_steps}, {self.phase.value}"
+        clock = f"iteration {self.iteration} of {self.total_steps}"
+        if any(part.during is not None for part in self.parts):
+            clock += f", {self.phase.value}"
         return "\n".join([f"{CALL}(", f"  {clock}", *(f"  {part!r}" for part in self.parts), ")"])
 
 

@@ -125,7 +125,7 @@ class Hyper:
     key: int = 0  # 32 bits on which this step's rounding of moments to codes depends
 
 
-def take_step(step: Step, hyper: Hyper) -> int:
+def take_step(step: Step, hyper: Hyper) -> int:  # noqa: PLR0912  (all that a step may have)
     """Make the step in plain torch; how many numbers of the gradient were not finite (CPU only).
 
     On other devices they are added to `hyper.nonfinite`, so that nothing waits.

@@ -82,8 +82,8 @@ _GSPLAT = Trainer(
         "Density control": f"`mcmc` relocates, `default` clones, splits and prunes. {_BOTH}",
         **_GSPLAT_NOTES,
         "Saved": "`ckpts/ckpt_*_rank0.pt` and, with `--save_ply`, `ply/*.ply` of the last "
-        "iteration hold the mean of all iterates but the last. With `mcmc` their positions have the "
-        "noise of one iteration on top, as without the lines. The PSNR that gsplat prints "
+        "iteration hold the mean of all iterates but the last. With `mcmc` their positions have "
+        "the noise of one iteration on top, as without the lines. The PSNR that gsplat prints "
         "last is of one step later. Files of earlier iterations hold plain iterates.",
         "Several ranks": "Each rank has a loss and Gaussians of its own. Give the scheduler "
         "`process_group=torch.distributed.group.WORLD if world_size > 1 else None`.",
