@@ -2,7 +2,7 @@
 
 Everything is stepped in turns, so that a busy machine slows all alike. Writes the medians to
 `--out`, from which `report.py` makes the table of docs/performance.md. `examples/gpu.py` measures
-the same on a GPU. Five minutes on a CPU.
+the same on a GPU. One to five minutes on a CPU.
 """
 
 from __future__ import annotations
@@ -29,7 +29,17 @@ from torch.nn import Parameter
 from torch.profiler import ProfilerActivity, profile
 from tqdm import tqdm
 
-from opt3dgs_optim import DEFAULTS, Curvature, EnergyHistogram, OwnFrame, Part, PhaseScheduler
+from opt3dgs_optim import (
+    DEFAULTS,
+    Averaging,
+    Curvature,
+    EnergyHistogram,
+    Fading,
+    OutOfView,
+    OwnFrame,
+    Part,
+    PhaseScheduler,
+)
 
 OUT = Path(__file__).resolve().parents[2] / "docs" / "results" / "steps.json"
 POINTS = {"cpu": (1_000, 10_000, 100_000, 1_000_000), "cuda": (10_000, 100_000, 1_000_000)}
@@ -108,6 +118,7 @@ SUBJECTS: dict[str, Callable[[int, torch.device], Subject]] = {
     "defaults, a tenth in view": stepped(lambda: DEFAULTS, in_view=0.1),
     "defaults, last thirtieth": stepped(lambda: DEFAULTS, at=0.975),
     "defaults, moments of 16 bits": stepped(lambda: DEFAULTS, moments=16),
+    "defaults without OwnFrame": stepped(lambda: [Fading(), OutOfView(), Averaging()]),
     "OwnFrame alone": stepped(lambda: [OwnFrame()]),
     "the paper's exploration": stepped(lambda: [EnergyHistogram.paper(warmup=4)]),
     "the paper's exploitation": stepped(lambda: [Curvature()], at=0.0, switch=0.0),
