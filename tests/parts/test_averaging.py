@@ -41,6 +41,23 @@ def test_the_end_is_the_mean_of_the_last_iterates(total: int) -> None:
         assert torch.allclose(params["sh0"].double(), torch.stack(last).mean(0), atol=1e-5)
 
 
+@pytest.mark.parametrize(("total", "said"), [(20, []), (40, [40]), (300, [299])])
+def test_the_line_says_where_the_mean_is_put(total: int, said: list[int], caplog: Any) -> None:
+    """A trial of fewer than 30 iterations has none, and one of fewer than 60 a mean of one."""
+    caplog.set_level("INFO")
+    params = parameters(ROWS, "sh0")
+    optimizers = PhaseScheduler(total, parts=[Averaging()]).upgrade(adams_of(params))
+    put = []
+    for iteration in range(total):
+        steps(optimizers, params, 1, seed=iteration)
+        mean = optimizers["sh0"].state[params["sh0"]].get("averaging.mean")
+        if mean is not None and torch.equal(mean, params["sh0"]):
+            put.append(iteration + 1)
+    lines = [r.getMessage() for r in caplog.records if "are the mean" in r.getMessage()]
+    assert [int(line.split("iteration ")[1].split()[0]) for line in lines] == said
+    assert put[-2:][: len(said)] == said
+
+
 def test_until_the_mean_is_put_nothing_is_changed() -> None:
     ends = []
     for parts in ([Averaging()], []):
