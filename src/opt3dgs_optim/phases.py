@@ -276,7 +276,7 @@ class PhaseScheduler(Course):
                 numbers["loss"], self._loss = self._loss, None
             self.log.step(self.iteration, phase=self.phase.value, **numbers)
         assert self.total_steps is not None
-        if self.iteration == self._mean_at < self.total_steps:
+        if self.iteration == self._mean_at < self.total_steps and not self.finished:
             say(
                 f"opt3dgs_optim: iteration {self.iteration + 1} of {self.total_steps}: from this "
                 "step on the parameters are the mean of the last thirtieth's iterates"

@@ -58,6 +58,19 @@ def test_the_line_says_where_the_mean_is_put(total: int, said: list[int], caplog
     assert put[-2:][: len(said)] == said
 
 
+def test_the_line_is_not_said_after_an_early_finish(caplog: Any) -> None:
+    """As where a trainer calls it at every save: there is no mean any more, which is warned of."""
+    caplog.set_level("INFO")
+    params = parameters(ROWS, "sh0")
+    phases = PhaseScheduler(TOTAL, parts=[Averaging()])
+    optimizers = phases.upgrade(adams_of(params))
+    phases.finish()
+    with pytest.warns(UserWarning, match="no mean any more"):
+        steps(optimizers, params, TOTAL)
+    assert "averaging.mean" not in optimizers["sh0"].state[params["sh0"]]
+    assert not any("are the mean" in record.getMessage() for record in caplog.records)
+
+
 def test_until_the_mean_is_put_nothing_is_changed() -> None:
     ends = []
     for parts in ([Averaging()], []):
