@@ -413,6 +413,23 @@ def test_a_mask_that_is_missing_or_too_much_changes_nothing() -> None:
         assert not optimizer.state
 
 
+def test_a_masked_step_that_breaks_off_leaves_the_positions(monkeypatch: Any) -> None:
+    """A GPU may run out of memory before there are zeros to step from."""
+
+    def full(*_: Any) -> Any:
+        raise RuntimeError("out of memory")
+
+    params = parameters(ROWS)
+    optimizer = PhaseScheduler(TOTAL, parts=[OwnFrame()]).upgrade(adam_of(params, SelectiveAdam))
+    start = params["means"].detach().clone()
+    for param in params.values():
+        param.grad = torch.ones_like(param)
+    monkeypatch.setattr("opt3dgs_optim.masked.into_frame", full)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        optimizer.step(torch.ones(ROWS, dtype=torch.bool))
+    assert torch.equal(params["means"], start)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_nan_is_told_where_masked_steps_are_made(kind: Any) -> None:
     """And counts as zero: no row becomes NaN."""

@@ -207,14 +207,17 @@ def test_nan_is_told_whatever_iterations_the_clock_is_put_to() -> None:
 ORDERS = ("m", "mo", "om", "moo", "oom", "omo", "mabab", "abmab")
 
 
+@pytest.mark.parametrize("observed", [False, True])
 @pytest.mark.parametrize("order", ORDERS)
-def test_the_clock_is_that_of_the_positions(order: str) -> None:
+def test_the_clock_is_that_of_the_positions(order: str, observed: bool) -> None:
     """Whatever other optimizers step before and after them, once or several times."""
     phases, part = clocked()
     params = parameters(5, *(("means", "sh0", "shN") if "a" in order else ("means", "sh0")))
     named = dict(zip("mab" if "a" in order else "mo", params, strict=True))
     adams = phases.upgrade(adams_of(params))
-    for _ in range(20):
+    for iteration in range(20):
+        if observed:
+            phases.observe(iteration=iteration)
         for letter in order:
             steps({"": adams[named[letter]]}, params, 1)
     assert part.seen["means"] == list(range(20))

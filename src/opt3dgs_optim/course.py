@@ -55,6 +55,7 @@ class Course:
         self.progress = 0.0  # the share of the run that is over, 0..1; 0 where it has no end
         self._means_at = -1  # the iteration of its last step
         self._means_open = False  # whether it stepped first there
+        self._begun = -1  # the iteration of the last step: `observe` puts the clock beyond it
         self.scratch: dict[Any, Any] = {}  # what parts keep from step to step, and never save
         self._resumed = False  # whether the present iteration is over, for all optimizers
         self.finished = False  # whether the run has been ended early
@@ -89,12 +90,12 @@ class Course:
         iteration = max(optimizer.next_iteration, present, 0)
         if optimizer.has_means:
             if iteration > self._means_at:  # of two sets' optimizers the first
-                self._means_open = iteration > self.iteration
+                self._means_open = iteration > self._begun
             self._means_at = iteration
         elif self.has_means and iteration > present:  # it has stepped in the present one
             begins = self._means_at >= present and not self._means_open
             iteration = max(present + begins, 0)
-        self._resumed = False
+        self._resumed, self._begun = False, iteration
         optimizer.next_iteration = iteration + 1
         if iteration > self.iteration:
             self._go_to(iteration)
@@ -244,7 +245,8 @@ class Course:
     def restore(self, state: Mapping[str, Any] | None, iteration: int) -> None:
         """Go on at an iteration, with what was noted there."""
         self._go_to(iteration - 1)
-        self._means_at, self._means_open, self._resumed = iteration - 1, False, True
+        self._means_at = self._begun = iteration - 1
+        self._means_open, self._resumed = False, True
         for name, notes in () if state is None else state["notes"].items():
             if name in self._notes:
                 self._notes[name].clear()

@@ -60,7 +60,7 @@ def step_around(
     finally:
         for lane, grad, lr, position, axes in undo:
             lane.param.grad, lane.group["lr"] = grad, lr
-            if axes is not None and lane.param.data is not position:
+            if axes is not None and lane.param.data_ptr() != position.data_ptr():
                 moved, lane.param.data = lane.param.data, position
                 lane.param.add_(out_of_frame(axes, moved))
     for lane, step in steps:

@@ -102,7 +102,9 @@ class PhaseScheduler(Course):
         self._pixel: Part | None = next(own, None)
         averaging = self.part(Averaging)
         self._end = End(total_steps, averaging)
-        self._mean_at = -1 if averaging is None else averaging.put_from(total_steps)
+        self._mean_at = total_steps  # never
+        if averaging is not None:  # a short run puts the mean where it begins, or has none
+            self._mean_at = max(averaging.start(total_steps), averaging.put_from(total_steps))
         weakref.finalize(self, self._end.say)  # at exit, or where the function that trains ends
 
     @classmethod
@@ -274,7 +276,7 @@ class PhaseScheduler(Course):
                 numbers["loss"], self._loss = self._loss, None
             self.log.step(self.iteration, phase=self.phase.value, **numbers)
         assert self.total_steps is not None
-        if self.iteration == self._mean_at:
+        if self.iteration == self._mean_at < self.total_steps and not self.finished:
             say(
                 f"opt3dgs_optim: iteration {self.iteration + 1} of {self.total_steps}: from this "
                 "step on the parameters are the mean of the last thirtieth's iterates"

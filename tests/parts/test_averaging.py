@@ -41,6 +41,36 @@ def test_the_end_is_the_mean_of_the_last_iterates(total: int) -> None:
         assert torch.allclose(params["sh0"].double(), torch.stack(last).mean(0), atol=1e-5)
 
 
+@pytest.mark.parametrize(("total", "said"), [(20, []), (40, [40]), (300, [299])])
+def test_the_line_says_where_the_mean_is_put(total: int, said: list[int], caplog: Any) -> None:
+    """A trial of fewer than 30 iterations has none, and one of fewer than 60 a mean of one."""
+    caplog.set_level("INFO")
+    params = parameters(ROWS, "sh0")
+    optimizers = PhaseScheduler(total, parts=[Averaging()]).upgrade(adams_of(params))
+    put = []
+    for iteration in range(total):
+        steps(optimizers, params, 1, seed=iteration)
+        mean = optimizers["sh0"].state[params["sh0"]].get("averaging.mean")
+        if mean is not None and torch.equal(mean, params["sh0"]):
+            put.append(iteration + 1)
+    lines = [r.getMessage() for r in caplog.records if "are the mean" in r.getMessage()]
+    assert [int(line.split("iteration ")[1].split()[0]) for line in lines] == said
+    assert put[-2:][: len(said)] == said
+
+
+def test_the_line_is_not_said_after_an_early_finish(caplog: Any) -> None:
+    """As where a trainer calls it at every save: there is no mean any more, which is warned of."""
+    caplog.set_level("INFO")
+    params = parameters(ROWS, "sh0")
+    phases = PhaseScheduler(TOTAL, parts=[Averaging()])
+    optimizers = phases.upgrade(adams_of(params))
+    phases.finish()
+    with pytest.warns(UserWarning, match="no mean any more"):
+        steps(optimizers, params, TOTAL)
+    assert "averaging.mean" not in optimizers["sh0"].state[params["sh0"]]
+    assert not any("are the mean" in record.getMessage() for record in caplog.records)
+
+
 def test_until_the_mean_is_put_nothing_is_changed() -> None:
     ends = []
     for parts in ([Averaging()], []):
