@@ -4,7 +4,6 @@ Everything here works on [D, N] tensors whose rows are contiguous: component by 
 several times faster on them than on [N, D].
 """
 
-import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -49,9 +48,14 @@ def largest(x: Tensor) -> Tensor:
 
 def length(x: Tensor) -> Tensor:
     """Euclidean norm of vectors [.., D, N] without overflow or underflow, [.., N]; 1 of zero."""
-    first, *others = x.unbind(-2)
-    norm = functools.reduce(torch.hypot, others, first) if others else first.abs()
-    return torch.threshold(norm, 0.0, 1.0)
+    norms = x.abs() if x.shape[-2] == 1 else x
+    while (count := norms.shape[-2]) > 1:  # by halves: D may be the size of a network
+        half = count // 2
+        first, last = norms[..., :half, :], norms[..., -1:, :]
+        norms = torch.hypot(first, norms[..., half : 2 * half, :])
+        if count % 2:
+            torch.hypot(norms[..., :1, :], last, out=norms[..., :1, :])
+    return torch.threshold(norms.squeeze(-2), 0.0, 1.0)
 
 
 def normalised(vectors: Tensor) -> Pair:
