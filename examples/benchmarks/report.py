@@ -114,6 +114,7 @@ def front(all_: Evidence) -> str:
         ours = all_.of("own", scene, iterations=10_000, **HALF)
         stock = all_.of("mcmc", scene, iterations=30_000, **HALF)
         stock = [x for x in stock if x["seed"] in seeds_of(ours)]
+        ours = [x for x in ours if x["seed"] in seeds_of(stock)]
         forms = {"psnr": "{:.2f}", "ssim": "{:.3f}", "lpips": "{:.3f}"}
         cells = (" / ".join(f.format(mean(x, m)) for m, f in forms.items()) for x in (stock, ours))
         rows.append((scene, photos, str(len(ours)), *cells))
