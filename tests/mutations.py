@@ -80,7 +80,8 @@ def _changed_calls(node: ast.Call, func: ast.Attribute) -> Iterator[ast.AST]:
     if func.attr in CALLS:
         yield _replaced(node, func=_replaced(func, attr=CALLS[func.attr]))
     elif func.attr == "where" and len(node.args) == 3:
-        yield _replaced(node, args=[node.args[0], node.args[2], node.args[1]])
+        if ast.dump(node.args[1]) != ast.dump(node.args[2]):
+            yield _replaced(node, args=[node.args[0], node.args[2], node.args[1]])
     elif func.attr == "clamp":
         yield func.value
 
