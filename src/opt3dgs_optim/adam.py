@@ -441,8 +441,9 @@ class StepAdam(Adam):
 
     def __getstate__(self) -> dict[str, Any]:
         self._drop_moved()
-        kept = ("course", "_slots", "_masked", "in_own_frame", "next_iteration", "coded")
-        kept += ("has_means",)
+        kept = (
+            "course", "_slots", "_masked", "has_means", "in_own_frame", "next_iteration", "coded",
+        )  # fmt: skip
         own = {key: getattr(self, key) for key in kept}
         return {**super().__getstate__(), **own, "_lanes": [], "_last": self.last_steps()}
 

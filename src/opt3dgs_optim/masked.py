@@ -8,6 +8,7 @@ out of view are held by the mask already, and moments are theirs.
 
 from __future__ import annotations
 
+import functools
 import inspect
 from typing import TYPE_CHECKING, Any
 
@@ -32,11 +33,14 @@ if TYPE_CHECKING:
     from opt3dgs_optim.course import Course
 
 
+_signature = functools.lru_cache(maxsize=8)(inspect.signature)  # every step asks
+
+
 def check_arguments(call: str, step: Any, *args: Any) -> None:
     """TypeError unless a step takes these arguments: self, the others, and a dict of named ones."""
     *given, named = args
     try:
-        inspect.signature(step).bind(*given, **named)
+        _signature(step).bind(*given, **named)
     except TypeError as error:
         raise TypeError(f"{call}.step: {error}; it needs its mask, as before the upgrade") from None
 
