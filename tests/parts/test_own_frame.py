@@ -60,6 +60,17 @@ def stepped(params: dict[str, Any], grad: Tensor, part: OwnFrame, count: int = 1
     return params["means"].detach() - before
 
 
+def test_the_first_step_is_against_the_gradient_in_the_frame() -> None:
+    """By rate standard deviations along each axis: -rate B sign(B^T g)."""
+    params = parameters(ROWS, *NAMES)
+    quats, scales, grad = params["quats"].detach(), params["scales"].detach(), draw(7, ROWS, 3)
+    dense = dense_axes(quats, scales, 0.1)
+    signs = torch.einsum("nij,ni->nj", dense, grad.double()).sign()
+    expected = -0.1 * torch.einsum("nij,nj->ni", dense, signs)
+    moved = stepped(params, grad, OwnFrame(rate=0.1, min_aspect=0.1))
+    assert torch.allclose(moved.double(), expected, rtol=1e-3, atol=1e-6)
+
+
 @settings(max_examples=25)
 @given(seed=SEEDS, rate=st.sampled_from([0.01, 0.1, 1.0]))
 def test_a_full_step_is_rate_standard_deviations_along_each_axis(seed: int, rate: float) -> None:
