@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -17,9 +18,15 @@ WINDOW = [weight / (_HALF[0] + 2 * sum(_HALF[1:])) for weight in (*_HALF[:0:-1],
 _C1, _C2 = 0.01**2, 0.03**2  # (K1 L)^2 and (K2 L)^2 of Wang et al. 2004, dynamic range L = 1
 
 
+@lru_cache
+def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """`WINDOW` on a device; a copy to a GPU waits for all that is queued there."""
+    return torch.tensor(WINDOW, dtype=dtype, device=device)
+
+
 def _blur(maps: Tensor) -> Tensor:
     """The zero-padded Gaussian window over images [..., H, W, C]."""
-    window = torch.tensor(WINDOW, dtype=maps.dtype, device=maps.device)
+    window = _window(maps.dtype, maps.device)
     planes = maps.movedim(-1, -3)
     flat = planes.reshape(-1, 1, *planes.shape[-2:])
     flat = conv2d(flat, window.view(1, 1, -1, 1), padding=(RADIUS, 0))
