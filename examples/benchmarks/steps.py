@@ -1,8 +1,9 @@
 """What a step costs beside six Adams, on a CPU or a GPU: python examples/benchmarks/steps.py
 
-Everything is stepped in turns, so that a busy machine slows all alike. Writes the medians to
-`--out`, from which `report.py` makes the table of docs/performance.md. `examples/gpu.py` measures
-the same on a GPU. One to five minutes on a CPU.
+Everything is stepped in turns, so that a busy machine slows all alike, in another order in each
+round, since what a step follows changes its time. Writes the medians to `--out`, from which
+`report.py` makes the table of docs/performance.md. `examples/gpu.py` measures the same on a GPU.
+One to five minutes on a CPU.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import argparse
 import json
 import logging
 import platform
+import random
 import statistics
 import sys
 import time
@@ -142,11 +144,13 @@ def measure(points: int, device: torch.device, names: Sequence[str], rounds: int
         kept = state_bytes(optimizers) / points
         made[name] = {"bytes_per_point": round(kept, 1), **counts(calls[name], device)}
     times: dict[str, list[float]] = {name: [] for name in calls}
+    order, shuffle = list(calls), random.Random(0).shuffle
     for _ in range(rounds):
-        for name, call in calls.items():
+        shuffle(order)
+        for name in order:
             if device.type == "cpu":
                 SWEPT.add_(1.0)
-            times[name].append(timed(call, device))
+            times[name].append(timed(calls[name], device))
     for name, row in made.items():
         theirs = times[FUSED if name.endswith("fused") else BASELINE]
         ratios = [a / b for a, b in zip(times[name], theirs, strict=True)]

@@ -22,6 +22,7 @@ pytestmark = pytest.mark.compiles
 def driver(monkeypatch: pytest.MonkeyPatch) -> FakeDriver:
     kernels = fresh_kernels({})
     monkeypatch.setattr(triton, "_kernels", lambda: kernels)
+    monkeypatch.setattr(torch._C, "_cuda_getCurrentRawStream", lambda _: 0, raising=False)
     monkeypatch.setattr(triton, "_COMPILED", {})
     made = fake_driver()
     made.launched, made.loaded = [], []
@@ -82,14 +83,15 @@ def test_nothing_that_changes_from_step_to_step_compiles_anew(driver: FakeDriver
     assert driver.loaded == ["step_rows", "step_in_own_frame"]
 
 
-def test_tensors_that_begin_anywhere_are_launched_by_triton(driver: FakeDriver) -> None:
+def test_tensors_that_begin_anywhere_have_a_kernel_of_their_own(driver: FakeDriver) -> None:
     """A view that begins at 4 bytes is compiled for by itself; others go on as they were."""
     whole, _ = launched(driver, (64, 3)), launched(driver, (64, 3))
     step, hyper = case((64, 3), torch.Generator().manual_seed(0))
     step.grad = torch.zeros(64 * 3 + 1)[1:].view(64, 3)
-    triton.launch(step, hyper)
+    for _ in range(2):
+        triton.launch(step, hyper)
     assert len(driver.loaded) == 2
-    assert isinstance(driver.launched[-1][4], torch.Tensor)
+    assert driver.launched[-1][4] == step.grad.data_ptr()
     assert len(launched(driver, (64, 3))) == len(whole)
     assert len(driver.loaded) == 2
 
@@ -120,11 +122,11 @@ def test_rows_are_read_four_numbers_at_a_time(
     ((key, made),) = triton._COMPILED.items()
     ptx = made.asm["ptx"]
     moments, means = (0 if "plain" in options else 2), (1 if "mean" in options else 0)
-    reads = ROWS_BLOCK // (4 * 128)  # of four numbers, by 128 threads
+    reads = ROWS_BLOCK // (4 * 32 * triton.WARPS["step_rows"])  # of four numbers, by its threads
     assert ptx.count("ld.global.v4") == reads * (2 + moments + means)
     assert ptx.count("st.global.v4") == reads * (1 + moments + means)
     assert ".local" not in ptx  # all in registers
-    assert key[-1] == (long is not None)
+    assert key[3] == (long is not None)
     assert ".s64" in ptx or not long
 
 

@@ -22,6 +22,8 @@ from opt3dgs_optim.moments import CODES
 from opt3dgs_optim.step import Hyper, Step
 
 ROWS_BLOCK, FRAME_BLOCK, LOOK_BLOCK = 1024, 128, 1024  # as in `kernels`
+WARPS = {"step_rows": 8, "step_in_own_frame": 2, "look_at_positions": 4}  # fastest on an H200
+MAX_WIDTH = 2**20 - ROWS_BLOCK  # numbers of a row: see `kernels.rows_of`
 NO_FADE = (0, 0.0, 1.0, 1.0)
 _HERE = contextlib.nullcontext()
 _COMPILED: dict[Any, Any] = {}  # what Triton has compiled, by what it depends on
@@ -43,7 +45,8 @@ def missing() -> str | None:
     try:
         p, g, m, v = torch.zeros(4, 1, device="cuda")
         hyper = Hyper(0.0, 0.9, 0.999, 1.0, 1.0, 1.0, m, v)
-        launch(Step(p, g, None, "", {}, {}, 0, -1), hyper)
+        for _ in range(2):  # by Triton's launcher, and as in all later steps
+            launch(Step(p, g, None, "", {}, {}, 0, -1), hyper)
     except Exception as error:  # no C compiler, a GPU that is too old, a folder that is read-only
         return (
             f"Triton cannot launch a kernel ({type(error).__name__}: {error}), so that a step on "
@@ -77,6 +80,9 @@ def fits(step: Step) -> bool:
         if tensor.dtype not in (torch.float32, CODES) or not tensor.is_contiguous():
             return False
     if frame is None:
+        numbers = step.param.numel()
+        if numbers > MAX_WIDTH and numbers > MAX_WIDTH * step.param.shape[0]:
+            return False
         return not step.plain or (step.fade is None and step.hold is None)
     if step.plain or step.fade is not None or step.hold is not None:
         return False  # none of our parts says so of positions in their own frames
@@ -124,10 +130,16 @@ def look(
         )  # fmt: skip
 
 
+@functools.cache
+def _several_gpus() -> bool:
+    return torch.cuda.device_count() > 1
+
+
 def _device_of(tensor: Tensor) -> Any:
     """A context in which kernels are launched where a tensor lies."""
     index = tensor.get_device()
-    return _HERE if index in (-1, torch.cuda.current_device()) else torch.cuda.device(index)
+    other = _several_gpus() and index not in (-1, torch.cuda.current_device())
+    return torch.cuda.device(index) if other else _HERE
 
 
 def launch(step: Step, hyper: Hyper) -> None:
@@ -183,27 +195,29 @@ def _run(
     """Launch a kernel; what Triton has compiled is launched again without its launcher.
 
     Triton's launcher looks at every argument, which takes 30 us. What it finds is the same again
-    where the same tensors are there, all begin at a multiple of 16 bytes, and are on one device.
+    where the same tensors are there, begin at multiples of 16 bytes or do not, and are on one
+    device.
     """
     pointers = [None if tensor is None else tensor.data_ptr() for tensor in tensors]
-    every, absent, bit = 0, 0, 1
-    for pointer in pointers:
-        if pointer is None:
-            absent |= bit
-        else:
-            every |= pointer
-        bit *= 2
     first = tensors[0]
     assert first is not None
-    key = name, coded, absent, first.get_device(), numbers[0] >= 2**31
-    compiled = _COMPILED.get(key) if every % 16 == 0 else None
+    device = first.get_device()
+    key = name, coded, device, numbers[0] >= 2**31, *[p and p & 15 for p in pointers]
+    compiled = _COMPILED.get(key)
     if compiled is not None:
-        compiled[programs, 1, 1](*pointers, *numbers)
+        # The public `torch.cuda.current_stream` makes an object of it, at the cost of this launch.
+        stream = torch._C._cuda_getCurrentRawStream(device)
+        # As the code that torch.compile generates does; the Nones are of profilers' hooks.
+        compiled.run(
+            programs, 1, 1, stream, compiled.function, compiled.packed_metadata, None, None, None,
+            *pointers, *numbers,
+        )  # fmt: skip
         return
     kernel = getattr(_kernels(), name)
     # Without the fusion of a product and a sum the numbers are those of torch's operators.
-    compiled = kernel[programs,](*tensors, *numbers, enable_fp_fusion=False)
-    if every % 16 == 0 and compiled is not None:
+    options = {"enable_fp_fusion": False, "num_warps": WARPS[name]}
+    compiled = kernel[programs,](*tensors, *numbers, **options)
+    if compiled is not None:
         _COMPILED[key] = compiled
 
 
