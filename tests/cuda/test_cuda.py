@@ -123,7 +123,7 @@ def test_side_stream_and_no_synchronisation() -> None:
 
 
 def test_a_launch_costs_little_of_python() -> None:
-    """Microseconds; a launch of torch's own takes five."""
+    """At most 25 us with all that Python does; a launch of torch's own takes five."""
     grad, history = (t.float().cuda().contiguous() for t in two_loop_case(10_000, 5))
     times = []
     for _ in range(200):
@@ -132,7 +132,7 @@ def test_a_launch_costs_little_of_python() -> None:
         for _ in range(10):  # no more than a queue takes
             two_loop(grad, history, 5)
         times.append((time.perf_counter() - begun) / 10)
-    assert statistics.median(times) < 15e-6
+    assert statistics.median(times) < 25e-6
 
 
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="one GPU only")
