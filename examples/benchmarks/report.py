@@ -1,7 +1,7 @@
 """Make the tables and the picture of docs/evidence.md anew: python examples/benchmarks/report.py
 
 So it does with README's table. All comes from docs/results/evidence.jsonl, and the cost of a step,
-which docs/performance.md has, from steps.json beside it. In a page a table stands between
+which docs/performance.md has, from steps.json and gpu.json beside it. In a page a table stands between
 `<!-- evidence:NAME -->` and `<!-- end -->`, where NAME is a function of `TABLES`.
 """
 
@@ -22,6 +22,7 @@ from benchmarks import evidence, steps
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", ROOT / "docs" / "evidence.md", ROOT / "docs" / "performance.md")
+GPU = evidence.FILE.with_name("gpu.json")
 PICTURE = evidence.FILE.with_name("iterations.png")
 MAIN = ("bonsai", "lego", "plush")
 FEW = ("banana", "brighton_beach", "embedded", "lund_door")
@@ -159,23 +160,55 @@ def kept_aside(all_: Evidence) -> str:
 
 
 def gpu(all_: Evidence) -> str:
-    """What was read on a GPU, at the last evaluation that all arms reached and at a third of it."""
+    """The trainings on a GPU that came to their end."""
+    found = [x for x in all_.lines if "NVIDIA" in x["device"] and x["lpips"] is not None]
     rows = []
-    found = [x for x in all_.lines if "NVIDIA" in x["device"]]
-    for setting in sorted({(x["scene"], x["points"], x["iterations"]) for x in found}):
-        those = {
-            x["arm"]: dict(zip(x["curve"]["iteration"], x["curve"]["psnr"], strict=True))
-            for x in found
-            if (x["scene"], x["points"], x["iterations"]) == setting
-        }
-        marks = sorted(set.intersection(*map(set, those.values())))
-        for arm in ("mcmc", "defaults", "own"):
-            cells = [f"{those[arm][n]:.2f} at {n:,}" for n in (marks[len(marks) // 3], marks[-1])]
-            scene, points, planned = setting
-            what = f"{scene}, {points:,}, {planned:,}" if arm == "mcmc" else ""
-            rows.append((what, NAMES[arm], *cells))
-    heads = ("scene, Gaussians, planned iterations", "training", "PSNR early", "PSNR at the last")
-    return table(heads, rows)
+    for scene in sorted({x["scene"] for x in found}):
+        those = [x for x in found if x["scene"] == scene]
+        stock = [x for x in those if x["arm"] == "mcmc" and x["iterations"] == 15_000]
+        for line in (*stock, *(x for x in those if x["arm"] == "own")):
+            name = f"{NAMES[line['arm']]}, {line['iterations']:,}"
+            less = "" if line in stock else gained([line], stock).removesuffix(" (1 seed)")
+            ends = shown([line]).removesuffix(" (1 seed)")
+            first = scene if line in stock else ""
+            rows.append((first, name, ends, less, f"{line['seconds']:.0f} s"))
+    return table(("scene", "training", "PSNR / SSIM / LPIPS", "less stock", "took"), rows)
+
+
+def gpu_step(_: Evidence) -> str:
+    """What a step costs on a GPU."""
+    found = json.loads(GPU.read_text(encoding="utf-8"))["steps"]["results"]
+    rows = []
+    for name in found["5000000"]:
+        cells = []
+        for results in found.values():
+            row = results.get(name)
+            cells.append("-" if row is None else f"{row['ms']:.2f} ms, x{row['ratio']:.2f}")
+        rows.append((name, *cells, str(found["1000000"][name]["launches"])))
+    heads = [f"{int(points):,} Gaussians" for points in found]
+    return table(("", *heads, "launches"), rows)
+
+
+def gpu_iteration(_: Evidence) -> str:
+    """What a whole iteration of gsplat's training costs on a GPU."""
+    made = json.loads(GPU.read_text(encoding="utf-8"))
+    found, before = made["iterations"]["results"], made["before"]["iterations"]
+    names = {  # of the step before: its defaults had no own frame
+        "defaults": "the same with OwnFrame",
+        "defaults, last thirtieth": "the same in the last thirtieth",
+    }
+    rows = []
+    for name in found["1000000"]:
+        cells = []
+        for points, results in found.items():
+            row = results[name]
+            spread = "" if name == "stock" else f" ({row['low']:.2f} to {row['high']:.2f})"
+            cells.append(f"{row['ms']:.1f} ms, x{row['ratio']:.2f}{spread}")
+            old = before[points].get(names.get(name, ""))
+            cells.append("" if old is None else f"x{old:.2f}")
+        rows.append((name, *cells))
+    heads = [h for n in found for h in (f"{int(n):,} Gaussians", "the step before")]
+    return table(("", *heads), rows)
 
 
 def equal(all_: Evidence) -> str:
@@ -297,8 +330,11 @@ NAMES = {
 }
 TABLES: dict[str, Callable[[Evidence], str]] = {
     f.__name__: f
-    for f in (front, iterations, kept_aside, gpu, equal, cost, few, adaptive, capture, closed)
-}
+    for f in (
+        front, iterations, kept_aside, gpu, gpu_step, gpu_iteration, equal, cost, few, adaptive,
+        capture, closed,
+    )
+}  # fmt: skip
 
 
 DRAWN = (
