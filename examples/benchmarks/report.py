@@ -1,8 +1,8 @@
 """Make the tables and the picture of docs/evidence.md anew: python examples/benchmarks/report.py
 
 So it does with README's table. All comes from docs/results/evidence.jsonl, and the cost of a step,
-which docs/performance.md has, from steps.json and gpu.json beside it. In a page a table stands between
-`<!-- evidence:NAME -->` and `<!-- end -->`, where NAME is a function of `TABLES`.
+which docs/performance.md has, from steps.json and gpu.json beside it. In a page a table stands
+between `<!-- evidence:NAME -->` and `<!-- end -->`, where NAME is a function of `TABLES`.
 """
 
 from __future__ import annotations
