@@ -3,7 +3,9 @@
 `HYPOTHESIS_PROFILE=random python -m pytest` explores; with `--hypothesis-seed=N` it repeats itself.
 """
 
+import logging
 import os
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -18,6 +20,15 @@ settings.register_profile(
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
 
 torch.set_num_threads(1)  # tensors are small, and other processes of the test run need the cores
+
+
+@pytest.fixture(autouse=True)
+def level_of_the_log() -> Iterator[None]:
+    """Programs of examples/ set it for their process, which is that of the tests."""
+    logger = logging.getLogger("opt3dgs_optim")
+    level = logger.level
+    yield
+    logger.setLevel(level)
 
 
 @pytest.fixture(autouse=True)
