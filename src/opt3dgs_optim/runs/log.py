@@ -1,21 +1,20 @@
 """The run log: one JSON object a line, written while a trainer runs, without slowing it down.
 
-Lines are `{"kind": "start" | "step" | "evaluation" | "event", "iteration": ..., "seconds": ...}`
-plus whatever the call adds. JSON has no NaN or infinity: they are the strings "nan", "inf", "-inf".
+Lines are `{"kind": "start" | "step" | "evaluation", "iteration": ..., "seconds": ...}` plus what
+the call adds. JSON has no NaN or infinity: they are the strings "nan", "inf", "-inf".
 """
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import platform
-import re
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from datetime import datetime, timezone
-from enum import Enum
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,11 +22,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import check_count
-from opt3dgs_optim.runs.lines import RESUMED, encoded, number, read_run
+from opt3dgs_optim.checks import check_count, check_energy
+from opt3dgs_optim.runs.lines import read_run
 
-Number = float | Tensor | np.number | np.bool_ | np.ndarray  # of one element
-RESERVED = ("kind", "iteration", "seconds", "phase", "event", "metadata")
+Number = float | Tensor | np.number | np.bool_  # of one element
 
 
 class _Pending(NamedTuple):
@@ -47,23 +45,27 @@ class RunLog(AbstractContextManager["RunLog"]):
     reads a log, and `opt3dgs report` compares several.
 
     A killed process loses at most the line that it was writing and, on a GPU, the few step lines
-    whose numbers were still on their way. To go on from a checkpoint, use `resume`.
+    whose numbers were still on their way.
 
     A step line costs no synchronisation with the GPU: CUDA scalars are copied to pinned memory in
-    stream order, and written at a later call. Evaluations, events, `paused` and `close` do wait for
-    the GPU. No autograd graph is kept.
+    stream order, and written at a later call. Evaluations, `paused` and `close` do wait for the
+    GPU. No autograd graph is kept.
 
     Args:
-        path: the log file, a new one. Missing parent folders are made.
-        metadata: what describes the run, as JSON can hold it; numbers may be numpy's. The report
-            groups runs by `scene` and `arm`, and pairs those of two arms by `seed`. `command`
-            replaces the command line, which is recorded otherwise.
-        clock: returns seconds; None is the wall's, `time.perf_counter`. `time.process_time` counts
-            the seconds of this process alone: a CPU that is busy with others changes nothing.
+        path: the log file, a new one unless the run resumes. Missing parent folders are made.
+        metadata: what describes the run, as JSON can hold it. The report groups runs by `scene` and
+            `arm`, and pairs those of two arms by `seed`.
+        resume: the iteration of the checkpoint from which the run goes on in the log at `path`, and
+            its clock with it. Readers leave out what was logged past that iteration. `metadata` is
+            added to the log's, and its entries win.
+        clock: returns seconds. `time.process_time` counts those of this process alone: a CPU that
+            is busy with others changes nothing.
 
     Raises:
         FileExistsError: two runs in one file would be compared as one.
-        TypeError: metadata that JSON cannot hold.
+        FileNotFoundError: there is no log to resume.
+        TypeError, ValueError: metadata that JSON cannot hold; `resume` is no iteration, or `path`
+            no run log.
 
     Examples:
         >>> import tempfile
@@ -89,75 +91,35 @@ class RunLog(AbstractContextManager["RunLog"]):
         path: str | os.PathLike[str],
         *,
         metadata: Mapping[str, Any] | None = None,
-        clock: Callable[[], float] | None = None,
+        resume: int | None = None,
+        clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        if Path(path).exists():
+        self.path, self._clock, self._base = Path(path), clock, 0.0
+        if resume is not None:
+            check_count("RunLog", "resume", resume, 0)
+            past = [r["seconds"] for r in read_run(path).records if r["iteration"] <= resume]
+            self._base = past[-1] if past else 0.0
+        elif self.path.exists():
             raise FileExistsError(
-                f"RunLog: {os.fspath(path)!r} is there already; go on in it with RunLog.resume("
-                "path, iteration=...), or choose another path"
+                f"RunLog: {os.fspath(path)!r} is there already; go on in it with "
+                "resume=ITERATION, or choose another path"
             )
-        self._open(path, metadata, clock, iteration=0, seconds=0.0)
-
-    def _open(
-        self,
-        path: str | os.PathLike[str],
-        metadata: Mapping[str, Any] | None,
-        clock: Callable[[], float] | None,
-        *,
-        iteration: int,
-        seconds: float,
-    ) -> None:
-        start = _origin() | {"metadata": dict(metadata or {})}
-        encoded(start)  # a TypeError comes before there is a file
-        self.path, self._clock = Path(path), clock or time.perf_counter
         self._pending: deque[_Pending] = deque()
-        self._pauses, self._base = 0, seconds
-        self._since: float | None = self._clock()
+        self._since: float | None = self._clock()  # None: paused
+        start = self._line("start", resume or 0) | _origin() | {"metadata": dict(metadata or {})}
+        text = _encoded(start)  # an error comes before there is a file
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self._file = open(self.path, "ab", buffering=0)  # noqa: SIM115 - closed by close()
         # What a kill left of a line is no line.
         self._file.truncate(self.path.read_bytes().rfind(b"\n") + 1)
-        self._write(self._line("start", iteration) | start)
-
-    @classmethod
-    def resume(
-        cls,
-        path: str | os.PathLike[str],
-        *,
-        iteration: int,
-        metadata: Mapping[str, Any] | None = None,
-        clock: Callable[[], float] | None = None,
-    ) -> RunLog:
-        """Continue the log `path`, and its clock, from a checkpoint taken at `iteration`.
-
-        What was logged past that iteration stays in the file; a "resumed" event tells readers to
-        drop it. `metadata` is added to the log's, and its entries win.
-
-        Raises:
-            FileNotFoundError: there is no log at `path`.
-            ValueError: `iteration` is negative, or `path` is no run log.
-        """
-        check_count("RunLog.resume", "iteration", iteration, 0)
-        past = [r["seconds"] for r in read_run(path).records if r["iteration"] <= iteration]
-        log = cls.__new__(cls)
-        seconds = past[-1] if past else 0.0
-        log._open(path, metadata, clock, iteration=iteration, seconds=seconds)
-        log._write(log._line("event", iteration) | {"event": RESUMED})
-        return log
+        self._file.write(text)
 
     @property
     def seconds(self) -> float:
         """Run seconds so far by the log's clock, without pauses, of all sessions of this run."""
-        # A clock may be set back to before the session began.
-        passed = 0.0 if self._since is None else max(self._clock() - self._since, 0.0)
-        return self._base + passed
+        return self._base + (0.0 if self._since is None else self._clock() - self._since)
 
-    @property
-    def closed(self) -> bool:
-        """Whether nothing can be written any more."""
-        return self._file.closed
-
-    def step(self, iteration: int, *, phase: str | Enum | None = None, **columns: Number) -> None:
+    def step(self, iteration: int, *, phase: str | None = None, **columns: Number) -> None:
         """Log one optimization step: `log.step(iteration, loss=loss, lr=1e-3)`.
 
         `columns` are numbers of Python or numpy, or tensors of one element on any device, by a name
@@ -165,37 +127,21 @@ class RunLog(AbstractContextManager["RunLog"]):
         the columns whose name says no loss.
 
         Raises:
-            ValueError: a negative iteration, a reserved name, or a tensor of several elements.
-            TypeError: a value that is no number.
+            ValueError: a negative iteration, a name of the log's own, what is not one number, or
+                the log is closed.
         """
         line = self._line("step", iteration)
         if phase is not None:
-            line["phase"] = str(phase.value if isinstance(phase, Enum) else phase)
-        self._add("RunLog.step", line, columns)
-        self._drain(wait=False)
+            line["phase"] = phase
+        self._add(line, columns, wait=False)
 
     def evaluation(self, iteration: int, **metrics: Number) -> None:
         """Log metrics of a number each: `log.evaluation(7_000, psnr=27.1, ssim=0.83)`.
 
-        Names are free. The report knows of names with `psnr`, `ssim`, `lpips`, `l1` and the like in
-        them whether higher is better; of others it has to be told. Raises as `step`.
+        Names are free. The report compares by those with `psnr`, `ssim`, `lpips`, `l1` and the like
+        in them. Raises as `step`.
         """
-        self._add("RunLog.evaluation", self._line("evaluation", iteration), metrics)
-        self._drain(wait=True)
-
-    def event(self, kind: str, iteration: int, **fields: Any) -> None:
-        """Log that something happened: `log.event("pruned", iteration, points=1_200)`.
-
-        `fields` may hold what `metadata` may, and one-element tensors. Raises as `step`.
-
-        Raises:
-            ValueError: the kind is "resumed", by which `resume` tells readers what to leave out.
-        """
-        if kind == RESUMED:
-            raise ValueError(f"RunLog.event: kind={kind!r} is the log's own; choose another")
-        _check_names("RunLog.event", fields)
-        self._drain(wait=True)
-        self._write(self._line("event", iteration) | {"event": kind} | fields)
+        self._add(self._line("evaluation", iteration), metrics, wait=True)
 
     @contextmanager
     def paused(self) -> Iterator[None]:
@@ -203,15 +149,14 @@ class RunLog(AbstractContextManager["RunLog"]):
 
         Waits for the GPU on both sides: queued training work counts, the work inside does not.
         """
-        if self._pauses == 0:
+        outermost = self._since is not None
+        if outermost:
             _synchronize()
             self._base, self._since = self.seconds, None
-        self._pauses += 1
         try:
             yield
         finally:
-            self._pauses -= 1
-            if self._pauses == 0:
+            if outermost:
                 _synchronize()
                 self._since = self._clock()
 
@@ -226,18 +171,23 @@ class RunLog(AbstractContextManager["RunLog"]):
         self.close()
 
     def _line(self, kind: str, iteration: int) -> dict[str, Any]:
-        if self.closed:
-            raise ValueError(f"RunLog.{kind}: the log {str(self.path)!r} is closed")
         at = check_count(f"RunLog.{kind}", "iteration", iteration, 0)
         return {"kind": kind, "iteration": at, "seconds": round(self.seconds, 6)}
 
-    def _add(self, call: str, line: dict[str, Any], values: Mapping[str, Any]) -> None:
-        """Put host numbers into `line` and send CUDA ones on their way to pinned memory."""
-        _check_names(call, values)
-        on_gpu = {name: value for name, value in values.items() if _on_gpu(value)}
-        line |= {n: number(call, n, value) for n, value in values.items() if n not in on_gpu}
-        sent = _to_pinned(list(on_gpu.values())) if on_gpu else ()
-        self._pending.append(_Pending(line, list(on_gpu), *sent))
+    def _add(self, line: dict[str, Any], values: Mapping[str, Any], *, wait: bool) -> None:
+        """Put host numbers into `line`, send CUDA ones on their way, and write what can be."""
+        call, sent = f"RunLog.{line['kind']}", {}
+        for name, value in values.items():
+            if name in line:
+                raise ValueError(f"{call}: {name} is a name of the log's own; choose another")
+            one = check_energy(call, name, value, torch.float64)
+            if _on_gpu(value):
+                sent[name] = one
+            else:
+                line[name] = _plain(float(one))
+        waiting = _to_pinned([*sent.values()]) if sent else ()
+        self._pending.append(_Pending(line, [*sent], *waiting))
+        self._drain(wait=wait)
 
     def _drain(self, *, wait: bool) -> None:
         """Write pending lines in order, up to the first whose numbers have not arrived."""
@@ -248,26 +198,25 @@ class RunLog(AbstractContextManager["RunLog"]):
                     ready.synchronize()
                 elif not ready.query():
                     return
-                line |= dict(zip(names, host.tolist(), strict=True))
+                line |= zip(names, map(_plain, host.tolist()), strict=True)
             self._pending.popleft()
-            self._write(line)
+            self._file.write(_encoded(line))
 
-    def _write(self, line: Mapping[str, Any]) -> None:
-        self._file.write(encoded(line).encode() + b"\n")
+
+def _plain(value: float) -> float | str:
+    return value if math.isfinite(value) else str(value)
+
+
+def _encoded(line: Mapping[str, Any]) -> bytes:
+    return json.dumps(line, separators=(",", ":"), allow_nan=False).encode() + b"\n"
 
 
 def _origin() -> dict[str, Any]:
-    """What runs, where and since when; no host name, no folders."""
-    machine = f"{platform.platform()}, {os.cpu_count()} CPUs"
+    """Since when and on what the run goes; no host name."""
+    machine = f"{platform.platform()}, {os.cpu_count()} CPUs, torch {torch.__version__}"
     if torch.cuda.is_initialized():
         machine += f", {torch.cuda.get_device_name()}"
-    # "--data=/home/me/plush" becomes "--data=plush".
-    words = [re.sub(r"[^=]*[/\\](?=[^=]*$)", "", word.rstrip("/\\")) for word in sys.argv]
-    return {
-        "time": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "command": " ".join(words),
-        "machine": f"{machine}, Python {platform.python_version()}, torch {torch.__version__}",
-    }
+    return {"time": datetime.now(timezone.utc).isoformat(timespec="seconds"), "machine": machine}
 
 
 def _synchronize() -> None:
@@ -276,21 +225,14 @@ def _synchronize() -> None:
 
 
 def _on_gpu(value: Any) -> bool:
-    return isinstance(value, Tensor) and value.is_cuda and value.numel() == 1
+    return isinstance(value, Tensor) and value.is_cuda
 
 
 def _to_pinned(values: list[Tensor]) -> tuple[Tensor, Any]:
     """Copy CUDA scalars to the host in stream order: (pinned [n] float64, event of completion)."""
-    device = values[0].device
-    packed = [v.detach().reshape(()).to(device, torch.float64, non_blocking=True) for v in values]
+    packed = torch.stack([value.to(torch.float64) for value in values])
     host = torch.empty(len(values), dtype=torch.float64, device="cpu", pin_memory=True)
-    host.copy_(torch.stack(packed), non_blocking=True)
+    host.copy_(packed, non_blocking=True)
     ready = torch.cuda.Event()
-    ready.record(torch.cuda.current_stream(device))
+    ready.record(torch.cuda.current_stream(packed.device))
     return host, ready
-
-
-def _check_names(call: str, values: Mapping[str, Any]) -> None:
-    for name in values:
-        if name in RESERVED:
-            raise ValueError(f"{call}({name}=...): reserved; choose a name not in {RESERVED}")

@@ -5,11 +5,10 @@ Writes `report.md` and, with matplotlib (the extra `opt3dgs_optim[report]`), `re
 """
 
 import argparse
-import math
 import re
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 from opt3dgs_optim.runs.lines import Run, read_run
@@ -18,37 +17,16 @@ from opt3dgs_optim.runs.stats import Comparison, Stat, compare
 
 NO_PICTURE = "report: no picture without matplotlib: pip install 'opt3dgs_optim[report]'"
 READING = (
-    "Mean ± sample standard deviation over the seeds; (k of n) where not all n runs have the "
-    "value. *seconds to baseline*: until the arm first reaches the baseline's mean final value. "
+    "Mean ± standard error over the seeds; (k of n) where not all n runs have the value. "
+    "*seconds to baseline*: until the arm first reaches the baseline's mean final value. "
     "*gain*: difference to the baseline's run of the same seed at the smaller of the two final "
     "times, positive is better; runs without a seed are not paired. Both interpolate linearly "
     "between evaluations."
 )
 
 
-def find_logs(paths: Sequence[str | Path]) -> list[Path]:
-    """The log files among `paths`, and below those that are folders (`*.jsonl`), each once.
-
-    Raises:
-        FileNotFoundError: a path that does not exist, or a folder without a log.
-    """
-    found: dict[Path, Path] = {}
-    for path in map(Path, paths):
-        logs = sorted(path.rglob("*.jsonl")) if path.is_dir() else [path]
-        if not logs or not path.exists():
-            raise FileNotFoundError(f"{str(path)!r}: neither a log nor a folder with *.jsonl in it")
-        for log in logs:
-            found.setdefault(log.resolve(), log)
-    return list(found.values())
-
-
 def write_report(
-    runs: Sequence[Run],
-    out: str | Path,
-    *,
-    metric: str | None = None,
-    baseline: str | None = None,
-    higher_is_better: bool | None = None,
+    runs: Sequence[Run], out: str | Path, *, metric: str | None = None, baseline: str | None = None
 ) -> list[Path]:
     """Write the report on `runs` into the folder `out` and return the files written.
 
@@ -57,10 +35,12 @@ def write_report(
     Args:
         runs: of any number of scenes, arms and seeds.
         out: folder, made if it is missing.
-        metric, baseline, higher_is_better: as `stats.compare`'s, with its errors.
+        metric: to compare by; None takes psnr if it is logged, else the first whose name says
+            whether higher or lower is better.
+        baseline: reference arm; None takes "mcmc" if there, else the first.
 
     Raises:
-        ValueError, OSError: there are no runs; `out` cannot be written.
+        ValueError, OSError: as `stats.compare` raises; `out` cannot be written.
 
     Examples:
         >>> import tempfile
@@ -77,87 +57,52 @@ def write_report(
         ...     "| defaults | 1 | 25.50 |" in report.read_text()
         True
     """
-    if not runs:
-        raise ValueError("write_report: no runs; pass at least one")
-    comparisons = compare(runs, metric, baseline, higher_is_better)
-    scenes = [re.sub(r"[^\w.-]+", "_", each.scene or "")[:60] for each in comparisons]
-    names = ["report.png"] if len(scenes) == 1 else [f"report-{scene}.png" for scene in scenes]
+    comparisons = compare(runs, metric, baseline)
+    said = (
+        f"{str(run.origin['time'])[:10]}, {run.origin['machine']}" for run in runs if run.origin
+    )
+    origin = "; ".join(dict.fromkeys(said))  # usually one
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    try:
-        for comparison, name in zip(comparisons, names, strict=True):
-            draw(comparison, out / name, origin(runs))
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "matplotlib":
-            raise
-        names = []
-    (out / "report.md").write_text(as_markdown(comparisons, runs, names), encoding="utf-8")
-    return [out / name for name in ("report.md", *names)]
-
-
-def as_markdown(
-    comparisons: Sequence[Comparison], runs: Sequence[Run], pictures: Sequence[str]
-) -> str:
-    """A section a scene: table and picture (all have one, or none); how to read them."""
-    parts = ["# Error against run time"]
-    for i, comparison in enumerate(comparisons):
-        if comparison.scene is not None or len(comparisons) > 1:
-            parts.append(f"## {escaped(comparison.scene or 'Runs without a scene')}")
+    parts, written = ["# Error against run time"], [out / "report.md"]
+    for comparison in comparisons:
+        scene = comparison.scene
+        if scene or len(comparisons) > 1:
+            parts.append(f"## {_cell(scene) or 'Runs without a scene'}")
         parts.append(_table(comparison))
-        metric = escaped(comparison.metric)
-        if pictures:
-            parts.append(f"![{metric} over seconds and iterations]({pictures[i]})")
-        others = [arm for arm in comparison.arms if arm.name != comparison.baseline]
-        unpaired = [escaped(arm.name) for arm in others if arm.num_paired == 0]
-        if comparison.baseline is None:
-            parts.append("The baseline arm did not run on this scene: nothing to compare with.")
-        elif unpaired:
-            parts.append(
-                f"No gain is shown for {', '.join(unpaired)}: no run has the `seed` of one of the "
-                "baseline's in its metadata."
-            )
-    return "\n\n".join([*parts, READING, escaped(origin(runs))]).rstrip() + "\n"
+        if find_spec("matplotlib"):
+            tail = f"-{scene}" if len(comparisons) > 1 else ""
+            picture = out / (re.sub(r"[^\w.-]+", "_", f"report{tail}")[:60] + ".png")
+            draw(comparison, picture, origin)
+            parts.append(f"![{comparison.metric} over seconds and iterations]({picture.name})")
+            written.append(picture)
+    text = "\n\n".join([*parts, READING, origin]).rstrip() + "\n"
+    written[0].write_text(text, encoding="utf-8")
+    return written
 
 
-def escaped(text: str) -> str:
-    """`text` without a meaning in Markdown or HTML; `_` inside a word has none."""
-    special = r"[\\`*\[\]<>|~&$#\n]|(?<![^\W_])_|_(?![^\W_])"
-    return re.sub(special, lambda found: f"&#{ord(found[0])};", text)
+def _cell(text: str) -> str:
+    """`text` in one line and one cell of a table."""
+    return " ".join(text.split()).replace("|", "\\|")
 
 
 def _table(comparison: Comparison) -> str:
     numbers = list(comparison.arms[0].numbers)
-    rows = [["arm", "seeds", *map(escaped, numbers)], ["---", *["---:"] * (len(numbers) + 1)]]
+    rows = [["arm", "seeds", *map(_cell, numbers)], ["---", *["---:"] * (len(numbers) + 1)]]
     for arm in comparison.arms:
-        n = len(arm.runs)
-        *cells, gain = (_shown(stat, n) for stat in arm.numbers.values())
-        if arm.name == comparison.baseline:
-            gain = "baseline"
-        rows.append([escaped(arm.name), str(n), *cells, gain])
+        *cells, gain = (_shown(stat, len(arm.runs)) for stat in arm.numbers.values())
+        gain = "baseline" if arm.name == comparison.baseline else gain
+        rows.append([_cell(arm.name), str(len(arm.runs)), *cells, gain])
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
 def _shown(stat: Stat | None, runs: int) -> str:
-    """Text such as "25.210 ± 0.031": two digits of the deviation, else four of the mean."""
+    """Text such as "25.21 ± 0.03" or "0.8312 ± 0.0012 (2 of 3)"."""
     if stat is None:
         return "–"
-    leading, wanted = (stat.std, 2) if stat.std else (stat.mean, 4)
-    if not math.isfinite(leading) or leading == 0:
-        digits = 0 if stat.mean == round(stat.mean, 6) else 3
-    else:
-        digits = min(4, max(0, wanted - 1 - math.floor(math.log10(abs(leading)))))
-    text = f"{stat.mean:.{digits}f}" + ("" if stat.std is None else f" ± {stat.std:.{digits}f}")
-    return text if stat.n == runs else f"{text} ({stat.n} of {runs})"
-
-
-def origin(runs: Sequence[Run]) -> str:
-    """Command, dates and machines that the logs were written with; no host names, no folders."""
-    said = []
-    for key in ("command", "time", "machine"):
-        found = [(run.origin | run.metadata).get(key) for run in runs]
-        texts = dict.fromkeys(str(f)[:10] if key == "time" else str(f) for f in found if f)
-        said.append(", ".join(list(texts)[:3]) + (", ..." if len(texts) > 3 else ""))
-    return "; ".join(text for text in said if text)
+    digits = 4 if abs(stat.mean) < 1 else 2 if abs(stat.mean) < 100 else 0
+    error = "" if stat.error is None else f" ± {stat.error:.{digits}f}"
+    return f"{stat.mean:.{digits}f}{error}" + ("" if stat.n == runs else f" ({stat.n} of {runs})")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -171,25 +116,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("runs", nargs="+", metavar="RUN", help="run log, or folder of *.jsonl")
     add("-o", "--out", default="report", metavar="DIR", help="to write into (default: report)")
     add("--metric", help="to compare by (default: psnr if logged, else the first that is known)")
-    add("--better", choices=("higher", "lower"), help="direction of the metric (default: its name)")
     add("--baseline", metavar="ARM", help="reference arm (default: mcmc if there, else the first)")
-    if not arguments:
-        parser.print_help()
-        return 0
     options = parser.parse_args(arguments)
     try:
-        logs = find_logs(options.runs)
-        runs = [read_run(path) for path in logs]
-        if len({run.name for run in runs}) < len(runs):  # A/stock/log.jsonl, A/ours/log.jsonl
-            names = [path.resolve().parent.name for path in logs]
-            runs = [replace(run, name=name) for run, name in zip(runs, names, strict=True)]
-        better = None if options.better is None else options.better == "higher"
+        paths = map(Path, options.runs)
+        logs = (sorted(p.rglob("*.jsonl")) if p.is_dir() else [p] for p in paths)
+        runs = [read_run(path) for found in logs for path in found]
         chosen = {"metric": options.metric, "baseline": options.baseline}
-        written = write_report(runs, options.out, higher_is_better=better, **chosen)
+        written = write_report(runs, options.out, **chosen)
     except (OSError, ValueError) as error:
         print(f"report: {error}", file=sys.stderr)
         return 2
     print(*written, sep="\n")
-    if not any(path.suffix == ".png" for path in written):
+    if len(written) == 1:
         print(NO_PICTURE, file=sys.stderr)
     return 0
