@@ -53,8 +53,8 @@ class RunLog(AbstractContextManager["RunLog"]):
 
     Args:
         path: the log file, a new one unless the run resumes. Missing parent folders are made.
-        metadata: what describes the run, as JSON can hold it. The report groups runs by `scene` and
-            `arm`, and pairs those of two arms by `seed`.
+        metadata: what describes the run, as JSON can hold it; others, as paths, by their `str`. The
+            report groups runs by `scene` and `arm`, and pairs those of two arms by `seed`.
         resume: the iteration of the checkpoint from which the run goes on in the log at `path`, and
             its clock with it. Readers leave out what was logged past that iteration. `metadata` is
             added to the log's, and its entries win.
@@ -64,7 +64,7 @@ class RunLog(AbstractContextManager["RunLog"]):
     Raises:
         FileExistsError: two runs in one file would be compared as one.
         FileNotFoundError: there is no log to resume.
-        TypeError, ValueError: metadata that JSON cannot hold; `resume` is no iteration, or `path`
+        ValueError: metadata that is NaN or infinite; `resume` is no iteration, or `path`
             no run log.
 
     Examples:
@@ -208,7 +208,9 @@ def _plain(value: float) -> float | str:
 
 
 def _encoded(line: Mapping[str, Any]) -> bytes:
-    return json.dumps(line, separators=(",", ":"), allow_nan=False).encode() + b"\n"
+    # A trainer's configuration has paths.
+    text = json.dumps(line, separators=(",", ":"), allow_nan=False, default=str)
+    return text.encode() + b"\n"
 
 
 def _origin() -> dict[str, Any]:
