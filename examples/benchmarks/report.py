@@ -186,7 +186,7 @@ def gpu_step(_: Evidence) -> str:
             cells.append("-" if row is None else f"{row['ms']:.2f} ms, x{row['ratio']:.2f}")
         rows.append((name, *cells, str(found["1000000"][name]["launches"])))
     heads = [f"{int(points):,} Gaussians" for points in found]
-    return table(("", *heads, "launches"), rows)
+    return table(("", *heads, "launches at a million"), rows)
 
 
 def gpu_iteration(_: Evidence) -> str:
@@ -287,7 +287,7 @@ CLOSED = (  # what, its arm, the same training without it
     ("the positions' rate times 3", "positions-x3", "mcmc"),
     ("rates times 2", "x2", "mcmc"),
     ("averaging", "averaged", "mcmc"),
-    ("fading, a hold and averaging: the defaults before", "defaults", "mcmc"),
+    ("fading, `OutOfView` and averaging: the defaults before", "defaults", "mcmc"),
     ("own frame: the defaults", "own", "mcmc"),
 )
 
