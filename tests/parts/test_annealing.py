@@ -99,5 +99,6 @@ def test_options(name: str) -> None:
             Annealing(**{name: wrong})
     with pytest.raises(ValueError, match="names="):
         Annealing(names=("colour",))
-    assert getattr(Annealing(**{name: 0.5}), name) == 0.5  # below 1 is allowed
+    below_one: Any = {name: 0.5}
+    assert getattr(Annealing(**below_one), name) == 0.5
     assert repr(Annealing()) == "Annealing(peak=4.0, final=0.4, opacity_peak=1.0)"
