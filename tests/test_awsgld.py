@@ -376,10 +376,12 @@ def test_wrong_options_are_named() -> None:
         ({"histogram": 1.5}, TypeError, "histogram=1.5"),
         ({"noise": EnergyHistogram()}, TypeError, "but IsotropicNoise or PositionNoise is needed"),
         ({"noise": PositionNoise()}, ValueError, "positions are [N, 3]"),
+        ({"moments": 8}, ValueError, "AWSGLD: moments=8, but 32 or 16"),
         ({"lr": -1.0}, ValueError, "Invalid learning rate"),
     ):
         with pytest.raises(error, match=re.escape(said)):
             build(**options)
+    assert build(moments=16).course.moments == 16
 
 
 def test_a_histogram_serves_one_optimizer_or_one_training() -> None:

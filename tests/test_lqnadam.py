@@ -16,7 +16,7 @@ from problems import gradient, hessians, quadratic
 from torch import Tensor
 from torch.nn import Parameter
 
-from opt3dgs_optim import LQNAdam, two_loop
+from opt3dgs_optim import Curvature, LQNAdam, two_loop
 from opt3dgs_optim.parts.curvature import HISTORY
 
 OPTIONS: list[dict[str, Any]] = [
@@ -153,7 +153,7 @@ def test_a_parameter_of_one_dimension_is_warned_of() -> None:
         LQNAdam([Parameter(torch.ones(7))])
     optimizer = LQNAdam([Parameter(torch.ones(1, 7))])
     with pytest.warns(UserWarning, match="dimension 0 is the batch"):
-        optimizer.add_param_group({"params": [Parameter(torch.ones(3))]})
+        optimizer.add_param_group({"params": [Parameter(torch.ones(2))]})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         LQNAdam([Parameter(torch.tensor(s)) for s in (1.0, [1.0], [[1.0, 2.0]])])
@@ -164,6 +164,12 @@ def test_the_options_defaults_are_adams() -> None:
     ours, theirs = LQNAdam(x).defaults, torch.optim.Adam(x).defaults
     for name in ("lr", "betas", "eps", "weight_decay"):
         assert ours[name] == theirs[name], name
+
+
+def test_the_other_defaults_are_curvatures() -> None:
+    ours, theirs = LQNAdam([points()]).course.part(Curvature), Curvature()
+    for name in ("history_size", "min_cosine", "graft", "backend"):
+        assert getattr(ours, name) == getattr(theirs, name), name
 
 
 @pytest.mark.parametrize("option", ["amsgrad", "maximize", "foreach", "fused", "capturable"])
@@ -182,3 +188,6 @@ def test_what_is_outside_is_refused() -> None:
     assert len(optimizer.param_groups) == 1
     with pytest.raises(ValueError, match="Curvature: history_size=17"):
         LQNAdam([points()], history_size=17)
+    with pytest.raises(ValueError, match="LQNAdam: moments=8, but 32 or 16"):
+        LQNAdam([points()], moments=8)  # pyright: ignore[reportArgumentType]
+    assert LQNAdam([points()], moments=16).course.moments == 16

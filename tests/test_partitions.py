@@ -230,11 +230,12 @@ def test_nothing_is_read_back(make: Any) -> None:
 @pytest.mark.parametrize("make", [fixed, moving])
 def test_states_that_fit(make: Any) -> None:
     partitions = make()
+    assert partitions.fits(partitions.state.tolist())  # before the first energy
     nus_of(partitions, stream(30))
     state = partitions.state.tolist()
     assert partitions.fits(state)
     for place in (-1, -2):
-        for wrong in (-0.01, 1.5):
+        for wrong in (-0.01, 0.5):
             assert not partitions.fits([*state[:place], wrong, *state[place:][1:]])
 
 

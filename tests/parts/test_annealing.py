@@ -44,7 +44,15 @@ def test_the_positions_are_left_alone_unless_they_are_named() -> None:
     assert [Annealing().at("scales", t) for t in (0.0, 1.0)] == [4.0, 0.4]  # as measured
 
 
-@pytest.mark.parametrize("annealing", [Annealing(), Annealing(8.0, 0.5, names=("means", "sh0"))])
+@pytest.mark.parametrize(
+    "annealing",
+    [
+        Annealing(),
+        Annealing(8.0, 0.5, names=("means", "sh0")),
+        Annealing(0.5, 0.25, names=("opacities", "sh0")),
+    ],
+    ids=str,
+)
 def test_every_step_is_adams_times_the_factor(annealing: Annealing) -> None:
     """The same gradients with rates set by hand give the same bits."""
 
@@ -91,4 +99,6 @@ def test_options(name: str) -> None:
             Annealing(**{name: wrong})
     with pytest.raises(ValueError, match="names="):
         Annealing(names=("colour",))
+    below_one: Any = {name: 0.5}
+    assert getattr(Annealing(**below_one), name) == 0.5
     assert repr(Annealing()) == "Annealing(peak=4.0, final=0.4, opacity_peak=1.0)"

@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import Parameter
 
-from opt3dgs_optim import Averaging, PhaseScheduler
+from opt3dgs_optim import Averaging, Course, PhaseScheduler
+from opt3dgs_optim.step import Step
 
 TOTAL, ROWS = 300, 6
 
@@ -22,6 +23,17 @@ def test_where_the_mean_begins_and_where_it_is_put(total: int) -> None:
     start, put = Averaging.start(total), Averaging.put_from(total)
     assert total - start == int(1 / 30 * total)
     assert total - put == max(2, int((total - start) / 10))
+
+
+@pytest.mark.parametrize(
+    ("iteration", "mean"),
+    [(289, None), (290, (1, False)), (297, (8, False)), (298, (9, True)), (300, None)],
+)
+def test_what_it_says_of_a_step(iteration: int, mean: tuple[int, bool] | None) -> None:
+    """The number of the iterate in the mean, from 1, and whether the mean is put."""
+    step = Step(torch.zeros(1), torch.zeros(1), "means", "", {}, {}, iteration, iteration - 1)
+    Averaging().plan(step, Course([], TOTAL))
+    assert step.mean == mean
 
 
 @settings(max_examples=20)

@@ -61,21 +61,22 @@ def test_the_share_is_over_all_parameters_of_a_step() -> None:
     groups = [{"params": [x], "name": "xyz"}, {"params": [y], "name": "scaling"}]
     phases = PhaseScheduler(10, 0, parts=[curvature])
     optimizer = phases.upgrade(torch.optim.Adam(groups, lr=0.1))
-    for expected in (0.0, 3 / 8, 3 / 8):
+    for slope, expected in ((-1.0, 0.0), (-1.0, 3 / 8), (1.0, 1.0), (-9.0, 3 / 8)):
         x.grad = torch.ones(3, 3) + x.detach()  # convex: accepted
-        y.grad = torch.ones(5, 3) - y.detach()  # concave: refused
+        y.grad = torch.ones(5, 3) + slope * y.detach()  # refused where it is concave
         optimizer.step()
-        assert float(curvature.accepted_share or 0.0) == pytest.approx(expected)
-    assert float(phases.numbers()["accepted"]) == pytest.approx(3 / 8)
+        assert float(phases.numbers()["accepted"]) == pytest.approx(expected)
 
 
-def test_an_empty_parameter_and_one_of_one_row() -> None:
-    for n in (0, 1):
-        x, optimizer = positions(n=n)
-        for _ in range(4):
-            quadratic_step(x, optimizer)
-        assert x.shape == (n, 3)
-        assert bool(torch.isfinite(x).all())
+@pytest.mark.parametrize(("shape", "accepted"), [((0, 3), None), ((1, 3), 1.0), ((), 1.0)])
+def test_no_row_one_row_and_a_number(shape: tuple[int, ...], accepted: float | None) -> None:
+    x = Parameter(torch.ones(shape))
+    optimizer = LQNAdam([x], lr=0.1, history_size=1)
+    for _ in range(4):
+        quadratic_step(x, optimizer, torch.tensor(5.0))
+    assert x.shape == shape
+    assert bool((x < 1.0).all())
+    assert optimizer.accepted_share == accepted
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])

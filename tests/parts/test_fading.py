@@ -70,6 +70,46 @@ def test_of_more_than_ten_thousand_points_some_events_happen(count: int) -> None
     assert happened == int(300 * min(1.0, 10_000 / count) ** (2 / 3))
 
 
+@pytest.mark.parametrize(
+    ("steps_of_run", "points", "times"),
+    [(30_000, 100, 300), (30_000, 10_000, 300), (30_000, 80_000, 75), (600, 100, 70), (600, 0, 0)],
+)
+def test_how_many_events_a_run_has(steps_of_run: int, points: int, times: int) -> None:
+    """Eight times 10,000 points: a quarter. In 600 iterations, 4 apart in 47 % of them."""
+    assert Fading().num_events(steps_of_run, points) == times
+
+
+def test_from_ten_thousand_and_one_points_on_the_first_event_does_not_happen() -> None:
+    assert Fading().happens(0, 10_000)
+    assert not Fading().happens(0, 10_001)
+
+
+def test_every_event_fades_once_and_the_log_says_when() -> None:
+    """Events at the 24th, 32nd, 40th and 48th of 64 steps: the end of each quarter of the stretch.
+
+    The gradient is zero from the second step on, so that moments change by their decay and events.
+    """
+    param = Parameter(torch.zeros(100, 1))
+    part = Fading(0.4, 0.5, 0.25, events=4, start=0.25, stop=0.75, names=("scales",))
+    phases = PhaseScheduler(64, parts=[part])
+    optimizer = phases.upgrade(
+        Adam([{"params": [param], "name": "scales"}], lr=1.0, betas=(0.5, 0.5))
+    )
+    before, event = {"exp_avg": torch.zeros(100), "exp_avg_sq": torch.zeros(100)}, 0
+    for step in range(1, 65):
+        param.grad = torch.full((100, 1), float(step == 1))
+        optimizer.step()
+        faded = torch.zeros(100, dtype=torch.bool)
+        if step in (24, 32, 40, 48):
+            faded, event = part.chosen(event, 100, CPU), event + 1
+        assert phases.numbers() == {"faded": 0.4 if step in (24, 32, 40, 48) else 0.0}
+        for (name, was), factor in zip(before.items(), (0.5, 0.25), strict=True):
+            now = optimizer.state[param][name].flatten().clone()
+            if step > 1:
+                assert torch.equal(now, was * torch.where(faded, factor, 1.0) * 0.5), step
+            before[name] = now
+
+
 def test_a_faded_step_is_as_long_as_before_then_up_to_five_times() -> None:
     """exp_avg^2 = exp_avg_sq of the factors; a constant gradient shows it."""
     param = Parameter(torch.zeros(1000, 1))
@@ -113,8 +153,11 @@ def test_all_parameters_fade_the_same_points() -> None:
         ({"share": 0.0}, r"share=0.0.*\(0.0, 1.0\]"),
         ({"exp_avg": 1.5}, "exp_avg=1.5"),
         ({"exp_avg_sq": -1}, "exp_avg_sq=-1"),
+        ({"exp_avg_sq": 1.5}, "exp_avg_sq=1.5"),
         ({"events": 0}, "events=0.*at least 1"),
-        ({"start": 0.6}, "stop=0.5"),
+        ({"start": 1.5}, "start=1.5"),
+        ({"start": 0.5}, r"stop=0.5.*\(0.5, 1.0\]"),
+        ({"stop": 1.5}, "stop=1.5"),
         ({"seed": -1}, "seed=-1"),
         ({"names": ("mean",)}, "names=.'mean',.*means, scales"),
         ({"names": ()}, "names=.*a tuple of Gaussian parameters' names"),
@@ -123,3 +166,9 @@ def test_all_parameters_fade_the_same_points() -> None:
 def test_options_that_are_refused(options: dict, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         Fading(**options)
+
+
+def test_the_defaults_are_what_it_says_of_itself() -> None:
+    assert repr(Fading()) == (
+        "Fading(share=0.2, exp_avg=0.2, exp_avg_sq=0.04, events=300, start=0.03, stop=0.5, seed=0)"
+    )

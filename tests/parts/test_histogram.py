@@ -215,6 +215,7 @@ def test_it_goes_on_as_it_was(options: dict[str, Any], warmup: int) -> None:
     nus_of(histogram, stream(40))
     loaded.load_state_dict(by_torch(histogram.state_dict()))
     copies = copy.deepcopy(histogram), pickle.loads(pickle.dumps(histogram)), loaded
+    assert len({float(each.multiplier) for each in (histogram, *copies)}) == 1
     expected = nus_of(histogram, stream(40, seed=1)).tolist()
     for each in copies:
         assert nus_of(each, stream(40, seed=1)).tolist() == expected
@@ -222,13 +223,25 @@ def test_it_goes_on_as_it_was(options: dict[str, Any], warmup: int) -> None:
         assert repr(each) == repr(histogram)
 
 
-def test_under_a_longer_warm_up_nu_is_one_until_it_is_over() -> None:
-    short, long = EnergyHistogram(warmup=4), EnergyHistogram(warmup=45)
+@pytest.mark.parametrize("left", [0, 5])
+def test_under_a_longer_warm_up_nu_is_one_until_it_is_over(left: int) -> None:
+    short, long = EnergyHistogram(warmup=4), EnergyHistogram(warmup=40 + left)
     nus_of(short, stream(40))
     long.load_state_dict(short.state_dict())
+    assert float(long.multiplier) == 1.0
     nus = nus_of(long, stream(10, seed=1))
-    assert set(nus[:5]) == {1.0}
-    assert 1.0 not in nus[5:]
+    assert nus[:left].tolist() == [1.0] * left
+    assert 1.0 not in nus[left:]
+
+
+def test_a_variance_that_rounding_makes_negative_is_zero() -> None:
+    """As where nu lies at its clamp all the time."""
+    histogram = EnergyHistogram()
+    nus_of(histogram, stream(10))
+    state = histogram.state_dict()
+    state["learnt"][2:5] = 3.0, 3 * 0.7, 3 * 0.7**2 - 1e-15  # of nu^0, nu and nu^2
+    histogram.load_state_dict(state)
+    assert float(histogram.multiplier_std) == 0.0
 
 
 def changed(state: dict[str, Any], place: int, value: Any) -> dict[str, Any]:

@@ -191,12 +191,16 @@ def test_two_sets_of_gaussians_in_one_adam() -> None:
 
 
 @pytest.mark.parametrize(
-    "option", [{"rate": 0.0}, {"final": -1.0}, {"min_aspect": 1.5}, {"rate": math.nan}]
+    "option", [{"rate": 0.0}, {"final": 0.0}, {"min_aspect": 1.5}, {"rate": math.nan}]
 )
 def test_options_that_are_refused(option: dict) -> None:
     (name, value), *_ = option.items()
     with pytest.raises(ValueError, match=f"OwnFrame: {name}={value}, but a finite number in"):
         OwnFrame(**option)
+
+
+def test_the_defaults_are_what_it_says_of_itself() -> None:
+    assert repr(OwnFrame()) == "OwnFrame(rate=0.1, final=0.01, min_aspect=0.1)"
 
 
 def test_of_two_sets_the_one_in_own_frames_is_known_after_a_load() -> None:

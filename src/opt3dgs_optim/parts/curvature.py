@@ -63,7 +63,7 @@ class Curvature(Part):
         self.names = None if names is None else check_names(call, names)
         self.backend: Backend = check_choice(call, "backend", backend, BACKENDS)
         self._tally: Tensor | None = None  # [2] accepted pairs and candidates of the last step
-        self._counted_in = -1
+        self._counted_in: int | None = None
 
     def __repr__(self) -> str:
         names = "all" if self.names is None else " ".join(self.names)

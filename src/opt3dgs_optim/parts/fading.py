@@ -41,7 +41,8 @@ class Fading(Part):
         events: how many over the run, but never less than 4 iterations apart. Where there are many
             points they are small and lose detail by so many events. So with N > 10,000 points only
             (10,000 / N)^(2/3) of the events happen.
-        start, stop: where the first and the last event are, as shares of the run.
+        start, stop: the stretch over which they are spread, as shares of the run; the last event
+            is at its end.
         seed: of the choice of points.
         names: the Gaussian parameters, under gsplat's or INRIA's names.
 
@@ -81,7 +82,7 @@ class Fading(Part):
         done = _events_before(step.stepped_in + 1, *options)
         now = _events_before(step.iteration + 1, *options)
         # Several are due where the trainer has left steps out; they are one.
-        if now > done and any(self.happens(e, len(step.param)) for e in range(done, now)):
+        if any(self.happens(e, len(step.param)) for e in range(done, now)):
             step.fade = self.fade(now - 1)
 
     def events_before(self, iteration: int, total_steps: int) -> int:

@@ -71,7 +71,7 @@ class _Seen:
 
     Attributes:
         notes: of the part, with the mean share of this set under the name `note`.
-        iteration: in which it was looked at last.
+        iteration: in which it was looked at last; None: not yet.
         rows: [N] bool, out of view; None where views see enough.
         counter: [1] int64, 2^32 for each point in view and 1 for each that is or was, of all looks.
         counted: the counter before the look whose `reading` is on its way to the host.
@@ -79,10 +79,9 @@ class _Seen:
 
     def __init__(self, note: str, notes: dict[str, Any]) -> None:
         self.note, self.notes = note, notes
-        self.iteration = -1
+        self.iteration: int | None = None
         self.rows: Tensor | None = None
         self.counter: Tensor | None = None
-        self.counted = 0
         self.reading: Reading | None = None
         self._mask: Tensor | None = None
 
@@ -91,7 +90,7 @@ class _Seen:
         self.iteration, self.rows = step.iteration, None
         if self.reading is not None:
             self.take()
-        means = step.param if step.name == "means" else course.param_of(step.set, "means")
+        means = course.param_of(step.set, "means")
         grad = None if means is None else means.grad
         # Multiples of the golden ratio keep step with no order of views, as of a rig of cameras.
         looks = self.reading is None and step.iteration * GOLDEN_RATIO % 1.0 < SHARE_LOOKED_AT
