@@ -42,7 +42,7 @@ def encode(
     """
     chance = _signed(0x80004000) if key is None else _chances(second, key, at)
     codes = (second.contiguous().view(torch.int32) + (chance & 0x7FFF)) >> 15
-    exp_avg_sq.copy_((codes ^ 0x8000) - 0x8000)  # the upper half of 16 bits is negative
+    exp_avg_sq.copy_(codes)  # the upper half of 16 bits wraps around to negative ones
     exp_avg.copy_((first.contiguous().view(torch.int32) + ((chance >> 16) & 0xFFFF)) >> 16)
 
 

@@ -19,7 +19,6 @@ from opt3dgs_optim.step import (
     Fade,
     Frame,
     Hyper,
-    Mean,
     Step,
     chosen_rows,
     mixed,
@@ -216,18 +215,6 @@ def test_a_coordinate_that_would_leave_float32_stays() -> None:
         run(step, Hyper(1.0, 1.0, 1.0, 0.0, 1.0, 1.0, exp_avg, torch.ones(3, 3)))
         assert (param[[0, 1, 2], [2, 0, 1]] == 1.0).all()
         assert (param[[0, 1, 2], [1, 2, 0]].abs() < 1e33).all()
-
-
-def test_a_mean_keeps_its_digits() -> None:
-    """Of an iterate far away, and of one that takes the place of what was there."""
-    mean, param = torch.tensor([[1.0, 1e8, 3.0, 1e8], [1e8, 1.0, 1e8, 3.0]])
-    began = torch.tensor([1.0, 1.0, 1000.0, 0.0])
-    weight = torch.tensor([1e-3, 1e-3, 1.0, 1.0], dtype=torch.float64)
-    expected = mean.double() + (param.double() - mean.double()) * weight
-    step = Step(param, torch.zeros(4), None, "", {}, {}, 0, -1, mean=Mean(1000, False))
-    moments = torch.zeros(2, 4)
-    triton.launch(step, Hyper(0.0, 0.9, 0.999, 1.0, 1.0, 1.0, *moments, mean=mean, began=began))
-    torch.testing.assert_close(mean.double(), expected, rtol=TOLERANCE, atol=0.0)
 
 
 @pytest.mark.parametrize("options", [{"hold": True}, {"frame": True}, {"coded": True}], ids=str)
