@@ -96,7 +96,8 @@ def test_the_nearest_code_is_that_of_the_nearer_half() -> None:
 def test_chances_are_the_hash_of_the_place_and_the_step(key: int, at: int) -> None:
     """A checkpoint resumed by another version, or on another device, rounds alike."""
     bits = torch.randint(1, 2**31 - 2**24, (2, 500), generator=torch.Generator().manual_seed(0))
-    found = coded(*bits.to(torch.int32).view(torch.float32), key, at)
+    numbers = bits.to(torch.int32).view(torch.float32)
+    found = coded(numbers[0], numbers[1], key, at)
     for i in range(500):
         chance = mixed(((at + i) % 2**32) ^ key)
         first, second = (int(bits[which, i]) for which in (0, 1))
