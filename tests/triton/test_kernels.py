@@ -218,8 +218,9 @@ def test_a_coordinate_that_would_leave_float32_stays() -> None:
 
 
 @pytest.mark.parametrize("options", [{"hold": True}, {"frame": True}, {"coded": True}], ids=str)
-@pytest.mark.parametrize("rows", [1, 129, 683])
-def test_nothing_beside_the_numbers_is_read_or_written(options: dict[str, Any], rows: int) -> None:
+def test_nothing_beside_the_numbers_is_read_or_written(options: dict[str, Any]) -> None:
+    shape = 683, 3  # the last program of each kernel has less than the others
+
     def amid(given: Any) -> Any:
         """The same numbers with 4,096 sevens before and behind."""
         around = torch.full((given.numel() + 8192,), 7).to(given.dtype)
@@ -227,8 +228,8 @@ def test_nothing_beside_the_numbers_is_read_or_written(options: dict[str, Any], 
         whole.append(around)
         return around[4096:-4096].view(given.shape)
 
-    step, hyper = case((rows, 3), torch.Generator().manual_seed(0), mean=True, **options)
-    apart, hyper2 = case((rows, 3), torch.Generator().manual_seed(0), mean=True, **options)
+    step, hyper = case(shape, torch.Generator().manual_seed(0), mean=True, **options)
+    apart, hyper2 = case(shape, torch.Generator().manual_seed(0), mean=True, **options)
     whole: list[torch.Tensor] = []
     for name in ("exp_avg", "exp_avg_sq", "mean", "began", "nonfinite"):
         setattr(hyper, name, amid(getattr(hyper, name)))
