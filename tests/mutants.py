@@ -35,8 +35,9 @@ KERNELS = PACKAGE / "triton/kernels.py"
 CHOSEN = "not slow and not hosts and not compiles and not processes and not thorough"
 ENERGY = ["test_partitions.py", "parts/test_histogram.py", "parts/test_histogram_extremes.py"]
 LBFGS = ["lbfgs/test_history.py", "lbfgs/test_two_loop.py", "lbfgs/test_lqn_direction.py"]
-STEP = ["parts/test_own_frame.py", "parts/test_fading.py", "parts/test_averaging.py"]
-STEP += ["parts/test_out_of_view.py", "test_moments.py", "test_adam.py", "test_reference_step.py"]
+STEP = ["test_step.py", "parts/test_own_frame.py", "parts/test_fading.py"]
+STEP += ["parts/test_averaging.py", "parts/test_out_of_view.py", "test_moments.py", "test_adam.py"]
+STEP += ["test_reference_step.py"]
 TARGETS = {  # module: the tests that are meant to notice
     "partitions.py": ENERGY,
     "parts/histogram.py": ENERGY,

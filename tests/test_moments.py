@@ -81,6 +81,30 @@ def test_a_code_is_as_near_as_it_says_over_float32s_whole_range() -> None:
     assert ((found[1] - second).abs() <= SECOND * second).all()
 
 
+def test_the_nearest_code_is_that_of_the_nearer_half() -> None:
+    """Between 1 and the number of the next code."""
+    for which, step in enumerate((2 * FIRST, 2 * SECOND)):
+        middle, one = torch.tensor(1.0 + step / 2), torch.tensor(1.0)
+        x = torch.stack([torch.nextafter(middle, 0 * one), torch.nextafter(middle, 2 * one)])
+        codes = coded(x, x, NEAREST)
+        assert decoded(*codes)[which].tolist() == [1.0, 1.0 + step]
+
+
+@pytest.mark.parametrize(
+    ("key", "at"), [(0, 0), (7, 2**31 - 3), (2**31, 2**32 - 3), (2**32 - 1, 5)]
+)
+def test_chances_are_the_hash_of_the_place_and_the_step(key: int, at: int) -> None:
+    """A checkpoint resumed by another version, or on another device, rounds alike."""
+    bits = torch.randint(1, 2**31 - 2**24, (2, 500), generator=torch.Generator().manual_seed(0))
+    numbers = bits.to(torch.int32).view(torch.float32)
+    found = coded(numbers[0], numbers[1], key, at)
+    for i in range(500):
+        chance = mixed(((at + i) % 2**32) ^ key)
+        first, second = (int(bits[which, i]) for which in (0, 1))
+        assert int(found[0][i]) == (first + (chance >> 16)) >> 16
+        assert int(found[1][i]) % 2**16 == (second + chance % 2**15) >> 15
+
+
 def test_zero_is_zero_and_a_row_without_second_moment_has_no_first() -> None:
     zeros = torch.zeros(3, dtype=CODES)
     assert all(torch.equal(each, torch.zeros(3)) for each in decoded(zeros, zeros))

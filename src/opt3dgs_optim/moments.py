@@ -40,9 +40,9 @@ def encode(
         key: 32 bits on which the chances of this step depend; `NEAREST`: to the nearest code.
         at: the place of the first number in its parameter.
     """
-    chance = _signed(0x80004000) if key is None else _chances(second, key, at)
+    chance = 0x80004000 if key is None else _chances(second, key, at)
     codes = (second.contiguous().view(torch.int32) + (chance & 0x7FFF)) >> 15
-    exp_avg_sq.copy_((codes ^ 0x8000) - 0x8000)  # the upper half of 16 bits is negative
+    exp_avg_sq.copy_(codes)  # the upper half of 16 bits wraps around to negative ones
     exp_avg.copy_((first.contiguous().view(torch.int32) + ((chance >> 16) & 0xFFFF)) >> 16)
 
 

@@ -216,7 +216,7 @@ def take_into_mean(how: Mean, param: Tensor, mean: Tensor, began: Tensor) -> Non
 
 def like_rows(numbers: Tensor, param: Tensor) -> Tensor:
     """Numbers of rows [N] that broadcast with a parameter [N, ...]."""
-    return numbers.view(-1, *[1] * (param.dim() - 1)) if param.dim() > 1 else numbers
+    return numbers.view(-1, *[1] * (param.dim() - 1))
 
 
 # -- which rows an event fades ---------------------------------------------------------------------

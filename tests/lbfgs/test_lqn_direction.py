@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 import torch
-from points_first import header, record
+from points_first import direction, header, record
+from simulated_device import on_device, on_host
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -53,6 +54,31 @@ def test_both_memory_layouts_give_the_same_numbers() -> None:
         outcomes.append((fed, copy))
     assert torch.equal(outcomes[0][0], outcomes[1][0])
     assert torch.equal(outcomes[0][1], outcomes[1][1])
+
+
+@pytest.mark.parametrize("contiguous", [False, True])
+def test_chunks_make_the_whole(contiguous: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Directions, pairs and the history, which is written where it lies."""
+    x, grad, history = points(40)
+    outcomes = []
+    for chunk in (7, 40):
+        monkeypatch.setattr(columns_of, "CHUNK", chunk)
+        copy = laid_out(history.clone(), contiguous=contiguous)
+        found = lqn_direction(x, grad, copy, 5, min_cosine=1e-6, graft=True)
+        outcomes.append([*found, copy])
+    # other SIMD lanes: equal to rounding
+    torch.testing.assert_close(*outcomes, rtol=1e-5, atol=1e-6)
+    assert not torch.equal(outcomes[0][-1], history)
+
+
+def test_columns_of_a_device_are_those_of_a_cpu() -> None:
+    """There and back."""
+    points = torch.randn(2, 9, 3)
+    found = columns_of.columns(*(on_device(each) for each in points))
+    assert torch.equal(on_host(found), points.mT)
+    there = on_device(torch.empty(9, 3))
+    columns_of.put(there, found[1])
+    assert torch.equal(on_host(there), points[1])
 
 
 # -- what it costs ---------------------------------------------------------------------------------
@@ -242,8 +268,9 @@ def test_gradients_too_small_for_products() -> None:
     y = torch.tensor([[[0.0, 1.0, 0.5]], [[1.0, 0.0, 0.0]]])
     grad, history = torch.ones(1, 3), history_from_pairs(s, y)
     expected = two_loop(grad.double(), history_from_pairs(s.double(), y.double()), 2)
-    found = two_loop(1e-36 * grad, history, 2).double() * 1e36
-    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-6)
+    small = 1e-36 * grad
+    for found in (two_loop(small, history, 2), direction(small, history, 2, graft=False)):
+        torch.testing.assert_close(found.double() * 1e36, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_a_direction_beyond_float32_leaves_the_gradient() -> None:

@@ -14,7 +14,16 @@ from interpreted import interpreted_kernels
 
 from opt3dgs_optim import triton
 from opt3dgs_optim.parts.out_of_view import look_at_positions
-from opt3dgs_optim.step import Fade, Hyper, Step, chosen_rows, take_step
+from opt3dgs_optim.step import (
+    LARGEST,
+    Fade,
+    Frame,
+    Hyper,
+    Step,
+    chosen_rows,
+    mixed,
+    take_step,
+)
 from opt3dgs_optim.triton.check import both, case, difference, tensors
 
 ROWS = (0, 1, 255, 256, 257, 1000, 4096)
@@ -107,10 +116,13 @@ def test_whatever_a_step_has_with_moments_of_16_bits(
 
 
 @pytest.mark.parametrize("key", [0, 1, 2**31 - 1, 2**31, 2**32 - 1])
-@pytest.mark.parametrize("share", [0.01, 0.2, 0.5, 1.0])
-def test_the_same_rows_fade(key: int, share: float) -> None:
+@pytest.mark.parametrize("share", [0.01, 0.2, 0.5, 1.0, "a row's"])
+def test_the_same_rows_fade(key: int, share: Any) -> None:
+    """A row does not fade where the share is the number that its hash is."""
     exp_avg, exp_avg_sq = torch.ones(2, 4099, 3)
     param, grad = torch.zeros(2, 4099, 3)
+    if share == "a row's":
+        share = (mixed(7 ^ key) >> 8) / 2**24
     fade = Fade(key, share, 0.5, 0.25)
     step = Step(param, grad, None, "", {}, {}, 0, -1, fade=fade)
     triton.launch(step, Hyper(0.1, 0.5, 0.5, 1e-8, 1.0, 1.0, exp_avg, exp_avg_sq))
@@ -166,6 +178,73 @@ def test_a_gaussian_whose_axes_are_not_finite_is_not_moved() -> None:
     assert moved.tolist() == [True, True, False, False, True, False, True, True, True]
 
 
+@pytest.mark.parametrize("options", [{}, {"frame": True}], ids=str)
+def test_eps_is_in_the_denominator(options: dict[str, Any]) -> None:
+    """One that counts beside the root of the second moment."""
+    made = []
+    for run in (take_step, triton.launch):
+        step, hyper = case((40, 3), torch.Generator().manual_seed(2), **options)
+        hyper.eps = 0.5
+        run(step, hyper)
+        made.append(step.param)
+    torch.testing.assert_close(*made, rtol=1e-5, atol=1e-6)  # sums that may cancel
+
+
+def test_the_border_of_what_adam_can_square_in_the_frame() -> None:
+    """The last number is taken, one above counts as zero; along each axis."""
+    largest = torch.tensor(LARGEST[torch.float32])
+    above = torch.nextafter(largest, torch.tensor(torch.inf))
+    step, hyper = case((6, 3), torch.Generator().manual_seed(0), frame=True)
+    step.frame = Frame(0.1, 0.1, torch.eye(4)[:1].repeat(6, 1), torch.zeros(6, 3))
+    step.grad = torch.cat([largest * torch.eye(3), -above * torch.eye(3)])
+    faded = 0.9 * hyper.exp_avg[3:]
+    triton.launch(step, hyper)
+    torch.testing.assert_close(hyper.exp_avg[:3].diagonal(), 0.1 * largest.expand(3))
+    torch.testing.assert_close(hyper.exp_avg[3:], faded)
+
+
+def test_a_coordinate_that_would_leave_float32_stays() -> None:
+    """Of a Gaussian of 3e38, turned by 45 degrees: about each of the axes."""
+    half = torch.tensor(torch.pi / 8)
+    quats = torch.cat([half.cos().expand(3, 1), half.sin() * torch.eye(3)], 1)
+    frame = Frame(1.0, 0.0, quats, torch.full((3, 3), 88.65))
+    for run in (take_step, triton.launch):
+        param, exp_avg = torch.ones(3, 3), torch.ones(3, 3)
+        exp_avg.fill_diagonal_(0.0)  # along the axis that it is turned about
+        step = Step(param, torch.zeros(3, 3), "means", "", {}, {}, 0, -1, frame=frame)
+        run(step, Hyper(1.0, 1.0, 1.0, 0.0, 1.0, 1.0, exp_avg, torch.ones(3, 3)))
+        assert (param[[0, 1, 2], [2, 0, 1]] == 1.0).all()
+        assert (param[[0, 1, 2], [1, 2, 0]].abs() < 1e33).all()
+
+
+@pytest.mark.parametrize("options", [{"hold": True}, {"frame": True}, {"coded": True}], ids=str)
+def test_nothing_beside_the_numbers_is_read_or_written(options: dict[str, Any]) -> None:
+    shape = 683, 3  # the last program of each kernel has less than the others
+
+    def amid(given: Any) -> Any:
+        """The same numbers with 4,096 sevens before and behind."""
+        around = torch.full((given.numel() + 8192,), 7).to(given.dtype)
+        around[4096:-4096] = given.flatten()
+        whole.append(around)
+        return around[4096:-4096].view(given.shape)
+
+    step, hyper = case(shape, torch.Generator().manual_seed(0), mean=True, **options)
+    apart, hyper2 = case(shape, torch.Generator().manual_seed(0), mean=True, **options)
+    whole: list[torch.Tensor] = []
+    for name in ("exp_avg", "exp_avg_sq", "mean", "began", "nonfinite"):
+        setattr(hyper, name, amid(getattr(hyper, name)))
+    step.param, step.grad = amid(step.param), amid(step.grad)
+    triton.launch(step, hyper)
+    triton.launch(apart, hyper2)
+    for ours, theirs in zip(tensors(step, hyper), tensors(apart, hyper2), strict=True):
+        assert torch.equal(ours, theirs)
+    assert hyper.nonfinite is not None
+    assert not hyper.nonfinite.any()
+    for around in whole:
+        assert (around[:4096] == 7).all()
+        assert (around[-4096:] == 7).all()
+
+
 def test_what_it_takes() -> None:
     """Anything else is made by plain torch."""
     draw = torch.Generator().manual_seed(0)
@@ -195,7 +274,9 @@ def test_it_looks_at_positions_as_torch_does(
     """One coordinate of a gradient, or of a second moment, is enough."""
     monkeypatch.setattr(triton, "_device_of", lambda _: nullcontext())  # the CPU
     draw = torch.Generator().manual_seed(rows)
-    grad = torch.randn(rows, 3, generator=draw) * torch.eye(3)[torch.arange(rows) % 3]
+    behind = torch.ones(rows + 1, 3)  # what lies behind is not looked at
+    grad = behind[:rows].copy_(torch.randn(rows, 3, generator=draw))
+    grad *= torch.eye(3)[torch.arange(rows) % 3]
     second = grad.roll(1, 1).square() if not coded else (grad.roll(1, 1) * 1e4).to(torch.int16)
     grad[torch.rand(rows, generator=draw) < 0.4] = 0.0
     second[torch.rand(rows, generator=draw) < 0.4] = 0

@@ -134,8 +134,7 @@ def push(cells: Cells, vectors: Tensor, accepted: Tensor) -> None:
     """Put a pair [2, D, N] in front of the others where `accepted` (bool) says, in place."""
     bits = BITS[vectors.dtype]
     stored, new, chosen = cells.pairs.view(bits), vectors.view(bits), bits_of(accepted, bits)
-    if cells.history_size > 1:
-        overwrite(stored[1:], stored[:-1], chosen)
+    overwrite(stored[1:], stored[:-1], chosen)
     overwrite(stored[0], new, chosen)
 
 

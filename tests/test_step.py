@@ -1,0 +1,225 @@
+"""The step in plain torch: in pieces, on a device, and where numbers leave their range."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from oracles import rotation_matrix
+from simulated_device import on_device, on_host
+from torch import Tensor
+
+from opt3dgs_optim import step as module
+from opt3dgs_optim.step import (
+    Axes,
+    Fade,
+    Hyper,
+    Mean,
+    Step,
+    chosen_rows,
+    finite,
+    into_frame,
+    mixed,
+    out_of_frame,
+    take_into_mean,
+    take_step,
+)
+from opt3dgs_optim.triton.check import case, tensors
+
+CPU = torch.device("cpu")
+NAN, INF = float("nan"), float("inf")
+KINDS: dict[str, dict[str, Any]] = {
+    "rows": {"fade": True, "hold": True, "decay": 0.1},
+    "frame": {"frame": True, "shrink": 0.9},
+    "plain": {"plain": True},
+}
+each_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+
+
+def stepped(device: bool = False, rows: int = 50, seed: int = 0, **options: Any) -> list[Tensor]:
+    """What a step leaves, on the CPU, and how many numbers were not finite."""
+    step, hyper = case((rows, 3), torch.Generator().manual_seed(seed), **options)
+    if device:
+        for owner, names in (
+            (step, ("param", "grad")),
+            (hyper, ("exp_avg", "exp_avg_sq", "mean", "began", "nonfinite")),
+        ):
+            for name in names:
+                given = getattr(owner, name)
+                setattr(owner, name, given if given is None else on_device(given))
+    bad = take_step(step, hyper)
+    assert hyper.nonfinite is not None
+    assert bad == 0 or not device  # nobody waits
+    return [on_host(each) for each in (*tensors(step, hyper), hyper.nonfinite + bad)]
+
+
+def by_rows(step: Step, hyper: Hyper) -> list[np.ndarray]:
+    """What a step leaves, one Gaussian at a time, in the order of the module's docstring."""
+    given = step.param, step.grad, hyper.exp_avg, hyper.exp_avg_sq, hyper.mean, hyper.began
+    x, g, m, v, mean, began = (each.double().numpy().copy() for each in given if each is not None)
+    fade, hold, frame, how = step.fade, step.hold, step.frame, step.mean
+    faded = chosen_rows(fade, len(x), CPU) if fade else torch.zeros(len(x))
+    g[~np.isfinite(g)] = 0.0
+    for i in range(len(x)):
+        if fade and faded[i]:
+            m[i], v[i] = m[i] * fade.exp_avg, v[i] * fade.exp_avg_sq
+        x[i] *= hyper.shrink
+        g[i] += hyper.decay * x[i]
+        axes, rate = np.eye(3), hyper.lr
+        if frame:
+            deviations = np.exp(frame.scales[i].numpy())
+            deviations = np.maximum(deviations, frame.min_aspect * deviations.max())
+            axes, rate = rotation_matrix(frame.quats[i].numpy()) * deviations, frame.rate
+        g[i] = axes.T @ g[i]
+        if hold and hold.rows[i]:
+            v[i] = np.maximum(v[i], (hold.weight * g[i]) ** 2)
+        z = g[i]
+        if not step.plain:
+            m[i] = hyper.beta1 * m[i] + (1 - hyper.beta1) * g[i]
+            v[i] = hyper.beta2 * v[i] + (1 - hyper.beta2) * g[i] ** 2
+            z = m[i] / hyper.correction1 / (np.sqrt(v[i]) / hyper.root2 + hyper.eps)
+        x[i] -= axes @ (rate * step.factor * z)
+        if how:
+            began[i] = began[i] or how.number
+            mean[i] += (x[i] - mean[i]) / (how.number + 1 - began[i])
+            x[i] = mean[i] if how.put else x[i]
+    return [x, m, v, mean, began]
+
+
+@each_kind
+@pytest.mark.parametrize("put", [False, True])
+def test_a_step_is_what_the_docstring_says(kind: dict[str, Any], put: bool) -> None:
+    step, hyper = case(
+        (50, 3), torch.Generator().manual_seed(1), **kind, mean=True, put=put, factor=0.7, bad=3
+    )
+    for owner, names in ((step, ("param", "grad")), (hyper, ("exp_avg", "exp_avg_sq", "mean"))):
+        for name in names:
+            setattr(owner, name, getattr(owner, name).double())
+    if step.frame is not None:
+        step.frame = step.frame._replace(
+            quats=step.frame.quats.double(), scales=step.frame.scales.double()
+        )
+    expected = by_rows(step, hyper)
+    take_step(step, hyper)
+    for ours, theirs in zip(tensors(step, hyper), expected, strict=True):
+        # Sums of nine terms, which may cancel, and weights of the mean, which are float32.
+        np.testing.assert_allclose(ours.numpy(), theirs, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("rows", "width", "pieces"), [(8, 3, [8]), (9, 3, [4, 4, 1]), (3, 13, [1, 1, 1]), (0, 3, [0])]
+)
+def test_a_cpu_takes_as_many_whole_rows_at_a_time_as_a_chunk_holds(
+    rows: int, width: int, pieces: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two chunks are not worth it."""
+    taken: list[int] = []
+
+    def noted(grad: Tensor, counter: Tensor | None) -> tuple[Tensor, int]:
+        taken.append(len(grad))
+        return finite(grad, counter)
+
+    monkeypatch.setattr(module, "CHUNK", 12)
+    monkeypatch.setattr(module, "finite", noted)
+    take_step(*case((rows, width), torch.Generator()))
+    assert taken == pieces
+
+
+@pytest.mark.parametrize("kind", [*KINDS.values(), {"coded": True}], ids=[*KINDS, "16 bits"])
+def test_pieces_make_the_whole(kind: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    options = {**kind, "mean": True, "put": True, "bad": 100}
+    whole = stepped(**options)
+    monkeypatch.setattr(module, "CHUNK", 12)
+    for ours, theirs in zip(whole, stepped(**options), strict=True):
+        assert torch.equal(ours, theirs)
+    assert whole[-1] == 100
+
+
+@each_kind
+def test_a_device_steps_as_a_cpu(kind: dict[str, Any]) -> None:
+    """It counts there what was not finite, and reads a factor there."""
+    options = {**kind, "fade": False, "mean": True, "put": True, "bad": 3}
+    host = stepped(**options, factor=0.25)
+    for ours, theirs in zip(
+        host, stepped(device=True, **options, factor=torch.tensor(0.25)), strict=True
+    ):
+        torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=1e-7)  # the factor's product
+    assert host[-1] == 3
+    grad = on_device(torch.tensor([1.0, NAN]))
+    assert on_host(finite(grad, None)[0]).tolist() == [1.0, 0.0]  # where nobody counts
+
+
+@each_kind
+def test_a_factor_scales_the_step(kind: dict[str, Any]) -> None:
+    """And nothing else."""
+    still, whole, half = (stepped(**kind, factor=factor) for factor in (0.0, 1.0, 0.5))
+    torch.testing.assert_close(half[0] - still[0], 0.5 * (whole[0] - still[0]))
+    assert not torch.equal(whole[0], still[0])
+    for one, other in zip(whole[1:], half[1:], strict=True):
+        assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("value", [NAN, INF, -INF])
+def test_a_number_that_is_not_finite_costs_no_other_its_place_in_the_mean(value: float) -> None:
+    """An iterate leaves its mean alone, and is not put over; a mean begins with its iterate."""
+    mean, began = torch.tensor([[2.0, 2.0], [value, 2.0], [7.0, 2.0]]), torch.tensor([1.0, 1.0, 0])
+    param = torch.tensor([[8.0, value], [8.0, 8.0], [8.0, 8.0]])
+    take_into_mean(Mean(3, True), param, mean, began)
+    assert mean.tolist() == [[4.0, 2.0], [8.0, 4.0], [8.0, 8.0]]
+    torch.testing.assert_close(
+        param, torch.tensor([[4.0, value], [8.0, 4.0], [8.0, 8.0]]), equal_nan=True
+    )
+    assert began.tolist() == [1.0, 1.0, 3.0]
+
+
+# -- which rows ------------------------------------------------------------------------------------
+
+# By Wellons' C. A resumed training repeats its events and its rounding by them.
+LOWBIAS32 = {1: 0x688990C0, 2: 0xD1132181, 2**16: 0xDCAFAE10, 2**31: 0xCC4B4124}
+LOWBIAS32 |= {0: 0, 2**32 - 1: 0x6768824A}
+
+
+def test_the_hash_is_lowbias32() -> None:
+    assert [mixed(number) for number in LOWBIAS32] == list(LOWBIAS32.values())
+    assert mixed(torch.tensor(list(LOWBIAS32))).tolist() == list(LOWBIAS32.values())
+
+
+@pytest.mark.parametrize("key", [0, 7, 2**32 - 1])
+def test_a_row_fades_where_its_number_is_below_the_share(key: int) -> None:
+    """Of a share of 0 none, of 1 all; a row's own number is not below itself."""
+
+    def chosen(share: float) -> Tensor:
+        return chosen_rows(Fade(key, share, 0.5, 0.5), 1000, CPU)
+
+    numbers = torch.tensor([(mixed(row ^ key) >> 8) / 2**24 for row in range(1000)])
+    for share in (0.0, float(numbers[7]), 1.0):
+        assert torch.equal(chosen(share), numbers < share)
+    assert not chosen(0.0).any()
+    assert chosen(1.0).all()
+
+
+# -- own frames ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_a_gradient_that_adam_cannot_square_counts_as_zero_in_the_frame(dtype: torch.dtype) -> None:
+    """Half of the largest number that it can is taken; a row costs no other."""
+    root = torch.finfo(dtype).max ** 0.5
+    zero, one = torch.zeros(3, dtype=dtype), torch.ones(3, dtype=dtype)
+    world = Axes((one, zero, zero, zero), (one, one, one))
+    vectors = torch.tensor(
+        [[root / 2, 1.0, -0.4 * root], [2.0 * root, -1.1 * root, 0.0], [1.0, 2.0, 3.0]], dtype=dtype
+    )
+    found = into_frame(world, vectors)
+    assert torch.equal(found[[0, 2]], vectors[[0, 2]])
+    assert found[1].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_a_step_to_no_finite_place_is_none() -> None:
+    """The largest finite one is one."""
+    zero, one, largest = torch.zeros(2), torch.ones(2), torch.finfo(torch.float32).max
+    world = Axes((one, zero, zero, zero), (one, one, one))
+    vectors = torch.tensor([[largest, 0.0, 0.0], [0.0, 1.0, INF]])
+    assert out_of_frame(world, vectors).tolist() == [[largest, 0.0, 0.0], [0.0, 0.0, 0.0]]
