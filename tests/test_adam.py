@@ -270,6 +270,25 @@ def test_parts_act_around_a_masked_step(kind: Any) -> None:
         assert bool(torch.isfinite(found[name]).all())
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_mean_of_what_is_stepped_seldom_is_of_all_its_iterates(kind: Any) -> None:
+    """As harmonics that are stepped in every fourth iteration; neither Adam counts its steps."""
+    params, total, iterates = parameters(ROWS, "means", "sh0"), 600, []
+    optimizer = PhaseScheduler(total, parts=[Averaging()]).upgrade(adam_of(params, kind))
+    start, generator = Averaging.start(total), torch.Generator().manual_seed(0)
+    for iteration in range(Averaging.put_from(total)):
+        stepped = iteration % 4 == 0
+        for name, param in params.items():
+            given = torch.randn(param.shape, generator=generator)
+            param.grad = given if name == "means" or stepped else None
+        optimizer.step(*masked(kind, torch.ones(ROWS, dtype=torch.bool)))
+        if stepped and iteration >= start:
+            iterates.append(params["sh0"].detach().clone())
+    assert len(iterates) == 5
+    mean = optimizer.state[params["sh0"]]["averaging.mean"]
+    assert torch.allclose(mean, torch.stack(iterates).mean(0), atol=1e-6)
+
+
 def test_a_masked_step_in_the_own_frame_is_theirs_in_standard_deviations() -> None:
     params = parameters(ROWS, "means", "scales", "quats")
     params["scales"].data.fill_(2.0)

@@ -18,6 +18,7 @@ from torch import Tensor
 from opt3dgs_optim.lane import MOMENTS, Lane
 from opt3dgs_optim.step import (
     Axes,
+    Mean,
     Step,
     axes_of,
     chosen_rows,
@@ -50,14 +51,14 @@ def step_around(
     optimizer: StepAdam, iteration: int, args: tuple[Any, ...], masks: dict[str, Any]
 ) -> None:
     """Have the optimizer's own class make a step as the parts say; put back what it was given."""
-    steps: list[tuple[Lane, Step]] = []
+    steps: list[tuple[Lane, Step, float]] = []
     undo: list[tuple[Lane, Tensor, float, Tensor, Axes | None]] = []
     try:
         for lane in optimizer.present_lanes():
             if lane.param.grad is not None:
                 step = optimizer.plan(lane, iteration)
                 axes = None if step.frame is None else axes_of(step.frame)
-                steps.append((lane, step))
+                steps.append((lane, step, float(step.state["step"])))
                 undo.append((lane, lane.param.grad, lane.group["lr"], lane.param.data, axes))
                 _give(step, axes, optimizer.course)
         optimizer.own_class_step(*args, **masks)
@@ -67,9 +68,12 @@ def step_around(
             if axes is not None and lane.param.data_ptr() != position.data_ptr():
                 moved, lane.param.data = lane.param.data, position
                 lane.param.add_(out_of_frame(axes, moved))
-    for lane, step in steps:
-        if step.mean is not None:
-            take_into_mean(step.mean, step.param, *lane.mean_of(step.state))
+    for lane, step, count in steps:
+        if step.state["step"] == count:  # gsplat's and INRIA's kernels need no count, and keep none
+            step.state["step"] += 1
+        if step.mean is not None:  # it counts the steps that are made, not the iterations
+            how = Mean(int(step.state["step"]), step.mean.put)
+            take_into_mean(how, step.param, *lane.mean_of(step.state))
         optimizer.finish_step(lane, step)
 
 

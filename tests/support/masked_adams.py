@@ -23,7 +23,6 @@ class MaskedAdam(Adam):
                 state["step"] = torch.zeros(())
                 state["exp_avg"] = torch.zeros_like(param)
                 state["exp_avg_sq"] = torch.zeros_like(param)
-            state["step"] += 1
             m, v, g = state["exp_avg"][visible], state["exp_avg_sq"][visible], param.grad[visible]
             m, v = beta1 * m + (1 - beta1) * g, beta2 * v + (1 - beta2) * g * g
             state["exp_avg"][visible], state["exp_avg_sq"][visible] = m, v
