@@ -211,6 +211,15 @@ def gpu_iteration(_: Evidence) -> str:
     return table(("", *heads), rows)
 
 
+def bits(all_: Evidence) -> str:
+    """Moments of 16 bits beside those of 32."""
+    rows = []
+    for scene in MAIN:
+        wide, half = (all_.of(a, scene, iterations=10_000, **HALF) for a in ("own", "own-16"))
+        rows.append((scene, shown(wide), shown(half), gained(half, wide)))
+    return table(("scene", "32 bits", "16 bits", "16 less 32 bits, same seeds"), rows)
+
+
 def equal(all_: Evidence) -> str:
     """All of 30,000 iterations."""
     rows = []
@@ -331,8 +340,8 @@ NAMES = {
 TABLES: dict[str, Callable[[Evidence], str]] = {
     f.__name__: f
     for f in (
-        front, iterations, kept_aside, gpu, gpu_step, gpu_iteration, equal, cost, few, adaptive,
-        capture, closed,
+        front, iterations, kept_aside, gpu, gpu_step, gpu_iteration, bits, equal, cost, few,
+        adaptive, capture, closed,
     )
 }  # fmt: skip
 
