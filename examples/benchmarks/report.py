@@ -177,16 +177,7 @@ def gpu(all_: Evidence) -> str:
 
 def gpu_step(_: Evidence) -> str:
     """What a step costs on a GPU."""
-    found = json.loads(GPU.read_text(encoding="utf-8"))["steps"]["results"]
-    rows = []
-    for name in found["5000000"]:
-        cells = []
-        for results in found.values():
-            row = results.get(name)
-            cells.append("-" if row is None else f"{row['ms']:.2f} ms, x{row['ratio']:.2f}")
-        rows.append((name, *cells, str(found["1000000"][name]["launches"])))
-    heads = [f"{int(points):,} Gaussians" for points in found]
-    return table(("", *heads, "launches at a million"), rows)
+    return steps.table(json.loads(GPU.read_text(encoding="utf-8"))["steps"]["results"])
 
 
 def gpu_iteration(_: Evidence) -> str:
@@ -237,9 +228,8 @@ def equal(all_: Evidence) -> str:
 def cost(_: Evidence) -> str:
     """What a step costs on a CPU."""
     made = json.loads(steps.OUT.read_text(encoding="utf-8"))
-    found = {int(points): rows for points, rows in made["results"].items()}
     about = f"{made['machine']}, {made['date']}, medians of {made['rounds']} rounds."
-    return f"{steps.table(found)}\n\n{about}"
+    return f"{steps.table(made['results'])}\n\n{about}"
 
 
 def few(all_: Evidence) -> str:

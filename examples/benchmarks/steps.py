@@ -17,7 +17,7 @@ import statistics
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -206,13 +206,13 @@ def state_bytes(optimizers: Iterable[torch.optim.Optimizer]) -> int:
     return sum(x.numel() * x.element_size() for x in tensors)
 
 
-def table(results: dict[int, dict[str, Row]]) -> str:
+def table(results: Mapping[Any, dict[str, Row]]) -> str:
     """Markdown: a row a subject; for each number of Gaussians its ms and its ratio to six Adams."""
-    heads = ["", *(f"{points:,} Gaussians" for points in results)]
+    heads = ["", *(f"{int(points):,} Gaussians" for points in results)]
     lines = [f"| {' | '.join(heads)} |", f"|---|{'---:|' * len(results)}"]
     for name in next(iter(results.values())):
-        rows = [found[name] for found in results.values()]
-        cells = (f"{row['ms']:.3g} ms, x{row['ratio']:.2f}" for row in rows)
+        rows = [found.get(name) for found in results.values()]
+        cells = (f"{row['ms']:.3g} ms, x{row['ratio']:.2f}" if row else "-" for row in rows)
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
