@@ -13,7 +13,7 @@ from torch.nn import Parameter
 from torch.optim import Adam
 
 from opt3dgs_optim import AWSGLD, DEFAULTS_ADC, LQNAdam, PhaseScheduler
-from opt3dgs_optim.moments import CODES, NEAREST, decoded, encode
+from opt3dgs_optim.moments import CODES, NEAREST, chances, decoded, encode
 from opt3dgs_optim.step import mixed
 
 SHAPES = {
@@ -26,7 +26,7 @@ FIRST, SECOND = 2.0**-8, 2.0**-9  # half of the way between two codes, of a numb
 
 def coded(first: Tensor, second: Tensor, key: int | None, at: int = 0) -> tuple[Tensor, Tensor]:
     codes = torch.empty_like(first, dtype=CODES), torch.empty_like(first, dtype=CODES)
-    encode(first, second, *codes, key=key, at=at)
+    encode(first, second, *codes, NEAREST if key is None else chances(first, key, at))
     return codes
 
 
@@ -76,7 +76,7 @@ def same(one: list[Tensor], other: list[Tensor]) -> bool:
 
 def test_a_code_is_as_near_as_it_says_over_float32s_whole_range() -> None:
     first, second = wide(20_000)
-    found = decoded(*coded(first, second, NEAREST))
+    found = decoded(*coded(first, second, None))
     assert ((found[0] - first).abs() <= FIRST * first.abs()).all()
     assert ((found[1] - second).abs() <= SECOND * second).all()
 
@@ -86,7 +86,7 @@ def test_the_nearest_code_is_that_of_the_nearer_half() -> None:
     for which, step in enumerate((2 * FIRST, 2 * SECOND)):
         middle, one = torch.tensor(1.0 + step / 2), torch.tensor(1.0)
         x = torch.stack([torch.nextafter(middle, 0 * one), torch.nextafter(middle, 2 * one)])
-        codes = coded(x, x, NEAREST)
+        codes = coded(x, x, None)
         assert decoded(*codes)[which].tolist() == [1.0, 1.0 + step]
 
 
@@ -110,7 +110,7 @@ def test_zero_is_zero_and_a_row_without_second_moment_has_no_first() -> None:
     assert all(torch.equal(each, torch.zeros(3)) for each in decoded(zeros, zeros))
     codes = coded(torch.zeros(3), torch.zeros(3), key=12345)
     assert all(torch.equal(each, zeros) for each in codes)
-    ones = coded(torch.ones(3), torch.ones(3), NEAREST)
+    ones = coded(torch.ones(3), torch.ones(3), None)
     assert torch.equal(decoded(ones[0], zeros)[0], torch.zeros(3))
 
 
@@ -174,6 +174,55 @@ def test_half_of_the_bytes() -> None:
     assert sizes == {16: 1_000 * BYTES, 32: 2_000 * BYTES}
 
 
+def kept(adams: dict[str, Adam], *keys: str) -> int:
+    """Bytes of what is kept under these names."""
+    states = [adam.state[param_of(adam)] for adam in adams.values()]
+    return sum(s[k].numel() * s[k].element_size() for s in states for k in keys if k in s)
+
+
+MEAN = ("averaging.mean", "averaging.distance", "averaging.began")
+
+
+@pytest.mark.parametrize(("moments", "size"), [(32, 260), (16, 148)])
+def test_what_the_mean_takes(moments: int, size: int) -> None:
+    """Of positions a mean, which leaves out the noise that trainers move them by, of others less.
+
+    And six numbers a row say when each mean began.
+    """
+    adams, _ = trained(100, moments, total=300)
+    iterate(adams, 0, 292)
+    assert kept(adams, *MEAN) == 100 * size
+    assert "averaging.mean" in adams["means"].state[param_of(adams["means"])]
+
+
+@pytest.mark.parametrize("moments", [32, 16])
+def test_a_mean_in_the_other_form_begins_anew(moments: Any) -> None:
+    """A checkpoint of the last thirtieth, and as many bits as it had not."""
+    adams, _ = trained(20, moments, total=300)
+    iterate(adams, 0, 294)
+    again, _ = trained(20, 48 - moments, total=300)
+    for adam, other in zip(adams.values(), again.values(), strict=True):
+        param_of(other).data.copy_(param_of(adam))
+        other.load_state_dict(adam.state_dict())
+    assert not kept(again, *MEAN)
+    iterate(again, 294, 300)
+    began = [adam.state[param_of(adam)]["averaging.began"] for adam in again.values()]
+    assert all((each == 295).all() for each in began)
+
+
+@pytest.mark.parametrize("moments", [32, 16])
+def test_noise_of_the_trainer_stays_out_of_the_mean_of_positions(moments: Any) -> None:
+    """As that of 3DGS-MCMC, after each step."""
+    adams, _ = trained(1_000, moments, total=300)
+    means, draw = param_of(adams["means"]), torch.Generator().manual_seed(1)
+    iterate(adams, 0, 285)
+    for i in range(285, 300):
+        means.data = 100.0 + 10.0 * torch.randn(means.shape, generator=draw)
+        iterate(adams, i, i + 1)
+    assert means.detach().std() == pytest.approx(10.0 / 10**0.5, rel=0.05)
+    assert kept(adams, "averaging.distance") == (0 if moments == 32 else 1_000 * 112)
+
+
 def test_a_training_goes_as_with_32_bits() -> None:
     ends = []
     for moments in (32, 16):
@@ -186,24 +235,26 @@ def test_a_training_goes_as_with_32_bits() -> None:
         assert (one - other).square().mean().sqrt() < 0.02 * (one - first).square().mean().sqrt()
 
 
+@pytest.mark.parametrize(("at", "total"), [(33, 60), (293, 300), (298, 300)])
 @pytest.mark.parametrize("order", ["gsplat", "INRIA"])
-def test_a_resume_is_bit_for_bit(order: str) -> None:
-    adams, _ = trained()
-    iterate(adams, 0, 33)
+def test_a_resume_is_bit_for_bit(order: str, at: int, total: int) -> None:
+    """Also in the last thirtieth, and where the mean is in the parameters' place."""
+    adams, _ = trained(total=total)
+    iterate(adams, 0, at)
     file = io.BytesIO()
     torch.save([(param_of(a).detach(), a.state_dict()) for a in adams.values()], file)
-    iterate(adams, 33, 60)
+    iterate(adams, at, total)
     file.seek(0)
     if order == "gsplat":
-        again, _ = trained()
+        again, _ = trained(total=total)
     else:
         again = {k: Adam([Parameter(torch.zeros(200, *s))], lr=1e-2) for k, s in SHAPES.items()}
     for adam, (values_, state) in zip(again.values(), torch.load(file), strict=True):
         param_of(adam).data.copy_(values_)
         adam.load_state_dict(state)
     if order == "INRIA":
-        PhaseScheduler(60, parts=DEFAULTS_ADC, moments=16).upgrade(again)
-    iterate(again, 33, 60)
+        PhaseScheduler(total, parts=DEFAULTS_ADC, moments=16).upgrade(again)
+    iterate(again, at, total)
     assert same(values(adams), values(again))
 
 

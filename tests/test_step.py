@@ -12,11 +12,11 @@ from simulated_device import on_device, on_host
 from torch import Tensor
 
 from opt3dgs_optim import step as module
+from opt3dgs_optim.moments import CODES, chances, numbers_of
 from opt3dgs_optim.step import (
     Axes,
     Fade,
     Hyper,
-    Mean,
     Step,
     chosen_rows,
     finite,
@@ -59,7 +59,7 @@ def by_rows(step: Step, hyper: Hyper) -> list[np.ndarray]:
     """What a step leaves, one Gaussian at a time, in the order of the module's docstring."""
     given = step.param, step.grad, hyper.exp_avg, hyper.exp_avg_sq, hyper.mean, hyper.began
     x, g, m, v, mean, began = (each.double().numpy().copy() for each in given if each is not None)
-    fade, hold, frame, how = step.fade, step.hold, step.frame, step.mean
+    fade, hold, frame, put = step.fade, step.hold, step.frame, step.mean
     faded = chosen_rows(fade, len(x), CPU) if fade else torch.zeros(len(x))
     g[~np.isfinite(g)] = 0.0
     for i in range(len(x)):
@@ -81,10 +81,10 @@ def by_rows(step: Step, hyper: Hyper) -> list[np.ndarray]:
             v[i] = hyper.beta2 * v[i] + (1 - hyper.beta2) * g[i] ** 2
             z = m[i] / hyper.correction1 / (np.sqrt(v[i]) / hyper.root2 + hyper.eps)
         x[i] -= axes @ (rate * step.factor * z)
-        if how:
-            began[i] = began[i] or how.number
-            mean[i] += (x[i] - mean[i]) / (how.number + 1 - began[i])
-            x[i] = mean[i] if how.put else x[i]
+        if put is not None:
+            began[i] = began[i] or hyper.count
+            mean[i] += (x[i] - mean[i]) / (hyper.count + 1 - began[i])
+            x[i] = mean[i] if put else x[i]
     return [x, m, v, mean, began]
 
 
@@ -166,12 +166,64 @@ def test_a_number_that_is_not_finite_costs_no_other_its_place_in_the_mean(value:
     """An iterate leaves its mean alone, and is not put over; a mean begins with its iterate."""
     mean, began = torch.tensor([[2.0, 2.0], [value, 2.0], [7.0, 2.0]]), torch.tensor([1.0, 1.0, 0])
     param = torch.tensor([[8.0, value], [8.0, 8.0], [8.0, 8.0]])
-    take_into_mean(Mean(3, True), param, mean, began)
+    take_into_mean(3, True, param, mean, began)
     assert mean.tolist() == [[4.0, 2.0], [8.0, 4.0], [8.0, 8.0]]
     torch.testing.assert_close(
         param, torch.tensor([[4.0, value], [8.0, 4.0], [8.0, 8.0]]), equal_nan=True
     )
     assert began.tolist() == [1.0, 1.0, 3.0]
+
+
+def test_a_distance_at_16_bits_keeps_a_mean_of_a_thousand_iterates() -> None:
+    """Rounded a thousand times; of rows that begin at the first one, and at the 600th."""
+    draw, x = torch.Generator().manual_seed(0), torch.full((2, 2_000), 100.0)
+    distance, began, iterates = torch.zeros(2, 2_000, dtype=CODES), torch.zeros(2), []
+    chance = chances(x, mixed(0), 0)
+    for number in range(1, 1_001):
+        before = x.clone()
+        x += 1e-3 * torch.randn(x.shape, generator=draw) + 1e-2 * (100.0 - x)
+        iterates.append(x.double())
+        if number == 600:
+            began[1], distance[1] = 0.0, 0
+        chance = chances(x, mixed(number), 0)
+        take_into_mean(number, False, x, distance, began, before, chance)
+    for row, first in ((0, 0), (1, 599)):
+        exact = torch.stack(iterates[first:]).mean(0)[row] - x[row]
+        away = numbers_of(distance)[row] - exact
+        # The docstring's twentieth; no drift, of which 2,000 show a fiftieth of it.
+        assert 0.01 < (away.square().mean() / exact.square().mean()) ** 0.5 < 0.08
+        assert abs(away.mean()) < 5 * away.std() / 2_000**0.5
+    assert began.tolist() == [1.0, 600.0]
+    end = torch.stack(iterates).mean(0)[0]
+    take_into_mean(1_001, True, x, distance, began, x.clone(), chance)
+    assert (x[0] - end).abs().max() < 0.1 * exact.abs().max()
+    assert not distance.any()
+
+
+@pytest.mark.parametrize("put", [False, True])
+def test_a_distance_is_of_the_same_mean(put: bool) -> None:
+    """Also where the trainer decays the parameter; what is not finite begins with its iterate."""
+    options: dict[str, Any] = {"coded": True, "mean": True, "put": put, "shrink": 0.9, "decay": 0.1}
+    made = [case((50, 3), torch.Generator().manual_seed(2), **options) for _ in range(2)]
+    (step, hyper), (step2, hyper2) = made
+    assert hyper.mean is not None
+    assert hyper2.mean is not None
+    for each in (step, step2):
+        each.param[7, 1] = INF
+    hyper2.mean = step2.param + numbers_of(hyper2.mean)
+    take_step(step, hyper)
+    take_step(step2, hyper2)
+    away = numbers_of(hyper.mean)
+    assert hyper.began is not None
+    for i in range(50):
+        for j in range(3):
+            if (i, j) == (7, 1):
+                assert not torch.isfinite(step.param[i, j])
+                assert away[i, j] == 0
+                continue
+            distance = hyper2.mean[i, j] - step2.param[i, j]
+            assert abs(step.param[i, j] - step2.param[i, j]) < 1e-6 * (1 + abs(step.param[i, j]))
+            assert abs(away[i, j] - distance) <= 2**-7 * abs(distance) + 2e-6
 
 
 # -- which rows ------------------------------------------------------------------------------------

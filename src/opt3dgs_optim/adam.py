@@ -13,12 +13,12 @@ from opt3dgs_optim.checkpoint import check_tensors
 from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.contract import Slots, check_supported, own_step
 from opt3dgs_optim.course import STATE_KEY, Course
-from opt3dgs_optim.lane import BEGAN, KEPT, MEAN, MOMENTS, Lane
+from opt3dgs_optim.lane import BEGAN, DISTANCE, KEPT, MEAN, MOMENTS, Lane
 from opt3dgs_optim.masked import check_arguments, step_around
-from opt3dgs_optim.moments import CODES, NEAREST, decoded, encode
+from opt3dgs_optim.moments import CODES, NEAREST, decoded, encode, numbers_of
 from opt3dgs_optim.names import split_name
 from opt3dgs_optim.part import Part
-from opt3dgs_optim.step import Hyper, Mean, Step, like_rows, mixed, take_step
+from opt3dgs_optim.step import Hyper, Step, like_rows, mixed, take_step
 
 
 class StepAdam(Adam):
@@ -226,7 +226,7 @@ class StepAdam(Adam):
             state["step"].zero_()
             for key in MOMENTS:
                 state[key].zero_()
-            for key in (MEAN, BEGAN):
+            for key in (MEAN, DISTANCE, BEGAN):
                 state.pop(key, None)
         lane.stepped_in = iteration
         return step
@@ -269,8 +269,8 @@ class StepAdam(Adam):
                 hyper.shrink = 1 - lr * decay
             else:
                 hyper.decay = decay
-        if step.mean is not None:  # it counts the steps that are made, not the iterations
-            step.mean = Mean(int(t), step.mean.put)
+        if step.mean is not None:
+            hyper.count = int(t)  # the steps that are made, not the iterations
             hyper.mean, hyper.began = lane.mean_of(state)
         if lane.counter is not None and triton.takes(step):
             triton.take_step(step, hyper)
@@ -314,11 +314,14 @@ class StepAdam(Adam):
         found = 0
         for group in self.param_groups:
             for param in group["params"]:
-                mean = self.state.get(param, {}).get(MEAN)
-                if mean is not None and mean.shape == param.shape:
-                    began = self.state[param][BEGAN] > 0
+                state = self.state.get(param, {})
+                mean, distance = state.get(MEAN), state.get(DISTANCE)
+                if distance is not None:
+                    mean = param + numbers_of(distance.to(CODES))
+                    state[DISTANCE] = torch.zeros_like(distance)
+                if mean is not None:
                     known = torch.isfinite(param) & torch.isfinite(mean)
-                    known &= like_rows(began, param)
+                    known &= like_rows(state[BEGAN] > 0, param)
                     param.copy_(torch.where(known, mean, param))
                     found += 1
         return found
@@ -378,8 +381,9 @@ class StepAdam(Adam):
         ours = None if missed else saved  # what it says of the moments holds
         self.in_own_frame = frozenset(() if ours is None else ours["own_frame"])
         self._last = () if ours is None else tuple(ours["last"])
-        if ours is None or ours["total_steps"] != course.total_steps:
-            for state in self.state.values():  # they belong to the end of another run
+        now = {"total_steps": course.total_steps, "moments": course.moments}
+        if ours is None or any(ours[key] != value for key, value in now.items()):
+            for state in self.state.values():  # of the end of another run, or in another form
                 for key in KEPT:
                     state.pop(key, None)
         if saved is not None:
@@ -424,7 +428,7 @@ class StepAdam(Adam):
                 first, second = (each.to(param.dtype) for each in decoded(first, second))
             elif not self.coded and bits == 16:
                 codes = torch.empty_like(first, dtype=CODES), torch.empty_like(second, dtype=CODES)
-                encode(first, second, *codes, key=NEAREST, at=0)
+                encode(first, second, *codes, NEAREST)
                 first, second = codes
             state["exp_avg"], state["exp_avg_sq"] = first, second
         if tell and found and self.coded != (bits == 16):
@@ -482,12 +486,12 @@ def as_numbers(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def as_codes(state: dict[str, Any]) -> None:
-    """Have the codes of a parameter's moments as integers again.
+    """Have the codes of a parameter's moments, and of its mean's distance, as integers again.
 
     An edit of rows, and torch's loading, make them float32, with the same values.
     """
-    for key in MOMENTS:
-        if state[key].dtype != CODES:
+    for key in (*MOMENTS, DISTANCE):
+        if key in state and state[key].dtype != CODES:
             state[key] = state[key].to(CODES)
 
 

@@ -7,11 +7,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from opt3dgs_optim.moments import CODES
 from opt3dgs_optim.part import Part, Phase, overrides
 
 MOMENTS = ("exp_avg", "exp_avg_sq")  # torch's names
 MEAN, BEGAN = "averaging.mean", "averaging.began"  # ours, of the rows
-KEPT = (MEAN, BEGAN, "curvature.history")  # what a checkpoint may hold for rows beside moments
+DISTANCE = "averaging.distance"  # in the place of the mean, beside moments of 16 bits
+# What a checkpoint may hold for rows beside moments.
+KEPT = (MEAN, DISTANCE, BEGAN, "curvature.history")
 
 
 class Lane:
@@ -20,6 +23,7 @@ class Lane:
     Attributes:
         name, set: which Gaussian parameter it is, and of which set of Gaussians.
         acting: by `Course.exploiting`: the parts with a `plan`, with a `before`, with an `after`.
+        moved: whether parts move it after the step, while exploiting.
         counter: where its device counts numbers that are not finite; None on a CPU.
         stepped_in: the iteration of its last step; -1: none.
         framed: whether its moments are those of the own frame; None: it has none yet.
@@ -46,29 +50,38 @@ class Lane:
             )
             for phase in (Phase.EXPLORATION, Phase.EXPLOITATION)
         )
+        self.moved = bool(self.acting[True][2])
         self.stepped_in = -1
         self.framed: bool | None = None
         self.keeps = False
         self.noted: dict[str, tuple[Tensor, int]] = {}
         self.version = param._version
 
-    def keep(self, state: dict[str, Any], key: str, shape: tuple[int, ...]) -> Tensor:
+    def keep(
+        self, state: dict[str, Any], key: str, shape: tuple[int, ...], dtype: Any = None
+    ) -> Tensor:
         """What is kept for the rows under a name; a row of zeros: nothing is kept for it."""
         tensor, self.keeps = state.get(key), True
         if tensor is None or tensor.shape != shape:
             tensor = state[key] = torch.zeros(
-                shape, dtype=self.param.dtype, device=self.param.device
+                shape, dtype=dtype or self.param.dtype, device=self.param.device
             )
         return tensor
 
     def mean_of(self, state: dict[str, Any]) -> tuple[Tensor, Tensor]:
-        """The running mean, and with which count the mean of each row began."""
-        param, mean, began = self.param, state.get(MEAN), state.get(BEGAN)
+        """The running mean, and with which count the mean of each row began.
+
+        Beside moments of 16 bits it is its distance from the iterate, in as many. Positions have
+        their mean: trainers move them between steps, by noise that the mean is to leave out.
+        """
+        coded = state["exp_avg"].dtype is CODES and self.name != "means" and not self.moved
+        key, param = DISTANCE if coded else MEAN, self.param
+        mean, began = state.get(key), state.get(BEGAN)
         if (
             mean is None or mean.numel() != param.numel()
             or began is None or len(began) != param.size(0)
         ):  # fmt: skip
-            mean = self.keep(state, MEAN, tuple(param.shape))
+            mean = self.keep(state, key, tuple(param.shape), CODES if coded else None)
             began = self.keep(state, BEGAN, tuple(param.shape[:1]))
         self.keeps = True
         return mean, began

@@ -18,7 +18,6 @@ from torch import Tensor
 from opt3dgs_optim.lane import MOMENTS, Lane
 from opt3dgs_optim.step import (
     Axes,
-    Mean,
     Step,
     axes_of,
     chosen_rows,
@@ -71,9 +70,9 @@ def step_around(
     for lane, step, count in steps:
         if step.state["step"] == count:  # gsplat's and INRIA's kernels need no count, and keep none
             step.state["step"] += 1
-        if step.mean is not None:  # it counts the steps that are made, not the iterations
-            how = Mean(int(step.state["step"]), step.mean.put)
-            take_into_mean(how, step.param, *lane.mean_of(step.state))
+        if step.mean is not None:
+            made = int(step.state["step"])  # steps, not iterations
+            take_into_mean(made, step.mean, step.param, *lane.mean_of(step.state))
         optimizer.finish_step(lane, step)
 
 

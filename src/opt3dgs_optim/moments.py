@@ -1,6 +1,7 @@
 """Adam's moments at 16 bits a number: what a code means, and how a number becomes one.
 
-    first moment    the upper half of its float32: sign, 8 bits of exponent, 7 of mantissa
+    first moment    the upper half of its float32: sign, 8 bits of exponent, 7 of mantissa;
+                    what a mean keeps is coded so, too, see `step.take_into_distance`
     second moment   8 bits of exponent and 8 of mantissa of its float32, which has no sign
 
 Both reach as far as float32 does, and need no scale of a row or of a tensor, so that rows can be
@@ -19,7 +20,7 @@ import torch
 from torch import Tensor
 
 CODES = torch.int16
-NEAREST = None  # in the place of a key: no chance
+NEAREST = 0x80004000  # in the place of chances: a half, for both moments
 
 
 def decoded(exp_avg: Tensor, exp_avg_sq: Tensor) -> tuple[Tensor, Tensor]:
@@ -29,25 +30,39 @@ def decoded(exp_avg: Tensor, exp_avg_sq: Tensor) -> tuple[Tensor, Tensor]:
     return first.view(torch.float32), second.view(torch.float32)
 
 
+def numbers_of(codes: Tensor) -> Tensor:
+    """The numbers, float32, of codes as first moments have."""
+    return (codes.to(torch.int32) << 16).view(torch.float32)
+
+
 def encode(
-    first: Tensor, second: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, key: int | None, at: int
+    first: Tensor, second: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, chance: Tensor | int
 ) -> None:
     """Write the codes of moments.
 
     Args:
         first, second: [n, ...] float32.
         exp_avg, exp_avg_sq: [n, ...] int16, written.
-        key: 32 bits on which the chances of this step depend; `NEAREST`: to the nearest code.
-        at: the place of the first number in its parameter.
+        chance: of each number, as of `chances`; `NEAREST`: to the nearest code.
     """
-    chance = 0x80004000 if key is None else _chances(second, key, at)
     codes = (second.contiguous().view(torch.int32) + (chance & 0x7FFF)) >> 15
     exp_avg_sq.copy_(codes)  # the upper half of 16 bits wraps around to negative ones
-    exp_avg.copy_((first.contiguous().view(torch.int32) + ((chance >> 16) & 0xFFFF)) >> 16)
+    encode_first(first, exp_avg, chance)
 
 
-def _chances(like: Tensor, key: int, at: int) -> Tensor:
-    """`step.mixed` of the numbers' places, in 32 bits with a sign."""
+def encode_first(numbers: Tensor, codes: Tensor, chance: Tensor | int) -> None:
+    """Write the codes of numbers, as of first moments."""
+    codes.copy_((numbers.contiguous().view(torch.int32) + ((chance >> 16) & 0xFFFF)) >> 16)
+
+
+def chances(like: Tensor, key: int, at: int) -> Tensor:
+    """`step.mixed` of the places of numbers, in 32 bits with a sign.
+
+    Args:
+        like: [n, ...], the numbers.
+        key: 32 bits, another in each step.
+        at: the place of the first number in its parameter.
+    """
     x = torch.arange(like.numel(), dtype=torch.int32, device=like.device)
     x = x.add_(_signed(at)).bitwise_xor_(_signed(key))
     x = x.bitwise_xor_((x >> 16) & 0xFFFF).mul_(0x7FEB352D)

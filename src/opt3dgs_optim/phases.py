@@ -54,7 +54,7 @@ class PhaseScheduler(Course):
             for parts that read it.
 
     Memory: that of Adam, or half of it with `moments=16`. In the last thirtieth `Averaging` keeps a
-    copy of the parameters.
+    copy of the parameters, or half of one.
 
     Examples:
         >>> import torch

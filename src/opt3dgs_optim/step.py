@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.moments import CODES, decoded, encode
+from opt3dgs_optim.moments import CODES, chances, decoded, encode, encode_first, numbers_of
 
 CHUNK = 65_536  # numbers that a CPU works on at a time, so that intermediates stay in its cache
 # Above it a square is infinite: Adam's second moment would stay so for ever.
@@ -62,13 +62,6 @@ class Hold(NamedTuple):
     weight: float
 
 
-class Mean(NamedTuple):
-    """Take the iterate into the running mean of the last iterates."""
-
-    number: int  # how many iterations are in the mean with this one, from 1
-    put: bool  # whether the mean takes the parameter's place
-
-
 @dataclass(slots=True)
 class Step:
     """What the step of one parameter has in one iteration. Parts set what they want of it.
@@ -84,7 +77,9 @@ class Step:
         factor: on the learning rate; on a device it may be a tensor of one element.
         fresh: Adam's moments begin anew before the step.
         plain: no moments and no frame: the step is the gradient times the rate.
-        fade, frame, hold, mean: see there; None: not in this step.
+        fade, frame, hold: see there; None: not in this step.
+        mean: the iterate goes into the running mean; True: which takes the parameter's place;
+            None: it does not.
     """
 
     param: Tensor
@@ -102,7 +97,7 @@ class Step:
     fade: Fade | None = None
     frame: Frame | None = None
     hold: Hold | None = None
-    mean: Mean | None = None
+    mean: bool | None = None
 
 
 @dataclass(slots=True)
@@ -119,17 +114,19 @@ class Hyper:
     exp_avg_sq: Tensor
     shrink: float = 1.0  # decoupled weight decay: factor on the parameter
     decay: float = 0.0  # the other kind: share of the parameter in the gradient
-    mean: Tensor | None = None  # like the parameter
-    began: Tensor | None = None  # [N] the `Mean.number` with which a row's mean began; 0: not yet
+    mean: Tensor | None = None  # like the parameter, or int16: see `take_into_distance`
+    began: Tensor | None = None  # [N] the `count` with which a row's mean began; 0: not yet
+    count: int = 0  # Adam's steps with this one: of the mean
     nonfinite: Tensor | None = None  # [1] int32 on the device: counts numbers
     key: int = 0  # 32 bits on which this step's rounding of moments to codes depends
 
 
-def take_step(step: Step, hyper: Hyper) -> int:  # noqa: PLR0912  (all that a step may have)
+def take_step(step: Step, hyper: Hyper) -> int:  # noqa: PLR0912, PLR0915  (all a step has)
     """Make the step in plain torch; how many numbers of the gradient were not finite (CPU only).
 
     On other devices they are added to `hyper.nonfinite`, so that nothing waits.
     """
+    chance: Any = None
     fade, all_rows, bad = step.fade, step.param, 0
     chosen = None if fade is None else chosen_rows(fade, len(all_rows), all_rows.device)
     chunks: Sequence[Any] = (...,)
@@ -141,7 +138,10 @@ def take_step(step: Step, hyper: Hyper) -> int:  # noqa: PLR0912  (all that a st
         coded = exp_avg.dtype == CODES
         if coded:
             exp_avg, exp_avg_sq = decoded(exp_avg, exp_avg_sq)
+            at = 0 if rows is ... else rows.start * (all_rows.numel() // len(all_rows))
+            chance = chances(exp_avg, hyper.key, at)
         param = all_rows[rows]
+        before = param.clone() if coded and step.mean is not None else None
         grad, found = finite(step.grad[rows], hyper.nonfinite)
         bad += found
         if fade is not None and chosen is not None:
@@ -175,10 +175,10 @@ def take_step(step: Step, hyper: Hyper) -> int:  # noqa: PLR0912  (all that a st
         if step.mean is not None:
             assert hyper.mean is not None
             assert hyper.began is not None
-            take_into_mean(step.mean, param, hyper.mean[rows], hyper.began[rows])
+            mean, began = hyper.mean[rows], hyper.began[rows]
+            take_into_mean(hyper.count, step.mean, param, mean, began, before, chance)
         if coded and not step.plain:
-            at = 0 if rows is ... else rows.start * (all_rows.numel() // len(all_rows))
-            encode(exp_avg, exp_avg_sq, *codes, hyper.key, at)
+            encode(exp_avg, exp_avg_sq, *codes, chance)
     return bad
 
 
@@ -194,24 +194,54 @@ def finite(grad: Tensor, nonfinite: Tensor | None) -> tuple[Tensor, int]:
     return torch.nan_to_num(grad, 0.0, 0.0, 0.0), 0
 
 
-def take_into_mean(how: Mean, param: Tensor, mean: Tensor, began: Tensor) -> None:
+def take_into_mean(
+    count: int, put: bool, param: Tensor, mean: Tensor, began: Tensor,
+    before: Any = None, chance: Any = None,
+) -> None:  # fmt: skip
     """An iterate that is not finite leaves its mean alone; a mean that is not begins with it.
 
-    A row that has `began` with 0 begins now.
+    A row that has `began` with 0 begins now, with this `count`. Means of codes are for
+    `take_into_distance`, with `before` and `chance`.
     """
-    began.masked_fill_(began == 0, how.number)
-    weight = like_rows(1.0 / (how.number + 1 - began), param)
+    began.masked_fill_(began == 0, count)
+    weight = like_rows(1.0 / (count + 1 - began), param)
+    if mean.dtype == CODES:
+        take_into_distance(put, before, param, mean, 1.0 - weight, chance)
+        return
     if param.is_cpu and math.isfinite((param.sum() + mean.sum()).item()):
         mean.lerp_(param, weight.to(param.dtype))
-        if how.put:
+        if put:
             param.copy_(mean)
         return
     known = torch.isfinite(param)
     start = torch.where(torch.isfinite(mean), mean, param)
     # The old mean in the place of a number that is not finite moves nothing.
     mean.copy_(torch.where(known, start.lerp(torch.where(known, param, start), weight), mean))
-    if how.put:
+    if put:
         param.copy_(torch.where(known, mean, param))
+
+
+def take_into_distance(
+    put: bool, before: Tensor, param: Tensor, distance: Tensor, left: Tensor, chance: Tensor
+) -> None:
+    """`take_into_mean` in 16 bits: the mean as its distance from the iterate, which is short.
+
+    A thousand iterates round it a thousand times. Of the mean itself that is seven times the
+    distance of two codes, and of the distance a twentieth. What moves the iterate between steps
+    moves the mean, too. A distance that is not finite is 0: the mean begins with the iterate.
+
+    Args:
+        before, param: the iterate before and after this step, [n, ...] float32.
+        distance: [n, ...] int16, the mean less the iterate, in codes as of first moments.
+        left: what weight the mean before has.
+        chance: for the rounding, see `moments.chances`.
+    """
+    away = (numbers_of(distance) + (before - param)) * left
+    away = torch.where(torch.isfinite(away), away, 0.0)
+    if put:
+        param.add_(away)
+        away.zero_()
+    encode_first(away, distance, chance)
 
 
 def like_rows(numbers: Tensor, param: Tensor) -> Tensor:

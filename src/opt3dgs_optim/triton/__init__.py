@@ -126,7 +126,7 @@ def look(
     with _device_of(grad):
         _run(
             "look_at_positions", -(-len(grad) // LOOK_BLOCK), (grad, exp_avg_sq, mask, counter),
-            (len(grad),), exp_avg_sq is not None and exp_avg_sq.dtype is CODES,
+            (len(grad),), (exp_avg_sq is not None and exp_avg_sq.dtype is CODES, False),
         )  # fmt: skip
 
 
@@ -147,7 +147,7 @@ def launch(step: Step, hyper: Hyper) -> None:
     numbers = param.numel()
     if not numbers:
         return
-    frame, fade, hold, how, factor = step.frame, step.fade, step.hold, step.mean, step.factor
+    frame, fade, hold, factor = step.frame, step.fade, step.hold, step.factor
     size = hyper.lr if frame is None else frame.rate
     on_device = None
     if isinstance(factor, Tensor):
@@ -156,9 +156,9 @@ def launch(step: Step, hyper: Hyper) -> None:
         size *= factor
     if not step.plain:
         size /= hyper.correction1
-    number, put = (0.0, 0.0) if how is None else (float(how.number), float(how.put))
-    mean, began = (None, None) if how is None else (hyper.mean, hyper.began)
-    coded = hyper.exp_avg.dtype is CODES
+    mean, began = (None, None) if step.mean is None else (hyper.mean, hyper.began)
+    number, put = float(hyper.count), 1.0 if step.mean else 0.0
+    coded = hyper.exp_avg.dtype is CODES, mean is not None and mean.dtype is CODES
     adam = (
         hyper.beta2, 1 - hyper.beta1, 1 - hyper.beta2, hyper.eps, hyper.root2, hyper.shrink,
         hyper.decay, _signed(hyper.key),
@@ -190,7 +190,7 @@ def _signed(number: int) -> int:
 
 def _run(
     name: str, programs: int, tensors: tuple[Tensor | None, ...], numbers: tuple[float, ...],
-    coded: bool,
+    coded: tuple[bool, bool],
 ) -> None:  # fmt: skip
     """Launch a kernel; what Triton has compiled is launched again without its launcher.
 

@@ -13,13 +13,12 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim import triton
-from opt3dgs_optim.moments import CODES, NEAREST, decoded, encode
+from opt3dgs_optim.moments import CODES, NEAREST, decoded, encode, encode_first, numbers_of
 from opt3dgs_optim.step import (
     Fade,
     Frame,
     Hold,
     Hyper,
-    Mean,
     Step,
     like_rows,
     mixed,
@@ -64,7 +63,7 @@ def case(
     ]
     if coded:
         codes = torch.zeros(2, *shape, dtype=CODES)
-        encode(exp_avg, exp_avg_sq, codes[0], codes[1], NEAREST, 0)
+        encode(exp_avg, exp_avg_sq, codes[0], codes[1], NEAREST)
         exp_avg, exp_avg_sq = codes[0], codes[1]
         exp_avg_sq[:1] = 0  # a row without history
     step = Step(param, grad, None, "", {}, {"exp_avg": exp_avg, "exp_avg_sq": exp_avg_sq}, 0, -1)
@@ -80,10 +79,13 @@ def case(
         shrink, decay, nonfinite=torch.zeros(1, dtype=torch.int32), key=mixed(steps),
     )  # fmt: skip
     if mean:
-        step.mean = Mean(steps, put)
+        step.mean, hyper.count = put, steps
         began = torch.randint(0, steps, (rows,), generator=generator).to(torch.float32)
         hyper.mean, hyper.began = (param + 0.1 * draw(*shape)), began
         hyper.mean.mul_(like_rows(began > 0, param))  # others begin with this step
+        if coded and not frame:
+            hyper.mean, distance = torch.zeros(shape, dtype=CODES), hyper.mean - param
+            encode_first(distance * like_rows(began > 0, param), hyper.mean, NEAREST)
     return step, hyper
 
 
@@ -95,7 +97,8 @@ def tensors(step: Step, hyper: Hyper) -> list[Tensor]:
     found = [step.param, *moments]
     if hyper.mean is None or hyper.began is None:
         return found
-    return [*found, hyper.mean, hyper.began]
+    mean = numbers_of(hyper.mean) if hyper.mean.dtype == CODES else hyper.mean
+    return [*found, mean, hyper.began]
 
 
 def both(options: dict[str, Any], shape: tuple[int, ...], seed: int = 0) -> tuple[Any, Any]:

@@ -113,6 +113,23 @@ def into_mean(value, mean, began, row, at, inside, number, put):
 
 
 @triton.jit
+def into_distance(value, before, distance, began, row, at, inside, number, put, round_key):
+    """`step.take_into_distance` of one number; what the parameter is afterwards."""
+    first = tl.load(began + row, inside)
+    tl.store(began + row, number, new_row(first, inside))
+    weight = 1.0 / (number + 1.0 - tl.where(first == 0.0, number, first))
+    away = (tl.load(distance + at, inside).to(tl.int32) << 16).to(tl.float32, bitcast=True)
+    away = (away + (before - value)) * (1.0 - weight)
+    away = tl.where(tl.abs(away) < INFINITY, away, 0.0)
+    if put > 0.0:
+        value = value + away
+        away = away * 0.0
+    code = away.to(tl.int32, bitcast=True) + (mixed(at, round_key) >> 16).to(tl.int32)
+    tl.store(distance + at, (code >> 16).to(tl.int16), inside)
+    return value
+
+
+@triton.jit
 def rows_of(first, width):
     """The row of each number of a program whose first one is `first`, for widths below 2^20.
 
@@ -130,7 +147,8 @@ def _step_rows(
     eps, root2, shrink, decay, round_key, key, share, fade_m, fade_v, weight, number, put,
 ):  # fmt: skip
     grad = finite(tl.load(g + at, inside), nonfinite, inside)
-    value = tl.load(p + at, inside) * shrink
+    before = tl.load(p + at, inside)
+    value = before * shrink
     if decay != 0.0:
         grad = grad + value * decay
     if factor is not None:
@@ -152,7 +170,12 @@ def _step_rows(
         value = value - size * exp_avg / (tl.sqrt(exp_avg_sq) / root2 + eps)
         store_moments(m, v, at, inside, exp_avg, exp_avg_sq, round_key)
     if mean is not None:
-        value = into_mean(value, mean, began, row, at, inside, number, put)
+        if mean.dtype.element_ty == tl.int16:
+            value = into_distance(
+                value, before, mean, began, row, at, inside, number, put, round_key
+            )
+        else:
+            value = into_mean(value, mean, began, row, at, inside, number, put)
     tl.store(p + at, value, inside)
 
 
@@ -165,7 +188,7 @@ def step_rows(
 
     Args:
         p, g, m, v, mean: numbers float32: parameter, gradient, moments (or codes int16; None: the
-            step is the gradient times the rate), mean (or None).
+            step is the gradient times the rate), mean (or its distance, int16; or None).
         began: [rows] float32, the number with which a row's mean began, 0: it begins now; or None.
         held: [rows] uint8, not 0: raise the second moment to (weight * gradient)^2; or None.
         factor: one float32 on the device, on the size; or None.
