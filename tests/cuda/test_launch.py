@@ -24,6 +24,7 @@ class Machine:
         self.launched: list[tuple[Any, ...]] = []
         self.compiled: list[tuple[Any, ...]] = []
         self.current, self.stream = HERE, 0
+        monkeypatch.setattr(cuda, "several_gpus", lambda: True)
         monkeypatch.setattr(torch.cuda, "current_device", lambda: self.current)
         monkeypatch.setattr(torch.cuda, "device", self.on)
         monkeypatch.setattr(

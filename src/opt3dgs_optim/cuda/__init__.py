@@ -93,6 +93,12 @@ def _stream(handle: int) -> Any:
 
 
 @functools.cache
+def several_gpus() -> bool:
+    """Whether a tensor may lie on a GPU that is not the current one."""
+    return torch.cuda.device_count() > 1
+
+
+@functools.cache
 def _launcher() -> Any:
     return importlib.import_module("cuda.core").launch
 
@@ -106,7 +112,7 @@ def launch(kernel: str, like: Tensor, *arguments: Any, history_size: int) -> Non
     threads, device = like.shape[0], like.get_device()
     if threads == 0:
         return
-    if device != torch.cuda.current_device():
+    if several_gpus() and device != torch.cuda.current_device():
         with torch.cuda.device(device):
             launch(kernel, like, *arguments, history_size=history_size)
         return
@@ -141,8 +147,9 @@ def lqn_direction(
 
 def two_loop(grad: Tensor, history: Tensor, history_size: int) -> Tensor:
     """`lbfgs.two_loop` on the GPU, for points of three coordinates. Never synchronises."""
-    result = torch.empty_like(grad, memory_format=torch.contiguous_format)
-    tensors = (_contiguous(grad), _aligned(history), result)
+    grad = _contiguous(grad)
+    result = torch.empty_like(grad)
+    tensors = grad, _aligned(history), result
     launch("two_loop", grad, *tensors, grad.shape[0], history_size=history_size)
     return result
 

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.checks import LOGGER
+from opt3dgs_optim.cuda import several_gpus
 from opt3dgs_optim.moments import CODES
 from opt3dgs_optim.step import Hyper, Step
 
@@ -130,15 +131,10 @@ def look(
         )  # fmt: skip
 
 
-@functools.cache
-def _several_gpus() -> bool:
-    return torch.cuda.device_count() > 1
-
-
 def _device_of(tensor: Tensor) -> Any:
     """A context in which kernels are launched where a tensor lies."""
     index = tensor.get_device()
-    other = _several_gpus() and index not in (-1, torch.cuda.current_device())
+    other = several_gpus() and index not in (-1, torch.cuda.current_device())
     return torch.cuda.device(index) if other else _HERE
 
 
