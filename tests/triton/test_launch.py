@@ -130,6 +130,22 @@ def test_rows_are_read_four_numbers_at_a_time(
     assert ".s64" in ptx or not long
 
 
+def test_codes_are_read_four_at_a_time(driver: FakeDriver) -> None:
+    """Of moments, and of the mean's distance, which has a kernel of its own beside a mean."""
+    for mean in (False, True):
+        launched(driver, (64, 4), coded=True, mean=mean)
+    step, hyper = case((64, 4), torch.Generator().manual_seed(0), coded=True, mean=True)
+    hyper.mean = torch.zeros(64, 4)
+    triton.launch(step, hyper)
+    assert len(driver.loaded) == 3
+    reads = ROWS_BLOCK // (4 * 32 * triton.WARPS["step_rows"])
+    for made, codes, numbers in zip(triton._COMPILED.values(), (2, 3, 2), (2, 2, 3), strict=True):
+        ptx = made.asm["ptx"]
+        assert ptx.count("ld.global.v4.b32") == reads * numbers
+        assert ptx.count("ld.global.v2.b32") == reads * codes
+        assert ".local" not in ptx
+
+
 @pytest.mark.parametrize("options", [{}, {"mean": True, "factor": torch.ones(1)}], ids=str)
 def test_own_frames_are_in_registers(driver: FakeDriver, options: Any) -> None:
     launched(driver, (64, 3), frame=True, **options)
