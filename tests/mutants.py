@@ -54,7 +54,7 @@ TARGETS = {  # module: the tests that are meant to notice
     "lbfgs/pairs.py": LBFGS,
     "lbfgs/history.py": LBFGS,
     "lbfgs/two_loop.py": LBFGS,
-    "moments.py": ["test_moments.py"],
+    "moments.py": ["test_moments.py", "test_step.py"],
     "step.py": STEP,
     "triton/kernels.py": ["triton/test_kernels.py", "triton/test_simulated_training.py"],
 }

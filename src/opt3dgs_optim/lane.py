@@ -76,15 +76,11 @@ class Lane:
         """
         coded = state["exp_avg"].dtype is CODES and self.name != "means" and not self.moved
         key, param = DISTANCE if coded else MEAN, self.param
-        mean, began = state.get(key), state.get(BEGAN)
-        if (
-            mean is None or mean.numel() != param.numel()
-            or began is None or len(began) != param.size(0)
-        ):  # fmt: skip
+        mean, self.keeps = state.get(key), True
+        if mean is None or mean.numel() != param.numel():  # none yet, or `param.data` has new rows
             mean = self.keep(state, key, tuple(param.shape), CODES if coded else None)
-            began = self.keep(state, BEGAN, tuple(param.shape[:1]))
-        self.keeps = True
-        return mean, began
+            state[BEGAN] = torch.zeros(param.shape[:1], dtype=param.dtype, device=param.device)
+        return mean, state[BEGAN]
 
     def drop_moved(self, state: dict[str, Any], new: bool, written: bool) -> None:
         """Drop what is kept for rows that are others now, if the Parameter is new.

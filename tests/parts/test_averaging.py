@@ -118,6 +118,21 @@ def test_an_edit_of_rows_in_the_last_thirtieth(inria: bool, moments: Any) -> Non
     assert began.tolist() == [296.0 if inria else 291.0] * (ROWS - 1)  # steps
 
 
+@pytest.mark.parametrize("moments", [32, 16])
+def test_rows_of_the_same_parameter_begin_anew_where_their_number_changes(moments: Any) -> None:
+    """A trainer that puts other rows into `data`, and into Adam's moments."""
+    params = parameters(ROWS, "sh0")
+    phases = PhaseScheduler(TOTAL, parts=[Averaging()], moments=moments)
+    optimizer = phases.upgrade(adam_of(params))
+    steps({"all": optimizer}, params, 293)
+    state = optimizer.state[params["sh0"]]
+    params["sh0"].data = params["sh0"].data[1:]
+    for key in ("exp_avg", "exp_avg_sq"):
+        state[key] = state[key][1:]
+    steps({"all": optimizer}, params, 1)
+    assert state["averaging.began"].tolist() == [294.0] * (ROWS - 1)
+
+
 @pytest.mark.parametrize(("between", "moments"), [(0, 32), (1, 32), (3, 32), (0, 16), (3, 16)])
 def test_new_rows_begin_with_their_first_iterate(between: int, moments: Any) -> None:
     """Also where the iterations after the edit have no gradient."""
