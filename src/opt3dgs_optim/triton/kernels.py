@@ -123,7 +123,7 @@ def into_distance(value, before, distance, began, row, at, inside, number, put, 
     away = tl.where(tl.abs(away) < INFINITY, away, 0.0)
     if put > 0.0:
         value = value + away
-        away = away * 0.0
+        away = away - away
     code = away.to(tl.int32, bitcast=True) + (mixed(at, round_key) >> 16).to(tl.int32)
     tl.store(distance + at, (code >> 16).to(tl.int16), inside)
     return value
