@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 import torch
-from gaussians import adam_of, adams_of, parameters
+from gaussians import adam_of, adams_of, parameters, steps
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from opt3dgs_optim import AWSGLD, DEFAULTS_ADC, LQNAdam, PhaseScheduler
+from opt3dgs_optim import AWSGLD, DEFAULTS_ADC, Curvature, LQNAdam, PhaseScheduler
 from opt3dgs_optim.moments import CODES, NEAREST, chances, decoded, encode
 from opt3dgs_optim.step import mixed
 
@@ -180,15 +180,12 @@ def kept(adams: dict[str, Adam], *keys: str) -> int:
     return sum(s[k].numel() * s[k].element_size() for s in states for k in keys if k in s)
 
 
-MEAN = ("averaging.mean", "averaging.distance", "averaging.began")
+MEAN = ("averaging.mean", "averaging.residue", "averaging.began")
 
 
 @pytest.mark.parametrize(("moments", "size"), [(32, 260), (16, 148)])
 def test_what_the_mean_takes(moments: int, size: int) -> None:
-    """Of positions a mean, which leaves out the noise that trainers move them by, of others less.
-
-    And six numbers a row say when each mean began.
-    """
+    """With six numbers a row, which say when each mean began."""
     adams, _ = trained(100, moments, total=300)
     iterate(adams, 0, 292)
     assert kept(adams, *MEAN) == 100 * size
@@ -210,6 +207,34 @@ def test_a_mean_in_the_other_form_begins_anew(moments: Any) -> None:
     assert all((each == 295).all() for each in began)
 
 
+def test_a_mean_of_32_bits_beside_moments_of_16_begins_anew() -> None:
+    """As revisions of 2026-11-27 saved it; what is saved then can be loaded."""
+    adams, _ = trained(20, 16, total=300)
+    iterate(adams, 0, 294)
+    saved = adams["sh0"].state_dict()
+    saved["state"][0]["averaging.mean"] = saved["state"][0].pop("averaging.residue").float()
+    adams["sh0"].load_state_dict(saved)
+    iterate(adams, 294, 296)
+    state = adams["sh0"].state[param_of(adams["sh0"])]
+    assert set(state) == {"step", *MOMENTS, "averaging.residue", "averaging.began"}
+    assert (state["averaging.began"] == 295).all()
+    adams["sh0"].load_state_dict(adams["sh0"].state_dict())
+
+
+@pytest.mark.parametrize("both", [(32, 16), (16, 32)])
+def test_curvature_pairs_are_kept_where_the_bits_change(both: Any) -> None:
+    made = []
+    for moments in both:
+        params = parameters(20, "means")
+        phases = PhaseScheduler(300, parts=[Curvature()], switch=0, moments=moments)
+        made.append((phases.upgrade(adam_of(params)), params))
+    (first, params), (again, _) = made
+    steps({"all": first}, params, 5)
+    again.load_state_dict(first.state_dict())
+    pairs = [opt.state[each["means"]]["curvature.history"] for opt, each in made]
+    assert torch.equal(*pairs)
+
+
 @pytest.mark.parametrize("moments", [32, 16])
 def test_noise_of_the_trainer_stays_out_of_the_mean_of_positions(moments: Any) -> None:
     """As that of 3DGS-MCMC, after each step."""
@@ -220,7 +245,7 @@ def test_noise_of_the_trainer_stays_out_of_the_mean_of_positions(moments: Any) -
         means.data = 100.0 + 10.0 * torch.randn(means.shape, generator=draw)
         iterate(adams, i, i + 1)
     assert means.detach().std() == pytest.approx(10.0 / 10**0.5, rel=0.05)
-    assert kept(adams, "averaging.distance") == (0 if moments == 32 else 1_000 * 112)
+    assert kept(adams, "averaging.residue") == (0 if moments == 32 else 1_000 * 112)
 
 
 def test_a_training_goes_as_with_32_bits() -> None:

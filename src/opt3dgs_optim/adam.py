@@ -13,12 +13,12 @@ from opt3dgs_optim.checkpoint import check_tensors
 from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.contract import Slots, check_supported, own_step
 from opt3dgs_optim.course import STATE_KEY, Course
-from opt3dgs_optim.lane import BEGAN, DISTANCE, KEPT, MEAN, MOMENTS, Lane
+from opt3dgs_optim.lane import BEGAN, KEPT, MEAN, MOMENTS, OF_MEAN, RESIDUE, Lane
 from opt3dgs_optim.masked import check_arguments, step_around
-from opt3dgs_optim.moments import CODES, NEAREST, decoded, encode, numbers_of
+from opt3dgs_optim.moments import CODES, NEAREST, decoded, encode
 from opt3dgs_optim.names import split_name
 from opt3dgs_optim.part import Part
-from opt3dgs_optim.step import Hyper, Step, like_rows, mixed, take_step
+from opt3dgs_optim.step import GRIDS, Hyper, Step, like_rows, mixed, places_of, take_step
 
 
 class StepAdam(Adam):
@@ -226,7 +226,7 @@ class StepAdam(Adam):
             state["step"].zero_()
             for key in MOMENTS:
                 state[key].zero_()
-            for key in (MEAN, DISTANCE, BEGAN):
+            for key in OF_MEAN:
                 state.pop(key, None)
         lane.stepped_in = iteration
         return step
@@ -272,6 +272,7 @@ class StepAdam(Adam):
         if step.mean is not None:
             hyper.count = int(t)  # the steps that are made, not the iterations
             hyper.mean, hyper.began = lane.mean_of(state)
+            hyper.grid = GRIDS.get(lane.name or "", 1.0)
         if lane.counter is not None and triton.takes(step):
             triton.take_step(step, hyper)
         elif bad := take_step(step, hyper):
@@ -310,20 +311,18 @@ class StepAdam(Adam):
     @torch.no_grad()
     def put_means(self) -> int:
         """Put the running means in the parameters' place now; of how many parameters."""
-        self.present_lanes()  # what was kept for rows that are others now is dropped
         found = 0
-        for group in self.param_groups:
-            for param in group["params"]:
-                state = self.state.get(param, {})
-                mean, distance = state.get(MEAN), state.get(DISTANCE)
-                if distance is not None:
-                    mean = param + numbers_of(distance.to(CODES))
-                    state[DISTANCE] = torch.zeros_like(distance)
-                if mean is not None:
-                    known = torch.isfinite(param) & torch.isfinite(mean)
-                    known &= like_rows(state[BEGAN] > 0, param)
-                    param.copy_(torch.where(known, mean, param))
-                    found += 1
+        for lane in self.present_lanes():
+            param, state = lane.param, self.state.get(lane.param, {})
+            mean, residue = state.get(MEAN), state.get(RESIDUE)
+            if residue is not None and residue.shape == param.shape:
+                grid = GRIDS[lane.name or ""]
+                mean = param + places_of(param, residue.to(CODES), grid)[-1] * grid
+            if mean is not None and mean.shape == param.shape:
+                known = torch.isfinite(param) & torch.isfinite(mean)
+                known &= like_rows(state[BEGAN] > 0, param)
+                param.copy_(torch.where(known, mean, param))
+                found += 1
         return found
 
     def state_dict(self) -> dict[str, Any]:
@@ -381,11 +380,12 @@ class StepAdam(Adam):
         ours = None if missed else saved  # what it says of the moments holds
         self.in_own_frame = frozenset(() if ours is None else ours["own_frame"])
         self._last = () if ours is None else tuple(ours["last"])
-        now = {"total_steps": course.total_steps, "moments": course.moments}
-        if ours is None or any(ours[key] != value for key, value in now.items()):
-            for state in self.state.values():  # of the end of another run, or in another form
-                for key in KEPT:
-                    state.pop(key, None)
+        dropped = KEPT if ours is None or ours["total_steps"] != course.total_steps else ()
+        if ours is not None and ours["moments"] != course.moments:
+            dropped = dropped or OF_MEAN
+        for state in self.state.values():  # of the end of another run, or in another form
+            for key in dropped:
+                state.pop(key, None)
         if saved is not None:
             iteration = saved["iteration"] + max(missed, 0)
         else:
@@ -486,11 +486,11 @@ def as_numbers(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def as_codes(state: dict[str, Any]) -> None:
-    """Have the codes of a parameter's moments, and of its mean's distance, as integers again.
+    """Have the codes of a parameter's moments, and its mean of 16 bits, as integers again.
 
     An edit of rows, and torch's loading, make them float32, with the same values.
     """
-    for key in (*MOMENTS, DISTANCE):
+    for key in (*MOMENTS, RESIDUE):
         if key in state and state[key].dtype != CODES:
             state[key] = state[key].to(CODES)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from opt3dgs_optim.checks import check_count, check_number
 from opt3dgs_optim.contract import REFUSED
-from opt3dgs_optim.lane import BEGAN, DISTANCE, KEPT, MEAN, MOMENTS
+from opt3dgs_optim.lane import BEGAN, KEPT, MEAN, MOMENTS, RESIDUE
 from opt3dgs_optim.moments import CODES
 
 
@@ -70,16 +70,16 @@ def check_moments(call: str, state: Any) -> None:
         if value is None and key in KEPT:
             continue
         if not isinstance(value, Tensor) or not (
-            value.is_floating_point() or (key in (*MOMENTS, DISTANCE) and value.dtype == CODES)
+            value.is_floating_point() or (key in (*MOMENTS, RESIDUE) and value.dtype == CODES)
         ):
             raise ValueError(f"{call} has {key}={value!r}, but a tensor of real numbers is needed")
         shapes[key] = tuple(value.shape)
     one = shapes["exp_avg"]
-    if any(shapes.get(key, one) != one for key in ("exp_avg_sq", MEAN, DISTANCE)) or any(
+    if any(shapes.get(key, one) != one for key in ("exp_avg_sq", MEAN, RESIDUE)) or any(
         shapes.get(key, one)[:1] != one[:1] for key in KEPT
     ):
         raise ValueError(f"{call} has shapes {shapes}, but the same rows are needed in all")
-    means = (MEAN in shapes) + (DISTANCE in shapes)
+    means = (MEAN in shapes) + (RESIDUE in shapes)
     if means != (BEGAN in shapes) or shapes.get(BEGAN, one[:1]) != one[:1]:
         raise ValueError(f"{call} has shapes {shapes}, but {BEGAN} needs a number for each row")
 

@@ -9,12 +9,14 @@ from torch import Tensor
 
 from opt3dgs_optim.moments import CODES
 from opt3dgs_optim.part import Part, Phase, overrides
+from opt3dgs_optim.step import GRIDS
 
 MOMENTS = ("exp_avg", "exp_avg_sq")  # torch's names
 MEAN, BEGAN = "averaging.mean", "averaging.began"  # ours, of the rows
-DISTANCE = "averaging.distance"  # in the place of the mean, beside moments of 16 bits
+RESIDUE = "averaging.residue"  # in the place of the mean, beside moments of 16 bits
 # What a checkpoint may hold for rows beside moments.
-KEPT = (MEAN, DISTANCE, BEGAN, "curvature.history")
+OF_MEAN = (MEAN, RESIDUE, BEGAN)
+KEPT = (*OF_MEAN, "curvature.history")
 
 
 class Lane:
@@ -23,7 +25,6 @@ class Lane:
     Attributes:
         name, set: which Gaussian parameter it is, and of which set of Gaussians.
         acting: by `Course.exploiting`: the parts with a `plan`, with a `before`, with an `after`.
-        moved: whether parts move it after the step, while exploiting.
         counter: where its device counts numbers that are not finite; None on a CPU.
         stepped_in: the iteration of its last step; -1: none.
         framed: whether its moments are those of the own frame; None: it has none yet.
@@ -50,7 +51,6 @@ class Lane:
             )
             for phase in (Phase.EXPLORATION, Phase.EXPLOITATION)
         )
-        self.moved = bool(self.acting[True][2])
         self.stepped_in = -1
         self.framed: bool | None = None
         self.keeps = False
@@ -71,16 +71,22 @@ class Lane:
     def mean_of(self, state: dict[str, Any]) -> tuple[Tensor, Tensor]:
         """The running mean, and with which count the mean of each row began.
 
-        Beside moments of 16 bits it is its distance from the iterate, in as many. Positions have
-        their mean: trainers move them between steps, by noise that the mean is to leave out.
+        Beside moments of 16 bits the mean has as many, see `step.take_into_residue`, but that of
+        positions: no grid is fine enough for each scene, and reaches as far as noise moves them.
         """
-        coded = state["exp_avg"].dtype is CODES and self.name != "means" and not self.moved
-        key, param = DISTANCE if coded else MEAN, self.param
-        mean, self.keeps = state.get(key), True
-        if mean is None or mean.numel() != param.numel():  # none yet, or `param.data` has new rows
+        coded = state["exp_avg"].dtype is CODES and self.name in GRIDS
+        key, param = RESIDUE if coded else MEAN, self.param
+        mean, began = state.get(key), state.get(BEGAN)
+        if (
+            mean is None or mean.numel() != param.numel()
+            or began is None or len(began) != param.size(0)
+        ):  # fmt: skip
+            for each in OF_MEAN:
+                state.pop(each, None)
             mean = self.keep(state, key, tuple(param.shape), CODES if coded else None)
-            state[BEGAN] = torch.zeros(param.shape[:1], dtype=param.dtype, device=param.device)
-        return mean, state[BEGAN]
+            began = self.keep(state, BEGAN, tuple(param.shape[:1]))
+        self.keeps = True
+        return mean, began
 
     def drop_moved(self, state: dict[str, Any], new: bool, written: bool) -> None:
         """Drop what is kept for rows that are others now, if the Parameter is new.

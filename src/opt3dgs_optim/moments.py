@@ -1,7 +1,6 @@
 """Adam's moments at 16 bits a number: what a code means, and how a number becomes one.
 
-    first moment    the upper half of its float32: sign, 8 bits of exponent, 7 of mantissa;
-                    what a mean keeps is coded so, too, see `step.take_into_distance`
+    first moment    the upper half of its float32: sign, 8 bits of exponent, 7 of mantissa
     second moment   8 bits of exponent and 8 of mantissa of its float32, which has no sign
 
 Both reach as far as float32 does, and need no scale of a row or of a tensor, so that rows can be
@@ -30,11 +29,6 @@ def decoded(exp_avg: Tensor, exp_avg_sq: Tensor) -> tuple[Tensor, Tensor]:
     return first.view(torch.float32), second.view(torch.float32)
 
 
-def numbers_of(codes: Tensor) -> Tensor:
-    """The numbers, float32, of codes as first moments have."""
-    return (codes.to(torch.int32) << 16).view(torch.float32)
-
-
 def encode(
     first: Tensor, second: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, chance: Tensor | int
 ) -> None:
@@ -47,12 +41,7 @@ def encode(
     """
     codes = (second.contiguous().view(torch.int32) + (chance & 0x7FFF)) >> 15
     exp_avg_sq.copy_(codes)  # the upper half of 16 bits wraps around to negative ones
-    encode_first(first, exp_avg, chance)
-
-
-def encode_first(numbers: Tensor, codes: Tensor, chance: Tensor | int) -> None:
-    """Write the codes of numbers, as of first moments."""
-    codes.copy_((numbers.contiguous().view(torch.int32) + ((chance >> 16) & 0xFFFF)) >> 16)
+    exp_avg.copy_((first.contiguous().view(torch.int32) + ((chance >> 16) & 0xFFFF)) >> 16)
 
 
 def chances(like: Tensor, key: int, at: int) -> Tensor:

@@ -29,12 +29,23 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.moments import CODES, chances, decoded, encode, encode_first, numbers_of
+from opt3dgs_optim.moments import CODES, chances, decoded, encode
 
 CHUNK = 65_536  # numbers that a CPU works on at a time, so that intermediates stay in its cache
 # Above it a square is infinite: Adam's second moment would stay so for ever.
 LARGEST = {dtype: torch.finfo(dtype).max ** 0.5 / 2 for dtype in (torch.float32, torch.float64)}
 MIN_QUATERNION = 1e-12  # a shorter one is divided by this
+# The grids of means of 16 bits, see `take_into_residue`: fine beside the steps of all trainers, and
+# 16 bits reach as far as parameters wander in the last thirtieth.
+GRIDS = {
+    "scales": 2.0**-14,
+    "quats": 2.0**-15,
+    "opacities": 2.0**-11,
+    "sh0": 2.0**-14,
+    "shN": 2.0**-15,
+}
+MAX_PLACE = 2.0**23  # on a grid, from which on float32 has no fractions
+MAX_AWAY = 30_000.0  # places of a mean from its iterate: another 2,768 are for the next step
 
 
 class Fade(NamedTuple):
@@ -78,8 +89,8 @@ class Step:
         fresh: Adam's moments begin anew before the step.
         plain: no moments and no frame: the step is the gradient times the rate.
         fade, frame, hold: see there; None: not in this step.
-        mean: the iterate goes into the running mean; True: which takes the parameter's place;
-            None: it does not.
+        mean: whether the running mean, with this iterate in it, takes the parameter's place; None:
+            this iterate is none of the mean's.
     """
 
     param: Tensor
@@ -114,9 +125,10 @@ class Hyper:
     exp_avg_sq: Tensor
     shrink: float = 1.0  # decoupled weight decay: factor on the parameter
     decay: float = 0.0  # the other kind: share of the parameter in the gradient
-    mean: Tensor | None = None  # like the parameter, or int16: see `take_into_distance`
+    mean: Tensor | None = None  # like the parameter, or int16: see `take_into_residue`
+    grid: float = 1.0  # of a mean of int16
     began: Tensor | None = None  # [N] the `count` with which a row's mean began; 0: not yet
-    count: int = 0  # Adam's steps with this one: of the mean
+    count: int = 0  # Adam's steps of the parameter with this one, by which the mean counts
     nonfinite: Tensor | None = None  # [1] int32 on the device: counts numbers
     key: int = 0  # 32 bits on which this step's rounding of moments to codes depends
 
@@ -141,7 +153,6 @@ def take_step(step: Step, hyper: Hyper) -> int:  # noqa: PLR0912, PLR0915  (all 
             at = 0 if rows is ... else rows.start * (all_rows.numel() // len(all_rows))
             chance = chances(exp_avg, hyper.key, at)
         param = all_rows[rows]
-        before = param.clone() if coded and step.mean is not None else None
         grad, found = finite(step.grad[rows], hyper.nonfinite)
         bad += found
         if fade is not None and chosen is not None:
@@ -176,7 +187,8 @@ def take_step(step: Step, hyper: Hyper) -> int:  # noqa: PLR0912, PLR0915  (all 
             assert hyper.mean is not None
             assert hyper.began is not None
             mean, began = hyper.mean[rows], hyper.began[rows]
-            take_into_mean(hyper.count, step.mean, param, mean, began, before, chance)
+            how = hyper.count, step.mean
+            take_into_mean(*how, param, mean, began, hyper.grid, chance)
         if coded and not step.plain:
             encode(exp_avg, exp_avg_sq, *codes, chance)
     return bad
@@ -196,17 +208,17 @@ def finite(grad: Tensor, nonfinite: Tensor | None) -> tuple[Tensor, int]:
 
 def take_into_mean(
     count: int, put: bool, param: Tensor, mean: Tensor, began: Tensor,
-    before: Any = None, chance: Any = None,
+    grid: float = 1.0, chance: Any = None,
 ) -> None:  # fmt: skip
     """An iterate that is not finite leaves its mean alone; a mean that is not begins with it.
 
-    A row that has `began` with 0 begins now, with this `count`. Means of codes are for
-    `take_into_distance`, with `before` and `chance`.
+    A row that has `began` with 0 begins now, with this `count`. `grid` and `chance` are of a mean
+    of int16, see `take_into_residue`.
     """
     began.masked_fill_(began == 0, count)
     weight = like_rows(1.0 / (count + 1 - began), param)
     if mean.dtype == CODES:
-        take_into_distance(put, before, param, mean, 1.0 - weight, chance)
+        take_into_residue(put, param, mean, weight, grid, chance)
         return
     if param.is_cpu and math.isfinite((param.sum() + mean.sum()).item()):
         mean.lerp_(param, weight.to(param.dtype))
@@ -221,27 +233,44 @@ def take_into_mean(
         param.copy_(torch.where(known, mean, param))
 
 
-def take_into_distance(
-    put: bool, before: Tensor, param: Tensor, distance: Tensor, left: Tensor, chance: Tensor
+def take_into_residue(
+    put: bool, param: Tensor, residue: Tensor, weight: Tensor, grid: float, chance: Tensor
 ) -> None:
-    """`take_into_mean` in 16 bits: the mean as its distance from the iterate, which is short.
+    """`take_into_mean` in 16 bits: the lower bits of the mean's place on a grid.
 
-    A thousand iterates round it a thousand times. Of the mean itself that is seven times the
-    distance of two codes, and of the distance a twentieth. What moves the iterate between steps
-    moves the mean, too. A distance that is not finite is 0: the mean begins with the iterate.
+    The iterate is near, and so tells the upper ones. The place is rounded by chance. A thousand
+    roundings make seven places, which is little beside an iterate's way. A mean further away than
+    `MAX_AWAY` places follows its iterate. Numbers beyond `MAX_PLACE` places have no mean.
 
     Args:
-        before, param: the iterate before and after this step, [n, ...] float32.
-        distance: [n, ...] int16, the mean less the iterate, in codes as of first moments.
-        left: what weight the mean before has.
-        chance: for the rounding, see `moments.chances`.
+        param: the iterate [n, ...] float32.
+        residue: [n, ...] int16.
+        weight: of the iterate in the mean.
+        chance: of the rounding, as of `moments.chances`.
     """
-    away = (numbers_of(distance) + (before - param)) * left
-    away = torch.where(torch.isfinite(away), away, 0.0)
+    known, lower, rest, away = places_of(param, residue, grid)
+    away = (away * (1.0 - weight)).clamp_(-MAX_AWAY, MAX_AWAY)
+    # An integer is cut off towards zero, hence a number that is positive.
+    shift = ((chance >> 16) & 0xFFFF).to(torch.float32) * 2.0**-16 + 32_768.0
+    moved = lower + (rest + away + shift).to(torch.int32) - 32_768
+    residue.copy_(torch.where(known, moved.to(CODES), residue))
     if put:
-        param.add_(away)
-        away.zero_()
-    encode_first(away, distance, chance)
+        param.copy_(torch.where(known, param + away * grid, param))
+
+
+def places_of(param: Tensor, residue: Tensor, grid: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Where iterates, and their means of int16, lie on a grid.
+
+    Returns:
+        Whether the number has a mean, bool; its place, whole as int32, and the rest of it; how many
+        places its mean is from it. All [n, ...].
+    """
+    place = param / grid
+    known = place.abs() < MAX_PLACE
+    place = torch.where(known, place, 0.0)
+    lower = place.to(torch.int32)
+    rest = place - lower
+    return known, lower, rest, (residue.to(torch.int32) - lower).to(CODES).to(torch.float32) - rest
 
 
 def like_rows(numbers: Tensor, param: Tensor) -> Tensor:

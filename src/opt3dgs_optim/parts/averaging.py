@@ -23,8 +23,8 @@ class Averaging(Part):
     parameters' place, because trainers save before their last step. Until then nothing is changed.
 
     Rows that density control edits begin anew, the others are spared. Iterates that are not finite
-    are left out. It takes the memory of the parameters once more, and a number a row, in the last
-    thirtieth; beside moments of 16 bits half of that, but for positions.
+    are left out. In the last thirtieth it takes the memory of the parameters once more, and one
+    number a row. Beside moments of 16 bits the mean has as many, but that of positions.
     """
 
     @staticmethod

@@ -174,7 +174,7 @@ def launch(step: Step, hyper: Hyper) -> None:
         "step_rows", -(-numbers // ROWS_BLOCK),
         (param, step.grad, m, v, mean, began, held, on_device, hyper.nonfinite),
         (numbers, numbers // param.shape[0] if param.dim() else 1, size, *adam,
-         _signed(key), share, fade_m, fade_v, weight, number, put),
+         _signed(key), share, fade_m, fade_v, weight, number, put, hyper.grid),
         coded,
     )  # fmt: skip
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim import triton
-from opt3dgs_optim.moments import CODES, NEAREST, decoded, encode, encode_first, numbers_of
+from opt3dgs_optim.moments import CODES, NEAREST, decoded, encode
 from opt3dgs_optim.step import (
     Fade,
     Frame,
@@ -22,6 +22,7 @@ from opt3dgs_optim.step import (
     Step,
     like_rows,
     mixed,
+    places_of,
     take_step,
 )
 
@@ -84,8 +85,8 @@ def case(
         hyper.mean, hyper.began = (param + 0.1 * draw(*shape)), began
         hyper.mean.mul_(like_rows(began > 0, param))  # others begin with this step
         if coded and not frame:
-            hyper.mean, distance = torch.zeros(shape, dtype=CODES), hyper.mean - param
-            encode_first(distance * like_rows(began > 0, param), hyper.mean, NEAREST)
+            hyper.grid = 2.0**-12
+            hyper.mean = (hyper.mean / hyper.grid).to(torch.int32).to(CODES)
     return step, hyper
 
 
@@ -97,7 +98,10 @@ def tensors(step: Step, hyper: Hyper) -> list[Tensor]:
     found = [step.param, *moments]
     if hyper.mean is None or hyper.began is None:
         return found
-    mean = numbers_of(hyper.mean) if hyper.mean.dtype == CODES else hyper.mean
+    mean = hyper.mean
+    if mean.dtype == CODES:
+        known, _, _, away = places_of(step.param, mean, hyper.grid)
+        mean = torch.where(known, step.param + away * hyper.grid, step.param)
     return [*found, mean, hyper.began]
 
 

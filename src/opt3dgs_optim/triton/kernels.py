@@ -16,6 +16,7 @@ import triton
 import triton.language as tl
 
 INFINITY = tl.constexpr(float("inf"))
+MAX_PLACE, MAX_AWAY = tl.constexpr(8388608.0), tl.constexpr(30000.0)  # as in `step`
 LARGEST = tl.constexpr(9.223371761976868e18)  # float32's in `step.LARGEST`: its square is finite
 ROWS_BLOCK = tl.constexpr(1024)  # numbers of a program
 FRAME_BLOCK = tl.constexpr(128)  # Gaussians of a program
@@ -113,19 +114,24 @@ def into_mean(value, mean, began, row, at, inside, number, put):
 
 
 @triton.jit
-def into_distance(value, before, distance, began, row, at, inside, number, put, round_key):
-    """`step.take_into_distance` of one number; what the parameter is afterwards."""
+def into_residue(value, mean, began, row, at, inside, number, put, grid, round_key):
+    """`step.take_into_residue` of one number; what the parameter is afterwards."""
     first = tl.load(began + row, inside)
     tl.store(began + row, number, new_row(first, inside))
     weight = 1.0 / (number + 1.0 - tl.where(first == 0.0, number, first))
-    away = (tl.load(distance + at, inside).to(tl.int32) << 16).to(tl.float32, bitcast=True)
-    away = (away + (before - value)) * (1.0 - weight)
-    away = tl.where(tl.abs(away) < INFINITY, away, 0.0)
+    old = tl.load(mean + at, inside)
+    place = value / grid
+    known = tl.abs(place) < MAX_PLACE
+    place = tl.where(known, place, 0.0)
+    lower = place.to(tl.int32)
+    rest = place - lower.to(tl.float32)
+    away = ((old.to(tl.int32) - lower).to(tl.int16).to(tl.float32) - rest) * (1.0 - weight)
+    away = tl.minimum(tl.maximum(away, -MAX_AWAY), MAX_AWAY)
+    shift = (mixed(at, round_key) >> 16).to(tl.float32) * (1.0 / 65536.0) + 32768.0
+    moved = lower + (rest + away + shift).to(tl.int32) - 32768
+    tl.store(mean + at, tl.where(known, moved.to(tl.int16), old), inside)
     if put > 0.0:
-        value = value + away
-        away = away - away
-    code = away.to(tl.int32, bitcast=True) + (mixed(at, round_key) >> 16).to(tl.int32)
-    tl.store(distance + at, (code >> 16).to(tl.int16), inside)
+        value = tl.where(known, value + away * grid, value)
     return value
 
 
@@ -144,11 +150,10 @@ def rows_of(first, width):
 @triton.jit
 def _step_rows(
     p, g, m, v, mean, began, held, factor, nonfinite, at, row, inside, size, beta2, ones1, ones2,
-    eps, root2, shrink, decay, round_key, key, share, fade_m, fade_v, weight, number, put,
+    eps, root2, shrink, decay, round_key, key, share, fade_m, fade_v, weight, number, put, grid,
 ):  # fmt: skip
     grad = finite(tl.load(g + at, inside), nonfinite, inside)
-    before = tl.load(p + at, inside)
-    value = before * shrink
+    value = tl.load(p + at, inside) * shrink
     if decay != 0.0:
         grad = grad + value * decay
     if factor is not None:
@@ -171,9 +176,7 @@ def _step_rows(
         store_moments(m, v, at, inside, exp_avg, exp_avg_sq, round_key)
     if mean is not None:
         if mean.dtype.element_ty == tl.int16:
-            value = into_distance(
-                value, before, mean, began, row, at, inside, number, put, round_key
-            )
+            value = into_residue(value, mean, began, row, at, inside, number, put, grid, round_key)
         else:
             value = into_mean(value, mean, began, row, at, inside, number, put)
     tl.store(p + at, value, inside)
@@ -182,13 +185,13 @@ def _step_rows(
 @triton.jit(do_not_specialize=PLAIN_INTS)
 def step_rows(
     p, g, m, v, mean, began, held, factor, nonfinite, numbers, width, size, beta2, ones1, ones2,
-    eps, root2, shrink, decay, round_key, key, share, fade_m, fade_v, weight, number, put,
+    eps, root2, shrink, decay, round_key, key, share, fade_m, fade_v, weight, number, put, grid,
 ):  # fmt: skip
     """Step a parameter [rows, width], ROWS_BLOCK of its numbers in a program.
 
     Args:
         p, g, m, v, mean: numbers float32: parameter, gradient, moments (or codes int16; None: the
-            step is the gradient times the rate), mean (or its distance, int16; or None).
+            step is the gradient times the rate), mean (or of int16; or None).
         began: [rows] float32, the number with which a row's mean began, 0: it begins now; or None.
         held: [rows] uint8, not 0: raise the second moment to (weight * gradient)^2; or None.
         factor: one float32 on the device, on the size; or None.
@@ -198,7 +201,7 @@ def step_rows(
         round_key: for the rounding of moments to codes, see `opt3dgs_optim.moments`.
         shrink, decay: of weight decay, decoupled and the other kind; 1.0 and 0.0: none.
         key, share, fade_m, fade_v: of fading; a share of 0.0: none.
-        number, put: of the mean; put > 0: it takes the parameter's place.
+        number, put, grid: of the mean; put > 0: it takes the parameter's place.
         numbers: 64 bits, where there are more than 2^31.
     """
     first = tl.program_id(0).to(numbers.dtype) * ROWS_BLOCK
@@ -209,14 +212,14 @@ def step_rows(
         _step_rows(
             p, g, m, v, mean, began, held, factor, nonfinite, at, row, None, size,
             beta2, ones1, ones2, eps, root2, shrink, decay, round_key, key, share, fade_m, fade_v,
-            weight, number, put,
+            weight, number, put, grid,
         )  # fmt: skip
     else:  # in 64 bits, since the place of a number that is not there may need them
         last = first.to(tl.int64) + tl.arange(0, ROWS_BLOCK)
         _step_rows(
             p, g, m, v, mean, began, held, factor, nonfinite, last, row, last < numbers, size,
             beta2, ones1, ones2, eps, root2, shrink, decay, round_key, key, share, fade_m, fade_v,
-            weight, number, put,
+            weight, number, put, grid,
         )  # fmt: skip
 
 
