@@ -102,9 +102,7 @@ class PhaseScheduler(Course):
         self._pixel: Part | None = next(own, None)
         averaging = self.part(Averaging)
         self._end = End(total_steps, averaging)
-        self._mean_at = total_steps  # never
-        if averaging is not None:  # a short run puts the mean where it begins, or has none
-            self._mean_at = max(averaging.start(total_steps), averaging.put_from(total_steps))
+        self._mean_at = total_steps if averaging is None else averaging.put_from(total_steps)
         weakref.finalize(self, self._end.say)  # at exit, or where the function that trains ends
 
     @classmethod

@@ -51,4 +51,5 @@ class Averaging(Part):
 def _window(total_steps: int) -> tuple[int, int]:
     """The first iteration that is averaged, and the first after which the mean is put."""
     length = math.floor(SHARE * total_steps)
-    return total_steps - length, total_steps - math.floor(max(2, length / 10))
+    # A short run puts the mean where it begins, or has none.
+    return total_steps - length, total_steps - min(length, max(2, math.floor(length / 10)))
