@@ -225,6 +225,24 @@ def equal(all_: Evidence) -> str:
     return table(heads, rows)
 
 
+def short(all_: Evidence) -> str:
+    """Both with schedules as short."""
+    rows = []
+    for count in (15_000, 10_000, 7_500):
+        gains = []
+        for scene in MAIN:
+            stock = all_.of("mcmc", scene, iterations=count, **HALF)
+            found = gain(all_.of("own", scene, iterations=count, **HALF), stock)
+            if found is not None:
+                gains.append(found)
+                cells = " / ".join(signed(v, m) for m, v in found.items())
+                rows.append((f"{count:,}", scene, shown(stock).removesuffix(" (1 seed)"), cells))
+        if len(gains) == len(MAIN):
+            means = (signed(statistics.mean(g[m] for g in gains), m) for m in METRICS)
+            rows.append((f"{count:,}", "*mean*", "", " / ".join(means)))
+    return table(("iterations", "scene", "stock", "own frame gains"), rows)
+
+
 def cost(_: Evidence) -> str:
     """What a step costs on a CPU."""
     made = json.loads(steps.OUT.read_text(encoding="utf-8"))
@@ -237,11 +255,11 @@ def few(all_: Evidence) -> str:
     rows = []
     for scene in FEW:
         stock = all_.of("mcmc", scene, iterations=30_000, **QUARTER)
-        others = (("defaults", 30_000), ("own", 30_000), ("own", 10_000))
+        others = (("defaults", 30_000), ("own", 30_000), ("own", 10_000), ("own", 3_000))
         lines = (all_.of(arm, scene, iterations=n, **QUARTER) for arm, n in others)
         rows.append((scene, shown(stock), *(gained(x, stock) for x in lines)))
-    fading, own = NAMES["defaults"], "own frame"
-    heads = ("scene", "stock", fading, f"{own}, 30,000", f"{own}, 10,000")
+    lengths = (f"own frame, {n}" for n in ("30,000", "10,000", "3,000"))
+    heads = ("scene", "stock", NAMES["defaults"], *lengths)
     return table(heads, rows)
 
 
@@ -330,7 +348,7 @@ NAMES = {
 TABLES: dict[str, Callable[[Evidence], str]] = {
     f.__name__: f
     for f in (
-        front, iterations, kept_aside, gpu, gpu_step, gpu_iteration, bits, equal, cost, few,
+        front, iterations, kept_aside, gpu, gpu_step, gpu_iteration, bits, equal, short, cost, few,
         adaptive, capture, closed,
     )
 }  # fmt: skip
