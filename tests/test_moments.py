@@ -221,6 +221,15 @@ def test_a_mean_of_32_bits_beside_moments_of_16_begins_anew() -> None:
     adams["sh0"].load_state_dict(adams["sh0"].state_dict())
 
 
+def test_a_mean_of_other_numbers_than_the_parameter_is_refused() -> None:
+    adams, _ = trained(20, 16, total=300)
+    iterate(adams, 0, 294)
+    saved = adams["sh0"].state_dict()
+    saved["state"][0]["averaging.residue"] = saved["state"][0]["averaging.residue"][..., :2]
+    with pytest.raises(ValueError, match="the same rows are needed in all"):
+        adams["sh0"].load_state_dict(saved)
+
+
 @pytest.mark.parametrize("both", [(32, 16), (16, 32)])
 def test_curvature_pairs_are_kept_where_the_bits_change(both: Any) -> None:
     made = []

@@ -77,10 +77,7 @@ class Lane:
         coded = state["exp_avg"].dtype is CODES and self.name in GRIDS
         key, param = RESIDUE if coded else MEAN, self.param
         mean, began = state.get(key), state.get(BEGAN)
-        if (
-            mean is None or mean.numel() != param.numel()
-            or began is None or len(began) != param.size(0)
-        ):  # fmt: skip
+        if mean is None or began is None or len(began) != param.size(0):  # rows are others now
             for each in OF_MEAN:
                 state.pop(each, None)
             mean = self.keep(state, key, tuple(param.shape), CODES if coded else None)

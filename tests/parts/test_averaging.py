@@ -145,6 +145,20 @@ def test_rows_of_the_same_parameter_begin_anew_where_their_number_changes(
 
 
 @pytest.mark.parametrize("moments", [32, 16])
+def test_rows_without_a_mean_stay_where_they_are_at_the_end(moments: Any) -> None:
+    """Of an edit after the last step before `finish`."""
+    params = parameters(ROWS, "sh0")
+    phases = PhaseScheduler(TOTAL, parts=[Averaging()], moments=moments)
+    optimizer = phases.upgrade(adam_of(params))
+    steps({"all": optimizer}, params, 295)
+    row_edits.apply(row_edits.added(torch.tensor([0, 3])), params, [optimizer], ["sh0"], False)
+    before = params["sh0"].detach().clone()
+    phases.finish()
+    moved = (params["sh0"] != before).flatten(1).any(1)
+    assert moved.tolist() == [True] * ROWS + [False] * 2
+
+
+@pytest.mark.parametrize("moments", [32, 16])
 def test_a_trainer_that_edits_what_has_the_parameters_shape(moments: Any) -> None:
     """It leaves what there is one of a row, and so the mean begins anew."""
     params = parameters(ROWS, "sh0")

@@ -53,6 +53,27 @@ def test_rows_of_every_size(rows: int, width: tuple[int, ...]) -> None:
     assert difference(everything, shape) <= TOLERANCE
 
 
+@pytest.mark.parametrize("put", [False, True])
+def test_means_of_16_bits_are_the_same_codes(put: bool) -> None:
+    """Also of numbers that have no place on the grid, and of a mean that is too far."""
+    made = []
+    for kernels in (False, True):
+        options: dict[str, Any] = {"coded": True, "mean": True, "put": put, "steps": 1_000}
+        step, hyper = case((301, 5), torch.Generator().manual_seed(3), **options)
+        step.param[:4, 0] = torch.tensor([float("inf"), float("nan"), 3e38, -3_000.0])
+        assert hyper.mean is not None
+        hyper.mean[5, :2] = torch.tensor([-32_768, 32_767])
+        before = hyper.mean.clone()
+        if kernels:
+            triton.launch(step, hyper)
+        else:
+            take_step(step, hyper)
+        made.append(hyper.mean)
+        assert torch.equal(hyper.mean[:4, 0], before[:4, 0])
+        assert not torch.equal(hyper.mean[4:], before[4:])
+    assert torch.equal(*made)
+
+
 @pytest.mark.parametrize("rows", ROWS)
 def test_own_frames_of_every_size(rows: int) -> None:
     assert difference({"frame": True, "bad": 3}, (rows, 3)) <= FRAME_TOLERANCE
