@@ -18,7 +18,7 @@ from opt3dgs_optim.masked import check_arguments, step_around
 from opt3dgs_optim.moments import CODES, NEAREST, decoded, encode
 from opt3dgs_optim.names import split_name
 from opt3dgs_optim.part import Part
-from opt3dgs_optim.step import GRIDS, Hyper, Step, like_rows, mixed, places_of, take_step
+from opt3dgs_optim.step import Hyper, Step, like_rows, mixed, places_of, take_step
 
 
 class StepAdam(Adam):
@@ -272,7 +272,7 @@ class StepAdam(Adam):
         if step.mean is not None:
             hyper.count = int(t)  # the steps that are made, not the iterations
             hyper.mean, hyper.began = lane.mean_of(state)
-            hyper.grid = GRIDS.get(lane.name or "", 1.0)
+            hyper.grid = lane.grid or 1.0
         if lane.counter is not None and triton.takes(step):
             triton.take_step(step, hyper)
         elif bad := take_step(step, hyper):
@@ -315,9 +315,9 @@ class StepAdam(Adam):
         for lane in self.present_lanes():
             param, state = lane.param, self.state.get(lane.param, {})
             mean, residue = state.get(MEAN), state.get(RESIDUE)
-            if residue is not None and residue.shape == param.shape:
-                grid = GRIDS[lane.name or ""]
-                mean = param + places_of(param, residue.to(CODES), grid)[-1] * grid
+            if residue is not None and lane.grid is not None and residue.shape == param.shape:
+                inside, _, _, away = places_of(param, residue.to(CODES), lane.grid)
+                mean = torch.where(inside, param + away * lane.grid, param)
             if mean is not None and mean.shape == param.shape:
                 known = torch.isfinite(param) & torch.isfinite(mean)
                 known &= like_rows(state[BEGAN] > 0, param)

@@ -14,9 +14,8 @@ from opt3dgs_optim.step import GRIDS
 MOMENTS = ("exp_avg", "exp_avg_sq")  # torch's names
 MEAN, BEGAN = "averaging.mean", "averaging.began"  # ours, of the rows
 RESIDUE = "averaging.residue"  # in the place of the mean, beside moments of 16 bits
-# What a checkpoint may hold for rows beside moments.
 OF_MEAN = (MEAN, RESIDUE, BEGAN)
-KEPT = (*OF_MEAN, "curvature.history")
+KEPT = (*OF_MEAN, "curvature.history")  # what a checkpoint may hold for rows beside moments
 
 
 class Lane:
@@ -25,6 +24,7 @@ class Lane:
     Attributes:
         name, set: which Gaussian parameter it is, and of which set of Gaussians.
         acting: by `Course.exploiting`: the parts with a `plan`, with a `before`, with an `after`.
+        grid: of its mean at 16 bits; None: it has none of these.
         counter: where its device counts numbers that are not finite; None on a CPU.
         stepped_in: the iteration of its last step; -1: none.
         framed: whether its moments are those of the own frame; None: it has none yet.
@@ -51,6 +51,7 @@ class Lane:
             )
             for phase in (Phase.EXPLORATION, Phase.EXPLOITATION)
         )
+        self.grid = GRIDS.get(self.name or "")
         self.stepped_in = -1
         self.framed: bool | None = None
         self.keeps = False
@@ -71,10 +72,10 @@ class Lane:
     def mean_of(self, state: dict[str, Any]) -> tuple[Tensor, Tensor]:
         """The running mean, and with which count the mean of each row began.
 
-        Beside moments of 16 bits the mean has as many, see `step.take_into_residue`, but that of
-        positions: no grid is fine enough for each scene, and reaches as far as noise moves them.
+        Beside moments of 16 bits the mean has as many, see `step.take_into_residue`, except that of
+        positions, for which no grid can be named: they are in the units of the scene.
         """
-        coded = state["exp_avg"].dtype is CODES and self.name in GRIDS
+        coded = self.grid is not None and state["exp_avg"].dtype is CODES
         key, param = RESIDUE if coded else MEAN, self.param
         mean, began = state.get(key), state.get(BEGAN)
         if mean is None or began is None or len(began) != param.size(0):  # rows are others now
@@ -99,7 +100,8 @@ class Lane:
                 continue
             as_it_was = was is not None and now is was[0] and now._version == was[1]
             if len(now) != rows or (new and (as_it_was or written)):
-                del state[key]
+                for each in OF_MEAN if key in OF_MEAN else (key,):  # they belong together
+                    state.pop(each, None)
 
     def note(self, state: dict[str, Any]) -> None:
         """Note how the step leaves the rows, by which edits of them show at the next one."""

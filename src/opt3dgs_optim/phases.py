@@ -47,8 +47,9 @@ class PhaseScheduler(Course):
         switch: where exploitation starts: a fraction of `total_steps` in (0, 1] if a float, an
             iteration if an int (`total_steps`: never). The paper: 29/30.
         parts: what the steps have, in order; None: `DEFAULTS`.
-        moments: bits of each of Adam's two moments of a number; 16 take half of Adam's memory, and
-            are for the Gaussians alone (see docs/performance.md).
+        moments: bits of each of Adam's two moments of a number, and of the mean of the last
+            thirtieth; 16 take half of the memory, and are for the Gaussians alone (see
+            docs/performance.md).
         log: a `RunLog` that gets one line an iteration, with what the parts say of themselves.
         process_group: a `torch.distributed` process group over whose ranks the loss is averaged,
             for parts that read it.

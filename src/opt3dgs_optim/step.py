@@ -35,17 +35,11 @@ CHUNK = 65_536  # numbers that a CPU works on at a time, so that intermediates s
 # Above it a square is infinite: Adam's second moment would stay so for ever.
 LARGEST = {dtype: torch.finfo(dtype).max ** 0.5 / 2 for dtype in (torch.float32, torch.float64)}
 MIN_QUATERNION = 1e-12  # a shorter one is divided by this
-# The grids of means of 16 bits, see `take_into_residue`: fine beside the steps of all trainers, and
-# 16 bits reach as far as parameters wander in the last thirtieth.
-GRIDS = {
-    "scales": 2.0**-14,
-    "quats": 2.0**-15,
-    "opacities": 2.0**-11,
-    "sh0": 2.0**-14,
-    "shN": 2.0**-15,
-}
+# The grids of means of 16 bits, see `take_into_residue`. They reach for 2, 2, 16, 2 and 1, further
+# than parameters go in the last thirtieth at a hundred times the usual rates.
+GRIDS = {"scales": 2**-14, "quats": 2**-14, "opacities": 2**-11, "sh0": 2**-14, "shN": 2**-15}
 MAX_PLACE = 2.0**23  # on a grid, from which on float32 has no fractions
-MAX_AWAY = 30_000.0  # places of a mean from its iterate: another 2,768 are for the next step
+MAX_AWAY = 24_576.0  # places of a mean from its iterate; a step may have another 8,192
 
 
 class Fade(NamedTuple):
@@ -187,8 +181,9 @@ def take_step(step: Step, hyper: Hyper) -> int:  # noqa: PLR0912, PLR0915  (all 
             assert hyper.mean is not None
             assert hyper.began is not None
             mean, began = hyper.mean[rows], hyper.began[rows]
-            how = hyper.count, step.mean
-            take_into_mean(*how, param, mean, began, hyper.grid, chance)
+            take_into_mean(
+                hyper.count, step.mean, param, mean, began, hyper.grid, chance
+            )  # fmt: skip
         if coded and not step.plain:
             encode(exp_avg, exp_avg_sq, *codes, chance)
     return bad
@@ -238,21 +233,24 @@ def take_into_residue(
 ) -> None:
     """`take_into_mean` in 16 bits: the lower bits of the mean's place on a grid.
 
-    The iterate is near, and so tells the upper ones. The place is rounded by chance. A thousand
-    roundings make seven places, which is little beside an iterate's way. A mean further away than
-    `MAX_AWAY` places follows its iterate. Numbers beyond `MAX_PLACE` places have no mean.
+    The mean is read as the one of the places with these bits that is nearest to the iterate. Each
+    place is rounded by chance; after a thousand iterates they are off by seven. A mean further away
+    than `MAX_AWAY` places follows its iterate. Numbers beyond `MAX_PLACE` places have no mean. A
+    trainer that moves a number by more than 32,768 places at once, in the last thirtieth, has to
+    tell by `reset_rows`.
 
     Args:
+        put: whether the mean takes the parameter's place.
         param: the iterate [n, ...] float32.
         residue: [n, ...] int16.
         weight: of the iterate in the mean.
+        grid: the distance of two places.
         chance: of the rounding, as of `moments.chances`.
     """
     known, lower, rest, away = places_of(param, residue, grid)
     away = (away * (1.0 - weight)).clamp_(-MAX_AWAY, MAX_AWAY)
-    # An integer is cut off towards zero, hence a number that is positive.
-    shift = ((chance >> 16) & 0xFFFF).to(torch.float32) * 2.0**-16 + 32_768.0
-    moved = lower + (rest + away + shift).to(torch.int32) - 32_768
+    chance = ((chance >> 16) & 0xFFFF).to(torch.float32) * 2.0**-16
+    moved = lower + (rest + away + chance).floor_().to(torch.int32)
     residue.copy_(torch.where(known, moved.to(CODES), residue))
     if put:
         param.copy_(torch.where(known, param + away * grid, param))

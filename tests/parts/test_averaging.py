@@ -171,7 +171,11 @@ def test_a_trainer_that_edits_what_has_the_parameters_shape(moments: Any) -> Non
     params["sh0"] = Parameter(old.detach()[1:].clone())
     optimizer.param_groups[0]["params"] = [params["sh0"]]
     optimizer.state[params["sh0"]] = state
+    saved = optimizer.state_dict()
+    assert optimizer.put_means() == 0
+    optimizer.load_state_dict(saved)
     steps({"all": optimizer}, params, 1)
+    state = optimizer.state[params["sh0"]]
     assert state["averaging.began"].tolist() == [294.0] * (ROWS - 1)
 
 

@@ -24,7 +24,7 @@ class Averaging(Part):
 
     Rows that density control edits begin anew, the others are spared. Iterates that are not finite
     are left out. In the last thirtieth it takes the memory of the parameters once more, and one
-    number a row. Beside moments of 16 bits the mean has as many, but that of positions.
+    number a row. Beside moments of 16 bits each number of the mean has 16, too, except positions.
     """
 
     @staticmethod

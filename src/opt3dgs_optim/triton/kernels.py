@@ -16,7 +16,7 @@ import triton
 import triton.language as tl
 
 INFINITY = tl.constexpr(float("inf"))
-MAX_PLACE, MAX_AWAY = tl.constexpr(8388608.0), tl.constexpr(30000.0)  # as in `step`
+MAX_PLACE, MAX_AWAY = tl.constexpr(8388608.0), tl.constexpr(24576.0)  # as in `step`
 LARGEST = tl.constexpr(9.223371761976868e18)  # float32's in `step.LARGEST`: its square is finite
 ROWS_BLOCK = tl.constexpr(1024)  # numbers of a program
 FRAME_BLOCK = tl.constexpr(128)  # Gaussians of a program
@@ -127,8 +127,8 @@ def into_residue(value, mean, began, row, at, inside, number, put, grid, round_k
     rest = place - lower.to(tl.float32)
     away = ((old.to(tl.int32) - lower).to(tl.int16).to(tl.float32) - rest) * (1.0 - weight)
     away = tl.minimum(tl.maximum(away, -MAX_AWAY), MAX_AWAY)
-    shift = (mixed(at, round_key) >> 16).to(tl.float32) * (1.0 / 65536.0) + 32768.0
-    moved = lower + (rest + away + shift).to(tl.int32) - 32768
+    chance = (mixed(at, round_key) >> 16).to(tl.float32) * (1.0 / 65536.0)
+    moved = lower + tl.floor(rest + away + chance).to(tl.int32)
     tl.store(mean + at, tl.where(known, moved.to(tl.int16), old), inside)
     if put > 0.0:
         value = tl.where(known, value + away * grid, value)
