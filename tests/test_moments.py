@@ -193,15 +193,20 @@ def test_what_the_mean_takes(moments: int, size: int) -> None:
 
 
 @pytest.mark.parametrize("moments", [32, 16])
-def test_a_mean_in_the_other_form_begins_anew(moments: Any) -> None:
+def test_a_mean_in_the_other_form_begins_anew(
+    moments: Any, caplog: pytest.LogCaptureFixture
+) -> None:
     """A checkpoint of the last thirtieth, and as many bits as it had not."""
     adams, _ = trained(20, moments, total=300)
     iterate(adams, 0, 294)
     again, _ = trained(20, 48 - moments, total=300)
+    caplog.set_level("INFO", "opt3dgs_optim")
     for adam, other in zip(adams.values(), again.values(), strict=True):
         param_of(other).data.copy_(param_of(adam))
         other.load_state_dict(adam.state_dict())
     assert not kept(again, *MEAN)
+    said = f"the mean of the last iterates begins anew, at {48 - moments} bits"
+    assert sum(said in message for message in caplog.messages) == 1
     iterate(again, 294, 300)
     began = [adam.state[param_of(adam)]["averaging.began"] for adam in again.values()]
     assert all((each == 295).all() for each in began)

@@ -75,6 +75,14 @@ _ARMS = (
         "own", "own frame, the others faded, a hold, averaged: the defaults since 2026-11-27", own()
     ),
     Arm("own-16", "as own, Adam's moments in 16 bits", own(), moments=16),
+    *(
+        Arm(
+            f"own-{count}-events",
+            f"as own, Fading(events={count})",
+            of(OwnFrame(0.1), Fading(events=count, names=OTHERS), OutOfView(), Averaging()),
+        )
+        for count in (600, 1200)
+    ),
     Arm("averaged", "the baseline, its last thirtieth averaged", of(Averaging())),
     Arm("x2", "the baseline, all steps times 2", of(Longer(2.0))),
     Arm("x3", "the baseline, all steps times 3", of(Longer(3.0))),

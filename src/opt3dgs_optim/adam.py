@@ -383,6 +383,11 @@ class StepAdam(Adam):
         dropped = KEPT if ours is None or ours["total_steps"] != course.total_steps else ()
         if ours is not None and ours["moments"] != course.moments:
             dropped = dropped or OF_MEAN
+            if any(BEGAN in state for state in self.state.values()):
+                course.say_once(
+                    f"opt3dgs_optim: the mean of the last iterates begins anew, at {course.moments} "
+                    "bits"
+                )
         for state in self.state.values():  # of the end of another run, or in another form
             for key in dropped:
                 state.pop(key, None)
