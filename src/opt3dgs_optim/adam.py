@@ -384,10 +384,8 @@ class StepAdam(Adam):
         if ours is not None and ours["moments"] != course.moments:
             dropped = dropped or OF_MEAN
             if any(BEGAN in state for state in self.state.values()):
-                course.say_once(
-                    f"opt3dgs_optim: the mean of the last iterates begins anew, at {course.moments} "
-                    "bits"
-                )
+                bits = f"at {course.moments} bits"
+                course.say_once(f"opt3dgs_optim: the mean of the last iterates begins anew, {bits}")
         for state in self.state.values():  # of the end of another run, or in another form
             for key in dropped:
                 state.pop(key, None)
