@@ -19,6 +19,14 @@ from opt3dgs_optim.step import GRIDS, Step, places_of
 TOTAL, ROWS = 300, 6
 
 
+def averaged(params: Any, count: int, moments: Any) -> tuple[PhaseScheduler, Any]:
+    """One optimizer of all after so many iterations."""
+    phases = PhaseScheduler(TOTAL, parts=[Averaging()], moments=moments)
+    optimizer = phases.upgrade(adam_of(params))
+    steps({"all": optimizer}, params, count)
+    return phases, optimizer
+
+
 @given(total=st.integers(1, 100_000))
 def test_where_the_mean_begins_and_where_it_is_put(total: int) -> None:
     start, put = Averaging.start(total), Averaging.put_from(total)
@@ -130,9 +138,7 @@ def test_rows_of_the_same_parameter_begin_anew_where_their_number_changes(
     params = parameters(ROWS, name)
     if name == "shN":
         params[name] = Parameter(torch.zeros(ROWS, 0, 3))
-    phases = PhaseScheduler(TOTAL, parts=[Averaging()], moments=moments)
-    optimizer = phases.upgrade(adam_of(params))
-    steps({"all": optimizer}, params, 293)
+    _, optimizer = averaged(params, 293, moments)
     state = optimizer.state[params[name]]
     kept = params[name].data[1:].clone()
     params[name].data = kept.clone()
@@ -148,9 +154,7 @@ def test_rows_of_the_same_parameter_begin_anew_where_their_number_changes(
 def test_rows_without_a_mean_stay_where_they_are_at_the_end(moments: Any) -> None:
     """Of an edit after the last step before `finish`."""
     params = parameters(ROWS, "sh0")
-    phases = PhaseScheduler(TOTAL, parts=[Averaging()], moments=moments)
-    optimizer = phases.upgrade(adam_of(params))
-    steps({"all": optimizer}, params, 295)
+    phases, optimizer = averaged(params, 295, moments)
     row_edits.apply(row_edits.added(torch.tensor([0, 3])), params, [optimizer], ["sh0"], False)
     before = params["sh0"].detach().clone()
     phases.finish()
@@ -162,9 +166,7 @@ def test_rows_without_a_mean_stay_where_they_are_at_the_end(moments: Any) -> Non
 def test_a_trainer_that_edits_what_has_the_parameters_shape(moments: Any) -> None:
     """It leaves what there is one of a row, and so the mean begins anew."""
     params = parameters(ROWS, "sh0")
-    phases = PhaseScheduler(TOTAL, parts=[Averaging()], moments=moments)
-    optimizer = phases.upgrade(adam_of(params))
-    steps({"all": optimizer}, params, 293)
+    _, optimizer = averaged(params, 293, moments)
     old = params["sh0"]
     state = optimizer.state.pop(old)
     state = {key: v[1:] if v.shape == old.shape else v for key, v in state.items()}
@@ -203,9 +205,7 @@ def test_what_comes_after_the_end_leaves_the_mean_of_16_bits() -> None:
 def test_new_rows_begin_with_their_first_iterate(between: int, moments: Any) -> None:
     """Also where the iterations after the edit have no gradient."""
     params = parameters(ROWS, "sh0")
-    phases = PhaseScheduler(TOTAL, parts=[Averaging()], moments=moments)
-    optimizer = phases.upgrade(adam_of(params))
-    steps({"all": optimizer}, params, 293)
+    _, optimizer = averaged(params, 293, moments)
     row_edits.apply(row_edits.added(torch.tensor([0, 3])), params, [optimizer], ["sh0"], False)
     for _ in range(between):
         optimizer.step()
