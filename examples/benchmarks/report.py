@@ -12,7 +12,7 @@ import json
 import re
 import statistics
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -86,8 +86,12 @@ def gained(lines: Sequence[Line], control: Sequence[Line]) -> str:
     if found is None:
         return "not trained" if not lines else "-"
     count = len(set(seeds_of(lines)) & set(seeds_of(control)))
-    values = " / ".join(signed(v, m) for m, v in found.items())
-    return f"{values} ({count} seed{'s' * (count > 1)})"
+    return f"{all_signed(found)} ({count} seed{'s' * (count > 1)})"
+
+
+def all_signed(found: Mapping[str, float]) -> str:
+    """Differences of all metrics."""
+    return " / ".join(signed(value, metric) for metric, value in found.items())
 
 
 def signed(value: float, metric: str) -> str:
@@ -235,11 +239,11 @@ def short(all_: Evidence) -> str:
             found = gain(all_.of("own", scene, iterations=count, **HALF), stock)
             if found is not None:
                 gains.append(found)
-                cells = " / ".join(signed(v, m) for m, v in found.items())
-                rows.append((f"{count:,}", scene, shown(stock).removesuffix(" (1 seed)"), cells))
+                ends = shown(stock).removesuffix(" (1 seed)")
+                rows.append((f"{count:,}", scene, ends, all_signed(found)))
         if len(gains) == len(MAIN):
-            means = (signed(statistics.mean(g[m] for g in gains), m) for m in METRICS)
-            rows.append((f"{count:,}", "*mean*", "", " / ".join(means)))
+            means = {m: statistics.mean(g[m] for g in gains) for m in METRICS}
+            rows.append((f"{count:,}", "*mean*", "", all_signed(means)))
     return table(("iterations", "scene", "stock", "own frame gains"), rows)
 
 

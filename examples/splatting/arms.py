@@ -63,9 +63,9 @@ def of(*parts: Part) -> Callable[[int], Sequence[Part]]:
     return lambda _iterations: [*parts]
 
 
-def own(frame: OwnFrame | None = None) -> Callable[[int], Sequence[Part]]:
+def own(events: int = 300) -> Callable[[int], Sequence[Part]]:
     """Steps of the positions in the own frame, the others faded, a hold, the last ones averaged."""
-    return of(frame or OwnFrame(0.1), Fading(names=OTHERS), OutOfView(), Averaging())
+    return of(OwnFrame(0.1), Fading(events=events, names=OTHERS), OutOfView(), Averaging())
 
 
 _ARMS = (
@@ -76,11 +76,7 @@ _ARMS = (
     ),
     Arm("own-16", "as own, Adam's moments in 16 bits", own(), moments=16),
     *(
-        Arm(
-            f"own-{count}-events",
-            f"as own, Fading(events={count})",
-            of(OwnFrame(0.1), Fading(events=count, names=OTHERS), OutOfView(), Averaging()),
-        )
+        Arm(f"own-{count}-events", f"as own, Fading(events={count})", own(count))
         for count in (600, 1200)
     ),
     Arm("averaged", "the baseline, its last thirtieth averaged", of(Averaging())),

@@ -18,7 +18,7 @@ from opt3dgs_optim.masked import check_arguments, step_around
 from opt3dgs_optim.moments import CODES, NEAREST, decoded, encode
 from opt3dgs_optim.names import split_name
 from opt3dgs_optim.part import Part
-from opt3dgs_optim.step import Hyper, Step, like_rows, mixed, places_of, take_step
+from opt3dgs_optim.step import Hyper, Step, like_rows, mean_of_residue, mixed, take_step
 
 
 class StepAdam(Adam):
@@ -316,8 +316,7 @@ class StepAdam(Adam):
             param, state = lane.param, self.state.get(lane.param, {})
             mean, residue = state.get(MEAN), state.get(RESIDUE)
             if residue is not None and lane.grid is not None and residue.shape == param.shape:
-                inside, _, _, away = places_of(param, residue.to(CODES), lane.grid)
-                mean = torch.where(inside, param + away * lane.grid, param)
+                mean = mean_of_residue(param, residue.to(CODES), lane.grid)
             if mean is not None and mean.shape == param.shape:
                 known = torch.isfinite(param) & torch.isfinite(mean)
                 known &= like_rows(state[BEGAN] > 0, param)

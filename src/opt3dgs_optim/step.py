@@ -271,6 +271,12 @@ def places_of(param: Tensor, residue: Tensor, grid: float) -> tuple[Tensor, Tens
     return known, lower, rest, (residue.to(torch.int32) - lower).to(CODES).to(torch.float32) - rest
 
 
+def mean_of_residue(param: Tensor, residue: Tensor, grid: float) -> Tensor:
+    """The mean that int16 keep beside its iterate; the iterate where there is none."""
+    known, _, _, away = places_of(param, residue, grid)
+    return torch.where(known, param + away * grid, param)
+
+
 def like_rows(numbers: Tensor, param: Tensor) -> Tensor:
     """Numbers of rows [N] that broadcast with a parameter [N, ...]."""
     return numbers.view(-1, *[1] * (param.dim() - 1))

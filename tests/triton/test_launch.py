@@ -131,7 +131,7 @@ def test_rows_are_read_four_numbers_at_a_time(
 
 
 def test_codes_are_read_four_at_a_time(driver: FakeDriver) -> None:
-    """Of moments, and of the mean's distance, which has a kernel of its own beside a mean."""
+    """Of moments, and of a mean of 16 bits, which has a kernel of its own beside one of 32."""
     for mean in (False, True):
         launched(driver, (64, 4), coded=True, mean=mean)
     step, hyper = case((64, 4), torch.Generator().manual_seed(0), coded=True, mean=True)

@@ -190,6 +190,7 @@ def _run(
 ) -> None:  # fmt: skip
     """Launch a kernel; what Triton has compiled is launched again without its launcher.
 
+    `coded` says whether moments, and whether the mean, are codes: each has a kernel of its own.
     Triton's launcher looks at every argument, which takes 30 us. What it finds is the same again
     where the same tensors are there, begin at multiples of 16 bytes or do not, and are on one
     device.

@@ -21,8 +21,8 @@ from opt3dgs_optim.step import (
     Hyper,
     Step,
     like_rows,
+    mean_of_residue,
     mixed,
-    places_of,
     take_step,
 )
 
@@ -100,8 +100,7 @@ def tensors(step: Step, hyper: Hyper) -> list[Tensor]:
         return found
     mean = hyper.mean
     if mean.dtype == CODES:
-        known, _, _, away = places_of(step.param, mean, hyper.grid)
-        mean = torch.where(known, step.param + away * hyper.grid, step.param)
+        mean = mean_of_residue(step.param, mean, hyper.grid)
     return [*found, mean, hyper.began]
 
 

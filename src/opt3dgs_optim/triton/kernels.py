@@ -59,12 +59,14 @@ def chosen_rows(row, key, share):
 
 
 @triton.jit
-def new_row(began, inside):
-    """Whether a row's mean begins with this step."""
-    first = began == 0.0
+def weight_in_mean(began, row, inside, number):
+    """What weight an iterate has in the mean of its row; one that has not begun begins."""
+    first = tl.load(began + row, inside)
+    new = first == 0.0
     if inside is not None:
-        first = first & inside
-    return first
+        new = new & inside
+    tl.store(began + row, number, new)  # by each number of a row: the same
+    return 1.0 / (number + 1.0 - tl.where(first == 0.0, number, first))
 
 
 @triton.jit
@@ -98,9 +100,7 @@ def store_moments(m, v, at, inside, exp_avg, exp_avg_sq, key):
 @triton.jit
 def into_mean(value, mean, began, row, at, inside, number, put):
     """`step.take_into_mean` of one number; what the parameter is afterwards."""
-    first = tl.load(began + row, inside)
-    tl.store(began + row, number, new_row(first, inside))  # by each number of a row: the same
-    weight = 1.0 / (number + 1.0 - tl.where(first == 0.0, number, first))
+    weight = weight_in_mean(began, row, inside, number)
     old = tl.load(mean + at, inside)
     known = tl.abs(value) < INFINITY
     start = tl.where(tl.abs(old) < INFINITY, old, value)
@@ -116,9 +116,7 @@ def into_mean(value, mean, began, row, at, inside, number, put):
 @triton.jit
 def into_residue(value, mean, began, row, at, inside, number, put, grid, round_key):
     """`step.take_into_residue` of one number; what the parameter is afterwards."""
-    first = tl.load(began + row, inside)
-    tl.store(began + row, number, new_row(first, inside))
-    weight = 1.0 / (number + 1.0 - tl.where(first == 0.0, number, first))
+    weight = weight_in_mean(began, row, inside, number)
     old = tl.load(mean + at, inside)
     place = value / grid
     known = tl.abs(place) < MAX_PLACE
@@ -191,7 +189,8 @@ def step_rows(
 
     Args:
         p, g, m, v, mean: numbers float32: parameter, gradient, moments (or codes int16; None: the
-            step is the gradient times the rate), mean (or of int16; or None).
+            step is the gradient times the rate), mean (or None).
+            A mean of int16 is what `step.take_into_residue` keeps, with its `grid`.
         began: [rows] float32, the number with which a row's mean began, 0: it begins now; or None.
         held: [rows] uint8, not 0: raise the second moment to (weight * gradient)^2; or None.
         factor: one float32 on the device, on the size; or None.
@@ -201,7 +200,7 @@ def step_rows(
         round_key: for the rounding of moments to codes, see `opt3dgs_optim.moments`.
         shrink, decay: of weight decay, decoupled and the other kind; 1.0 and 0.0: none.
         key, share, fade_m, fade_v: of fading; a share of 0.0: none.
-        number, put, grid: of the mean; put > 0: it takes the parameter's place.
+        number, put: of the mean; put > 0: it takes the parameter's place.
         numbers: 64 bits, where there are more than 2^31.
     """
     first = tl.program_id(0).to(numbers.dtype) * ROWS_BLOCK
