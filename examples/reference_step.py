@@ -309,42 +309,45 @@ def pseudo_gradient(position: Tensor, grad: Tensor, own: dict) -> Tensor:
     visible = (largest(grad) > 0) & (largest(grad) < torch.inf)  # false where one is no number
     before = own.get("visible_before", zeros.any(1))
 
-    # The pair between this visible step of a point and its last one, divided by |y|.
+    # The pair between this visible step of a point and its last one, divided by sqrt(s.y).
     new_s, new_y = position - x, grad - g
-    cosine = dot(new_s / length(new_s), new_y / length(new_y))
-    new_s, new_y = new_s / length(new_y), new_y / length(new_y)
+    of_s, of_y = length(new_s), length(new_y)
+    new_s, new_y = new_s / of_s, new_y / of_y
+    cosine = dot(new_s, new_y)
+    new_s = new_s * torch.sqrt(of_s / of_y / cosine[:, None])
+    new_y = new_y * torch.sqrt(of_y / of_s / cosine[:, None])
     accepted = (visible & before & (cosine > 1e-6))[:, None]
     s = [torch.where(accepted, new, old) for new, old in zip([new_s, *s], s, strict=False)]
     y = [torch.where(accepted, new, old) for new, old in zip([new_y, *y], y, strict=False)]
     x, g = (torch.where(visible[:, None], *each) for each in ((position, x), (grad, g)))
     own["pairs"], own["visible_before"] = (x, g, s, y), visible | before
 
-    # Divided by its largest component, the gradient keeps all products in float32.
-    scale = largest(grad)
-    scale = torch.where(scale > 0, scale, 1.0)[:, None]
+    # Divided by a power of two of about its largest component, the gradient keeps all products in
+    # float32, and all its digits.
+    mantissa, exponent = torch.frexp(largest(grad))
+    scale = torch.ldexp(torch.ones_like(mantissa), exponent - 1)[:, None]
     unit = grad / scale
     result = two_loop(unit, s, y)
-    along = result / length(result)
-    result = along * length(grad)  # graft
-    usable = (dot(unit, along) > 0) & (dot(s[0], y[0]) > 0) & (largest(result) < torch.inf)
+    result = result * (length(unit) / length(result))  # graft; times 1 without a pair
+    result = result * scale
+    descent = dot(unit, result)  # no number where the gradient is zero, or none
+    usable = (descent > 0) & (descent < torch.inf)
     return torch.where(usable[:, None], result, grad)
 
 
 def two_loop(grad: Tensor, s: list[Tensor], y: list[Tensor]) -> Tensor:
     """H g by Nocedal and Wright (2006), algorithm 7.4.
 
-    s, y: the pairs of every point, K of [N, 3], newest first; |y| = 1, and 0 where there is none.
+    s, y: the pairs of every point, K of [N, 3], newest first; s.y = 1, and 0 where there is none.
     """
-    sy = [dot(*pair) for pair in zip(s, y, strict=True)]
-    rho = [torch.where(each > 0, 1 / each, 0.0) for each in sy]
     q, alpha = grad, []
-    for s_j, y_j, rho_j in zip(s, y, rho, strict=True):  # newest to oldest
-        alpha.append(dot(s_j, q) * rho_j)
+    for s_j, y_j in zip(s, y, strict=True):  # newest to oldest
+        alpha.append(dot(s_j, q))
         q = torch.addcmul(q, alpha[-1][:, None], y_j, value=-1)
-    gamma = torch.where(sy[0] > 0, sy[0], 1.0)  # s.y / y.y of the newest pair
-    r = gamma[:, None] * q
-    for s_j, y_j, rho_j, alpha_j in reversed(list(zip(s, y, rho, alpha, strict=True))):
-        beta = dot(y_j, r) * rho_j
+    yy = dot(y[0], y[0])  # 1 / gamma, of the newest pair
+    r = q / torch.where(yy > 0, yy, 1.0)[:, None]
+    for s_j, y_j, alpha_j in reversed(list(zip(s, y, alpha, strict=True))):
+        beta = dot(y_j, r)
         r = torch.addcmul(r, (alpha_j - beta)[:, None], s_j)
     return r
 
@@ -361,7 +364,6 @@ def largest(a: Tensor) -> Tensor:
 
 
 def length(a: Tensor) -> Tensor:
-    """The length of every point's vector [N, 3], [N, 1]; 1 for a zero vector, to divide by."""
+    """The length of every point's vector [N, 3], [N, 1]."""
     x, y, z = a.T.contiguous()
-    result = torch.hypot(torch.hypot(x, y), z)[:, None]
-    return torch.where(result > 0, result, 1.0)
+    return torch.hypot(torch.hypot(x, y), z)[:, None]

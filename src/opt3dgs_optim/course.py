@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from opt3dgs_optim.adam import StepAdam
 
 STATE_KEY = "opt3dgs"  # in `param_groups[0]`: what a checkpoint needs beside tensors
-FORMAT = 2
+FORMAT = 3
 LOOK_INTERVAL = 100  # iterations between two looks at the numbers that were not finite
 AnyPart = TypeVar("AnyPart", bound=Part)
 

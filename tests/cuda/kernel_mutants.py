@@ -40,16 +40,16 @@ class Mutant(NamedTuple):
 
 
 MUTANTS = (
-    Mutant("sign in the second loop", "two_loop.cuh", "alpha[j] - beta", "alpha[j] + beta"),
+    Mutant("sign in the second loop", "two_loop.cuh", "alpha[j] - dot", "alpha[j] + dot"),
     Mutant(
         "slot of a pair", "two_loop.cuh", "s[j].v = s[j - 1].v", "s[j].v = s[j > 1 ? j - 2 : 0].v"
     ),
     Mutant("tail guard", "lqn.cu", "if (row >= rows) return;", "if (row > rows) return;"),
     Mutant("test of acceptance", "two_loop.cuh", "pair.cosine > min", "pair.cosine < min"),
-    Mutant("clamp of the counter", "two_loop.cuh", "history.counter < T(K + 1)", "true"),
-    Mutant(
-        "length of the grafted step", "two_loop.cuh", "sqrt(dot(unit, unit)) / size", "T(1) / size"
-    ),
+    Mutant("count of the steps", "two_loop.cuh", "history.steps += T(1)", "history.steps += T(0)"),
+    Mutant("gamma", "two_loop.cuh", "over(q, inverse_gamma)", "times(q, inverse_gamma)"),
+    Mutant("length of a pair", "two_loop.cuh", "sqrt(of_s / of_y / cosine)", "sqrt(of_s / of_y)"),
+    Mutant("length of the grafted step", "two_loop.cuh", "length(unit) /", "T(1) /"),
     Mutant("tail guard of the recursion", "two_loop.cu", "row >= rows", "row > rows"),
     Mutant(
         "scale of the gradient",

@@ -17,7 +17,7 @@ class Header(NamedTuple):
 
     position: Tensor  # [N, D] at the last visible step
     gradient: Tensor  # [N, D] at the last visible step
-    counter: Tensor  # [N] 0: never visible; c: holds c - 1 pairs
+    steps: Tensor  # [N] in which the point was visible
 
 
 def header(history: Tensor, history_size: int) -> Header:
@@ -63,6 +63,6 @@ def direction(grad: Tensor, history: Tensor, history_size: int, *, graft: bool) 
 
 
 def newest_gamma(history: Tensor, history_size: int) -> Tensor:
-    """Gamma of the newest pair, [N]; 0 where there is none."""
-    s, y = stored_pairs(history, history_size)
-    return (s[0] * y[0]).sum(1)
+    """Gamma of the newest pair, [N]."""
+    _, y = stored_pairs(history, history_size)
+    return (y[0] ** 2).sum(1).reciprocal()

@@ -82,9 +82,10 @@ def test_units_change_nothing_but_the_units(lqn: Step, condition: float, graft: 
     """Positions in units 1e-8 .. 1e8 and losses times 1e-12 .. 1e12, each row its own.
 
     The units are powers of two, so that the inputs are the same digits: so must the outputs be.
+    Those of the loss are powers of four: pairs are divided by a root of theirs.
     """
     length = log_uniform(ROWS, 1e-8, 1e8, seed=1).log2().round().exp2()[:, None]
-    loss = log_uniform(ROWS, 1e-12, 1e12, seed=2).log2().round().exp2()[:, None]
+    loss = (log_uniform(ROWS, 1e-12, 1e12, seed=2).log2() / 2).round().mul(2).exp2()[:, None]
     hessian, x, slope = hessians(ROWS, condition), walk(ROWS), loss / length
     plain, _, accepted, _ = fed(lqn, hessian, x, graft=graft)
     there = fed(lqn, hessian / length[:, :, None], x * length, slope, graft=graft)
@@ -161,9 +162,9 @@ def test_no_intermediate_leaves_float32(lqn: Step, size: float, step: float) -> 
     assert bool(torch.isfinite(found).all())
     assert bool(torch.isfinite(raw).all())
     assert bool((found != 0).any(1)[(g != 0).any(1)].all())
-    assert bool(torch.isfinite(header(history, SIZE).counter).all())
-    # Per unit of gradient: s / |y|, which is what is stored. Outside of 1e-30 .. 1e30 float32 has
-    # no room for it and its square.
+    assert bool(torch.isfinite(header(history, SIZE).steps).all())
+    # Per unit of gradient: |s| / |y|, whose root is in what is stored. Outside of 1e-30 .. 1e30
+    # float32 has no room for it.
     if slope >= 1e-36 and 1e-30 <= step / slope <= 1e30:
         assert bool(accepted.all())
         gamma = newest_gamma(history, SIZE)

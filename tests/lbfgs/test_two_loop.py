@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import dense_bfgs
-from points_first import direction, header, record
+from points_first import direction, header, record, stored_pairs
 from torch import Tensor
 
 from opt3dgs_optim.lbfgs import history_from_pairs, new_history, two_loop
@@ -140,12 +140,11 @@ def test_ring_keeps_the_newest_pairs(sizes: tuple[int, int, int, int], more: int
     feed(ring, k, s, y)
     last = history_from_pairs(s[-k:], y[-k:])
     assert torch.equal(two_loop(g, ring, k), two_loop(g, last, k))
-    assert float(header(ring, k).counter.max()) <= 2 * k  # never near float32's 2^24
 
 
 def empty(n: int, d: int, size: int) -> Tensor:
     history = new_history(torch.zeros(n, d, dtype=torch.float64), size)
-    header(history, size).counter.fill_(1)
+    header(history, size).steps.fill_(1)
     return history
 
 
@@ -174,9 +173,9 @@ def test_grafting_keeps_the_gradients_length() -> None:
     torch.testing.assert_close(free, two_loop(g, history, 4))
 
 
-@pytest.mark.parametrize("exponent", [-37, -30, -20, 0, 20, 29])
+@pytest.mark.parametrize("exponent", [-36, -30, -20, 0, 20, 29])
 def test_no_overflow_or_underflow_in_float32(exponent: int) -> None:
-    """Gradients from 1e-37 to 1e29: s.y and y.y themselves would leave the range."""
+    """Gradients from 1e-36 to 1e29: s.y and y.y themselves would leave the range."""
     s, y, _ = convex_pairs(5, 3, 50, 11)
     g = gradients(50, 3, 5)
     size = 10.0**exponent
@@ -223,15 +222,16 @@ def test_invisible_rows_keep_their_history() -> None:
     assert not torch.equal(history[visible], before[visible])
 
 
-def test_non_descent_falls_back_to_the_gradient() -> None:
-    """A pair of negative curvature that somebody wrote by hand must not turn the step around."""
-    history = new_history(torch.zeros(1, 3, dtype=torch.float64), 5)
-    head = header(history, 5)
-    head.counter.fill_(2)
-    history[0, 0, :3] = torch.tensor([-1.0, 0, 0])
-    history[0, 0, 4:7] = torch.tensor([1.0, 0, 0])
-    g = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
-    assert torch.equal(direction(g, history, 5, graft=False), g)
+def test_no_pair_turns_the_step_around() -> None:
+    """Whatever is written by hand, H is a sum of squares."""
+    history = new_history(torch.zeros(50, 3, dtype=torch.float64), 5)
+    generator = torch.Generator().manual_seed(0)
+    for vectors in stored_pairs(history, 5):
+        vectors.copy_(torch.randn(5, 50, 3, generator=generator))
+    g = gradients(50, 3, 0)
+    found = direction(g, history, 5, graft=False)
+    assert bool(((found * g).sum(1) > 0).all())
+    assert not bool((found == g).all(1).any())
 
 
 @pytest.mark.parametrize("poison", [float("nan"), float("inf")])
@@ -277,7 +277,7 @@ def test_pairs_that_describe_no_curvature_are_left_out(
     for row in range(n):
         good = kind[:, row] > 3
         count = int(good.sum())
-        assert float(header(history, k).counter[row]) == count + 1
+        assert int((stored_pairs(history, k)[0][:, row] != 0).any(1).sum()) == count
         if count == 0:
             torch.testing.assert_close(found[row], g[row], rtol=1e-15, atol=0)  # one rounding each
         else:

@@ -134,8 +134,7 @@ def lqn_direction(
     """`lbfgs.lqn_direction` on the GPU, for points of three coordinates. Never synchronises."""
     rows = grad.shape[0]
     fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
-    accepted = torch.empty(rows, dtype=torch.bool, device=grad.device)
-    candidates = torch.empty_like(accepted)
+    accepted, candidates = torch.empty(2, rows, dtype=torch.bool, device=grad.device).unbind()
     cells = _aligned(history)
     tensors = (_contiguous(position), _contiguous(grad), cells, fed, accepted, candidates)
     numbers = (rows, REALS[grad.dtype](min_cosine), np.int32(graft))

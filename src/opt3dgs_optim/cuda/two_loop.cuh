@@ -31,10 +31,21 @@ template <typename T> POINT T largest(Vec3<T> a) {
 
 template <typename T> POINT bool finite(Vec3<T> a) { return isfinite(a.x) && isfinite(a.y) && isfinite(a.z); }
 
-// Euclidean norm without overflow or underflow; 1 for a zero vector.
+// The largest power of two in a size; 0 of one that has not all of its digits.
+POINT float power_of_two(float size) {
+  union { float number; unsigned int bits; } value = {size};
+  value.bits &= 0x7F800000u;
+  return value.number;
+}
+POINT double power_of_two(double size) {
+  union { double number; unsigned long long bits; } value = {size};
+  value.bits &= 0x7FF0000000000000ull;
+  return value.number;
+}
+
+// Euclidean norm without overflow or underflow; NaN of a zero vector.
 template <typename T> POINT T length(Vec3<T> a) {
   const T size = largest(a);
-  if (size == T(0)) return T(1);
   const Vec3<T> scaled = over(a, size);
   return size * sqrt(dot(scaled, scaled));
 }
@@ -79,12 +90,13 @@ template <typename T> POINT void write_row(T* rows, long long row, Vec3<T> v) {
 
 template <typename T> struct Pair { Vec3<T> s, y; T cosine; };
 
-// Divide a pair by |y|.
+// Divide a pair by sqrt(s.y).
 template <typename T> POINT Pair<T> normalised(Vec3<T> s, Vec3<T> y) {
-  const T size = length(y);
-  s = over(s, size);
-  y = over(y, size);
-  return {s, y, dot(over(s, length(s)), y)};
+  const T of_s = length(s), of_y = length(y);
+  s = over(s, of_s);
+  y = over(y, of_y);
+  const T cosine = dot(s, y);
+  return {times(s, sqrt(of_s / of_y / cosine)), times(y, sqrt(of_y / of_s / cosine)), cosine};
 }
 
 // The history of one point, [slots][8]: see opt3dgs_optim/lbfgs/history.py for the layout. K, at most 5,
@@ -95,7 +107,7 @@ template <typename T, int K> struct History {
 
   Lanes<T> s[slots], y[slots];
   Vec3<T> position, gradient;  // of the last visible step
-  T counter;                   // 0: never visible; c: holds c - 1 pairs
+  T steps;                     // in which the point was visible
 
   // `row` is the point's row of the history tensor; it has to begin at a multiple of 16 bytes.
   POINT explicit History(const T* row) {
@@ -107,11 +119,11 @@ template <typename T, int K> struct History {
     if constexpr (K > 3) {
       position = {s[0].spare, s[1].spare, s[2].spare};
       gradient = {y[0].spare, y[1].spare, y[2].spare};
-      counter = s[3].spare;
+      steps = s[3].spare;
     } else {
       position = s[K].v;
       gradient = y[K].v;
-      counter = s[K].spare;
+      steps = s[K].spare;
     }
   }
 
@@ -133,9 +145,9 @@ template <typename T, int K> struct History {
       y[0].spare = gradient.x;
       y[1].spare = gradient.y;
       y[2].spare = gradient.z;
-      s[3].spare = counter;
+      s[3].spare = steps;
     } else {
-      s[K] = {position, counter};
+      s[K] = {position, steps};
       y[K] = {gradient, T(0)};
     }
 #pragma unroll
@@ -146,34 +158,30 @@ template <typename T, int K> struct History {
   }
 };
 
-// 1 / s.y, or 0 for an empty slot.
-template <typename T> POINT T inverse(T sy) { return sy <= T(0) ? T(0) : T(1) / sy; }
-
-// Nocedal and Wright (2006), algorithm 7.4, for pairs with |y| = 1; an empty slot is zero.
+// Nocedal and Wright (2006), algorithm 7.4, for pairs with s.y = 1; an empty slot is zero.
 template <int K, typename T> POINT Vec3<T> recursion(Vec3<T> q, const History<T, K>& history) {
   T alpha[K];
 #pragma unroll
   for (int j = 0; j < K; ++j) {
     const Vec3<T> s = history.s[j].v, y = history.y[j].v;
-    alpha[j] = dot(s, q) * inverse(dot(s, y));
+    alpha[j] = dot(s, q);
     q = along(q, -alpha[j], y);
   }
-  // |y| = 1, hence gamma = s.y / y.y = s.y of the newest pair. No pair: r stays the gradient.
-  T gamma = dot(history.s[0].v, history.y[0].v);
-  if (gamma <= T(0)) gamma = T(1);
-  Vec3<T> r = times(q, gamma);
+  // s.y = 1, hence gamma = 1 / y.y of the newest pair. No pair: r stays the gradient.
+  T inverse_gamma = dot(history.y[0].v, history.y[0].v);
+  if (inverse_gamma <= T(0)) inverse_gamma = T(1);
+  Vec3<T> r = over(q, inverse_gamma);
 #pragma unroll
   for (int j = K - 1; j >= 0; --j) {
     const Vec3<T> s = history.s[j].v, y = history.y[j].v;
-    const T beta = dot(y, r) * inverse(dot(s, y));
-    r = along(r, alpha[j] - beta, s);
+    r = along(r, alpha[j] - dot(y, r), s);
   }
   return r;
 }
 
-// H g of one point. Divided by its largest component, the gradient keeps s.q in the floating-point range.
+// H g of one point. Divided by about its largest component, the gradient keeps s.q in the floating-point range.
 template <int K, typename T> POINT Vec3<T> two_loop_point(Vec3<T> grad, const T* row) {
-  const T size = largest(grad);
+  const T size = power_of_two(largest(grad));
   const T scale = size == T(0) ? T(1) : size;
   return times(recursion(over(grad, scale), History<T, K>(row)), scale);
 }
@@ -184,25 +192,23 @@ struct Flags { bool accepted, candidate; };
 template <int K, typename T>
 POINT Flags lqn_point(Vec3<T> position, Vec3<T> grad, T* row, T min_cosine, bool graft, Vec3<T>* fed) {
   *fed = grad;  // what every point without a usable result keeps, bit for bit
-  const T scale = largest(grad);
-  if (!finite(grad) || scale == T(0)) return {false, false};  // not visible: nothing changes
+  const T size = largest(grad);
+  if (!finite(grad) || size == T(0)) return {false, false};  // not visible: nothing changes
   History<T, K> history(row);
   const Pair<T> pair = normalised(along(position, T(-1), history.position), along(grad, T(-1), history.gradient));
-  const bool candidate = history.counter > T(0);
-  const bool accepted = candidate && pair.cosine > min_cosine;  // false where not finite
+  const bool candidate = history.steps > T(0);
+  const bool accepted = candidate && pair.cosine > min_cosine;  // false where zero or not finite
   history.position = position;
   history.gradient = grad;
-  if (!candidate) history.counter = T(1);
-  if (accepted && history.counter < T(K + 1)) history.counter += T(1);
+  history.steps += T(1);
   history.write(row, pair, accepted);
-  if (history.counter <= T(1)) return {accepted, candidate};
 
+  const T scale = power_of_two(size);
   const Vec3<T> unit = over(grad, scale);
   Vec3<T> r = recursion(unit, history);
-  const T size = length(r);
-  const bool descent = dot(unit, over(r, size)) > T(0);  // false where not finite
-  if (graft) r = times(r, sqrt(dot(unit, unit)) / size);
+  if (graft) r = times(r, length(unit) / length(r));  // 1 without pairs
   r = times(r, scale);
-  if (descent && finite(r)) *fed = r;
+  const T descent = dot(unit, r);
+  if (descent > T(0) && isfinite(descent)) *fed = r;
   return {accepted, candidate};
 }

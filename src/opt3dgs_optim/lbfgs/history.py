@@ -4,12 +4,13 @@ One point is one row, because density control edits optimizer state by rows; all
 history". Layout, [N, slots, 2 (D + 1)] for points of D coordinates and a history of K pairs:
 
     slot j, lanes 0 .. D-1        s, the parameter difference   } of the j-th newest pair, both
-    slot j, lanes D+1 .. 2D       y, the gradient difference    } divided by |y|
+    slot j, lanes D+1 .. 2D       y, the gradient difference    } divided by sqrt(s.y)
     lanes D and 2D + 1            spare; the header below lives in them
 
-The header holds the point's last visible position and gradient and a counter. With K > D it fits
-into the spare lanes of slots 0 .. D (slots = K: 160 bytes per point in float32 for K = 5, D = 3);
-otherwise it gets a slot of its own (slots = K + 1).
+So s.y = 1, and no reader of a pair divides by it. The header holds the point's last visible
+position and gradient, and the number of its visible steps. With K > D it fits into the spare lanes
+of slots 0 .. D (slots = K: 160 bytes per point in float32 for K = 5, D = 3); otherwise it gets a
+slot of its own (slots = K + 1).
 
 A new pair moves the older ones down: readers of a ring would have to gather. A history that torch
 computes on has the strides of [slots, lanes, N], its cells; one of the CUDA kernel is contiguous.
@@ -107,7 +108,7 @@ class Cells:
         dim, history_size: D and K.
         pairs: [K, 2, D, N], the newest first; of each s and y.
         last: position and gradient of the last visible step, [2, D, N].
-        counter: [N], 0: never visible; c: holds c - 1 pairs.
+        steps: [N], in which a point was visible; of floats, which end to count at 2^24.
     """
 
     def __init__(self, cells: Tensor, history_size: int) -> None:
@@ -118,10 +119,10 @@ class Cells:
         if history_size > dim:
             self.pairs = pairs
             self.last = halves[:dim, :, dim].transpose(0, 1)
-            self.counter = cells[dim, dim]
+            self.steps = cells[dim, dim]
         else:
             self.pairs, self.last = pairs[:history_size], pairs[history_size]
-            self.counter = cells[history_size, dim]
+            self.steps = cells[history_size, dim]
 
 
 def cells_of(history: Tensor, rows: slice = slice(None)) -> Tensor:
@@ -133,7 +134,7 @@ def cells_of(history: Tensor, rows: slice = slice(None)) -> Tensor:
 def push(cells: Cells, vectors: Tensor, accepted: Tensor) -> None:
     """Put a pair [2, D, N] in front of the others where `accepted` (bool) says, in place."""
     bits = BITS[vectors.dtype]
-    stored, new, chosen = cells.pairs.view(bits), vectors.view(bits), bits_of(accepted, bits)
+    stored, new, chosen = cells.pairs.view(bits), vectors.view(bits), bits_of(accepted)
     overwrite(stored[1:], stored[:-1], chosen)
     overwrite(stored[0], new, chosen)
 
@@ -152,14 +153,13 @@ def take_pairs(
     `accepted` and `candidates` [N] bool are changed in place.
     """
     pair = normalised(seen - cells.last)
-    torch.bitwise_and(visible, cells.counter > 0, out=candidates)
-    # False where the pair is not finite.
+    torch.logical_and(visible, cells.steps, out=candidates)
+    # False where the pair is zero or not finite.
     torch.gt(pair.cosine, min_cosine, out=accepted).bitwise_and_(candidates)
     push(cells, pair.vectors, accepted)
     bits = BITS[seen.dtype]
-    overwrite(cells.last.view(bits), seen.view(bits), bits_of(visible, bits))
-    torch.maximum(cells.counter, visible, out=cells.counter)
-    cells.counter.add_(accepted).clamp_(max=cells.history_size + 1)
+    overwrite(cells.last.view(bits), seen.view(bits), bits_of(visible))
+    cells.steps.add_(visible)
 
 
 def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:
@@ -169,7 +169,7 @@ def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:
     Hessian B of the point's own function. A pair with s.y > 0 is kept; for a point without one, as
     where the function is concave along s, or where a number is not finite, that pair is left out,
     and the point holds one pair less. H would not be positive definite with it. Both vectors of a
-    pair are stored divided by |y|, which changes nothing: H depends on their ratio.
+    pair are stored divided by sqrt(s.y), which changes nothing: H depends on their ratio.
 
     Args:
         s: [K, N, D] differences of the parameters of N points of D coordinates, in the parameters'
@@ -208,10 +208,7 @@ def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:
     kernel = s.is_cuda and obstacle("auto", s.device, s.dtype, s.shape[2], size) is None
     history = new_history(s[0], size)
     cells = Cells(cells_of(history), size)
-    cells.counter.fill_(1)
     for k in range(size):
         pair = normalised(columns(s[k], y[k]))
-        accepted = pair.cosine > 0  # false where it is not finite
-        push(cells, pair.vectors, accepted)
-        cells.counter.add_(accepted)
+        push(cells, pair.vectors, pair.cosine > 0)  # false where it is not finite
     return laid_out(history, contiguous=kernel)

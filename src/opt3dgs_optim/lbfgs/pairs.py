@@ -13,18 +13,19 @@ from torch import Tensor
 CHUNK = 16384  # rows that a CPU works on at a time, so that intermediates stay in its cache
 DEVICE_CHUNK = 1 << 20  # rows that fill any GPU; intermediates are some 500 bytes per row
 BITS = {torch.float32: torch.int32, torch.float64: torch.int64}  # by the dtypes of points
+EXPONENTS = {torch.float32: 0x7F800000, torch.float64: 0x7FF0000000000000}  # of their bits
 
 
 class Pair(NamedTuple):
     """A candidate curvature pair of every point."""
 
-    vectors: Tensor  # [2, D, N]: s and y, both divided by |y|; y is 0 where gradients were equal
-    cosine: Tensor  # [N] s.y / (|s| |y|); 0 where s or y is zero, NaN where they are not finite
+    vectors: Tensor  # [2, D, N]: s and y, both divided by sqrt(s.y); not finite unless s.y > 0
+    cosine: Tensor  # [N] s.y / (|s| |y|); NaN where s or y is zero or not finite
 
 
-def bits_of(mask: Tensor, bits: torch.dtype) -> Tensor:
-    """All bits of a chosen point's numbers: what `overwrite` takes of `mask` (bool)."""
-    return mask.to(bits).neg_()
+def bits_of(mask: Tensor) -> Tensor:
+    """All bits of a chosen point, [N] int8: what `overwrite` takes of `mask` (bool)."""
+    return mask.view(torch.int8).neg()  # -1, which is all bits of wider integers, too
 
 
 def overwrite(old: Tensor, new: Tensor, chosen: Tensor) -> None:
@@ -46,8 +47,17 @@ def largest(x: Tensor) -> Tensor:
     return x.abs().amax(0)
 
 
+def power_of_two(sizes: Tensor) -> Tensor:
+    """The largest one in every size, in place; 0 of less than dtypes hold at full precision.
+
+    To divide by it and to multiply by it again changes no digit.
+    """
+    sizes.view(BITS[sizes.dtype]).bitwise_and_(EXPONENTS[sizes.dtype])
+    return sizes
+
+
 def length(x: Tensor) -> Tensor:
-    """Euclidean norm of vectors [.., D, N] without overflow or underflow, [.., N]; 1 of zero."""
+    """Euclidean norm of vectors [.., D, N] without overflow or underflow, [.., N]."""
     norms = x.abs() if x.shape[-2] == 1 else x
     while (count := norms.shape[-2]) > 1:  # by halves: D may be the size of a network
         half = count // 2
@@ -55,14 +65,16 @@ def length(x: Tensor) -> Tensor:
         norms = torch.hypot(first, norms[..., half : 2 * half, :])
         if count % 2:
             torch.hypot(norms[..., :1, :], last, out=norms[..., :1, :])
-    return torch.threshold(norms.squeeze(-2), 0.0, 1.0)
+    return norms.squeeze(-2)
 
 
 def normalised(vectors: Tensor) -> Pair:
-    """Divide a pair [2, D, N] by |y|, in place, without overflow or underflow on the way."""
+    """Divide a pair [2, D, N] by sqrt(s.y), in place, without overflow or underflow on the way."""
     lengths = length(vectors)
-    units = vectors / lengths.unsqueeze(1)
-    return Pair(vectors.div_(lengths[1]), dot(units[0], units[1]))
+    units = vectors.div_(lengths.unsqueeze(1))
+    cosine = dot(units[0], units[1])
+    factors = (lengths / lengths.flip(0)).div_(cosine).sqrt_()
+    return Pair(units.mul_(factors.unsqueeze(1)), cosine)
 
 
 def row_chunks(points: Tensor) -> list[slice]:

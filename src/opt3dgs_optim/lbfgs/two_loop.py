@@ -7,7 +7,15 @@ from opt3dgs_optim import cuda
 from opt3dgs_optim.backend import BACKENDS, Backend, obstacle
 from opt3dgs_optim.checks import check_choice
 from opt3dgs_optim.lbfgs.history import Cells, cells_of, check_alike, check_history, take_pairs
-from opt3dgs_optim.lbfgs.pairs import columns, dot, largest, length, put, row_chunks
+from opt3dgs_optim.lbfgs.pairs import (
+    columns,
+    dot,
+    largest,
+    length,
+    power_of_two,
+    put,
+    row_chunks,
+)
 
 
 def two_loop(
@@ -47,8 +55,8 @@ def two_loop(
 
     Returns:
         [N, D] of the gradient's dtype and device, in the parameters' units; the search direction is
-        its negative. A point without pairs gets its gradient back, to rounding. A point whose
-        gradient is not finite gets NaN.
+        its negative. A point without pairs gets its gradient back. A point whose gradient is not
+        finite gets NaN.
 
     Raises:
         TypeError: the gradient is no tensor of float32 or float64.
@@ -75,7 +83,8 @@ def two_loop(
     with torch.no_grad():
         for rows in row_chunks(grad):
             (g,) = columns(grad[rows])
-            scale = torch.threshold(largest(g), 0.0, 1.0)  # keeps s.q finite
+            # keeps s.q finite
+            scale = torch.threshold_(power_of_two(largest(g)), 0.0, 1.0)
             cells = Cells(cells_of(history, rows), history_size)
             put(result[rows], recursion(g / scale, cells).mul_(scale))
     return result
@@ -96,24 +105,22 @@ def by_kernel(call: str, grad: Tensor, history_size: int, backend: str, given: b
 
 
 def recursion(grad: Tensor, cells: Cells) -> Tensor:
-    """`two_loop` for gradients [D, N] of moderate size.
+    """`two_loop` for gradients [D, N] of moderate size, in place.
 
-    |y| = 1 where there is a pair, and s = y = 0 where there is none.
+    s.y = 1 where there is a pair, and s = y = 0 where there is none.
     """
-    sy = dot(cells.pairs[:, 0], cells.pairs[:, 1])
-    # |y| = 1, hence gamma = s.y / y.y = s.y. No pair: gamma = 1, and r stays the gradient.
-    gamma = torch.threshold(sy[0], 0.0, 1.0)
-    inverses = torch.threshold_(sy, 0.0, torch.inf).reciprocal_().unbind()  # no pair: 0
     vectors = cells.pairs.flatten(0, 1).unbind()
-    pairs = list(zip(vectors[::2], vectors[1::2], inverses, strict=True))
-    r, alphas = grad.clone(), []
-    for s, y, inverse in pairs:  # newest to oldest
-        alphas.append(dot(s, r).mul_(inverse))
+    pairs = list(zip(vectors[::2], vectors[1::2], strict=True))
+    newest = pairs[0][1]
+    # s.y = 1, hence gamma = 1 / y.y. No pair: gamma = 1, and r stays the gradient.
+    inverse_gamma = torch.threshold(dot(newest, newest), 0.0, 1.0)
+    r, alphas = grad, []
+    for s, y in pairs:  # newest to oldest
+        alphas.append(dot(s, r))
         r.addcmul_(alphas[-1], y, value=-1)
-    r.mul_(gamma)
-    for s, y, inverse in reversed(pairs):
-        beta = dot(y, r).mul_(inverse)
-        r.addcmul_(alphas.pop().sub_(beta), s)
+    r.div_(inverse_gamma)
+    for s, y in reversed(pairs):
+        r.addcmul_(alphas.pop().sub_(dot(y, r)), s)
     return r
 
 
@@ -152,14 +159,14 @@ def lqn_direction(
     if by_kernel(call, grad, history_size, backend, grad.is_cuda):
         return cuda.lqn_direction(position, grad, history, history_size, min_cosine, graft)
     fed = torch.empty_like(grad, memory_format=torch.contiguous_format)
-    accepted = torch.empty(grad.shape[0], dtype=torch.bool, device=grad.device)
-    candidates = torch.empty_like(accepted)
+    flags = torch.empty(2, grad.shape[0], dtype=torch.bool, device=grad.device)
+    accepted, candidates = flags.unbind()
     with torch.no_grad():
         for rows in row_chunks(grad):  # while a chunk is in the cache
             seen = columns(position[rows], grad[rows])
             g = seen[1]
-            size = largest(g)  # NaN where the gradient has one, which is not < inf
-            visible = (size > 0).bitwise_and_(size < torch.inf)
+            size = largest(g).nan_to_num_(0.0, 0.0)
+            visible = size > 0
             chunk = cells_of(history, rows)
             cells = Cells(chunk, history_size)
             take_pairs(cells, seen, visible, min_cosine, accepted[rows], candidates[rows])
@@ -169,15 +176,19 @@ def lqn_direction(
     return fed, accepted, candidates
 
 
-def direction(grad: Tensor, scale: Tensor, cells: Cells, graft: bool) -> Tensor:
-    """What Adam is fed, [D, N] of gradients [D, N] and their largest component [N]."""
-    scale = torch.threshold(scale, 0.0, 1.0)
-    unit = grad / scale  # keeps s.q finite
-    result = recursion(unit, cells)
-    along = result / length(result)
-    # Zero where the gradient is, NaN where the result is not finite.
-    usable = dot(unit, along) > 0
-    usable &= cells.counter > 1
-    found = along.mul_(length(grad)) if graft else result.mul_(scale)
-    usable &= largest(found) < torch.inf
-    return torch.where(usable, found, grad)
+def direction(grad: Tensor, size: Tensor, cells: Cells, graft: bool) -> Tensor:
+    """What Adam is fed, [D, N] of gradients [D, N] and their largest component [N].
+
+    `size` is 0 where the gradient is not finite. It is used up.
+    """
+    scale = power_of_two(size)
+    both = grad.expand(2, *grad.shape) / scale  # keeps s.q finite
+    unit, found = both.unbind()
+    recursion(found, cells)
+    if graft:
+        lengths = length(both)
+        found.mul_(lengths[0].div_(lengths[1]))  # 1 without pairs
+    found.mul_(scale)
+    # NaN where the gradient is zero, or either is not finite.
+    descent = dot(unit, found).nan_to_num_(0.0, 0.0)
+    return torch.where(descent > 0, found, grad)
