@@ -268,6 +268,6 @@ def test_rows_are_overwritten_bit_for_bit(dtype: torch.dtype) -> None:
     mask = torch.arange(len(old)) % 3 == 0
     found = torch.stack([old, old])
     bits = BITS[dtype]
-    overwrite(found.view(bits), torch.stack([new, old]).view(bits), bits_of(mask, bits))
+    overwrite(found.view(bits), torch.stack([new, old]).view(bits), bits_of(mask))
     assert torch.equal(found[0].view(bits), torch.where(mask, new.view(bits), old.view(bits)))
     assert torch.equal(found[1].view(bits), old.view(bits))
