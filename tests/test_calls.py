@@ -32,8 +32,8 @@ MOST = {
     "upgrade": (41, 7, 208),
     "iteration": (25, 8, 78),
     "iteration, at most": (30, 9, 84),  # one that looks who is out of view
-    "last thirtieth": (30, 9, 108),
-    "last thirtieth, at most": (35, 10, 114),
+    "last thirtieth": (29, 9, 102),
+    "last thirtieth, at most": (34, 10, 108),
 }
 
 

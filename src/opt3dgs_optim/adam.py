@@ -278,7 +278,7 @@ class StepAdam(Adam):
         elif bad := take_step(step, hyper):
             course.count_nonfinite(bad)
         if lane.keeps or lane.acting[course.exploiting][2]:
-            self.finish_step(lane, step)
+            lane.finish(step, course)
 
     def own_class_step(self, *args: Any, **options: Any) -> Any:
         """The step of the class that it had, without torch's hooks, which `step` runs already."""
@@ -286,13 +286,6 @@ class StepAdam(Adam):
         return (step.__wrapped__ if getattr(step, "hooked", False) else step)(
             self, *args, **options
         )
-
-    def finish_step(self, lane: Lane, step: Step) -> None:
-        """What comes after the arithmetic: parts of one's own, and a note of what is left."""
-        for part in lane.acting[self.course.exploiting][2]:
-            part.after(step, self.course)
-        if lane.keeps:
-            lane.note(step.state)
 
     # -- rows and checkpoints ----------------------------------------------------------------------
 

@@ -7,9 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from opt3dgs_optim.course import Course
 from opt3dgs_optim.moments import CODES
 from opt3dgs_optim.part import Part, Phase, overrides
-from opt3dgs_optim.step import GRIDS
+from opt3dgs_optim.step import GRIDS, Step
 
 MOMENTS = ("exp_avg", "exp_avg_sq")  # torch's names
 MEAN, BEGAN = "averaging.mean", "averaging.began"  # ours, of the rows
@@ -78,7 +79,7 @@ class Lane:
         coded = self.grid is not None and state["exp_avg"].dtype is CODES
         key, param = RESIDUE if coded else MEAN, self.param
         mean, began = state.get(key), state.get(BEGAN)
-        if mean is None or began is None or len(began) != param.size(0):  # rows are others now
+        if mean is None or began is None or began.numel() != param.size(0):  # rows are others now
             for each in OF_MEAN:
                 state.pop(each, None)
             mean = self.keep(state, key, tuple(param.shape), CODES if coded else None)
@@ -103,9 +104,15 @@ class Lane:
                 for each in OF_MEAN if key in OF_MEAN else (key,):  # they belong together
                     state.pop(each, None)
 
-    def note(self, state: dict[str, Any]) -> None:
-        """Note how the step leaves the rows, by which edits of them show at the next one."""
-        self.version = self.param._version
-        for key in KEPT:
-            if key in state:
-                self.noted[key] = state[key], state[key]._version
+    def finish(self, step: Step, course: Course) -> None:
+        """What comes after the arithmetic: parts of one's own, and a note of what is left.
+
+        By the note, edits of rows show at the next step.
+        """
+        for part in self.acting[course.exploiting][2]:
+            part.after(step, course)
+        if self.keeps:
+            self.version, state = self.param._version, step.state
+            for key in KEPT:
+                if (kept := state.get(key)) is not None:
+                    self.noted[key] = kept, kept._version

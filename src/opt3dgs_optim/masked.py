@@ -73,7 +73,7 @@ def step_around(
         if step.mean is not None:
             made = int(step.state["step"])  # steps, not iterations
             take_into_mean(made, step.mean, step.param, *lane.mean_of(step.state))
-        optimizer.finish_step(lane, step)
+        lane.finish(step, optimizer.course)
 
 
 def _give(step: Step, axes: Axes | None, course: Course) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -70,6 +72,35 @@ def programs(shape: tuple[int, ...], options: Any) -> int:
     if options.get("frame"):
         return -(shape[0] // -128)
     return -(torch.Size(shape).numel() // -1024)
+
+
+def test_a_kernel_is_launched_on_the_gpu_of_its_tensors(
+    driver: FakeDriver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class There(torch.Tensor):
+        def get_device(self) -> int:
+            return 1
+
+    current = [0]
+
+    @contextmanager
+    def on(device: int) -> Iterator[None]:
+        current.append(device)
+        yield
+        current.append(0)
+
+    monkeypatch.setattr(triton, "several_gpus", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: current[-1])
+    monkeypatch.setattr(torch.cuda, "device", on)
+    step, hyper = case((9, 3), torch.Generator().manual_seed(0))
+    for _ in range(2):
+        triton.launch(step, hyper)
+    assert current == [0]  # that of the CPU is every GPU's
+    step.param = step.param.as_subclass(There)
+    for _ in range(2):
+        triton.launch(step, hyper)
+    assert current == [0, 1, 0, 1, 0]
+    assert len(driver.launched) == 4
 
 
 def test_nothing_that_changes_from_step_to_step_compiles_anew(driver: FakeDriver) -> None:

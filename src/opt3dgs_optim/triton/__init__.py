@@ -6,7 +6,6 @@ tensor on a GPU. Where it is missing, or cannot compile, `opt3dgs_optim.step.tak
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import importlib
 import os
@@ -24,9 +23,9 @@ from opt3dgs_optim.step import Hyper, Step
 
 ROWS_BLOCK, FRAME_BLOCK, LOOK_BLOCK = 1024, 128, 1024  # as in `kernels`
 WARPS = {"step_rows": 8, "step_in_own_frame": 2, "look_at_positions": 4}  # fastest on an H200
+DTYPES = (torch.float32, CODES)  # of the kernels
 MAX_WIDTH = 2**20 - ROWS_BLOCK  # numbers of a row: see `kernels.rows_of`
 NO_FADE = (0, 0.0, 1.0, 1.0)
-_HERE = contextlib.nullcontext()
 _COMPILED: dict[Any, Any] = {}  # what Triton has compiled, by what it depends on
 CHECK = "opt3dgs_optim.triton.check"  # run as a program, with Triton's interpreter
 
@@ -78,7 +77,7 @@ def fits(step: Step) -> bool:
     """`takes`, wherever the tensors lie."""
     state, frame = step.state, step.frame
     for tensor in (step.param, step.grad, state["exp_avg"], state["exp_avg_sq"]):
-        if tensor.dtype not in (torch.float32, CODES) or not tensor.is_contiguous():
+        if tensor.dtype not in DTYPES or not tensor.is_contiguous():
             return False
     if frame is None:
         numbers = step.param.numel()
@@ -100,8 +99,7 @@ def take_step(step: Step, hyper: Hyper) -> None:
     Numbers that are not finite are added to `hyper.nonfinite` [1] int32. Nothing waits for the
     device, and nothing is allocated there.
     """
-    with _device_of(step.param):
-        launch(step, hyper)
+    launch(step, hyper)
     # Autograd is to see that a parameter has changed, as after an operator of torch's.
     torch.autograd.graph.increment_version(step.param)
 
@@ -124,18 +122,10 @@ def look(
             that has or had one; or None.
     """
     mask = None if out_of_view is None else out_of_view.view(torch.uint8)
-    with _device_of(grad):
-        _run(
-            "look_at_positions", -(-len(grad) // LOOK_BLOCK), (grad, exp_avg_sq, mask, counter),
-            (len(grad),), (exp_avg_sq is not None and exp_avg_sq.dtype is CODES, False),
-        )  # fmt: skip
-
-
-def _device_of(tensor: Tensor) -> Any:
-    """A context in which kernels are launched where a tensor lies."""
-    index = tensor.get_device()
-    other = several_gpus() and index not in (-1, torch.cuda.current_device())
-    return torch.cuda.device(index) if other else _HERE
+    _run(
+        "look_at_positions", -(-len(grad) // LOOK_BLOCK), (grad, exp_avg_sq, mask, counter),
+        (len(grad),), (exp_avg_sq is not None and exp_avg_sq.dtype is CODES, False),
+    )  # fmt: skip
 
 
 def launch(step: Step, hyper: Hyper) -> None:
@@ -157,7 +147,7 @@ def launch(step: Step, hyper: Hyper) -> None:
     coded = hyper.exp_avg.dtype is CODES, mean is not None and mean.dtype is CODES
     adam = (
         hyper.beta2, 1 - hyper.beta1, 1 - hyper.beta2, hyper.eps, hyper.root2, hyper.shrink,
-        hyper.decay, _signed(hyper.key),
+        hyper.decay, hyper.key and _signed(hyper.key),
     )  # fmt: skip
     if frame is not None:
         _run(
@@ -174,7 +164,7 @@ def launch(step: Step, hyper: Hyper) -> None:
         "step_rows", -(-numbers // ROWS_BLOCK),
         (param, step.grad, m, v, mean, began, held, on_device, hyper.nonfinite),
         (numbers, numbers // param.shape[0] if param.dim() else 1, size, *adam,
-         _signed(key), share, fade_m, fade_v, weight, number, put, hyper.grid),
+         key and _signed(key), share, fade_m, fade_v, weight, number, put, hyper.grid),
         coded,
     )  # fmt: skip
 
@@ -198,7 +188,11 @@ def _run(
     pointers = [None if tensor is None else tensor.data_ptr() for tensor in tensors]
     first = tensors[0]
     assert first is not None
-    device = first.get_device()
+    device = first.get_device()  # -1: the CPU
+    if several_gpus() and device not in (-1, torch.cuda.current_device()):
+        with torch.cuda.device(device):
+            _run(name, programs, tensors, numbers, coded)
+        return
     key = name, coded, device, numbers[0] >= 2**31, *[p and p & 15 for p in pointers]
     compiled = _COMPILED.get(key)
     if compiled is not None:
