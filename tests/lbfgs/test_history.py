@@ -22,7 +22,14 @@ from opt3dgs_optim.lbfgs.history import (
     laid_out,
     push,
 )
-from opt3dgs_optim.lbfgs.pairs import BITS, bits_of, length, normalised, overwrite
+from opt3dgs_optim.lbfgs.pairs import (
+    BITS,
+    bits_of,
+    length,
+    normalised,
+    overwrite,
+    power_of_two,
+)
 
 F64 = torch.float64
 
@@ -169,6 +176,15 @@ def test_length_of_vectors(size: float) -> None:
     assert float(found[1]) == 0.0
     # float32; a denormal has few digits, but the same ones on both sides
     torch.testing.assert_close(found[[0, 2]].double(), expected[[0, 2]], rtol=1e-6, atol=1.5e-45)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_power_of_two_in_a_number(dtype: torch.dtype) -> None:
+    least = torch.finfo(dtype).tiny
+    numbers = torch.tensor([1.0, 3.0, 5.0, 0.1, least, least / 2, 0.0, torch.inf], dtype=dtype)
+    below = torch.nextafter(numbers[:4], torch.zeros(4, dtype=dtype))
+    found = power_of_two(torch.cat([numbers, below])).tolist()
+    assert found == [1, 2, 4, 0.0625, least, 0, 0, torch.inf, 0.5, 2, 4, 0.0625]
 
 
 # -- where it lies ---------------------------------------------------------------------------------

@@ -287,6 +287,13 @@ def test_pairs_that_describe_no_curvature_are_left_out(
             torch.testing.assert_close(found[row], expected, rtol=1e-12, atol=1e-14)
 
 
+def test_a_pair_at_right_angles_is_left_out() -> None:
+    s, y = torch.tensor([[[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]])[:, None]
+    history = history_from_pairs(s, y)
+    assert not bool(history.any())
+    assert torch.equal(two_loop(y[0], history, 1), y[0])
+
+
 def test_a_gradient_that_is_not_finite_is_nan_and_the_others_are_not() -> None:
     s, y, _ = convex_pairs(3, 3, 4, 0)
     g = gradients(4, 3, 0)
