@@ -57,7 +57,9 @@ def test_free_running_with_every_option(kernels: dict, size: int, changed: dict)
     assert compare_runs(kernels[size, torch.float64], 257, size, **changed) < 1e-10
 
 
-def recorded_steps(rows: int, size: int, steps: int = 13) -> list[tuple[Tensor, Tensor, Tensor]]:
+def recorded_steps(
+    rows: int, size: int, steps: int = 13, min_cosine: float = OPTIONS["min_cosine"]
+) -> list[tuple[Tensor, Tensor, Tensor]]:
     """Position, gradient and the history before it, of each step of a run of pure torch."""
     problem = Problem(rows)
     x = problem.start.clone()
@@ -67,7 +69,8 @@ def recorded_steps(rows: int, size: int, steps: int = 13) -> list[tuple[Tensor, 
         history[reset] = 0
         grad = problem.gradient(x, noise, kind)
         states.append((x.clone(), grad, history.clone()))
-        direction, _, _ = lqn_direction(x, grad, history, size, **OPTIONS)  # pyright: ignore
+        options = {**OPTIONS, "min_cosine": min_cosine}
+        direction, _, _ = lqn_direction(x, grad, history, size, **options)  # pyright: ignore
         x = x - 0.05 * torch.nan_to_num(direction, nan=0.0, posinf=0.0, neginf=0.0)
     return states
 
@@ -80,7 +83,7 @@ def test_single_steps_in_float32(kernels: dict, size: int) -> None:
     keeps them out here.
     """
     options = {**OPTIONS, "min_cosine": 0.1}
-    for state in recorded_steps(1000, size):
+    for state in recorded_steps(1000, size, min_cosine=0.1):
         x, grad, before = (t.float() for t in state)
         ours, theirs = before.clone(), before.contiguous()
         expected = lqn_direction(x, grad, ours, size, **options)  # pyright: ignore
