@@ -322,8 +322,8 @@ def pseudo_gradient(position: Tensor, grad: Tensor, own: dict) -> Tensor:
     x, g = (torch.where(visible[:, None], *each) for each in ((position, x), (grad, g)))
     own["pairs"], own["visible_before"] = (x, g, s, y), visible | before
 
-    # Divided by a power of two of about its largest component, the gradient keeps all products in
-    # float32, and all its digits.
+    # Divided by the power of two in its largest component, the gradient keeps its digits, and all
+    # products stay in float32.
     mantissa, exponent = torch.frexp(largest(grad))
     scale = torch.ldexp(torch.ones_like(mantissa), exponent - 1)[:, None]
     unit = grad / scale

@@ -179,7 +179,7 @@ template <int K, typename T> POINT Vec3<T> recursion(Vec3<T> q, const History<T,
   return r;
 }
 
-// H g of one point. Divided by about its largest component, the gradient keeps s.q in the floating-point range.
+// H g of one point. Divided by the power of two in its largest component, the gradient keeps s.q in range.
 template <int K, typename T> POINT Vec3<T> two_loop_point(Vec3<T> grad, const T* row) {
   const T size = power_of_two(largest(grad));
   const T scale = size == T(0) ? T(1) : size;

@@ -108,7 +108,7 @@ class Cells:
         dim, history_size: D and K.
         pairs: [K, 2, D, N], the newest first; of each s and y.
         last: position and gradient of the last visible step, [2, D, N].
-        steps: [N], in which a point was visible; of floats, which end to count at 2^24.
+        steps: [N], in which a point was visible; as floats they stop at 2^24.
     """
 
     def __init__(self, cells: Tensor, history_size: int) -> None:

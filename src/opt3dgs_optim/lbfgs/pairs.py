@@ -48,9 +48,9 @@ def largest(x: Tensor) -> Tensor:
 
 
 def power_of_two(sizes: Tensor) -> Tensor:
-    """The largest one in every size, in place; 0 of less than dtypes hold at full precision.
+    """The largest power of two in each size, in place; 0 of a subnormal number.
 
-    To divide by it and to multiply by it again changes no digit.
+    Dividing by it and multiplying by it again changes no digit.
     """
     sizes.view(BITS[sizes.dtype]).bitwise_and_(EXPONENTS[sizes.dtype])
     return sizes

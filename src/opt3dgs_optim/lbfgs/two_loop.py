@@ -179,7 +179,7 @@ def lqn_direction(
 def direction(grad: Tensor, size: Tensor, cells: Cells, graft: bool) -> Tensor:
     """What Adam is fed, [D, N] of gradients [D, N] and their largest component [N].
 
-    `size` is 0 where the gradient is not finite. It is used up.
+    `size` is 0 where the gradient is not finite. It is overwritten.
     """
     scale = power_of_two(size)
     both = grad.expand(2, *grad.shape) / scale  # keeps s.q finite
