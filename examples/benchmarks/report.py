@@ -367,8 +367,8 @@ NAMES = {
 TABLES: dict[str, Callable[[Evidence], str]] = {
     f.__name__: f
     for f in (
-        front, iterations, quarter, kept_aside, gpu, gpu_step, gpu_iteration, bits, equal, short, cost, few,
-        adaptive, capture, closed,
+        front, iterations, quarter, kept_aside, gpu, gpu_step, gpu_iteration, bits, equal, short,
+        cost, few, adaptive, capture, closed,
     )
 }  # fmt: skip
 
