@@ -27,6 +27,7 @@ PICTURE = evidence.FILE.with_name("iterations.png")
 MAIN = ("bonsai", "lego", "plush")
 FEW = ("banana", "brighton_beach", "embedded", "lund_door")
 HALF: dict[str, Any] = {"size": "images_2", "points": 50_000, "sh_degree": 0}
+WHOLE: dict[str, Any] = {"size": "images", "points": 200_000, "sh_degree": 3}
 QUARTER: dict[str, Any] = {"size": "images_4", "sh_degree": 0}
 METRICS = ("psnr", "ssim", "lpips")
 FORMS = {"psnr": "{:.2f}", "ssim": "{:.4f}", "lpips": "{:.4f}"}
@@ -282,6 +283,25 @@ def few(all_: Evidence) -> str:
     return table(heads, rows)
 
 
+EVENTS = (  # size, iterations, arms with fewer and with more events of `Fading`, how many they have
+    ("half", HALF, 10_000, "own", "own-fourth", "102", "200"),
+    ("whole", WHOLE, 7_500, "own", "own-1200-events", "41", "120"),
+    ("whole", WHOLE, 7_500, "own", "own-fourth", "41", "141"),
+)
+
+
+def events(all_: Evidence) -> str:
+    """More events of `Fading`, each beside the same training with fewer."""
+    rows = []
+    for size, setting, count, few_, many, fewer, more in EVENTS:
+        for scene in MAIN:
+            pair = [all_.of(arm, scene, iterations=count, **setting) for arm in (few_, many)]
+            if all(pair):
+                rows.append((scene, size, fewer, shown(pair[0]), more, gained(*pair[::-1])))
+    heads = ("scene", "size", "events", "PSNR / SSIM / LPIPS", "more events", "what they change")
+    return table(heads, rows)
+
+
 def adaptive(all_: Evidence) -> str:
     """Clone, split, prune and reset."""
     rows = []
@@ -368,7 +388,7 @@ TABLES: dict[str, Callable[[Evidence], str]] = {
     f.__name__: f
     for f in (
         front, iterations, quarter, kept_aside, gpu, gpu_step, gpu_iteration, bits, equal, short,
-        cost, few, adaptive, capture, closed,
+        cost, few, events, adaptive, capture, closed,
     )
 }  # fmt: skip
 
