@@ -155,7 +155,7 @@ def events_before(iteration: int, total: int) -> int:
 
 def happens(event: int, num_points: int) -> bool:
     """Whether an event happens: of more than 10,000 points, fewer of them do."""
-    share = min(1.0, 10_000 / max(num_points, 1)) ** (2 / 3)
+    share = max(min(1.0, 10_000 / max(num_points, 1)) ** (2 / 3), 1 / 3)
     return int((event + 1) * share) > int(event * share)
 
 

@@ -67,7 +67,7 @@ def test_events_are_in_their_stretch_and_four_iterations_apart(
 @given(count=st.integers(1, 2_000_000))
 def test_of_more_than_ten_thousand_points_some_events_happen(count: int) -> None:
     happened = sum(Fading().happens(event, count) for event in range(300))
-    assert happened == int(300 * min(1.0, 10_000 / count) ** (2 / 3))
+    assert happened == int(300 * max(min(1.0, 10_000 / count) ** (2 / 3), 1 / 3))
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from opt3dgs_optim.step import Fade, Step, chosen_rows, mixed
 
 CALL = "Fading"
 MAX_POINTS_OF_ALL_EVENTS = 10_000  # of more points, fewer of the events happen
+FEWEST_EVENTS = 1 / 3  # of all, however many points there are
 # In 600 iterations, events 1 apart lose half of what events 4 apart gain.
 MIN_ITERATIONS_BETWEEN_EVENTS = 4
 
@@ -117,7 +118,9 @@ class Fading(Part):
 
 def share_of_events(num_points: int) -> float:
     """Of all events, those that fade any of so many points."""
-    return min(1.0, MAX_POINTS_OF_ALL_EVENTS / num_points) ** (2 / 3) if num_points else 0.0
+    if not num_points:
+        return 0.0
+    return max(min(1.0, MAX_POINTS_OF_ALL_EVENTS / num_points) ** (2 / 3), FEWEST_EVENTS)
 
 
 @functools.lru_cache(maxsize=64)  # every parameter asks for the same two iterations
