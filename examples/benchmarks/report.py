@@ -183,7 +183,7 @@ def gpu(all_: Evidence) -> str:
     for scene in sorted({x["scene"] for x in found}):
         those = [x for x in found if x["scene"] == scene]
         stock = [x for x in those if x["arm"] == "mcmc" and x["iterations"] == 15_000]
-        for line in (*stock, *(x for x in those if x["arm"] == "own")):
+        for line in (*stock, *(x for x in those if x["arm"] == "own-41-events")):
             name = f"{NAMES[line['arm']]}, {line['iterations']:,}"
             less = "" if line in stock else gained([line], stock).removesuffix(" (1 seed)")
             ends = shown([line]).removesuffix(" (1 seed)")
@@ -285,8 +285,9 @@ def few(all_: Evidence) -> str:
 
 EVENTS = (  # size, iterations, arms with fewer and with more events of `Fading`, how many they have
     ("half", HALF, 10_000, "own", "own-fourth", "102", "200"),
-    ("whole", WHOLE, 7_500, "own", "own-1200-events", "41", "120"),
-    ("whole", WHOLE, 7_500, "own", "own-fourth", "41", "141"),
+    ("whole", WHOLE, 7_500, "own-41-events", "own", "41", "100"),
+    ("whole", WHOLE, 7_500, "own-41-events", "own-120-events", "41", "120"),
+    ("whole", WHOLE, 7_500, "own-41-events", "own-fourth", "41", "141"),
 )
 
 
@@ -374,6 +375,7 @@ def spread(values: Sequence[float], metric: str) -> str:
 NAMES = {
     "mcmc": "stock",
     "own": "own frame",
+    "own-41-events": "own frame, 41 events of `Fading`",
     "defaults": "fading (the defaults before)",
     "x2": "rates times 2",
     "x3": "rates times 3",
