@@ -183,7 +183,8 @@ def gpu(all_: Evidence) -> str:
     for scene in sorted({x["scene"] for x in found}):
         those = [x for x in found if x["scene"] == scene]
         stock = [x for x in those if x["arm"] == "mcmc" and x["iterations"] == 15_000]
-        for line in (*stock, *(x for x in those if x["arm"] == "own-41-events")):
+        ours = [x for x in those if x["arm"] in ("own-41-events", "own")]
+        for line in (*stock, *ours):
             name = f"{NAMES[line['arm']]}, {line['iterations']:,}"
             less = "" if line in stock else gained([line], stock).removesuffix(" (1 seed)")
             ends = shown([line]).removesuffix(" (1 seed)")

@@ -63,11 +63,9 @@ def of(*parts: Part) -> Callable[[int], Sequence[Part]]:
     return lambda _iterations: [*parts]
 
 
-def own(
-    events: int = 300, rate: float = 0.1, final: float = 0.01
-) -> Callable[[int], Sequence[Part]]:
+def own(events: int = 300, rate: float = 0.1) -> Callable[[int], Sequence[Part]]:
     """Steps of the positions in the own frame, the others faded, a hold, the last ones averaged."""
-    return of(OwnFrame(rate, final), Fading(events=events, names=OTHERS), OutOfView(), Averaging())
+    return of(OwnFrame(rate), Fading(events=events, names=OTHERS), OutOfView(), Averaging())
 
 
 _ARMS = (
@@ -82,7 +80,6 @@ _ARMS = (
         for count in (600, 1200)
     ),
     Arm("own-rate-0.15", "as own, OwnFrame(0.15)", own(rate=0.15)),
-    Arm("own-final-0.03", "as own, OwnFrame(0.1, final=0.03)", own(final=0.03)),
     Arm("averaged", "the baseline, its last thirtieth averaged", of(Averaging())),
     Arm("x2", "the baseline, all steps times 2", of(Longer(2.0))),
     Arm("x3", "the baseline, all steps times 3", of(Longer(3.0))),
