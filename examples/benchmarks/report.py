@@ -295,11 +295,12 @@ EVENTS = (  # size, iterations, arms with fewer and with more events of `Fading`
 def events(all_: Evidence) -> str:
     """More events of `Fading`, each beside the same training with fewer."""
     rows = []
-    for size, setting, count, few_, many, fewer, more in EVENTS:
+    for size, setting, count, *arms, fewer, more in EVENTS:
         for scene in MAIN:
-            pair = [all_.of(arm, scene, iterations=count, **setting) for arm in (few_, many)]
-            if all(pair):
-                rows.append((scene, size, fewer, shown(pair[0]), more, gained(*pair[::-1])))
+            without, with_more = (all_.of(arm, scene, iterations=count, **setting) for arm in arms)
+            if without and with_more:
+                changes = gained(with_more, without)
+                rows.append((scene, size, fewer, shown(without), more, changes))
     heads = ("scene", "size", "events", "PSNR / SSIM / LPIPS", "more events", "what they change")
     return table(heads, rows)
 
