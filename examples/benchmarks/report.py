@@ -130,7 +130,7 @@ def front(all_: Evidence) -> str:
 
 SHORTER = (
     *(("own", count) for count in (15_000, 10_000, 7_500)),
-    *((arm, 10_000) for arm in ("mcmc", "x2", "x3", "averaged", "x2-averaged", "learn2splat")),
+    *((arm, 10_000) for arm in ("mcmc", "x2", "x3", "averaged", "learn2splat")),
 )
 
 
@@ -305,6 +305,32 @@ def events(all_: Evidence) -> str:
     return table(heads, rows)
 
 
+ASPECTS = (  # where 0.25 and 0.5 were trained: size, setting, iterations, scenes
+    ("half", HALF, 10_000, MAIN),
+    ("whole", WHOLE, 7_500, MAIN),
+    ("quarter", QUARTER, 7_500, MAIN),
+    ("quarter", QUARTER, 30_000, MAIN),
+    ("few photos", QUARTER, 3_000, FEW),
+)
+
+
+def aspects(all_: Evidence) -> str:
+    """How thin an axis of the own frame may count as, each beside the same training with 0.1."""
+    rows = []
+    for size, setting, count, scenes in ASPECTS:
+        for scene in scenes:
+            wider = [
+                all_.of(f"own-aspect-{least}", scene, iterations=count, **setting)
+                for least in (0.25, 0.5)
+            ]
+            if wider[0]:
+                points = {"points": wider[0][0]["points"]}
+                thin = all_.of("own", scene, iterations=count, **setting | points)
+                changes = (gained(lines, thin) for lines in wider)
+                rows.append((scene, size, f"{count:,}", shown(thin), *changes))
+    return table(("scene", "size", "iterations", "0.1", "0.25", "0.5"), rows)
+
+
 def adaptive(all_: Evidence) -> str:
     """Clone, split, prune and reset."""
     rows = []
@@ -382,7 +408,6 @@ NAMES = {
     "x2": "rates times 2",
     "x3": "rates times 3",
     "averaged": "stock, averaged",
-    "x2-averaged": "rates times 2, averaged",
     "learn2splat": "Learn2Splat's tuned Adam",
     "adc": "stock",
     "adc-own": "`OwnFrame` and `Averaging`",
@@ -392,7 +417,7 @@ TABLES: dict[str, Callable[[Evidence], str]] = {
     f.__name__: f
     for f in (
         front, iterations, quarter, kept_aside, gpu, gpu_step, gpu_iteration, bits, equal, short,
-        cost, few, events, adaptive, capture, closed,
+        cost, few, events, aspects, adaptive, capture, closed,
     )
 }  # fmt: skip
 

@@ -63,9 +63,12 @@ def of(*parts: Part) -> Callable[[int], Sequence[Part]]:
     return lambda _iterations: [*parts]
 
 
-def own(events: int = 300, rate: float = 0.1) -> Callable[[int], Sequence[Part]]:
+def own(
+    events: int = 300, rate: float = 0.1, aspect: float = 0.1
+) -> Callable[[int], Sequence[Part]]:
     """Steps of the positions in the own frame, the others faded, a hold, the last ones averaged."""
-    return of(OwnFrame(rate), Fading(events=events, names=OTHERS), OutOfView(), Averaging())
+    frame = OwnFrame(rate, min_aspect=aspect)
+    return of(frame, Fading(events=events, names=OTHERS), OutOfView(), Averaging())
 
 
 _ARMS = (
@@ -80,10 +83,13 @@ _ARMS = (
         for count in (600, 1200)
     ),
     Arm("own-rate-0.15", "as own, OwnFrame(0.15)", own(rate=0.15)),
+    *(
+        Arm(f"own-aspect-{least}", f"as own, OwnFrame(min_aspect={least})", own(aspect=least))
+        for least in (0.25, 0.5)
+    ),
     Arm("averaged", "the baseline, its last thirtieth averaged", of(Averaging())),
     Arm("x2", "the baseline, all steps times 2", of(Longer(2.0))),
     Arm("x3", "the baseline, all steps times 3", of(Longer(3.0))),
-    Arm("x2-averaged", "all steps times 2, averaged", of(Longer(2.0), Averaging())),
     Arm(
         "learn2splat",
         "Learn2Splat's tuned Adam: rates times 5, beta1 0.99, a constant rate of the positions",

@@ -16,7 +16,7 @@ from splatting.scenes import Scene
 from opt3dgs_optim import PhaseScheduler
 
 OPTIONS = FitOptions(iterations=90, points=150)
-RESUMED = ("mcmc", "own", "x2-averaged", "learn2splat", "paper")  # what the others have, too
+RESUMED = ("mcmc", "own", "x2", "learn2splat", "paper")  # what the others have, too
 
 
 @pytest.fixture(scope="module")
