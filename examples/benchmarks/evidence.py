@@ -44,10 +44,10 @@ def line_of(record: Line) -> Line:
 
 def command_of(line: Line) -> str:
     """The command that trains a line, in a folder that holds the scenes."""
-    options = {"scene": "", "arm": "own", "size": "", "iterations": 0, "points": 0}
+    options = {"scene": "", "arm": "", "size": "", "iterations": 0, "points": 0}
     options |= {"sh_degree": 0, "views": 0, "rates": 1.0, "seed": -1}
     said = [(name, line.get(name, usual)) for name, usual in options.items()]
-    words = [f"--{n.replace('_', '-')} {v}" for n, v in said if v != options[n] or n == "arm"]
+    words = [f"--{n.replace('_', '-')} {v}" for n, v in said if v != options[n]]
     words += ["--background white"] * (line["scene"] == "lego")
     return " ".join(["python examples/benchmarks/train.py", *words])
 

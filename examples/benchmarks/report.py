@@ -130,6 +130,7 @@ def front(all_: Evidence) -> str:
 
 SHORTER = (
     *(("own", count) for count in (15_000, 10_000, 7_500)),
+    ("own-aspect-0.25", 10_000),
     *((arm, 10_000) for arm in ("mcmc", "x2", "x3", "averaged", "learn2splat")),
 )
 
@@ -403,6 +404,7 @@ def spread(values: Sequence[float], metric: str) -> str:
 NAMES = {
     "mcmc": "stock",
     "own": "own frame",
+    "own-aspect-0.25": "own frame, `min_aspect` 0.25",
     "own-41-events": "own frame, 41 events of `Fading`",
     "defaults": "fading (the defaults before)",
     "x2": "rates times 2",
