@@ -41,7 +41,7 @@ class Fading(Part):
             next step from being longer than the last.
         events: how many over the run, but never less than 4 iterations apart. Where there are many
             points they are small and lose detail by so many events. So with N > 10,000 points only
-            (10,000 / N)^(2/3) of the events happen.
+            (10,000 / N)^(2/3) of the events happen, and a third of them at least.
         start, stop: the stretch over which they are spread, as shares of the run; the last event
             is at its end.
         seed: of the choice of points.

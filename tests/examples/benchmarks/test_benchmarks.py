@@ -10,6 +10,9 @@ from typing import Any
 import pytest
 import torch
 from benchmarks import evidence, report, steps, train
+from splatting.arms import ARMS
+
+from opt3dgs_optim import DEFAULTS
 
 TINY = ["--scene", "embedded", "--arm", "own", "--iterations", "20", "--points", "60"]
 
@@ -96,6 +99,13 @@ def test_the_pages_are_made_of_the_evidence() -> None:
         assert report.filled(page, report.Evidence()) == page
     with pytest.raises(ValueError, match="evidence:nothing, but there are"):
         report.filled("<!-- evidence:nothing --><!-- end -->", report.Evidence())
+
+
+def test_what_the_pages_call_the_defaults_is_the_defaults() -> None:
+    """Arm `own` writes its options out, since lines of the evidence keep its name."""
+    parts = ARMS["own"].parts
+    assert parts is not None
+    assert (*parts(30_000),) == DEFAULTS
 
 
 def test_the_picture_is_drawn(tmp_path: Path) -> None:
