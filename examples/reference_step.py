@@ -142,7 +142,7 @@ def views(grad: Tensor | None, state: dict, iteration: int) -> tuple[Tensor | No
     in_view = (grad != 0).any(1)
     if iteration * ((5**0.5 - 1) / 2) % 1 < 1 / 4:
         known = in_view | (state["means"]["exp_avg_sq"] != 0).any(1)
-        state["looked"] = float(in_view.sum() / known.sum().clamp(min=1))
+        state["looked"] = int(in_view.sum()) / max(int(known.sum()), 1)
     return ~in_view, share
 
 
