@@ -91,8 +91,10 @@ def default_step(
             rate *= (1.0 if name == "opacities" else 4.0) ** (1.0 - progress) * 0.4**progress
 
         # Fading: the moments of a random fifth of the points are shrunk, the same in all tensors.
-        # Events since the tensor's last step are one.
-        due = range(events_before(own["last"] + 1, total), events_before(iteration + 1, total))
+        # Events since the tensor's last step are one. Beside Annealing they end earlier.
+        stop = 0.5 if "annealing" in parts else 0.7
+        done, now = (events_before(each + 1, total, stop) for each in (own["last"], iteration))
+        due = range(done, now)
         own["last"] = iteration
         if name in parts.get("fading", ()) and any(happens(event, num_points) for event in due):
             chosen = chosen_points(due[-1], num_points)
@@ -107,11 +109,13 @@ def default_step(
             own["exp_avg_sq"][out_of_view] = larger[out_of_view]
 
         # OwnFrame: a position is stepped by B z, with Adam's step z in the Gaussian's own frame, in
-        # standard deviations. A full step has 0.1 of them at the start and 0.001 at the end.
+        # standard deviations. A full step has 0.1 of them at the start and 0.003 at the end.
         if in_own_frame:
-            frame = own_axes(params["quats"], params["scales"])
+            # Thin axes count as a share of the longest, a larger one in short trainings.
+            least = min(max(3_000 / total, 0.1), 0.25)
+            frame = own_axes(params["quats"], params["scales"], least)
             z = torch.zeros_like(param)
-            rate = 0.1 * 0.01**progress if rate else 0.0
+            rate = 0.1 * 0.03**progress if rate else 0.0
             adam_in_frame_(z, into_frame(frame, grad), own, rate)
             param.sub_(out_of_frame(frame, z))
         else:
@@ -146,9 +150,9 @@ def views(grad: Tensor | None, state: dict, iteration: int) -> tuple[Tensor | No
     return ~in_view, share
 
 
-def events_before(iteration: int, total: int) -> int:
-    """Fading's events before an iteration: 300 in 3 to 50 % of the run, at least 4 apart."""
-    length = 0.5 - 0.03
+def events_before(iteration: int, total: int, stop: float) -> int:
+    """Fading's events before an iteration: 300 from 3 % of the run to `stop`, at least 4 apart."""
+    length = stop - 0.03
     share = min(max((iteration / total - 0.03) / length, 0.0), 1.0)
     return int(share * min(300, length * total / 4))
 
@@ -172,16 +176,16 @@ def hashed(number: Tensor) -> Tensor:
     return number ^ (number >> 16)
 
 
-def own_axes(quats: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
+def own_axes(quats: Tensor, scales: Tensor, least: float) -> tuple[Tensor, Tensor]:
     """B = R diag(s) of every Gaussian: the unit quaternion [4, N] of R, and s [3, N].
 
-    An axis counts as no thinner than a tenth of the longest.
+    An axis counts as no thinner than `least` of the longest.
     """
     w, x, y, z = q = quats.T
     square = torch.addcmul(torch.addcmul(torch.addcmul(w * w, x, x), y, y), z, z)
     deviations = scales.T.exp()
-    longest = deviations.amax(0)
-    return q * square.sqrt().clamp(min=1e-12).reciprocal(), torch.maximum(deviations, longest * 0.1)
+    thinnest = deviations.amax(0) * least
+    return q * square.sqrt().clamp(min=1e-12).reciprocal(), torch.maximum(deviations, thinnest)
 
 
 def rotated(q: Tensor, v: Tensor, direction: int) -> Tensor:

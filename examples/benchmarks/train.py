@@ -1,6 +1,6 @@
 """Train one line of the evidence, from where an earlier start was stopped.
 
-    python examples/benchmarks/train.py --scene scenes/lego --arm own --size images_2 \\
+    python examples/benchmarks/train.py --scene scenes/lego --arm own-late --size images_2 \\
         --iterations 10000 --points 50000 --seed 0 --background white
 
 Writes `--out` (JSON: the training and its curve) and a checkpoint beside it at each of ten
@@ -122,7 +122,7 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     add = made.add_argument
     add("--scene", default="embedded", metavar="DIR", help="scene folder, or 'embedded'")
-    add("--arm", default="own", choices=ARMS, metavar="ARM", help=", ".join(ARMS))
+    add("--arm", default="own-late", choices=ARMS, metavar="ARM", help=", ".join(ARMS))
     add("--size", default="images_4", choices=get_args(Size), help="folder of the photos")
     add("--background", default="black", choices=get_args(Background))
     add("--iterations", type=int, default=7_500)

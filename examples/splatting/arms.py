@@ -67,15 +67,20 @@ def own(
     events: int = 300, rate: float = 0.1, aspect: float = 0.1
 ) -> Callable[[int], Sequence[Part]]:
     """Steps of the positions in the own frame, the others faded, a hold, the last ones averaged."""
-    frame = OwnFrame(rate, min_aspect=aspect)
-    return of(frame, Fading(events=events, names=OTHERS), OutOfView(), Averaging())
+    frame, fading = OwnFrame(rate, 0.01, aspect), Fading(events=events, stop=0.5, names=OTHERS)
+    return of(frame, fading, OutOfView(), Averaging())
 
 
 _ARMS = (
     Arm(BASELINE, "3DGS-MCMC as its authors publish it: the baseline"),
     Arm("defaults", "the package's defaults", of(*DEFAULTS)),
     Arm(
-        "own", "own frame, the others faded, a hold, averaged: the defaults since 2026-11-27", own()
+        "own-late",
+        "as own, with longer steps to the end: the defaults since 2026-11-28",
+        of(OwnFrame(0.1, 0.03), Fading(stop=0.7, names=OTHERS), OutOfView(), Averaging()),
+    ),
+    Arm(
+        "own", "own frame, the others faded, a hold, averaged: the defaults until 2026-11-28", own()
     ),
     Arm("own-16", "as own, Adam's moments in 16 bits", own(), moments=16),
     *(
@@ -100,7 +105,7 @@ _ARMS = (
     Arm("paper", "everything that the paper has, with its settings", paper_parts),
     Arm("adc", "3DGS with clone, split, prune and reset as published", density="adc"),
     Arm("adc-defaults", "as adc, the package's defaults for it", of(*DEFAULTS_ADC), "adc"),
-    Arm("adc-own", "as adc, own frame, averaged", of(OwnFrame(0.1), Averaging()), "adc"),
+    Arm("adc-own", "as adc, own frame, averaged", of(OwnFrame(0.1, 0.01, 0.1), Averaging()), "adc"),
 )
 ARMS = {arm.name: arm for arm in _ARMS}
 

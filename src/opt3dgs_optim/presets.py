@@ -38,11 +38,12 @@ DEFAULTS = Preset(
         Averaging(),
     ]
 )
-# For clone, split and prune: longer steps let scales grow until they are pruned as too big.
+# For clone, split and prune: longer steps let scales grow until they are pruned as too big. It was
+# trained with events in the first half alone.
 DEFAULTS_ADC = Preset(
     [
         Annealing(names=("quats", "opacities", "sh0", "shN")),
-        Fading(names=("means", "quats", "opacities", "sh0", "shN")),
+        Fading(stop=0.5, names=("means", "quats", "opacities", "sh0", "shN")),
         OutOfView(),
         Averaging(),
     ]

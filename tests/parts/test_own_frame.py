@@ -125,13 +125,24 @@ def test_the_rate_decays_and_a_learning_rate_of_zero_holds() -> None:
     assert torch.equal(*ends)
 
 
-def test_thin_axes_count_as_a_tenth_of_the_longest() -> None:
-    """A disk: steps across its own surface are a tenth of those along it, not a millionth."""
+def test_thin_axes_count_as_a_quarter_of_the_longest() -> None:
+    """A disk: steps across its own surface are a quarter of those along it, not a millionth."""
     params = parameters(ROWS, *NAMES)
     params["quats"].data[:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
     params["scales"].data[:] = torch.tensor([0.0, 0.0, -14.0])
     moved = stepped(params, torch.ones(ROWS, 3), OwnFrame()).abs()
-    assert torch.allclose(moved, torch.tensor([0.1, 0.1, 0.01]).expand(ROWS, 3), rtol=1e-3)
+    assert torch.allclose(moved, torch.tensor([0.1, 0.1, 0.025]).expand(ROWS, 3), rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("steps_of_run", "least"),
+    [(1, 0.25), (12_000, 0.25), (15_000, 0.2), (30_000, 0.1), (100_000, 0.1), (None, 0.1)],
+)
+def test_thin_axes_count_for_less_in_a_long_training(
+    steps_of_run: int | None, least: float
+) -> None:
+    assert OwnFrame().aspect(steps_of_run) == pytest.approx(least)
+    assert OwnFrame(min_aspect=0.5).aspect(steps_of_run) == 0.5
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 200.0])
@@ -200,7 +211,7 @@ def test_options_that_are_refused(option: dict) -> None:
 
 
 def test_the_defaults_are_what_it_says_of_itself() -> None:
-    assert repr(OwnFrame()) == "OwnFrame(rate=0.1, final=0.01, min_aspect=0.1)"
+    assert repr(OwnFrame()) == "OwnFrame(rate=0.1, final=0.03, min_aspect=None)"
 
 
 def test_of_two_sets_the_one_in_own_frames_is_known_after_a_load() -> None:

@@ -56,7 +56,7 @@ class Fading(Part):
     exp_avg_sq: float = 0.04
     events: int = 300
     start: float = 0.03
-    stop: float = 0.5
+    stop: float = 0.7
     seed: int = 0
     names: tuple[str, ...] = GAUSSIAN
 

@@ -11,6 +11,8 @@ from opt3dgs_optim.part import Part
 from opt3dgs_optim.step import Frame, Step
 
 CALL = "OwnFrame"
+# `min_aspect` where nothing is said: 0.25 in up to 12,000 iterations, 0.1 from 30,000 on.
+LEAST_ASPECT, MOST_ASPECT, ASPECT_TIMES_STEPS = 0.1, 0.25, 3_000
 
 
 @dataclass(frozen=True, repr=False)
@@ -29,7 +31,9 @@ class OwnFrame(Part):
 
     Trained Gaussians are thin, often far thinner than a pixel. Steps in proportion to such an axis
     would hold the Gaussian fast across its own surface, so that an axis counts as no thinner than
-    `min_aspect` of the longest.
+    `min_aspect` of the longest. The fewer steps a training has, the longer those must be: where
+    nothing is said the share is 3,000 / total_steps, within 0.1 (from 30,000 iterations on) and
+    0.25 (up to 12,000).
 
     Adam's moments of the positions then belong to the own frame. Where a training begins with it in
     the middle, from a checkpoint of the unchanged trainer, they begin anew, which is logged.
@@ -42,10 +46,11 @@ class OwnFrame(Part):
 
     Args:
         rate: standard deviations of a full step in the first iteration, above 0.
-        final: share of `rate` in the last iteration, above 0; 0.01 is the decay that all 3DGS
-            trainers give the positions' learning rate.
+        final: share of `rate` in the last iteration, above 0. 3DGS trainers give the positions'
+            learning rate a decay to 0.01; here longer steps at the end gain in short trainings.
         min_aspect: share of a Gaussian's longest standard deviation that a shorter one counts as,
-            at least, in 0..1; 0: every axis counts as it is, 1: a Gaussian counts as a ball.
+            at least, in 0..1; 0: every axis counts as it is, 1: a Gaussian counts as a ball; None:
+            by the length of the training.
 
     Raises:
         ValueError: an option is outside what is allowed.
@@ -67,22 +72,32 @@ class OwnFrame(Part):
     """
 
     rate: float = 0.1
-    final: float = 0.01
-    min_aspect: float = 0.1
+    final: float = 0.03
+    min_aspect: float | None = None
 
     names = ("means",)
 
     def __post_init__(self) -> None:
+        least = self.min_aspect
+        if least is not None:
+            least = check_number(CALL, "min_aspect", least, 0.0, 1.0)
         set_options(
             self,
             rate=check_number(CALL, "rate", self.rate, 0.0, open_low=True),
             final=check_number(CALL, "final", self.final, 0.0, open_low=True),
-            min_aspect=check_number(CALL, "min_aspect", self.min_aspect, 0.0, 1.0),
+            min_aspect=least,
         )
 
     def at(self, progress: float) -> float:
         """Standard deviations of a full step, where that share of the run is over."""
         return self.rate * self.final ** min(max(progress, 0.0), 1.0)
+
+    def aspect(self, total_steps: int | None) -> float:
+        """Share of the longest axis that a shorter one counts as, at least, in such a training."""
+        if self.min_aspect is not None:
+            return self.min_aspect
+        share = ASPECT_TIMES_STEPS / total_steps if total_steps else 0.0
+        return min(max(share, LEAST_ASPECT), MOST_ASPECT)
 
     def plan(self, step: Step, course: Course) -> None:
         """Step the positions [N, 3] in their own frames."""
@@ -104,7 +119,7 @@ class OwnFrame(Part):
             )
             return
         rate = self.at(course.progress) if step.group["lr"] else 0.0
-        step.frame = Frame(rate, self.min_aspect, quats, scales)
+        step.frame = Frame(rate, self.aspect(course.total_steps), quats, scales)
 
     def numbers(self, course: Course) -> Mapping[str, float]:
         """`own_frame_rate`: standard deviations of a full step."""
