@@ -102,8 +102,8 @@ def test_the_pages_are_made_of_the_evidence() -> None:
 
 
 def test_what_the_pages_call_the_defaults_is_the_defaults() -> None:
-    """Arm `own` writes its options out, since lines of the evidence keep its name."""
-    parts = ARMS["own"].parts
+    """The arm writes its options out, since lines of the evidence keep its name."""
+    parts = ARMS[report.DEFAULT].parts
     assert parts is not None
     assert (*parts(30_000),) == DEFAULTS
 
