@@ -185,7 +185,7 @@ def test_phase_progress_and_what_is_shown() -> None:
     assert "iteration 99 of 100\n" in repr(phases)  # no part acts in one phase alone
     assert "iteration -1 of 100, exploration\n" in repr(PhaseScheduler.paper(100))
     assert phases.part(Averaging) is DEFAULTS[3]
-    assert phases.numbers()["own_frame_rate"] == pytest.approx(0.1 * 0.01**0.99)
+    assert phases.numbers()["own_frame_rate"] == pytest.approx(0.1 * 0.03**0.99)
 
 
 def test_nan_is_told_whatever_iterations_the_clock_is_put_to() -> None:

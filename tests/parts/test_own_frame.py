@@ -16,6 +16,7 @@ from torch.nn import Parameter
 from torch.optim import Adam
 
 from opt3dgs_optim import OwnFrame, PhaseScheduler
+from opt3dgs_optim.parts.own_frame import min_aspect_of
 from opt3dgs_optim.step import Frame, axes_of, into_frame, out_of_frame
 
 ROWS, TOTAL = 12, 300
@@ -141,8 +142,7 @@ def test_thin_axes_count_as_a_quarter_of_the_longest() -> None:
 def test_thin_axes_count_for_less_in_a_long_training(
     steps_of_run: int | None, least: float
 ) -> None:
-    assert OwnFrame().aspect(steps_of_run) == pytest.approx(least)
-    assert OwnFrame(min_aspect=0.5).aspect(steps_of_run) == 0.5
+    assert min_aspect_of(steps_of_run) == pytest.approx(least)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 200.0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -11,8 +12,6 @@ from opt3dgs_optim.part import Part
 from opt3dgs_optim.step import Frame, Step
 
 CALL = "OwnFrame"
-# `min_aspect` where nothing is said: 0.25 in up to 12,000 iterations, 0.1 from 30,000 on.
-LEAST_ASPECT, MOST_ASPECT, ASPECT_TIMES_STEPS = 0.1, 0.25, 3_000
 
 
 @dataclass(frozen=True, repr=False)
@@ -92,13 +91,6 @@ class OwnFrame(Part):
         """Standard deviations of a full step, where that share of the run is over."""
         return self.rate * self.final ** min(max(progress, 0.0), 1.0)
 
-    def aspect(self, total_steps: int | None) -> float:
-        """Share of the longest axis that a shorter one counts as, at least, in such a training."""
-        if self.min_aspect is not None:
-            return self.min_aspect
-        share = ASPECT_TIMES_STEPS / total_steps if total_steps else 0.0
-        return min(max(share, LEAST_ASPECT), MOST_ASPECT)
-
     def plan(self, step: Step, course: Course) -> None:
         """Step the positions [N, 3] in their own frames."""
         quats = course.param_of(step.set, "quats")
@@ -119,8 +111,17 @@ class OwnFrame(Part):
             )
             return
         rate = self.at(course.progress) if step.group["lr"] else 0.0
-        step.frame = Frame(rate, self.aspect(course.total_steps), quats, scales)
+        least = self.min_aspect
+        if least is None:
+            least = min_aspect_of(course.total_steps)
+        step.frame = Frame(rate, least, quats, scales)
 
     def numbers(self, course: Course) -> Mapping[str, float]:
         """`own_frame_rate`: standard deviations of a full step."""
         return {"own_frame_rate": self.at(course.progress)}
+
+
+@functools.lru_cache(maxsize=64)  # every step asks
+def min_aspect_of(total_steps: int | None) -> float:
+    """`min_aspect` where nothing is said; None: a training without an end, the longest there is."""
+    return min(max(3_000 / total_steps, 0.1), 0.25) if total_steps else 0.1
