@@ -229,10 +229,14 @@ def bits(all_: Evidence) -> str:
     """Moments and mean of 16 bits beside those of 32; of some seeds both have more events."""
     rows = []
     for scene in MAIN:
-        wide, half = (
-            [x for arm in arms for x in all_.of(arm, scene, iterations=15_000, **HALF)]
-            for arms in (("own", "own-fourth"), ("own-16", "own-fourth-16"))
-        )
+        pairs = [
+            (wide, half)
+            for arm in ("own", "own-fourth")
+            for half in all_.of(f"{arm}-16", scene, iterations=15_000, **HALF)
+            for wide in all_.of(arm, scene, iterations=15_000, **HALF)
+            if wide["seed"] == half["seed"]
+        ]
+        wide, half = zip(*pairs, strict=True)
         rows.append((scene, shown(wide), shown(half), gained(half, wide)))
     return table(("scene", "32 bits", "16 bits", "16 less 32 bits, same seeds"), rows)
 
