@@ -259,24 +259,24 @@ def short(all_: Evidence) -> str:
     """Both with schedules as short."""
     rows = []
     for count in (15_000, 10_000, 7_500):
-        gains: dict[str, list[dict[str, float]]] = {"own": [], DEFAULT: []}
+        gains = []  # of the scenes, each of both arms
         for scene in MAIN:
             stock = all_.of("mcmc", scene, iterations=count, **HALF)
-            cells = []
-            for arm, those in gains.items():
-                found = gain(all_.of(arm, scene, iterations=count, **HALF), stock)
-                those.extend([found] if found else [])
-                cells.append(all_signed(found) if found else "not trained")
+            lines = (all_.of(arm, scene, iterations=count, **HALF) for arm in ("own", DEFAULT))
+            gains.append([gain(each, stock) for each in lines])
+            cells = ("not trained" if each is None else all_signed(each) for each in gains[-1])
             rows.append((f"{count:,}", scene, shown(stock).removesuffix(" (1 seed)"), *cells))
-        means = (
-            {m: statistics.mean(g[m] for g in those) for m in METRICS}
-            for those in gains.values()
-            if len(those) == len(MAIN)
-        )
-        cells = [all_signed(each) for each in means]
-        rows.append((f"{count:,}", "*mean*", "", *cells, *[""] * (len(gains) - len(cells))))
+        rows.append((f"{count:,}", "*mean*", "", *map(mean_gain, zip(*gains, strict=True))))
     heads = ("iterations", "scene", "stock", "own frame gains", "the defaults gain")
     return table(heads, rows)
+
+
+def mean_gain(gains: Sequence[dict[str, float] | None]) -> str:
+    """Over the scenes; empty where one was not trained."""
+    found = [each for each in gains if each is not None]
+    if len(found) < len(gains):
+        return ""
+    return all_signed({m: statistics.mean(each[m] for each in found) for m in METRICS})
 
 
 def cost(_: Evidence) -> str:
@@ -320,7 +320,7 @@ def events(all_: Evidence) -> str:
     return table(heads, rows)
 
 
-LENGTHS = (  # where the steps of the last part of a training were tried: size, setting, iterations
+LENGTHS = (  # where longer steps to the end were tried: size, setting, iterations, scenes
     ("half", HALF, 10_000, MAIN),
     ("whole", WHOLE, 7_500, MAIN),
     ("quarter", QUARTER, 7_500, MAIN),
@@ -434,7 +434,6 @@ NAMES = {
     "mcmc": "stock",
     DEFAULT: "the defaults",
     "own": "own frame",
-    "own-aspect-0.25": "own frame, `min_aspect` 0.25",
     "own-41-events": "own frame, 41 events of `Fading`",
     "defaults": "fading (the defaults before)",
     "x2": "rates times 2",
