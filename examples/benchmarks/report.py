@@ -1,8 +1,9 @@
 """Make the tables and the picture of docs/evidence.md anew: python examples/benchmarks/report.py
 
-So it does with README's table. All comes from docs/results/evidence.jsonl, and the cost of a step,
-which docs/performance.md has, from steps.json and gpu.json beside it. In a page a table stands
-between `<!-- evidence:NAME -->` and `<!-- end -->`, where NAME is a function of `TABLES`.
+So it does with the tables of README and of docs/trials.md. All comes from
+docs/results/evidence.jsonl, and the cost of a step, which docs/performance.md has, from steps.json
+and gpu.json beside it. In a page a table stands between `<!-- evidence:NAME -->` and
+`<!-- end -->`, where NAME is a function of `TABLES`.
 """
 
 from __future__ import annotations
@@ -21,7 +22,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import evidence, steps
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = (ROOT / "README.md", ROOT / "docs" / "evidence.md", ROOT / "docs" / "performance.md")
+PAGES = tuple(
+    ROOT / page
+    for page in ("README.md", "docs/evidence.md", "docs/trials.md", "docs/performance.md")
+)
 GPU = evidence.FILE.with_name("gpu.json")
 PICTURE = evidence.FILE.with_name("iterations.png")
 MAIN = ("bonsai", "lego", "plush")
@@ -29,8 +33,10 @@ FEW = ("banana", "brighton_beach", "embedded", "lund_door")
 HALF: dict[str, Any] = {"size": "images_2", "points": 50_000, "sh_degree": 0}
 WHOLE: dict[str, Any] = {"size": "images", "points": 200_000, "sh_degree": 3}
 QUARTER: dict[str, Any] = {"size": "images_4", "sh_degree": 0}
+SIZES = {"half": HALF, "whole": WHOLE, "quarter": QUARTER}
 DEFAULT = "own-late"  # the arm of the package's defaults; "own" was that of those before
 METRICS = ("psnr", "ssim", "lpips")
+COUNTS = ("10000", "100000", "1000000", "5000000")  # of Gaussians, as steps.json has them
 FORMS = {"psnr": "{:.2f}", "ssim": "{:.4f}", "lpips": "{:.4f}"}
 GAINS = {"psnr": "{:+.2f}", "ssim": "{:+.4f}", "lpips": "{:+.4f}"}
 Line = dict[str, Any]
@@ -130,30 +136,22 @@ def front(all_: Evidence) -> str:
 
 
 SHORTER = (
-    (DEFAULT, 10_000),
-    *(("own", count) for count in (15_000, 10_000, 7_500)),
+    *((DEFAULT, count) for count in (15_000, 10_000, 7_500)),
     *((arm, 10_000) for arm in ("mcmc", "x2", "x3", "averaged", "learn2splat")),
 )
 
 
 def iterations(all_: Evidence) -> str:
-    """Shorter trainings against stock's 30,000 iterations, seed by seed."""
-    rows: list[tuple[str, ...]] = []
-    missing: dict[str, list[str]] = {}
-    for scene in MAIN:
-        stock = all_.of("mcmc", scene, iterations=30_000, **HALF)
-        rows.append((scene, "stock, 30,000", shown(stock), ""))
-        for arm, count in SHORTER:
-            lines = all_.of(arm, scene, iterations=count, **HALF)
-            name = f"{NAMES[arm]}, {count:,}"
-            if lines:
-                rows.append(("", name, shown(lines), gained(lines, stock)))
-            else:
-                missing.setdefault(name, []).append(scene)
-    heads = ("scene", "training", "PSNR / SSIM / LPIPS", "less stock at 30,000, same seeds")
-    left = "; ".join(f"{name} ({', '.join(scenes)})" for name, scenes in missing.items())
-    said = f"\n\nNot trained yet: {left}." if missing else ""
-    return table(heads, rows) + said
+    """Shorter trainings less stock's 30,000 iterations, seed by seed."""
+    stock = {scene: all_.of("mcmc", scene, iterations=30_000, **HALF) for scene in MAIN}
+    rows = [("stock, 30,000", *map(shown, stock.values()))]
+    for arm, count in SHORTER:
+        cells = (
+            gained(all_.of(arm, scene, iterations=count, **HALF), lines)
+            for scene, lines in stock.items()
+        )
+        rows.append((f"{NAMES[arm]}, {count:,}", *cells))
+    return table(("training", *MAIN), rows)
 
 
 def quarter(all_: Evidence) -> str:
@@ -162,13 +160,9 @@ def quarter(all_: Evidence) -> str:
     for scene in MAIN:
         stock = all_.of("mcmc", scene, iterations=30_000, **QUARTER)
         points = stock[0]["points"]
-        lines = (
-            all_.of(arm, scene, iterations=7_500, points=points, **QUARTER)
-            for arm in ("own", DEFAULT)
-        )
-        rows.append((scene, f"{points:,}", shown(stock), *(gained(x, stock) for x in lines)))
-    gains = ("own frame, 7,500, less stock", "the defaults, 7,500, less stock")
-    return table(("scene", "Gaussians", "stock, 30,000", *gains), rows)
+        ours = all_.of(DEFAULT, scene, iterations=7_500, points=points, **QUARTER)
+        rows.append((scene, f"{points:,}", shown(stock), gained(ours, stock)))
+    return table(("scene", "Gaussians", "stock, 30,000", "the defaults, 7,500, less stock"), rows)
 
 
 def kept_aside(all_: Evidence) -> str:
@@ -196,6 +190,22 @@ def gpu(all_: Evidence) -> str:
             first = scene if line in stock else ""
             rows.append((first, name, ends, less, f"{line['seconds']:.0f} s"))
     return table(("scene", "training", "PSNR / SSIM / LPIPS", "less stock", "took"), rows)
+
+
+def whole(all_: Evidence) -> str:
+    """Half of the iterations at whole size, on a CPU, less stock's trainings on the GPU."""
+    rows = []
+    for scene in ("bonsai", "lego"):
+        stock = [
+            x
+            for x in all_.lines
+            if (x["scene"], x["arm"], x["iterations"]) == (scene, "mcmc", 15_000)
+            and all(x[k] == v for k, v in WHOLE.items())
+        ]
+        ours = all_.of(DEFAULT, scene, iterations=7_500, **WHOLE)
+        cells = (shown(ours), gained(ours, stock))
+        rows.append((scene, *(x.removesuffix(" (1 seed)") for x in cells)))
+    return table(("scene", "the defaults, 7,500, on a CPU", "less stock, 15,000, on the GPU"), rows)
 
 
 def gpu_step(_: Evidence) -> str:
@@ -259,16 +269,17 @@ def short(all_: Evidence) -> str:
     """Both with schedules as short."""
     rows = []
     for count in (15_000, 10_000, 7_500):
-        gains = []  # of the scenes, each of both arms
+        gains = []
         for scene in MAIN:
-            stock = all_.of("mcmc", scene, iterations=count, **HALF)
-            lines = (all_.of(arm, scene, iterations=count, **HALF) for arm in ("own", DEFAULT))
-            gains.append([gain(each, stock) for each in lines])
-            cells = ("not trained" if each is None else all_signed(each) for each in gains[-1])
-            rows.append((f"{count:,}", scene, shown(stock).removesuffix(" (1 seed)"), *cells))
-        rows.append((f"{count:,}", "*mean*", "", *map(mean_gain, zip(*gains, strict=True))))
-    heads = ("iterations", "scene", "stock", "own frame gains", "the defaults gain")
-    return table(heads, rows)
+            stock, ours = (
+                all_.of(arm, scene, iterations=count, **HALF) for arm in ("mcmc", DEFAULT)
+            )
+            found = gain(ours, stock)
+            gains.append(found)
+            less = "not trained" if found is None else all_signed(found)
+            rows.append((f"{count:,}", scene, shown(stock).removesuffix(" (1 seed)"), less))
+        rows.append((f"{count:,}", "*mean*", "", mean_gain(gains)))
+    return table(("iterations", "scene", "stock", "the defaults gain"), rows)
 
 
 def mean_gain(gains: Sequence[dict[str, float] | None]) -> str:
@@ -277,6 +288,23 @@ def mean_gain(gains: Sequence[dict[str, float] | None]) -> str:
     if len(found) < len(gains):
         return ""
     return all_signed({m: statistics.mean(each[m] for each in found) for m in METRICS})
+
+
+def ratios(_: Evidence) -> str:
+    """What a step of the defaults costs, in short."""
+    gpu_made, cpu_made = (json.loads(p.read_text(encoding="utf-8")) for p in (GPU, steps.OUT))
+    rows = []
+    for device, made, beside, name in (
+        ("one H200", gpu_made["steps"], "six fused Adams", "defaults"),
+        ("", gpu_made["steps"], "the same, last thirtieth", "defaults, last thirtieth"),
+        ("a CPU, one thread", cpu_made, "six Adams", "defaults"),
+        ("", cpu_made, "the same, last thirtieth", "defaults, last thirtieth"),
+        ("", cpu_made, "six fused Adams", "defaults, fused"),
+    ):
+        found = made["results"]
+        cells = (f"{found[n][name]['ratio']:.2f}" if n in found else "-" for n in COUNTS)
+        rows.append((device, beside, *cells))
+    return table(("", "beside", *(f"{int(n):,}" for n in COUNTS)), rows)
 
 
 def cost(_: Evidence) -> str:
@@ -359,6 +387,49 @@ def late(all_: Evidence) -> str:
                 rows.append((scene, name, f"{count:,}", shown(before), gained(ours, before)))
     heads = ("scene", "size", "iterations", "own frame", "what the defaults change")
     return table(heads, rows)
+
+
+TRIED = (  # and not taken: what, its arm, the same training without it, its size and iterations
+    ("new rows: a full first step", "own-first", "own", "quarter", 7_500),
+    ("new rows: a full first step", "own-first", "own", "half", 10_000),
+    ("new rows: a count for each row", "own-aged", "own", "quarter", 7_500),
+    ("`Annealing` beside the own frame", "own-annealed", "own", "quarter", 7_500),
+    ("rotations in angles", "angles", "own", "quarter", 7_500),
+    ("smaller angles for longer Gaussians", "angles-own", "own", "quarter", 7_500),
+    ("the same, longer at first", "angles-own-fall", "own", "quarter", 7_500),
+    ("own frame in pixels", "own-pixels", "own", "quarter", 7_500),
+    ("own frame, axes to the power 3/4", "own-power", "own", "quarter", 7_500),
+    ("own frame, rate 0.15", "own-rate-0.15", "own", "quarter", 7_500),
+    ("own frame, rate 0.15", "own-rate-0.15", "own", "half", 10_000),
+    ("own frame, rate 0.2", "own-r2", "own", "quarter", 7_500),
+    (
+        "rate 0.15 beside the longer steps",
+        "own-final-0.03-aspect-0.25-rate-0.15",
+        "own-final-0.03-aspect-0.25",
+        "quarter",
+        7_500,
+    ),
+    ("`min_aspect` from 0.1 to 0.35", "own-growing-0.35", "own-aspect-0.25", "quarter", 7_500),
+    ("`min_aspect` from 0.1 to 0.5", "own-growing-0.5", "own-aspect-0.25", "quarter", 7_500),
+    ("`min_aspect` 0.25 in a long training", "own-late-0.25", DEFAULT, "quarter", 30_000),
+    ("`Fading` to 80 %", "own-late-stop-0.8", DEFAULT, "half", 10_000),
+    ("with clone and split: more events", "adc-fourth", "adc-defaults", "quarter", 7_500),
+    ("with clone and split: own frame", "adc-own-root", "adc-defaults", "quarter", 7_500),
+)
+
+
+def tried(all_: Evidence) -> str:
+    """What was not taken, each beside the same training without it, scene by scene."""
+    rows = []
+    for what, arm, control, size, count in TRIED:
+        cells = []
+        for scene in MAIN:
+            lines = all_.of(arm, scene, iterations=count, **SIZES[size])
+            points = {"points": lines[0]["points"]} if lines else {}
+            without = all_.of(control, scene, iterations=count, **SIZES[size] | points)
+            cells.append(gained(lines, without))
+        rows.append((what, f"{size}, {count:,}", *cells))
+    return table(("what", "size, iterations", *MAIN), rows)
 
 
 def adaptive(all_: Evidence) -> str:
@@ -447,8 +518,8 @@ NAMES = {
 TABLES: dict[str, Callable[[Evidence], str]] = {
     f.__name__: f
     for f in (
-        front, iterations, quarter, kept_aside, gpu, gpu_step, gpu_iteration, bits, equal, short,
-        cost, few, events, aspects, late, adaptive, capture, closed,
+        front, iterations, quarter, kept_aside, gpu, whole, gpu_step, gpu_iteration, bits, equal,
+        short, ratios, cost, few, events, aspects, late, tried, adaptive, capture, closed,
     )
 }  # fmt: skip
 
@@ -456,9 +527,9 @@ TABLES: dict[str, Callable[[Evidence], str]] = {
 DRAWN = (
     ("mcmc", 30_000, "#555555"),
     ("own", 30_000, "#9ecae1"),
-    ("own", 15_000, "#56a0d3"),
+    (DEFAULT, 15_000, "#56a0d3"),
     (DEFAULT, 10_000, "#0072b2"),
-    ("own", 7_500, "#08306b"),
+    (DEFAULT, 7_500, "#08306b"),
 )
 
 
