@@ -58,6 +58,11 @@ OPTIMIZERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         TypeError,
         "SGD has a step of its own; have the trainer make a torch.optim.Adam",
     ),
+    "others, in a dict": (
+        lambda: {"means": one(), "camera": torch.optim.SGD([Parameter(torch.ones(3))], lr=0.1)},
+        TypeError,
+        "SGD has a step of its own.*; or leave 'camera' out, which holds no Gaussians",
+    ),
     "a foreign step": (lambda: Foreign(one().param_groups), TypeError, "Foreign has a step of its"),
     "no optimizer": (lambda: torch.ones(3), TypeError, "Tensor is no optimizer; pass the trainer"),
     "sparse gradients": (
@@ -296,10 +301,27 @@ def test_numbers_that_are_not_finite_are_told_once(recwarn: pytest.WarningsRecor
     assert "look for the first NaN of the loss" in found[0]
 
 
+def test_numbers_that_are_not_finite_are_told_at_the_end() -> None:
+    """Of a training that ends between two looks."""
+    params = parameters(ROWS, "means")
+    optimizers = PhaseScheduler(80, parts=[Averaging()]).upgrade(adams_of(params))
+    params["means"].grad = torch.full((ROWS, 3), torch.nan)
+    for _ in range(79):
+        optimizers["means"].step()
+    with pytest.warns(UserWarning, match="iteration 79: 948 numbers of gradients"):
+        optimizers["means"].step()
+
+
+def test_positions_of_a_name_that_is_not_known() -> None:
+    params = parameters(ROWS, "scales", "quats")
+    optimizers = PhaseScheduler(80).upgrade(adams_of(params) | {"mu": one(name="mu")})
+    with pytest.warns(UserWarning, match="no optimizer holds positions.*name their group"):
+        steps(optimizers, params, 3)
+
+
 @pytest.mark.parametrize(
     ("done", "finished", "said"),
     [
-        (0, False, False),
         (5, False, True),
         (585, False, True),
         (599, False, False),
@@ -315,6 +337,36 @@ def test_a_training_that_ends_early(done: int, finished: bool, said: bool) -> No
     line = phases.end_line()
     assert (line is not None) == said
     assert line is None or (f"iteration {done} of 600" in line and "phases.finish()" in line)
+
+
+def test_optimizers_that_make_no_step() -> None:
+    """As where the trainer makes its optimizers after `upgrade`."""
+    params = parameters(ROWS, "means")
+    phases = PhaseScheduler(600)
+    assert phases.end_line() is None
+    phases.upgrade(adams_of(params))
+    steps(adams_of(params), params, 3)
+    assert "have made no step; upgrade those that the training steps" in str(phases.end_line())
+
+
+def test_a_schedule_that_another_takes_over_says_no_more() -> None:
+    params = parameters(ROWS, "means")
+    first = PhaseScheduler(600, parts=[Averaging()])
+    optimizers = first.upgrade(adams_of(params))
+    steps(optimizers, params, 5)
+    PhaseScheduler(600, parts=[Averaging()]).upgrade(optimizers)
+    assert first.end_line() is None
+
+
+def test_a_training_too_short_for_a_mean_ends_without_a_line(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    params = parameters(ROWS, "means")
+    phases = PhaseScheduler(20, parts=[Averaging()])
+    steps(phases.upgrade(adams_of(params)), params, 20)
+    assert phases.end_line() is None
+    phases.finish()
+    assert "finish()" not in caplog.text
 
 
 def test_finish_before_there_is_a_mean(caplog: pytest.LogCaptureFixture) -> None:

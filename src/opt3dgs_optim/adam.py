@@ -302,10 +302,15 @@ class StepAdam(Adam):
                 self.state[param][key][rows] = 0
 
     @torch.no_grad()
-    def put_means(self) -> int:
-        """Put the running means in the parameters' place now; of how many parameters."""
+    def put_means(self, before: int) -> int:
+        """Put the running means in the parameters' place now; of how many parameters.
+
+        Of those alone whose last step was before that iteration, after which steps put it.
+        """
         found = 0
         for lane in self.present_lanes():
+            if lane.stepped_in >= before:
+                continue
             param, state = lane.param, self.state.get(lane.param, {})
             mean, residue = state.get(MEAN), state.get(RESIDUE)
             if residue is not None and lane.grid is not None and residue.shape == param.shape:

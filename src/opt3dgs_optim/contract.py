@@ -34,7 +34,8 @@ def check_supported(optimizer: Any, slots: Slots, moments: int = 32) -> None:
     kind = type(optimizer)
     if not isinstance(optimizer, Optimizer):
         raise TypeError(
-            f"upgrade: {kind.__name__} is no optimizer; pass the trainer's own, or a dict"
+            f"upgrade: {kind.__name__} is no optimizer; pass the trainer's own, or a dict or list "
+            "of them"
         )
     owner = (
         own_step(kind._base if hasattr(kind, "_base") else kind)

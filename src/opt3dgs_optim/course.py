@@ -108,7 +108,7 @@ class Course:
         self.exploits_next = iteration + 1 >= self._switch
         if self.total_steps:
             self.progress = min(max(iteration / self.total_steps, 0.0), 1.0)
-        if iteration >= self._look_at:
+        if iteration >= self._look_at or iteration + 1 == self.total_steps:
             self._look_at = iteration + LOOK_INTERVAL
             self._look()
 
@@ -195,6 +195,7 @@ class Course:
         """What a checkpoint of an optimizer has beside tensors: plain numbers and lists."""
         for part in self.parts:
             part.settle(self)
+        self._look()
         check_notes("state_dict", self._notes)
         return {
             "format": FORMAT,

@@ -130,13 +130,20 @@ class PhaseScheduler(Course):
         given = _named(optimizers)
         slots = [_slots_of(key, optimizer) for key, optimizer in given]
         held = [slot for each in slots for slot in each if slot[1] is not None]
-        for (_, optimizer), its in zip(given, slots, strict=True):
+        for (key, optimizer), its in zip(given, slots, strict=True):
             if not isinstance(getattr(optimizer, "course", self), PhaseScheduler):
                 raise TypeError(
                     f"{CALL}.upgrade: {type(optimizer).__name__} has parts of its own; upgrade a "
                     "torch.optim.Adam, with parts=[...] for what its steps are to have"
                 )
-            check_supported(optimizer, its, self.moments)
+            try:
+                check_supported(optimizer, its, self.moments)
+            except (TypeError, ValueError) as error:
+                if key is None or any(name for _, name in its):
+                    raise
+                raise type(error)(
+                    f"{error}; or leave {key!r} out, which holds no Gaussians"
+                ) from None
             if (saved := optimizer.param_groups[0].get(STATE_KEY)) is not None:
                 self.check_state(f"{CALL}.upgrade", saved)
                 self.restore_parts(saved)
@@ -161,6 +168,7 @@ class PhaseScheduler(Course):
             )
         for (_, optimizer), its in zip(given, slots, strict=True):
             self._upgrade(optimizer, its)
+        self._end.upgraded = True
         self._say_upgraded(" ".join(name for _, name in held if name))
         return optimizers
 
@@ -180,6 +188,7 @@ class PhaseScheduler(Course):
                 optimizer.follow(self, slots)
                 return
             optimizer.param_groups[0][STATE_KEY] = optimizer.course.state_of(optimizer)
+            optimizer.course._end.finished = True  # pyright: ignore[reportAttributeAccessIssue]
         else:
             vars(optimizer).pop("step", None)  # as learning-rate schedulers of old have wrapped it
             optimizer.__class__ = upgraded_class(type(optimizer))
@@ -252,22 +261,29 @@ class PhaseScheduler(Course):
     def finish(self) -> None:
         """End the run here: the mean of the last iterates takes the parameters' place.
 
-        Before the last thirtieth there is no mean, and the parameters stay as they are.
+        Before the last thirtieth there is no mean, and the parameters stay as they are. So they do
+        where the mean has taken their place already: at the end of the schedule, or by `finish()`.
         """
-        found = sum(
-            each.put_means() for each in {id(o): o for o, _ in self.members.values()}.values()
-        )
-        if not found and self.part(Averaging) is not None:
-            LOGGER.warning(
-                "opt3dgs_optim: finish() at iteration %d of %d: averaging begins at %d, and the "
-                "parameters stay the last iterate", self.iteration + 1, self.total_steps,
-                Averaging.start(self.total_steps or 0),
-            )  # fmt: skip
+        if not self.finished:
+            holders = {id(o): o for o, _ in self.members.values()}.values()
+            found = sum(each.put_means(self._mean_at) for each in holders)
+            if not found and self._end.line() is not None:
+                LOGGER.warning(
+                    "opt3dgs_optim: finish() at iteration %d of %d: averaging begins at %d, and "
+                    "the parameters stay the last iterate", self.iteration + 1, self.total_steps,
+                    Averaging.start(self.total_steps or 0),
+                )  # fmt: skip
         self.finished = self._end.finished = True
 
     # -- what it watches ---------------------------------------------------------------------------
 
     def _advance(self) -> None:
+        if self.members and not self.has_means and self.part(OwnFrame) is not None:
+            self.warn_once(
+                "positions",
+                f"{CALL}: no optimizer holds positions, so that OwnFrame does nothing; name their "
+                "group, or its key in the dict, 'means' (other trainers' names are known, too)",
+            )
         self._end.done = self.iteration + 1
         if self.log is not None:
             numbers = self.numbers()
@@ -329,19 +345,27 @@ class End:
 
     def __init__(self, total_steps: int, averaging: Averaging | None) -> None:
         self.total_steps, self.averaging = total_steps, averaging
+        self.upgraded = False
         self.done = 0  # iterations, if any was made here
         self.finished = False
 
     def line(self) -> str | None:
         """What is said where it ends before its end; None: it does not."""
+        if self.upgraded and not self.done:
+            return (
+                "opt3dgs_optim: the optimizers that were upgraded have made no step; upgrade those "
+                "that the training steps, after they have been made"
+            )
         if self.finished or self.averaging is None or not self.done:
             return None
-        if self.done > self.averaging.put_from(self.total_steps):
+        put = self.averaging.put_from(self.total_steps)
+        if self.done > put or put == self.total_steps:  # so short a training has no mean
             return None
         return (
             f"opt3dgs_optim: the training ended at iteration {self.done} of {self.total_steps}, so "
-            "that the parameters are the last iterate and no mean; call phases.finish() where it "
-            "ends early"
+            "that the parameters are the last iterate and no mean; make total_steps the number of "
+            "steps, upgrade optimizers that are made anew, and call phases.finish() where a "
+            "training ends early"
         )
 
     def say(self) -> None:

@@ -118,6 +118,7 @@ def train(
         "clone and split, few in view",
     ],
 )
+@pytest.mark.filterwarnings("ignore:opt3dgs_optim. iteration 59. 12 numbers")
 def test_a_training_ends_as_on_a_cpu(parts: Sequence[Part], seen: float) -> None:
     ours = train(parts, None, seen)
     with SimulatedDevice() as gpu:
@@ -137,6 +138,7 @@ def test_a_training_ends_as_on_a_cpu(parts: Sequence[Part], seen: float) -> None
 
 
 @pytest.mark.thorough
+@pytest.mark.filterwarnings("ignore:opt3dgs_optim. iteration 59. 12 numbers")
 def test_a_training_with_moments_of_16_bits_ends_as_on_a_cpu() -> None:
     ours = train(DEFAULTS, None, 0.3, moments=16)
     with SimulatedDevice() as gpu:

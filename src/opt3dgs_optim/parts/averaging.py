@@ -22,9 +22,11 @@ class Averaging(Part):
     run. In the last tenth of that, in the last two iterations at least, the mean takes the
     parameters' place, because trainers save before their last step. Until then nothing is changed.
 
-    Rows that density control edits begin anew, the others are spared. Iterates that are not finite
-    are left out. In the last thirtieth it takes the memory of the parameters once more, and one
-    number a row. Beside moments of 16 bits each number of the mean has 16, too, except positions.
+    Rows that density control edits begin anew, the others are spared. After a relocation of
+    gsplat's, which does not say what it wrote, all begin anew: it should end before. Iterates that
+    are not finite are left out. In the last thirtieth it takes the memory of the parameters once
+    more, and one number a row. Beside moments of 16 bits each number of the mean has 16, too,
+    except positions.
     """
 
     @staticmethod
