@@ -29,7 +29,7 @@ PAGES = tuple(
 GPU = evidence.FILE.with_name("gpu.json")
 PICTURE = evidence.FILE.with_name("iterations.png")
 MAIN = ("bonsai", "lego", "plush")
-FEW = ("banana", "brighton_beach", "embedded", "lund_door")
+FEW = ("banana", "brighton_beach", "lund_door")
 HALF: dict[str, Any] = {"size": "images_2", "points": 50_000, "sh_degree": 0}
 WHOLE: dict[str, Any] = {"size": "images", "points": 200_000, "sh_degree": 3}
 QUARTER: dict[str, Any] = {"size": "images_4", "sh_degree": 0}
@@ -261,7 +261,7 @@ def equal(all_: Evidence) -> str:
                 all_.of(a, scene, iterations=30_000, **setting) for a in ("own", "defaults", "x2")
             )
             rows.append((scene, size, shown(stock), *(gained(x, stock) for x in lines)))
-    heads = ("scene", "size", "stock", "own frame", "fading (the defaults before)", "rates times 2")
+    heads = ("scene", "size", "stock", NAMES["own"], NAMES["defaults"], NAMES["x2"])
     return table(heads, rows)
 
 
@@ -315,16 +315,14 @@ def cost(_: Evidence) -> str:
 
 
 def few(all_: Evidence) -> str:
-    """Scenes with 10 to 24 photos; all beside stock at 30,000."""
+    """Scenes with 10 to 15 photos; all beside stock at 30,000."""
     rows = []
+    others = (("mcmc", 3_000), (DEFAULT, 3_000), ("own", 10_000), ("own", 30_000))
     for scene in FEW:
         stock = all_.of("mcmc", scene, iterations=30_000, **QUARTER)
-        others = (("defaults", 30_000), ("own", 30_000), ("own", 10_000), ("own", 3_000))
         lines = (all_.of(arm, scene, iterations=n, **QUARTER) for arm, n in others)
         rows.append((scene, shown(stock), *(gained(x, stock) for x in lines)))
-    lengths = (f"own frame, {n}" for n in ("30,000", "10,000", "3,000"))
-    heads = ("scene", "stock", NAMES["defaults"], *lengths)
-    return table(heads, rows)
+    return table(("scene", "stock, 30,000", *(f"{NAMES[a]}, {n:,}" for a, n in others)), rows)
 
 
 EVENTS = (  # size, iterations, arms with fewer and with more events of `Fading`, how many they have
@@ -370,7 +368,8 @@ def aspects(all_: Evidence) -> str:
                 points = {"points": wider[0][0]["points"]}
                 thin = all_.of("own", scene, iterations=count, **setting | points)
                 changes = (gained(lines, thin) for lines in wider)
-                rows.append((scene, size, f"{count:,}", shown(thin), *changes))
+                name = f"{size}, {points['points']:,} Gaussians"
+                rows.append((scene, name, f"{count:,}", shown(thin), *changes))
     return table(("scene", "size", "iterations", "0.1", "0.25", "0.5"), rows)
 
 
@@ -385,11 +384,11 @@ def late(all_: Evidence) -> str:
                 before, ours = (all_.of(arm, scene, **those) for arm in ("own", DEFAULT))
                 name = f"{size}, {points:,} Gaussians"
                 rows.append((scene, name, f"{count:,}", shown(before), gained(ours, before)))
-    heads = ("scene", "size", "iterations", "own frame", "what the defaults change")
+    heads = ("scene", "size", "iterations", NAMES["own"], "what the defaults change")
     return table(heads, rows)
 
 
-TRIED = (  # and not taken: what, its arm, the same training without it, its size and iterations
+TRIED = (  # and not taken: what, its arm, its control, size and iterations
     ("new rows: a full first step", "own-first", "own", "quarter", 7_500),
     ("new rows: a full first step", "own-first", "own", "half", 10_000),
     ("new rows: a count for each row", "own-aged", "own", "quarter", 7_500),
@@ -409,12 +408,24 @@ TRIED = (  # and not taken: what, its arm, the same training without it, its siz
         "quarter",
         7_500,
     ),
-    ("`min_aspect` from 0.1 to 0.35", "own-growing-0.35", "own-aspect-0.25", "quarter", 7_500),
-    ("`min_aspect` from 0.1 to 0.5", "own-growing-0.5", "own-aspect-0.25", "quarter", 7_500),
+    (
+        "`min_aspect` from 0.1 to 0.35, beside 0.25",
+        "own-growing-0.35",
+        "own-final-0.03-aspect-0.25",
+        "quarter",
+        7_500,
+    ),
+    ("the same to 0.5", "own-growing-0.5", "own-aspect-0.25", "quarter", 7_500),
     ("`min_aspect` 0.25 in a long training", "own-late-0.25", DEFAULT, "quarter", 30_000),
     ("`Fading` to 80 %", "own-late-stop-0.8", DEFAULT, "half", 10_000),
     ("with clone and split: more events", "adc-fourth", "adc-defaults", "quarter", 7_500),
-    ("with clone and split: own frame", "adc-own-root", "adc-defaults", "quarter", 7_500),
+    (
+        "with clone and split: own frame, root of the axes",
+        "adc-own-root",
+        "adc-defaults",
+        "quarter",
+        7_500,
+    ),
 )
 
 
@@ -467,14 +478,14 @@ CLOSED = (  # what, its arm, the same training without it
     ("fresh moments in the last thirtieth", "l1+reset@1/30", "mcmc"),
     ("L-BFGS directions in the last thirtieth", "l2+reset+lqn@1/30", "l2+reset@1/30"),
     ("L-BFGS directions in the last quarter", "l1+reset+lqn@1/4", "l1+reset@1/4"),
-    ("`Annealing` beside fading and averaging", "annealed+averaged", "defaults"),
+    ("`Annealing` beside the defaults before 0.1.0", "annealed+averaged", "defaults"),
     ("one second moment a Gaussian", "faded+pooled+averaged", "defaults"),
     ("rates times 3", "x3", "mcmc"),
     ("the positions' rate times 3", "positions-x3", "mcmc"),
     ("rates times 2", "x2", "mcmc"),
     ("averaging", "averaged", "mcmc"),
-    ("fading, `OutOfView` and averaging: the defaults before", "defaults", "mcmc"),
-    ("own frame: the defaults until 2026-11-28", "own", "mcmc"),
+    ("`Fading` of all parameters, `OutOfView` and `Averaging`: before 0.1.0", "defaults", "mcmc"),
+    ("the defaults of version 0.1.0", "own", "mcmc"),
 )
 
 
@@ -491,7 +502,8 @@ def closed(all_: Evidence) -> str:
                 gains[scene] = found
                 trainings += len({*seeds_of(pair[0])} & {*seeds_of(pair[1])})
         cells = [spread([g[m] for g in gains.values()], m) for m in METRICS]
-        rows.append((what, f"{len(gains)}, {trainings}", *cells))
+        star = "*" * ("bonsai" not in gains)
+        rows.append((what + star, f"{len(gains)}, {trainings}", *cells))
     return table(("what", "scenes, trainings", "PSNR", "SSIM", "LPIPS"), rows)
 
 
@@ -504,16 +516,16 @@ def spread(values: Sequence[float], metric: str) -> str:
 NAMES = {
     "mcmc": "stock",
     DEFAULT: "the defaults",
-    "own": "own frame",
-    "own-41-events": "own frame, 41 events of `Fading`",
-    "defaults": "fading (the defaults before)",
+    "own": "version 0.1.0",
+    "own-41-events": "version 0.1.0",
+    "defaults": "before 0.1.0",
     "x2": "rates times 2",
     "x3": "rates times 3",
     "averaged": "stock, averaged",
     "learn2splat": "Learn2Splat's tuned Adam",
     "adc": "stock",
     "adc-own": "`OwnFrame` and `Averaging`",
-    "adc-annealed-faded-averaged": "`Annealing` and `Fading`, not of the scales",
+    "adc-annealed-faded-averaged": "`DEFAULTS_ADC`",
 }
 TABLES: dict[str, Callable[[Evidence], str]] = {
     f.__name__: f
@@ -558,7 +570,7 @@ def draw(all_: Evidence, path: Path) -> None:
             ]
             at = sorted(set.intersection(*map(set, pairs)))
             curve = [statistics.mean(each[n] for each in pairs) for n in at]
-            label = "stock" if arm == "mcmc" else f"opt3dgs_optim, planned for {count:,}"
+            label = "stock" if arm == "mcmc" else f"{NAMES[arm]}, planned for {count:,}"
             (entries[label],) = axis.plot([n / 1000 for n in at], curve, color=colour, lw=2)
             axis.plot(at[-1] / 1000, curve[-1], "o", color=colour, ms=6)
             if arm == "mcmc":
@@ -570,7 +582,7 @@ def draw(all_: Evidence, path: Path) -> None:
         axis.set_xlim(0, 31)
         axis.grid(color="#e4e4e4", lw=0.8)
     axes[0].set_ylabel("PSNR of held-out photos, dB", fontsize=12)
-    order = ["stock", *(f"opt3dgs_optim, planned for {n:,}" for _, n, _ in DRAWN[1:])]
+    order = ["stock", *(f"{NAMES[arm]}, planned for {n:,}" for arm, n, _ in DRAWN[1:])]
     names = [name for name in order if name in entries]
     handles = [entries[name] for name in names]
     place = "outside lower center"
