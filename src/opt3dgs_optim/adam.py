@@ -302,14 +302,15 @@ class StepAdam(Adam):
                 self.state[param][key][rows] = 0
 
     @torch.no_grad()
-    def put_means(self, before: int) -> int:
+    def put_means(self) -> int:
         """Put the running means in the parameters' place now; of how many parameters.
 
-        Of those alone whose last step was before that iteration, after which steps put it.
+        Of those that have not gone on since the end of the course. Inside it once more where a
+        step has put it: 3DGS-MCMC's trainers add noise to positions after the step.
         """
-        found = 0
+        found, end = 0, self.course.total_steps
         for lane in self.present_lanes():
-            if lane.stepped_in >= before:
+            if end is not None and lane.stepped_in > end:  # trainers that count from 1 end there
                 continue
             param, state = lane.param, self.state.get(lane.param, {})
             mean, residue = state.get(MEAN), state.get(RESIDUE)

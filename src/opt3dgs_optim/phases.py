@@ -262,11 +262,11 @@ class PhaseScheduler(Course):
         """End the run here: the mean of the last iterates takes the parameters' place.
 
         Before the last thirtieth there is no mean, and the parameters stay as they are. So they do
-        where the mean has taken their place already: at the end of the schedule, or by `finish()`.
+        where the training has gone on since: past its last iteration, or past another `finish()`.
         """
         if not self.finished:
             holders = {id(o): o for o, _ in self.members.values()}.values()
-            found = sum(each.put_means(self._mean_at) for each in holders)
+            found = sum(each.put_means() for each in holders)
             if not found and self._end.line() is not None:
                 LOGGER.warning(
                     "opt3dgs_optim: finish() at iteration %d of %d: averaging begins at %d, and "
