@@ -349,6 +349,15 @@ def test_optimizers_that_make_no_step() -> None:
     assert "have made no step; upgrade those that the training steps" in str(phases.end_line())
 
 
+def test_a_checkpoint_that_is_loaded_to_be_looked_at() -> None:
+    params = parameters(ROWS, "means")
+    trained = PhaseScheduler(600, parts=[Averaging()]).upgrade(adams_of(params))
+    steps(trained, params, 5)
+    phases = PhaseScheduler(600, parts=[Averaging()])
+    phases.upgrade(adams_of(params))["means"].load_state_dict(trained["means"].state_dict())
+    assert phases.end_line() is None
+
+
 def test_a_schedule_that_another_takes_over_says_no_more() -> None:
     params = parameters(ROWS, "means")
     first = PhaseScheduler(600, parts=[Averaging()])

@@ -166,9 +166,9 @@ class PhaseScheduler(Course):
                 f"{CALL}.upgrade: {doubled[0][1]!r} is held twice; for two sets of Gaussians name "
                 "the groups 'first#means', 'second#means', or make a scheduler for each"
             )
+        self._end.upgraded = True
         for (_, optimizer), its in zip(given, slots, strict=True):
             self._upgrade(optimizer, its)
-        self._end.upgraded = True
         self._say_upgraded(" ".join(name for _, name in held if name))
         return optimizers
 
@@ -277,6 +277,11 @@ class PhaseScheduler(Course):
 
     # -- what it watches ---------------------------------------------------------------------------
 
+    def restore(self, state: Mapping[str, Any] | None, iteration: int) -> None:
+        """As a course's."""
+        super().restore(state, iteration)
+        self._end.upgraded = False
+
     def _advance(self) -> None:
         if self.members and not self.has_means and self.part(OwnFrame) is not None:
             self.warn_once(
@@ -345,13 +350,13 @@ class End:
 
     def __init__(self, total_steps: int, averaging: Averaging | None) -> None:
         self.total_steps, self.averaging = total_steps, averaging
-        self.upgraded = False
+        self.upgraded = False  # and not resumed: a checkpoint may be loaded to be looked at
         self.done = 0  # iterations, if any was made here
         self.finished = False
 
     def line(self) -> str | None:
         """What is said where it ends before its end; None: it does not."""
-        if self.upgraded and not self.done:
+        if self.upgraded and not self.done and not self.finished:
             return (
                 "opt3dgs_optim: the optimizers that were upgraded have made no step; upgrade those "
                 "that the training steps, after they have been made"
