@@ -347,7 +347,7 @@ def events(all_: Evidence) -> str:
 
 
 LENGTHS = (  # where longer steps to the end were tried: size, setting, iterations, scenes
-    ("half", HALF, 10_000, MAIN),
+    *(("half", HALF, count, MAIN) for count in (7_500, 10_000, 15_000, 30_000)),
     ("whole", WHOLE, 7_500, MAIN),
     ("quarter", QUARTER, 7_500, MAIN),
     ("quarter", QUARTER, 30_000, MAIN),
@@ -538,8 +538,7 @@ TABLES: dict[str, Callable[[Evidence], str]] = {
 
 DRAWN = (
     ("mcmc", 30_000, "#555555"),
-    ("own", 30_000, "#9ecae1"),
-    (DEFAULT, 15_000, "#56a0d3"),
+    (DEFAULT, 15_000, "#7fc4ea"),
     (DEFAULT, 10_000, "#0072b2"),
     (DEFAULT, 7_500, "#08306b"),
 )
@@ -586,7 +585,7 @@ def draw(all_: Evidence, path: Path) -> None:
     names = [name for name in order if name in entries]
     handles = [entries[name] for name in names]
     place = "outside lower center"
-    figure.legend(handles, names, loc=place, ncols=min(len(names), 3), frameon=False, fontsize=11)
+    figure.legend(handles, names, loc=place, ncols=2, frameon=False, fontsize=11)
     figure.savefig(path)
 
 
