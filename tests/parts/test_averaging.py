@@ -206,7 +206,7 @@ def test_finish_takes_away_the_noise_that_came_after_the_last_step() -> None:
     mean = optimizer.state[params["sh0"]]["averaging.mean"]
     assert torch.equal(params["sh0"], mean)
     with torch.no_grad():
-        params["sh0"] += torch.randn(params["sh0"].shape)
+        params["sh0"].add_(torch.randn(params["sh0"].shape))
     phases.finish()
     assert torch.equal(params["sh0"], mean)
 
