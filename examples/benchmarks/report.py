@@ -253,15 +253,14 @@ def bits(all_: Evidence) -> str:
 
 def equal(all_: Evidence) -> str:
     """All of 30,000 iterations."""
-    rows = []
+    rows, arms = [], (DEFAULT, "own", "defaults", "x2")
     for size, setting in (("half", HALF), ("quarter", QUARTER)):
         for scene in MAIN:
             stock = all_.of("mcmc", scene, iterations=30_000, **setting)
-            lines = (
-                all_.of(a, scene, iterations=30_000, **setting) for a in ("own", "defaults", "x2")
-            )
+            points = {"points": stock[0]["points"]}
+            lines = (all_.of(a, scene, iterations=30_000, **setting | points) for a in arms)
             rows.append((scene, size, shown(stock), *(gained(x, stock) for x in lines)))
-    heads = ("scene", "size", "stock", NAMES["own"], NAMES["defaults"], NAMES["x2"])
+    heads = ("scene", "size", "stock", *(NAMES[arm] for arm in arms))
     return table(heads, rows)
 
 
