@@ -185,14 +185,14 @@ def test_a_trainer_that_edits_what_has_the_parameters_shape(moments: Any) -> Non
 @pytest.mark.parametrize("moments", [32, 16])
 def test_what_comes_after_the_mean_is_not_taken_back(moments: Any, caplog: Any) -> None:
     """By `finish`, in a run that has gone on past its end, or past an earlier `finish`."""
-    for ends_at in (300, 295):
+    for ends_at, goes_on in ((300, 20), (295, 3)):
         params = parameters(ROWS, "sh0")
         phases = PhaseScheduler(TOTAL, parts=[Averaging()], moments=moments)
         optimizers = phases.upgrade(adams_of(params))
         steps(optimizers, params, ends_at, seed=1)
         if ends_at < TOTAL:
             phases.finish()
-        steps(optimizers, params, 20, seed=2)
+        steps(optimizers, params, goes_on, seed=2)
         before = params["sh0"].detach().clone()
         phases.finish()
         assert torch.equal(params["sh0"], before)
