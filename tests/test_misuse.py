@@ -387,6 +387,18 @@ def test_finish_before_there_is_a_mean(caplog: pytest.LogCaptureFixture) -> None
     assert "averaging begins at 580, and the parameters stay the last iterate" in caplog.text
 
 
+def test_finish_of_a_resumed_training_before_there_is_a_mean(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    params = parameters(ROWS, "means")
+    trained = PhaseScheduler(600, parts=[Averaging()]).upgrade(adams_of(params))
+    steps(trained, params, 5)
+    phases = PhaseScheduler(600, parts=[Averaging()])
+    phases.upgrade(adams_of(params))["means"].load_state_dict(trained["means"].state_dict())
+    phases.finish()
+    assert "finish() at iteration 5 of 600: averaging begins at 580" in caplog.text
+
+
 @pytest.mark.processes
 def test_the_early_end_is_said_at_exit() -> None:
     code = """

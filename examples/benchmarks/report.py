@@ -33,7 +33,7 @@ FEW = ("banana", "brighton_beach", "lund_door")
 HALF: dict[str, Any] = {"size": "images_2", "points": 50_000, "sh_degree": 0}
 WHOLE: dict[str, Any] = {"size": "images", "points": 200_000, "sh_degree": 3}
 QUARTER: dict[str, Any] = {"size": "images_4", "sh_degree": 0}
-SIZES = {"half": HALF, "whole": WHOLE, "quarter": QUARTER}
+SIZES = {"half": HALF, "whole": WHOLE, "quarter": QUARTER, "few photos": QUARTER}
 DEFAULT = "own-late"  # the arm of the package's defaults; "own" was that of those before
 METRICS = ("psnr", "ssim", "lpips")
 COUNTS = ("10000", "100000", "1000000", "5000000")  # of Gaussians, as steps.json has them
@@ -48,11 +48,11 @@ class Evidence:
     def __init__(self, path: Path = evidence.FILE) -> None:
         self.lines = evidence.read(path)
 
-    def of(self, arm: str, scene: str, **those: Any) -> list[Line]:
-        """The lines of an arm; what is not said is as usual, on a CPU. One a seed, in order."""
+    def of(self, arm: str, scene: str, *, gpu: bool = False, **those: Any) -> list[Line]:
+        """The lines of an arm; what is not said is as usual. One a seed, in order."""
         wanted = evidence.USUAL | those | {"arm": arm, "scene": scene}
         found = [x for x in self.lines if all(x.get(k) == v for k, v in wanted.items())]
-        found = [x for x in found if "NVIDIA" not in x["device"]]
+        found = [x for x in found if ("NVIDIA" in x["device"]) is gpu]
         return sorted(found, key=lambda x: str(x["seed"]))
 
 
@@ -76,6 +76,11 @@ def shown(lines: Sequence[Line]) -> str:
     values = (FORMS[m].format(mean(lines, m)) for m in METRICS if lines[0][m] is not None)
     count = len(seeds_of(lines))
     return f"{' / '.join(values)} ({count} seed{'s' * (count > 1)})"
+
+
+def one_seed(cell: str) -> str:
+    """A cell of a table whose text says that all have one seed."""
+    return cell.removesuffix(" (1 seed)")
 
 
 def gain(lines: Sequence[Line], control: Sequence[Line]) -> dict[str, float] | None:
@@ -170,25 +175,22 @@ def kept_aside(all_: Evidence) -> str:
     rows = []
     for arm in ("mcmc", "x2", "defaults", "own"):
         found = [x for x in all_.lines if x["scene"] == "kept-aside" and x["arm"] == arm]
-        cells = {x["iterations"]: shown([x]).removesuffix(" (1 seed)") for x in found}
+        cells = {x["iterations"]: one_seed(shown([x])) for x in found}
         rows.append((NAMES[arm], *(cells.get(n, "-") for n in (1_875, 2_500, 3_750, 7_500))))
     return table(("training", "1,875", "2,500", "3,750", "7,500 iterations"), rows)
 
 
 def gpu(all_: Evidence) -> str:
-    """The trainings on a GPU that came to their end."""
-    found = [x for x in all_.lines if "NVIDIA" in x["device"] and x["lpips"] is not None]
+    """Half of the iterations at whole size, on a GPU."""
     rows = []
-    for scene in sorted({x["scene"] for x in found}):
-        those = [x for x in found if x["scene"] == scene]
-        stock = [x for x in those if x["arm"] == "mcmc" and x["iterations"] == 15_000]
-        ours = [x for x in those if x["arm"] in ("own-41-events", "own")]
-        for line in (*stock, *ours):
-            name = f"{NAMES[line['arm']]}, {line['iterations']:,}"
-            less = "" if line in stock else gained([line], stock).removesuffix(" (1 seed)")
-            ends = shown([line]).removesuffix(" (1 seed)")
-            first = scene if line in stock else ""
-            rows.append((first, name, ends, less, f"{line['seconds']:.0f} s"))
+    for scene in ("bonsai", "lego"):
+        stock = all_.of("mcmc", scene, gpu=True, iterations=15_000, **WHOLE)
+        ours = all_.of("own-41-events", scene, gpu=True, iterations=7_500, **WHOLE)
+        for lines in (stock, ours):
+            name = f"{NAMES[lines[0]['arm']]}, {lines[0]['iterations']:,}"
+            first, less = (scene, "") if lines is stock else ("", one_seed(gained(lines, stock)))
+            took = f"{mean(lines, 'seconds'):.0f} s"
+            rows.append((first, name, one_seed(shown(lines)), less, took))
     return table(("scene", "training", "PSNR / SSIM / LPIPS", "less stock", "took"), rows)
 
 
@@ -196,15 +198,9 @@ def whole(all_: Evidence) -> str:
     """Half of the iterations at whole size, on a CPU, less stock's trainings on the GPU."""
     rows = []
     for scene in ("bonsai", "lego"):
-        stock = [
-            x
-            for x in all_.lines
-            if (x["scene"], x["arm"], x["iterations"]) == (scene, "mcmc", 15_000)
-            and all(x[k] == v for k, v in WHOLE.items())
-        ]
+        stock = all_.of("mcmc", scene, gpu=True, iterations=15_000, **WHOLE)
         ours = all_.of(DEFAULT, scene, iterations=7_500, **WHOLE)
-        cells = (shown(ours), gained(ours, stock))
-        rows.append((scene, *(x.removesuffix(" (1 seed)") for x in cells)))
+        rows.append((scene, one_seed(shown(ours)), one_seed(gained(ours, stock))))
     return table(("scene", "the defaults, 7,500, on a CPU", "less stock, 15,000, on the GPU"), rows)
 
 
@@ -254,11 +250,11 @@ def bits(all_: Evidence) -> str:
 def equal(all_: Evidence) -> str:
     """All of 30,000 iterations."""
     rows, arms = [], (DEFAULT, "own", "defaults", "x2")
-    for size, setting in (("half", HALF), ("quarter", QUARTER)):
+    for size in ("half", "quarter"):
         for scene in MAIN:
-            stock = all_.of("mcmc", scene, iterations=30_000, **setting)
-            points = {"points": stock[0]["points"]}
-            lines = (all_.of(a, scene, iterations=30_000, **setting | points) for a in arms)
+            stock = all_.of("mcmc", scene, iterations=30_000, **SIZES[size])
+            those = {"iterations": 30_000, **SIZES[size], "points": stock[0]["points"]}
+            lines = (all_.of(arm, scene, **those) for arm in arms)
             rows.append((scene, size, shown(stock), *(gained(x, stock) for x in lines)))
     heads = ("scene", "size", "stock", *(NAMES[arm] for arm in arms))
     return table(heads, rows)
@@ -276,7 +272,7 @@ def short(all_: Evidence) -> str:
             found = gain(ours, stock)
             gains.append(found)
             less = "not trained" if found is None else all_signed(found)
-            rows.append((f"{count:,}", scene, shown(stock).removesuffix(" (1 seed)"), less))
+            rows.append((f"{count:,}", scene, one_seed(shown(stock)), less))
         rows.append((f"{count:,}", "*mean*", "", mean_gain(gains)))
     return table(("iterations", "scene", "stock", "the defaults gain"), rows)
 
@@ -325,19 +321,20 @@ def few(all_: Evidence) -> str:
 
 
 EVENTS = (  # size, iterations, arms with fewer and with more events of `Fading`, how many they have
-    ("half", HALF, 10_000, "own", "own-fourth", "102", "200"),
-    ("whole", WHOLE, 7_500, "own-41-events", "own", "41", "100"),
-    ("whole", WHOLE, 7_500, "own-41-events", "own-120-events", "41", "120"),
-    ("whole", WHOLE, 7_500, "own-41-events", "own-fourth", "41", "141"),
+    ("half", 10_000, "own", "own-fourth", "102", "200"),
+    ("whole", 7_500, "own-41-events", "own", "41", "100"),
+    ("whole", 7_500, "own-41-events", "own-120-events", "41", "120"),
+    ("whole", 7_500, "own-41-events", "own-fourth", "41", "141"),
 )
 
 
 def events(all_: Evidence) -> str:
     """More events of `Fading`, each beside the same training with fewer."""
     rows = []
-    for size, setting, count, *arms, fewer, more in EVENTS:
+    for size, count, *arms, fewer, more in EVENTS:
+        those = {"iterations": count, **SIZES[size]}
         for scene in MAIN:
-            without, with_more = (all_.of(arm, scene, iterations=count, **setting) for arm in arms)
+            without, with_more = (all_.of(arm, scene, **those) for arm in arms)
             if without and with_more:
                 changes = gained(with_more, without)
                 rows.append((scene, size, fewer, shown(without), more, changes))
@@ -345,29 +342,27 @@ def events(all_: Evidence) -> str:
     return table(heads, rows)
 
 
-LENGTHS = (  # where longer steps to the end were tried: size, setting, iterations, scenes
-    *(("half", HALF, count, MAIN) for count in (7_500, 10_000, 15_000, 30_000)),
-    ("whole", WHOLE, 7_500, MAIN),
-    ("quarter", QUARTER, 7_500, MAIN),
-    ("quarter", QUARTER, 30_000, MAIN),
-    ("few photos", QUARTER, 3_000, FEW),
+LENGTHS = (  # where longer steps to the end were tried: size, iterations, scenes
+    *(("half", count, MAIN) for count in (7_500, 10_000, 15_000, 30_000)),
+    ("whole", 7_500, MAIN),
+    ("quarter", 7_500, MAIN),
+    ("quarter", 30_000, MAIN),
+    ("few photos", 3_000, FEW),
 )
 
 
 def aspects(all_: Evidence) -> str:
     """How thin an axis of the own frame may count as, each beside the same training with 0.1."""
     rows = []
-    for size, setting, count, scenes in LENGTHS:
+    for size, count, scenes in LENGTHS:
+        those = {"iterations": count, **SIZES[size]}
         for scene in scenes:
-            wider = [
-                all_.of(f"own-aspect-{least}", scene, iterations=count, **setting)
-                for least in (0.25, 0.5)
-            ]
+            wider = [all_.of(f"own-aspect-{least}", scene, **those) for least in (0.25, 0.5)]
             if wider[0]:
-                points = {"points": wider[0][0]["points"]}
-                thin = all_.of("own", scene, iterations=count, **setting | points)
+                points = wider[0][0]["points"]
+                thin = all_.of("own", scene, **those | {"points": points})
                 changes = (gained(lines, thin) for lines in wider)
-                name = f"{size}, {points['points']:,} Gaussians"
+                name = f"{size}, {points:,} Gaussians"
                 rows.append((scene, name, f"{count:,}", shown(thin), *changes))
     return table(("scene", "size", "iterations", "0.1", "0.25", "0.5"), rows)
 
@@ -375,12 +370,13 @@ def aspects(all_: Evidence) -> str:
 def late(all_: Evidence) -> str:
     """Longer steps to the end, each beside the same training with the defaults before."""
     rows = []
-    for size, setting, count, scenes in LENGTHS:
+    for size, count, scenes in LENGTHS:
+        those = {"iterations": count, **SIZES[size]}
         for scene in scenes:
-            trained = all_.of(DEFAULT, scene, iterations=count, **setting)
-            for points in sorted({x["points"] for x in trained}):
-                those = {"iterations": count, **setting, "points": points}
-                before, ours = (all_.of(arm, scene, **those) for arm in ("own", DEFAULT))
+            for points in sorted({x["points"] for x in all_.of(DEFAULT, scene, **those)}):
+                before, ours = (
+                    all_.of(arm, scene, **those | {"points": points}) for arm in ("own", DEFAULT)
+                )
                 name = f"{size}, {points:,} Gaussians"
                 rows.append((scene, name, f"{count:,}", shown(before), gained(ours, before)))
     heads = ("scene", "size", "iterations", NAMES["own"], "what the defaults change")
@@ -432,11 +428,11 @@ def tried(all_: Evidence) -> str:
     """What was not taken, each beside the same training without it, scene by scene."""
     rows = []
     for what, arm, control, size, count in TRIED:
-        cells = []
+        those, cells = {"iterations": count, **SIZES[size]}, []
         for scene in MAIN:
-            lines = all_.of(arm, scene, iterations=count, **SIZES[size])
+            lines = all_.of(arm, scene, **those)
             points = {"points": lines[0]["points"]} if lines else {}
-            without = all_.of(control, scene, iterations=count, **SIZES[size] | points)
+            without = all_.of(control, scene, **those | points)
             cells.append(gained(lines, without))
         rows.append((what, f"{size}, {count:,}", *cells))
     return table(("what", "size, iterations", *MAIN), rows)

@@ -102,8 +102,8 @@ class PhaseScheduler(Course):
         own = (part for part in self.parts if overrides(part, "pixel_loss"))
         self._pixel: Part | None = next(own, None)
         averaging = self.part(Averaging)
-        self._end = End(total_steps, averaging)
-        self._mean_at = total_steps if averaging is None else averaging.put_from(total_steps)
+        put = total_steps if averaging is None else averaging.put_from(total_steps)
+        self._end = End(total_steps, put)
         weakref.finalize(self, self._end.say)  # at exit, or where the function that trains ends
 
     @classmethod
@@ -267,18 +267,19 @@ class PhaseScheduler(Course):
         if not self.finished:
             holders = {id(o): o for o, _ in self.members.values()}.values()
             found = sum(each.put_means() for each in holders)
-            if not found and self._end.line() is not None:
+            assert self.total_steps is not None
+            if not found and self.iteration < self._end.mean_at < self.total_steps:
                 LOGGER.warning(
                     "opt3dgs_optim: finish() at iteration %d of %d: averaging begins at %d, and "
                     "the parameters stay the last iterate", self.iteration + 1, self.total_steps,
-                    Averaging.start(self.total_steps or 0),
+                    Averaging.start(self.total_steps),
                 )  # fmt: skip
         self.finished = self._end.finished = True
 
     # -- what it watches ---------------------------------------------------------------------------
 
     def restore(self, state: Mapping[str, Any] | None, iteration: int) -> None:
-        """As a course's."""
+        """Go on from a checkpoint, which may have been loaded to be looked at alone."""
         super().restore(state, iteration)
         self._end.upgraded = False
 
@@ -296,7 +297,7 @@ class PhaseScheduler(Course):
                 numbers["loss"], self._loss = self._loss, None
             self.log.step(self.iteration, phase=self.phase.value, **numbers)
         assert self.total_steps is not None
-        if self.iteration == self._mean_at < self.total_steps and not self.finished:
+        if self.iteration == self._end.mean_at < self.total_steps and not self.finished:
             say(
                 f"opt3dgs_optim: iteration {self.iteration + 1} of {self.total_steps}: from this "
                 "step on the parameters are the mean of the last thirtieth's iterates"
@@ -346,25 +347,29 @@ class PhaseScheduler(Course):
 
 
 class End:
-    """How far a training has come, which outlives its scheduler."""
+    """How far a training has come, which outlives its scheduler.
 
-    def __init__(self, total_steps: int, averaging: Averaging | None) -> None:
-        self.total_steps, self.averaging = total_steps, averaging
+    Attributes:
+        mean_at: the first iteration after which the mean is in the parameters' place;
+            `total_steps`: there is none, without `Averaging`, or in so short a training.
+    """
+
+    def __init__(self, total_steps: int, mean_at: int) -> None:
+        self.total_steps, self.mean_at = total_steps, mean_at
         self.upgraded = False  # and not resumed: a checkpoint may be loaded to be looked at
         self.done = 0  # iterations, if any was made here
         self.finished = False
 
     def line(self) -> str | None:
         """What is said where it ends before its end; None: it does not."""
-        if self.upgraded and not self.done and not self.finished:
+        if self.finished:
+            return None
+        if self.upgraded and not self.done:
             return (
                 "opt3dgs_optim: the optimizers that were upgraded have made no step; upgrade those "
                 "that the training steps, after they have been made"
             )
-        if self.finished or self.averaging is None or not self.done:
-            return None
-        put = self.averaging.put_from(self.total_steps)
-        if self.done > put or put == self.total_steps:  # so short a training has no mean
+        if not 0 < self.done <= self.mean_at < self.total_steps:
             return None
         return (
             f"opt3dgs_optim: the training ended at iteration {self.done} of {self.total_steps}, so "
