@@ -15,7 +15,8 @@ from torch.nn import Parameter
 
 GROW_GRAD = 2e-4  # gsplat's own threshold
 # Pixels across the images that people train on; bonsai's are half of Mip-NeRF 360's.
-FULL_WIDTH = {"bonsai": 1559, "lego": 800, "plush": 640}
+FULL_WIDTH = {"bonsai": 1559, "lego": 800, "plush": 640, "train": 979}
+_REFERENCE_RUN = 30_000  # iterations that gsplat's 500, 15,000, 100 and 3,000 were made for
 
 
 class DefaultDensityControl:
@@ -26,6 +27,7 @@ class DefaultDensityControl:
 
     Args:
         extent: the scene's, in world units.
+        iterations: length of the whole run; the strategy's schedule is scaled to it.
         threshold: the gradient of the projected means above which it clones and splits.
 
     Attributes:
@@ -33,11 +35,18 @@ class DefaultDensityControl:
         info: of the last rendering; the strategy reads the projected means' gradient from it.
     """
 
-    def __init__(self, extent: float, threshold: float) -> None:
+    def __init__(self, extent: float, iterations: int, threshold: float) -> None:
         # Where there is nvcc it would compile its CUDA extension, which no strategy needs.
         with patch("torch.utils.cpp_extension._find_cuda_home", lambda: None):
             default = importlib.import_module("gsplat.strategy.default")
-        self.strategy: Any = default.DefaultStrategy(grow_grad2d=threshold)
+        scale = iterations / _REFERENCE_RUN
+        self.strategy: Any = default.DefaultStrategy(
+            grow_grad2d=threshold,
+            refine_start_iter=round(500 * scale),
+            refine_stop_iter=round(15_000 * scale),
+            refine_every=max(round(100 * scale), 1),
+            reset_every=max(round(3_000 * scale), 1),
+        )
         self.reset = default.reset_opa
         self.state: dict[str, Any] = self.strategy.initialize_state(scene_scale=extent)
         self.info: dict[str, Any] = {}
@@ -63,7 +72,8 @@ class AdaptiveFit(Fit):
     def _density_control(self) -> DefaultDensityControl:
         width = self.scene.train[0].camera.width
         shrunk = FULL_WIDTH.get(self.scene.name, width) / width
-        return DefaultDensityControl(self.scene.extent, shrunk * GROW_GRAD)
+        threshold = shrunk * GROW_GRAD * self.options.threshold
+        return DefaultDensityControl(self.scene.extent, self.options.iterations, threshold)
 
     def _train_image(self, view: View) -> Tensor:
         density, camera = self.density, view.camera

@@ -34,6 +34,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 EVALUATIONS = 10
+DENSITIES = {"relocation": "mcmc", "clone-and-split": "adc"}
 Lpips = Callable[[Tensor, Tensor], float]  # of images [H, W, 3] in 0..1
 
 
@@ -131,6 +132,8 @@ def parser() -> argparse.ArgumentParser:
     add("--seed", type=int, default=0)
     add("--views", type=int, default=0, metavar="N", help="evenly spaced ones to train on; 0: all")
     add("--rates", type=float, default=1.0, help="factor on all of the trainer's learning rates")
+    add("--density", default="", choices=["", *DENSITIES], help="default: the arm's")
+    add("--threshold", type=float, default=1.0, help="factor on that of clone and split")
     add("--lpips", nargs=2, type=Path, metavar=("FILE.py", "WEIGHTS"), help="see `lpips_of`")
     add("-o", "--out", type=Path, metavar="FILE", help="default: in runs/benchmarks")
     return made
@@ -142,10 +145,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     torch.set_num_threads(1)
     scene, arm = scene_of(args), find_arm(args.arm)
+    if args.density:
+        arm = replace(arm, density=DENSITIES[args.density])
+    args.density = next(name for name, short in DENSITIES.items() if short == arm.density)
     options = FitOptions(
-        args.iterations, args.points, args.seed, sh_degree=args.sh_degree, rates=args.rates
+        args.iterations,
+        args.points,
+        args.seed,
+        sh_degree=args.sh_degree,
+        rates=args.rates,
+        threshold=args.threshold,
     )
-    kept = ("size", "arm", "iterations", "points", "sh_degree", "seed", "views", "rates")
+    kept = ("size", "density", "arm", "iterations", "points", "sh_degree", "seed", "views")
+    kept += ("rates", "threshold")
     record = {"scene": scene.name, **{name: vars(args)[name] for name in kept}}
     record |= {"machine": f"{platform.system()} {platform.machine()}, torch {torch.__version__}"}
     record |= {"date": time.strftime("%Y-%m-%d", time.gmtime())}

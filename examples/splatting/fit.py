@@ -39,13 +39,15 @@ class FitOptions:
     seed: int = 0
     sh_degree: int = 0
     rates: float = 1.0  # factor on all learning rates of the trainer
+    threshold: float = 1.0  # factor on that of clone and split
 
     def __post_init__(self) -> None:
         for name in ("iterations", "points"):
             if getattr(self, name) < 1:
                 raise ValueError(f"FitOptions: {name}={getattr(self, name)}, must be at least 1")
-        if not self.rates > 0:
-            raise ValueError(f"FitOptions: rates={self.rates}, must be above 0")
+        for name in ("rates", "threshold"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"FitOptions: {name}={getattr(self, name)}, must be above 0")
 
 
 class DensityControl(Protocol):
