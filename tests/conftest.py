@@ -36,6 +36,6 @@ def no_line_of_an_early_end(
     request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Tests leave hundreds of trainings unfinished; each would say so in a line."""
-    from opt3dgs_optim.phases import End
+    from opt3dgs_optim.messages import End
 
     monkeypatch.setattr(End, "say", lambda _: None)

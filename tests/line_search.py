@@ -39,7 +39,7 @@ def minimise(
     history = new_history(x, history_size)
     options = {"min_cosine": 1e-14, "graft": False}
     length = x.norm(dim=1, keepdim=True) * first
-    course = []
+    training = []
     for _ in range(iterations):
         g = gradient(value, x)
         found = step(x, g, history, history_size, **options)[0]
@@ -49,10 +49,10 @@ def minimise(
         down = torch.where(own[:, None], steepest, -found)
         lengths = weak_wolfe(value, x, g, down)
         x = x + lengths[:, None] * down
-        course.append(x)
+        training.append(x)
         if not bool(lengths.any()):
             break
-    return course
+    return training
 
 
 def weak_wolfe(value: Function, x: Tensor, g: Tensor, down: Tensor) -> Tensor:

@@ -43,7 +43,7 @@ TARGETS = {  # module: the tests that are meant to notice
     "parts/histogram.py": ENERGY,
     "parts/noise.py": ["parts/test_noise.py"],
     "parts/annealing.py": ["parts/test_annealing.py"],
-    "parts/last_phase.py": ["parts/test_last_phase.py"],
+    "parts/switch.py": ["parts/test_last_phase.py"],
     "parts/curvature.py": ["parts/test_curvature.py"],
     "parts/fading.py": ["parts/test_fading.py"],
     "parts/averaging.py": ["parts/test_averaging.py"],

@@ -224,7 +224,7 @@ def test_a_copy_goes_on_alike_and_apart(pickled: bool) -> None:
     steps(copies, others, 50, seed=1)
     assert same_tensors(params, others)
     assert same_tensors(params, before)
-    assert copies["means"].course is copies["scales"].course is not optimizers["means"].course
+    assert copies["means"].training is copies["scales"].training is not optimizers["means"].training
 
 
 # -- masked steps: the arithmetic and the mask stay theirs -----------------------------------------
@@ -313,18 +313,18 @@ class Signs(Part):
 
     names = ("scales",)
 
-    def before(self, step: Step, course: Any) -> Tensor:
+    def before(self, step: Step, training: Any) -> Tensor:
         return step.grad.sign()
 
-    def after(self, step: Step, course: Any) -> None:
+    def after(self, step: Step, training: Any) -> None:
         step.param.clamp_(-1.0, 1.0)
 
 
 class Counts(Part):
     """Learns, in the notes of the training."""
 
-    def plan(self, step: Step, course: Any) -> None:
-        notes = course.notes_of(self)
+    def plan(self, step: Step, training: Any) -> None:
+        notes = training.notes_of(self)
         notes["steps"] = notes.get("steps", 0) + 1
         step.factor = step.factor * 0.5
 
@@ -350,7 +350,7 @@ def test_a_strangers_part_has_hooks_and_notes() -> None:
 @pytest.mark.parametrize("found", [None, torch.ones(2, 2), 1.0])
 def test_a_gradient_of_another_shape_is_refused(found: Any) -> None:
     class Wrong(Part):
-        def before(self, step: Step, course: Any) -> Tensor:
+        def before(self, step: Step, training: Any) -> Tensor:
             return found
 
     params = parameters(ROWS, "sh0")
@@ -364,7 +364,7 @@ def test_a_gradient_of_another_shape_is_refused(found: Any) -> None:
 class Plain(Part):
     names = None
 
-    def plan(self, step: Step, course: Any) -> None:
+    def plan(self, step: Step, training: Any) -> None:
         step.plain = True
 
 
@@ -443,7 +443,7 @@ def test_a_masked_step_that_breaks_off_leaves_the_positions(monkeypatch: Any) ->
     start = params["means"].detach().clone()
     for param in params.values():
         param.grad = torch.ones_like(param)
-    monkeypatch.setattr("opt3dgs_optim.masked.into_frame", full)
+    monkeypatch.setattr("opt3dgs_optim.sparse_adam.into_frame", full)
     with pytest.raises(RuntimeError, match="out of memory"):
         optimizer.step(torch.ones(ROWS, dtype=torch.bool))
     assert torch.equal(params["means"], start)

@@ -247,12 +247,12 @@ def test_it_resumes_bit_for_bit(road: str, preconditioner: str) -> None:
     params = parameters([(5, 3), ()])
     optimizer = made(params, preconditioner)
     go(optimizer, params, 0, 20)
-    noise: Any = optimizer.course.parts[1]
+    noise: Any = optimizer.training.parts[1]
     if road == "torch.save":
         others = [Parameter(p.detach().clone()) for p in params]
         twin = made(others, preconditioner)
         twin.load_state_dict(by_torch(optimizer.state_dict()))
-        generator: Any = twin.course.parts[1]
+        generator: Any = twin.training.parts[1]
         generator.generator.set_state(noise.generator.get_state())
     elif road == "deepcopy":
         twin = copy.deepcopy(optimizer)
@@ -260,7 +260,7 @@ def test_it_resumes_bit_for_bit(road: str, preconditioner: str) -> None:
         generator, noise.generator = noise.generator, None  # torch's generators cannot be pickled
         twin = pickle.loads(pickle.dumps(optimizer))
         noise.generator = generator
-        copied: Any = twin.course.parts[1]
+        copied: Any = twin.training.parts[1]
         copied.generator = torch.Generator()
         copied.generator.set_state(generator.get_state())
     others = [param for group in twin.param_groups for param in group["params"]]
@@ -268,7 +268,7 @@ def test_it_resumes_bit_for_bit(road: str, preconditioner: str) -> None:
     expected = go(optimizer, params, 20, 40)
     for ours, theirs in zip(go(twin, others, 20, 40), expected, strict=True):
         assert torch.equal(ours, theirs)
-    assert twin.course.iteration == optimizer.course.iteration == 39
+    assert twin.training.iteration == optimizer.training.iteration == 39
 
 
 def test_a_checkpoint_of_stock_adam_loads() -> None:
@@ -280,7 +280,7 @@ def test_a_checkpoint_of_stock_adam_loads() -> None:
     assert (ours.param_groups[0]["lr"], ours.param_groups[0]["betas"]) == (0.3, (0.8, 0.99))
     assert torch.equal(ours.state[y[0]]["exp_avg"], stock.state[x[0]]["exp_avg"])
     go(ours, y, 1, 2)
-    assert ours.course.iteration == 1
+    assert ours.training.iteration == 1
 
 
 def test_a_damaged_histogram_is_refused_with_nothing_changed() -> None:
@@ -381,7 +381,7 @@ def test_wrong_options_are_named() -> None:
     ):
         with pytest.raises(error, match=re.escape(said)):
             build(**options)
-    assert build(moments=16).course.moments == 16
+    assert build(moments=16).training.moments == 16
 
 
 def test_a_histogram_serves_one_optimizer_or_one_training() -> None:

@@ -11,8 +11,8 @@ from gaussians import adam_of, adams_of, parameters, same_tensors, steps
 from torch.nn import Parameter
 
 from opt3dgs_optim import DEFAULTS, DEFAULTS_ADC, Averaging, Part, Phase, PhaseScheduler
-from opt3dgs_optim.course import Course
 from opt3dgs_optim.step import Step
+from opt3dgs_optim.training import Training
 
 TOTAL = 120
 
@@ -25,7 +25,7 @@ class Clocked(Part):
     def __init__(self) -> None:
         self.seen: dict[Any, list[int]] = {}
 
-    def plan(self, step: Step, course: Course) -> None:
+    def plan(self, step: Step, training: Training) -> None:
         self.seen.setdefault(step.name, []).append(step.iteration)
 
 

@@ -167,7 +167,7 @@ def test_the_options_defaults_are_adams() -> None:
 
 
 def test_the_other_defaults_are_curvatures() -> None:
-    ours, theirs = LQNAdam([points()]).course.part(Curvature), Curvature()
+    ours, theirs = LQNAdam([points()]).training.part(Curvature), Curvature()
     for name in ("history_size", "min_cosine", "graft", "backend"):
         assert getattr(ours, name) == getattr(theirs, name), name
 
@@ -190,4 +190,4 @@ def test_what_is_outside_is_refused() -> None:
         LQNAdam([points()], history_size=17)
     with pytest.raises(ValueError, match="LQNAdam: moments=8, but 32 or 16"):
         LQNAdam([points()], moments=8)  # pyright: ignore[reportArgumentType]
-    assert LQNAdam([points()], moments=16).course.moments == 16
+    assert LQNAdam([points()], moments=16).training.moments == 16

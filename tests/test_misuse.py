@@ -236,7 +236,7 @@ def test_a_part_that_gets_no_loss_says_so_once() -> None:
 def test_several_ranks_without_a_process_group(
     monkeypatch: pytest.MonkeyPatch, grouped: bool, recwarn: pytest.WarningsRecorder
 ) -> None:
-    monkeypatch.setattr(module, "_num_ranks", lambda: 2)
+    monkeypatch.setattr(module, "num_ranks", lambda: 2)
     params = parameters(ROWS, "means")
     phases = PhaseScheduler(100, parts=[Averaging()], process_group="all" if grouped else None)
     steps(phases.upgrade(adams_of(params)), params, 3)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from oracles import LoopHistogram, MovingHistogram
 from torch import Tensor
 
-from opt3dgs_optim.partitions import FLOOR, MEAN_ABS, FixedPartitions, MovingPartitions
+from opt3dgs_optim.parts.partitions import FLOOR, MEAN_ABS, FixedPartitions, MovingPartitions
 
 CPU = torch.device("cpu")
 Partitions: TypeAlias = FixedPartitions | MovingPartitions

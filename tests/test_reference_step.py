@@ -41,7 +41,7 @@ from opt3dgs_optim import (
     SquaredLoss,
     paper_parts,
 )
-from opt3dgs_optim.step import like_rows
+from opt3dgs_optim.mean import like_rows
 
 pytestmark = pytest.mark.filterwarnings("ignore:opt3dgs_optim. iteration .* not been finite")
 

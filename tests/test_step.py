@@ -81,7 +81,7 @@ def by_rows(step: Step, hyper: Hyper) -> list[np.ndarray]:
         if not step.plain:
             m[i] = hyper.beta1 * m[i] + (1 - hyper.beta1) * g[i]
             v[i] = hyper.beta2 * v[i] + (1 - hyper.beta2) * g[i] ** 2
-            z = m[i] / hyper.correction1 / (np.sqrt(v[i]) / hyper.root2 + hyper.eps)
+            z = m[i] / hyper.correction1 / (np.sqrt(v[i]) / hyper.sqrt_correction2 + hyper.eps)
         x[i] -= axes @ (rate * step.factor * z)
         if put is not None:
             began[i] = began[i] or hyper.count

@@ -23,7 +23,7 @@ from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 
 from opt3dgs_optim import (
-    AWSGLD, DEFAULTS, DEFAULTS_ADC, Annealing, Averaging, Course, Curvature, EnergyHistogram,
+    AWSGLD, DEFAULTS, DEFAULTS_ADC, Annealing, Averaging, Training, Curvature, EnergyHistogram,
     Fading, FreshMoments, IsotropicNoise, LQNAdam, Part, Phase, PhaseScheduler,
     PositionNoise, SquaredLoss, backend_info, two_loop,
 )
@@ -59,10 +59,10 @@ upgraded: dict[str, Adam] = PhaseScheduler(10).upgrade(adams)
 class SignAgreement(Part):
     during: ClassVar[Phase | None] = Phase.EXPLOITATION
 
-    def plan(self, step: Step, course: Course) -> None:
+    def plan(self, step: Step, training: Training) -> None:
         step.factor *= 2.0
 
-    def before(self, step: Step, course: Course) -> Tensor:
+    def before(self, step: Step, training: Training) -> Tensor:
         return torch.where(step.grad * step.state["exp_avg"] < 0, 0.0, step.grad)
 
 

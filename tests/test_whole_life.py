@@ -269,7 +269,7 @@ class WholeLife(RuleBasedStateMachine):
         whole = (self.params, self.given)
         made = pickle.loads(pickle.dumps(whole)) if pickled else copy.deepcopy(whole)
         self.params, self.given = made
-        self.phases = self.optimizers[0].course
+        self.phases = self.optimizers[0].training
 
     @precondition(lambda self: self.preset != "paper" and not self.finished)
     @rule()

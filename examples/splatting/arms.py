@@ -32,7 +32,7 @@ class Longer(Part):
     times: float
     names = None
 
-    def plan(self, step, course) -> None:
+    def plan(self, step, training) -> None:
         """Scale the rate of every parameter."""
         step.factor *= self.times
 

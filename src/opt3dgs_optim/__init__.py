@@ -11,23 +11,24 @@ training ends at the mean of its last iterates.
 
 from opt3dgs_optim.adam import StepAdam
 from opt3dgs_optim.awsgld import AWSGLD
-from opt3dgs_optim.backend import backend_info
-from opt3dgs_optim.course import Course
+from opt3dgs_optim.clock import Phase
 from opt3dgs_optim.lbfgs import history_from_pairs, two_loop
+from opt3dgs_optim.lbfgs.backend import backend_info
 from opt3dgs_optim.lqnadam import LQNAdam
-from opt3dgs_optim.part import Part, Phase
+from opt3dgs_optim.part import Part
 from opt3dgs_optim.parts.annealing import Annealing
 from opt3dgs_optim.parts.averaging import Averaging
 from opt3dgs_optim.parts.curvature import Curvature
 from opt3dgs_optim.parts.fading import Fading
 from opt3dgs_optim.parts.histogram import EnergyHistogram
-from opt3dgs_optim.parts.last_phase import FreshMoments, SquaredLoss
 from opt3dgs_optim.parts.noise import IsotropicNoise, PositionNoise
 from opt3dgs_optim.parts.out_of_view import OutOfView
 from opt3dgs_optim.parts.own_frame import OwnFrame
+from opt3dgs_optim.parts.switch import FreshMoments, SquaredLoss
 from opt3dgs_optim.phases import PhaseScheduler
 from opt3dgs_optim.presets import DEFAULTS, DEFAULTS_ADC, paper_parts
 from opt3dgs_optim.runs import RunLog
+from opt3dgs_optim.training import Training
 from opt3dgs_optim.version import __version__
 
 __all__ = [
@@ -36,7 +37,6 @@ __all__ = [
     "DEFAULTS_ADC",
     "Annealing",
     "Averaging",
-    "Course",
     "Curvature",
     "EnergyHistogram",
     "Fading",
@@ -52,6 +52,7 @@ __all__ = [
     "RunLog",
     "SquaredLoss",
     "StepAdam",
+    "Training",
     "__version__",
     "backend_info",
     "history_from_pairs",

@@ -7,12 +7,12 @@ from typing import Any, Literal
 from opt3dgs_optim.adam import StepAdam
 from opt3dgs_optim.checks import check_choice
 from opt3dgs_optim.contract import Slots, check_supported
-from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import split_name
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.parts.histogram import EnergyHistogram
 from opt3dgs_optim.parts.noise import IsotropicNoise, PositionNoise
 from opt3dgs_optim.step import Step
+from opt3dgs_optim.training import Training
 
 
 class AWSGLD(StepAdam):
@@ -111,24 +111,15 @@ class AWSGLD(StepAdam):
         parts: list[Part] = [part for part in (histogram, noise) if part is not None]
         if preconditioner == "none":
             parts.append(PlainDrift())
-        course = Sampling(parts, moments=moments)
+        training = Training(parts, moments=moments)
         if histogram is not None:
             histogram.names = None  # nu is on every group's step
-        self.follow(course, slots)
+        self.follow(training, slots)
 
     @property
     def histogram(self) -> EnergyHistogram | None:
         """Where nu comes from."""
-        return self.course.part(EnergyHistogram)
-
-
-class Sampling(Course):
-    """A course without an end, whose energies come from closures or from the histogram's user."""
-
-    def observe(self, loss: Any) -> None:
-        """Take the value of a closure."""
-        for part in self.observers:
-            part.observe(loss, self)
+        return self.training.part(EnergyHistogram)
 
 
 class PlainDrift(Part):
@@ -136,6 +127,6 @@ class PlainDrift(Part):
 
     names = None
 
-    def plan(self, step: Step, course: Course) -> None:
+    def plan(self, step: Step, training: Training) -> None:
         """Have no moments in the step."""
         step.plain = True

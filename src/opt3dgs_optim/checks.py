@@ -1,17 +1,11 @@
 """Option checks whose messages name the call, the value and what is allowed."""
 
-import logging
 import math
-import os
-import sys
-import warnings
 from collections.abc import Sequence
 from numbers import Integral, Real
 from typing import Any
 
 import torch
-
-LOGGER = logging.getLogger("opt3dgs_optim")  # what the package says of itself
 
 
 def as_float(value: Any) -> float:
@@ -106,20 +100,3 @@ def check_interval(call: str, name: str, value: Any) -> tuple[float, float]:
     if low >= high or not math.isfinite(high - low):
         raise ValueError(f"{call}: {name}={value!r}, but low < high, a finite way apart, is needed")
     return low, high
-
-
-def warn_user(message: str) -> None:
-    """Warn at the line outside of this package and torch from which the call came."""
-    inside = tuple(os.path.dirname(each) + os.sep for each in (__file__, torch.__file__))
-    frame, level = sys._getframe(1), 2
-    while frame.f_back is not None and frame.f_code.co_filename.startswith(inside):
-        frame, level = frame.f_back, level + 1
-    warnings.warn(message, stacklevel=level)
-
-
-def say(message: str) -> None:
-    """Tell the user, by the logger, or on stderr where nothing has been set up to show INFO."""
-    LOGGER.info(message)
-    if not LOGGER.hasHandlers():
-        bars = getattr(sys.modules.get("tqdm"), "tqdm", None)  # a trainer's would share the line
-        getattr(bars, "write", print)(message, file=sys.stderr)

@@ -17,10 +17,10 @@ from torch.nn import Parameter
 
 from opt3dgs_optim import triton
 from opt3dgs_optim.awsgld import AWSGLD
-from opt3dgs_optim.backend import Backend, backend_info
-from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, two_loop
+from opt3dgs_optim.lbfgs.backend import Backend, backend_info
 from opt3dgs_optim.lqnadam import LQNAdam
+from opt3dgs_optim.messages import LOGGER
 from opt3dgs_optim.phases import PhaseScheduler
 from opt3dgs_optim.version import __version__
 

@@ -7,12 +7,13 @@ from typing import Any, Literal
 from torch import Tensor
 
 from opt3dgs_optim.adam import StepAdam
-from opt3dgs_optim.backend import Backend
-from opt3dgs_optim.checks import check_choice, warn_user
+from opt3dgs_optim.checks import check_choice
 from opt3dgs_optim.contract import check_supported
-from opt3dgs_optim.course import Course
+from opt3dgs_optim.lbfgs.backend import Backend
+from opt3dgs_optim.messages import warn_user
 from opt3dgs_optim.names import split_name
 from opt3dgs_optim.parts.curvature import Curvature
+from opt3dgs_optim.training import Training
 
 
 class LQNAdam(StepAdam):
@@ -90,7 +91,7 @@ class LQNAdam(StepAdam):
         super().__init__(params, lr, betas, eps, weight_decay)
         slots = [split_name(group.get("name")) for group in self.param_groups]
         check_supported(self, slots, moments)
-        self.follow(Course([curvature], switch_step=0, moments=moments), slots)
+        self.follow(Training([curvature], switch_step=0, moments=moments), slots)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Add a group as in `torch.optim.Adam`; parameters of one dimension get a warning."""
@@ -106,5 +107,5 @@ class LQNAdam(StepAdam):
     @property
     def accepted_share(self) -> Tensor | None:
         """Share of the last step's candidate pairs that were accepted, 0-d; None before any."""
-        curvature = self.course.part(Curvature)
+        curvature = self.training.part(Curvature)
         return None if curvature is None else curvature.accepted_share

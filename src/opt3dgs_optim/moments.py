@@ -15,10 +15,13 @@ that a resumed run repeats them, and every device and execution has the same.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 CODES = torch.int16
+MOMENTS = ("exp_avg", "exp_avg_sq")  # torch's names
 NEAREST = 0x80004000  # in the place of chances: a half, for both moments
 
 
@@ -61,3 +64,42 @@ def chances(like: Tensor, key: int, at: int) -> Tensor:
 
 def _signed(number: int) -> int:
     return (number + 2**31) % 2**32 - 2**31
+
+
+# -- the state of a parameter ----
+
+
+def as_numbers(state: dict[str, Any]) -> dict[str, Any]:
+    """A parameter's state with float32 moments in the place of codes."""
+    if "exp_avg" not in state:
+        return state
+    codes = [state[key].to(CODES) for key in MOMENTS]
+    return {**state, **dict(zip(MOMENTS, decoded(codes[0], codes[1]), strict=True))}
+
+
+def as_codes(state: dict[str, Any]) -> None:
+    """Have the codes of a parameter's moments, and its mean of 16 bits, as integers again.
+
+    An edit of rows, and torch's loading, make them float32, with the same values.
+    """
+    for key in (*MOMENTS, "averaging.residue"):
+        if key in state and state[key].dtype != CODES:
+            state[key] = state[key].to(CODES)
+
+
+@torch.no_grad()
+def recode(state: dict[str, Any], coded: bool, bits: int, dtype: torch.dtype) -> bool:
+    """Have moments, which are codes or not, at so many bits; whether there are any."""
+    if "exp_avg" not in state:
+        return False
+    if coded:
+        as_codes(state)
+    first, second = (state[key] for key in MOMENTS)
+    if coded and bits == 32:
+        first, second = (each.to(dtype) for each in decoded(first, second))
+    elif not coded and bits == 16:
+        codes = torch.empty_like(first, dtype=CODES), torch.empty_like(second, dtype=CODES)
+        encode(first, second, *codes, NEAREST)
+        first, second = codes
+    state["exp_avg"], state["exp_avg_sq"] = first, second
+    return True

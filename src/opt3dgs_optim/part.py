@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from torch import Tensor
 
+from opt3dgs_optim.clock import Phase
 from opt3dgs_optim.names import GAUSSIAN
-
-if TYPE_CHECKING:
-    from opt3dgs_optim.course import Course
-    from opt3dgs_optim.step import Step
-
-
-class Phase(enum.Enum):
-    """What a training is doing."""
-
-    EXPLORATION = "exploration"
-    EXPLOITATION = "exploitation"
+from opt3dgs_optim.step import Step
+from opt3dgs_optim.training import Training
 
 
 class Part:
@@ -30,7 +21,7 @@ class Part:
     the step of them (`opt3dgs_optim.step`), on a GPU in one launch. A part that needs its own
     arithmetic has `before` and `after`, in torch operations, at a launch for each of them.
 
-    What a part learns of a training goes into `course.notes_of(self)`, a dict of plain numbers by
+    What a part learns of a training goes into `training.notes_of(self)`, a dict of plain numbers by
     name, which is saved with the optimizers; a part object whose state lives in itself sets
     `learns`, and serves one training.
 
@@ -46,27 +37,27 @@ class Part:
     learns: ClassVar[bool] = False
     names: Any = GAUSSIAN  # tuple[str, ...] | None
 
-    def plan(self, step: Step, course: Course) -> None:
+    def plan(self, step: Step, training: Training) -> None:
         """Say what the step has, before it is made, by setting attributes of `step`."""
 
-    def before(self, step: Step, course: Course) -> Tensor:
+    def before(self, step: Step, training: Training) -> Tensor:
         """The gradient [N, ...] that Adam is fed in the place of `step.grad`."""
         return step.grad
 
-    def after(self, step: Step, course: Course) -> None:
+    def after(self, step: Step, training: Training) -> None:
         """Change `step.param` [N, ...] in place, after the step."""
 
-    def observe(self, energy: Tensor, course: Course) -> None:
+    def observe(self, energy: Tensor, training: Training) -> None:
         """Take the loss of this iteration, 0-d; called by `observe(loss)`."""
 
-    def settle(self, course: Course) -> None:
+    def read_back(self, training: Training) -> None:
         """Take what is still on its way from a device into the notes; called before a save."""
 
     def pixel_loss(self, error: Tensor) -> Tensor:
         """The photometric term of an error [...] of pixels, 0-d."""
         raise NotImplementedError
 
-    def numbers(self, course: Course) -> Mapping[str, float | Tensor]:
+    def numbers(self, training: Training) -> Mapping[str, float | Tensor]:
         """What a log may show of this iteration; a device's numbers stay there."""
         return {}
 
@@ -77,14 +68,13 @@ class Part:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore `state_dict()`; ValueError, with nothing changed, where it does not fit."""
 
+    def overrides(self, hook: str) -> bool:
+        """Whether it has a hook of its own."""
+        return getattr(type(self), hook) is not getattr(Part, hook)
+
     def __repr__(self) -> str:
         """The options that are given; the parameters where they are not the part's usual ones."""
         options = fields(self) if is_dataclass(self) else ()
         shown = [f.name for f in options if f.name != "names" or self.names != f.default]
         given = {name: getattr(self, name) for name in shown}
         return f"{type(self).__name__}({', '.join(f'{n}={v!r}' for n, v in given.items())})"
-
-
-def overrides(part: Part, hook: str) -> bool:
-    """Whether a part has a hook of its own."""
-    return getattr(type(part), hook) is not getattr(Part, hook)

@@ -12,16 +12,20 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from opt3dgs_optim.adam import StepAdam, upgraded_class
-from opt3dgs_optim.checks import LOGGER, check_count, check_energy, check_number, say
+from opt3dgs_optim.checkpoint import STATE_KEY, check_numbers, restore_parts
+from opt3dgs_optim.checks import check_count, check_energy, check_number
+from opt3dgs_optim.clock import Phase
 from opt3dgs_optim.contract import Slots, check_supported
-from opt3dgs_optim.course import STATE_KEY, Course
+from opt3dgs_optim.device import mean_over_ranks, num_ranks
+from opt3dgs_optim.messages import LOGGER, End, say
 from opt3dgs_optim.names import GAUSSIAN_NAMES, split_name
-from opt3dgs_optim.part import Part, Phase, overrides
+from opt3dgs_optim.part import Part
 from opt3dgs_optim.parts.averaging import Averaging
 from opt3dgs_optim.parts.curvature import Curvature
 from opt3dgs_optim.parts.fading import Fading
 from opt3dgs_optim.parts.own_frame import OwnFrame
 from opt3dgs_optim.presets import DEFAULTS, PAPER_STEPS, PAPER_SWITCH, paper_parts
+from opt3dgs_optim.training import Training
 
 if TYPE_CHECKING:
     from opt3dgs_optim.runs import RunLog
@@ -32,7 +36,7 @@ Optimizers = TypeVar(
 )
 
 
-class PhaseScheduler(Course):
+class PhaseScheduler(Training):
     """Put parts into the steps of a 3DGS trainer's optimizers, in two phases.
 
     By default `DEFAULTS`, for 3DGS-MCMC's relocation; `DEFAULTS_ADC` is for clone, split and prune,
@@ -99,7 +103,7 @@ class PhaseScheduler(Course):
             raise TypeError(f"{CALL}: log={log!r}, but a RunLog or None is needed")
         self.log, self._loss = log, None
         self._group = process_group
-        own = (part for part in self.parts if overrides(part, "pixel_loss"))
+        own = (part for part in self.parts if part.overrides("pixel_loss"))
         self._pixel: Part | None = next(own, None)
         averaging = self.part(Averaging)
         put = total_steps if averaging is None else averaging.put_from(total_steps)
@@ -131,7 +135,7 @@ class PhaseScheduler(Course):
         slots = [_slots_of(key, optimizer) for key, optimizer in given]
         held = [slot for each in slots for slot in each if slot[1] is not None]
         for (key, optimizer), its in zip(given, slots, strict=True):
-            if not isinstance(getattr(optimizer, "course", self), PhaseScheduler):
+            if not isinstance(getattr(optimizer, "training", self), PhaseScheduler):
                 raise TypeError(
                     f"{CALL}.upgrade: {type(optimizer).__name__} has parts of its own; upgrade a "
                     "torch.optim.Adam, with parts=[...] for what its steps are to have"
@@ -145,8 +149,8 @@ class PhaseScheduler(Course):
                     f"{error}; or leave {key!r} out, which holds no Gaussians"
                 ) from None
             if (saved := optimizer.param_groups[0].get(STATE_KEY)) is not None:
-                self.check_state(f"{CALL}.upgrade", saved)
-                self.restore_parts(saved)
+                check_numbers(f"{CALL}.upgrade", saved)
+                restore_parts(self, saved)
         if not held:
             names = [g.get("name") or key for key, o in given for g in o.param_groups]
             raise ValueError(
@@ -184,11 +188,11 @@ class PhaseScheduler(Course):
 
     def _upgrade(self, optimizer: Any, slots: Slots) -> None:
         if isinstance(optimizer, StepAdam):
-            if optimizer.course is self:  # its groups are others now
+            if optimizer.training is self:  # its groups are others now
                 optimizer.follow(self, slots)
                 return
-            optimizer.param_groups[0][STATE_KEY] = optimizer.course.state_of(optimizer)
-            optimizer.course._end.finished = True  # pyright: ignore[reportAttributeAccessIssue]
+            optimizer.param_groups[0][STATE_KEY] = optimizer.numbers()
+            optimizer.training._end.finished = True  # pyright: ignore[reportAttributeAccessIssue]
         else:
             vars(optimizer).pop("step", None)  # as learning-rate schedulers of old have wrapped it
             optimizer.__class__ = upgraded_class(type(optimizer))
@@ -218,25 +222,14 @@ class PhaseScheduler(Course):
                     f"{self.iteration} of total_steps={self.total_steps} and goes forward, to "
                     f"{2 * self.total_steps} at most; make a new PhaseScheduler for another run"
                 )
-            if iteration > self.iteration:
-                self._go_to(iteration)
-                self._resumed = False
-                self._advance()
+            self.put_on(iteration)
         if loss is None:
             return
         self._loss = energy = check_energy(f"{CALL}.observe", "loss", loss)
         if self.observers:
             if self._group is not None:
-                energy = self._mean_over_ranks(energy)
-            for part in self.observers:
-                part.observe(energy, self)
-
-    def _mean_over_ranks(self, energy: Tensor) -> Tensor:
-        from torch import distributed  # many builds of torch and most trainings are without it
-
-        total = energy.detach().to(torch.float32, copy=True)
-        distributed.all_reduce(total, group=self._group)
-        return total / distributed.get_world_size(self._group)
+                energy = mean_over_ranks(energy, self._group)
+            super().observe(energy)
 
     def pixel_loss(self, render: Tensor, target: Tensor) -> Tensor:
         """The photometric term of two images in 0..1: mean |error|, unless a part says another.
@@ -265,7 +258,7 @@ class PhaseScheduler(Course):
         where the training has gone on since: past its last iteration, or past another `finish()`.
         """
         if not self.finished:
-            holders = {id(o): o for o, _ in self.members.values()}.values()
+            holders: Any = {id(m.optimizer): m.optimizer for m in self.members.values()}.values()
             found = sum(each.put_means() for each in holders)
             assert self.total_steps is not None
             if not found and self.iteration < self._end.mean_at < self.total_steps:
@@ -278,14 +271,15 @@ class PhaseScheduler(Course):
 
     # -- what it watches ---------------------------------------------------------------------------
 
-    def restore(self, state: Mapping[str, Any] | None, iteration: int) -> None:
+    def resume(self, iteration: int) -> None:
         """Go on from a checkpoint, which may have been loaded to be looked at alone."""
-        super().restore(state, iteration)
+        super().resume(iteration)
         self._end.upgraded = False
 
-    def _advance(self) -> None:
-        if self.members and not self.has_means and self.part(OwnFrame) is not None:
-            self.warn_once(
+    def advanced(self) -> None:
+        """Say what is wrong with the training as it goes; write a line of the log."""
+        if self.members and not self.counts_means and self.part(OwnFrame) is not None:
+            self.messages.warn_once(
                 "positions",
                 f"{CALL}: no optimizer holds positions, so that OwnFrame does nothing; name their "
                 "group, or its key in the dict, 'means' (other trainers' names are known, too)",
@@ -303,28 +297,28 @@ class PhaseScheduler(Course):
                 "step on the parameters are the mean of the last thirtieth's iterates"
             )
         if self.iteration > self.total_steps:  # trainers that count from 1 end at total_steps
-            self.warn_once(
+            self.messages.warn_once(
                 "overrun",
                 f"{CALL}: iteration {self.iteration} of total_steps={self.total_steps}: the "
                 "schedule came too early for this run; pass the training's number of iterations",
             )
         if self.finished:
-            self.warn_once(
+            self.messages.warn_once(
                 "finished",
                 f"{CALL}: iteration {self.iteration} comes after finish(): the parameters are no "
                 "mean any more; call it after the last step",
             )
-        if self.iteration == 0 and self._group is None and _num_ranks() > 1:
-            self.warn_once(
+        if self.iteration == 0 and self._group is None and num_ranks() > 1:
+            self.messages.warn_once(
                 "ranks",
-                f"{CALL}: {_num_ranks()} ranks train, but process_group=None: parts that read the "
+                f"{CALL}: {num_ranks()} ranks train, but process_group=None: parts that read the "
                 "loss would differ between them; give process_group=torch.distributed.group.WORLD",
             )
 
     def rows_removed(self, count: int) -> None:
         """Gaussians have disappeared, under parts that are made for relocation."""
         if not self._chosen:
-            self.warn_once(
+            self.messages.warn_once(
                 "removed",
                 f"{CALL}: {count} Gaussians were removed at iteration {self.iteration}, but the "
                 "default parts are made for 3DGS-MCMC's relocation; for clone, split and prune "
@@ -344,50 +338,6 @@ class PhaseScheduler(Course):
         if any(part.during is not None for part in self.parts):
             clock += f", {self.phase.value}"
         return "\n".join([f"{CALL}(", f"  {clock}", *(f"  {part!r}" for part in self.parts), ")"])
-
-
-class End:
-    """How far a training has come, which outlives its scheduler.
-
-    Attributes:
-        mean_at: the first iteration after which the mean is in the parameters' place;
-            `total_steps`: there is none, without `Averaging`, or in so short a training.
-    """
-
-    def __init__(self, total_steps: int, mean_at: int) -> None:
-        self.total_steps, self.mean_at = total_steps, mean_at
-        self.upgraded = False  # and not resumed: a checkpoint may be loaded to be looked at
-        self.done = 0  # iterations, if any was made here
-        self.finished = False
-
-    def line(self) -> str | None:
-        """What is said where it ends before its end; None: it does not."""
-        if self.finished:
-            return None
-        if self.upgraded and not self.done:
-            return (
-                "opt3dgs_optim: the optimizers that were upgraded have made no step; upgrade those "
-                "that the training steps, after they have been made"
-            )
-        if not 0 < self.done <= self.mean_at < self.total_steps:
-            return None
-        return (
-            f"opt3dgs_optim: the training ended at iteration {self.done} of {self.total_steps}, so "
-            "that the parameters are the last iterate and no mean; make total_steps the number of "
-            "steps, upgrade optimizers that are made anew, and call phases.finish() where a "
-            "training ends early"
-        )
-
-    def say(self) -> None:
-        """Log the line, if there is one."""
-        if (line := self.line()) is not None:
-            LOGGER.warning(line)
-
-
-def _num_ranks() -> int:
-    distributed = torch.distributed
-    ready = distributed.is_available() and distributed.is_initialized()
-    return distributed.get_world_size() if ready else 1
 
 
 def _checked_parts(parts: Any) -> Sequence[Part]:

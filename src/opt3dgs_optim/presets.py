@@ -11,9 +11,9 @@ from opt3dgs_optim.parts.averaging import Averaging
 from opt3dgs_optim.parts.curvature import Curvature
 from opt3dgs_optim.parts.fading import Fading
 from opt3dgs_optim.parts.histogram import EnergyHistogram
-from opt3dgs_optim.parts.last_phase import FreshMoments, SquaredLoss
 from opt3dgs_optim.parts.out_of_view import OutOfView
 from opt3dgs_optim.parts.own_frame import OwnFrame
+from opt3dgs_optim.parts.switch import FreshMoments, SquaredLoss
 
 PAPER_STEPS = 30_000
 PAPER_SWITCH = 29_000 / PAPER_STEPS

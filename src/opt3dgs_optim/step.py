@@ -29,17 +29,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from opt3dgs_optim.mean import Mean, like_rows, take_into_mean
 from opt3dgs_optim.moments import CODES, chances, decoded, encode
 
 CHUNK = 65_536  # numbers that a CPU works on at a time, so that intermediates stay in its cache
 # Above it a square is infinite: Adam's second moment would stay so for ever.
 LARGEST = {dtype: torch.finfo(dtype).max ** 0.5 / 2 for dtype in (torch.float32, torch.float64)}
 MIN_QUATERNION = 1e-12  # a shorter one is divided by this
-# The grids of means of 16 bits, see `take_into_residue`. They reach for 2, 2, 16, 2 and 1, further
-# than parameters go in the last thirtieth at a hundred times the usual rates.
-GRIDS = {"scales": 2**-14, "quats": 2**-14, "opacities": 2**-11, "sh0": 2**-14, "shN": 2**-15}
-MAX_PLACE = 2.0**23  # on a grid, from which on float32 has no fractions
-MAX_AWAY = 24_576.0  # places of a mean from its iterate; a step may have another 8,192
 
 
 class Fade(NamedTuple):
@@ -83,7 +79,7 @@ class Step:
         fresh: Adam's moments begin anew before the step.
         plain: no moments and no frame: the step is the gradient times the rate.
         fade, frame, hold: see there; None: not in this step.
-        mean: whether the running mean, with this iterate in it, takes the parameter's place; None:
+        put: whether the running mean, with this iterate in it, takes the parameter's place; None:
             this iterate is none of the mean's.
     """
 
@@ -102,7 +98,7 @@ class Step:
     fade: Fade | None = None
     frame: Frame | None = None
     hold: Hold | None = None
-    mean: bool | None = None
+    put: bool | None = None
 
 
 @dataclass(slots=True)
@@ -114,20 +110,17 @@ class Hyper:
     beta2: float
     eps: float
     correction1: float  # 1 - beta1^t
-    root2: float  # sqrt(1 - beta2^t)
+    sqrt_correction2: float  # sqrt(1 - beta2^t)
     exp_avg: Tensor  # float32 or float64, or codes int16 of both: see `moments`
     exp_avg_sq: Tensor
     shrink: float = 1.0  # decoupled weight decay: factor on the parameter
     decay: float = 0.0  # the other kind: share of the parameter in the gradient
-    mean: Tensor | None = None  # like the parameter, or int16: see `take_into_residue`
-    grid: float = 1.0  # of a mean of int16
-    began: Tensor | None = None  # [N] the `count` with which a row's mean began; 0: not yet
-    count: int = 0  # Adam's steps of the parameter with this one, by which the mean counts
+    mean: Mean | None = None
     nonfinite: Tensor | None = None  # [1] int32 on the device: counts numbers
     key: int = 0  # 32 bits on which this step's rounding of moments to codes depends
 
 
-def take_step(step: Step, hyper: Hyper) -> int:  # noqa: PLR0912, PLR0915  (all a step has)
+def take_step(step: Step, hyper: Hyper) -> int:  # noqa: PLR0912  (all a step has)
     """Make the step in plain torch; how many numbers of the gradient were not finite (CPU only).
 
     On other devices they are added to `hyper.nonfinite`, so that nothing waits.
@@ -169,7 +162,7 @@ def take_step(step: Step, hyper: Hyper) -> int:  # noqa: PLR0912, PLR0915  (all 
         else:
             exp_avg.lerp_(grad, 1 - hyper.beta1)
             exp_avg_sq.mul_(hyper.beta2).addcmul_(grad, grad, value=1 - hyper.beta2)
-            root = exp_avg_sq.sqrt().div_(hyper.root2).add_(hyper.eps)
+            root = exp_avg_sq.sqrt().div_(hyper.sqrt_correction2).add_(hyper.eps)
             if step.frame is not None and axes is not None:
                 rate = step.frame.rate * step.factor / hyper.correction1
                 param.sub_(out_of_frame(axes, (exp_avg / root).mul_(rate)))
@@ -177,13 +170,8 @@ def take_step(step: Step, hyper: Hyper) -> int:  # noqa: PLR0912, PLR0915  (all 
                 param.sub_((exp_avg / root).mul_(step.factor * (hyper.lr / hyper.correction1)))
             else:
                 param.addcdiv_(exp_avg, root, value=-(hyper.lr * step.factor / hyper.correction1))
-        if step.mean is not None:
-            assert hyper.mean is not None
-            assert hyper.began is not None
-            mean, began = hyper.mean[rows], hyper.began[rows]
-            take_into_mean(
-                hyper.count, step.mean, param, mean, began, hyper.grid, chance
-            )  # fmt: skip
+        if hyper.mean is not None:
+            take_into_mean(hyper.mean, param, rows, chance)
         if coded and not step.plain:
             encode(exp_avg, exp_avg_sq, *codes, chance)
     return bad
@@ -199,87 +187,6 @@ def finite(grad: Tensor, nonfinite: Tensor | None) -> tuple[Tensor, int]:
     if nonfinite is not None:
         nonfinite.add_((~torch.isfinite(grad)).sum())
     return torch.nan_to_num(grad, 0.0, 0.0, 0.0), 0
-
-
-def take_into_mean(
-    count: int, put: bool, param: Tensor, mean: Tensor, began: Tensor,
-    grid: float = 1.0, chance: Any = None,
-) -> None:  # fmt: skip
-    """An iterate that is not finite leaves its mean alone; a mean that is not begins with it.
-
-    A row that has `began` with 0 begins now, with this `count`. `grid` and `chance` are of a mean
-    of int16, see `take_into_residue`.
-    """
-    began.masked_fill_(began == 0, count)
-    weight = like_rows(1.0 / (count + 1 - began), param)
-    if mean.dtype == CODES:
-        take_into_residue(put, param, mean, weight, grid, chance)
-        return
-    if param.is_cpu and math.isfinite((param.sum() + mean.sum()).item()):
-        mean.lerp_(param, weight.to(param.dtype))
-        if put:
-            param.copy_(mean)
-        return
-    known = torch.isfinite(param)
-    start = torch.where(torch.isfinite(mean), mean, param)
-    # The old mean in the place of a number that is not finite moves nothing.
-    mean.copy_(torch.where(known, start.lerp(torch.where(known, param, start), weight), mean))
-    if put:
-        param.copy_(torch.where(known, mean, param))
-
-
-def take_into_residue(
-    put: bool, param: Tensor, residue: Tensor, weight: Tensor, grid: float, chance: Tensor
-) -> None:
-    """`take_into_mean` in 16 bits: the lower bits of the mean's place on a grid.
-
-    The mean is read as the one of the places with these bits that is nearest to the iterate. Each
-    place is rounded by chance; after a thousand iterates they are off by seven. A mean further away
-    than `MAX_AWAY` places follows its iterate. Numbers beyond `MAX_PLACE` places have no mean. A
-    trainer that moves a number by more than 32,768 places at once, in the last thirtieth, has to
-    tell by `reset_rows`.
-
-    Args:
-        put: whether the mean takes the parameter's place.
-        param: the iterate [n, ...] float32.
-        residue: [n, ...] int16.
-        weight: of the iterate in the mean.
-        grid: the distance of two places.
-        chance: of the rounding, as of `moments.chances`.
-    """
-    known, lower, rest, away = places_of(param, residue, grid)
-    away = (away * (1.0 - weight)).clamp_(-MAX_AWAY, MAX_AWAY)
-    chance = ((chance >> 16) & 0xFFFF).to(torch.float32) * 2.0**-16
-    moved = lower + (rest + away + chance).floor_().to(torch.int32)
-    residue.copy_(torch.where(known, moved.to(CODES), residue))
-    if put:
-        param.copy_(torch.where(known, param + away * grid, param))
-
-
-def places_of(param: Tensor, residue: Tensor, grid: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Where iterates, and their means of int16, lie on a grid.
-
-    Returns:
-        Whether the number has a mean, bool; its place, whole as int32, and the rest of it; how many
-        places its mean is from it. All [n, ...].
-    """
-    place = param / grid
-    known = place.abs() < MAX_PLACE
-    place = torch.where(known, place, 0.0)
-    lower = place.to(torch.int32)
-    rest = place - lower
-    return known, lower, rest, (residue.to(torch.int32) - lower).to(CODES).to(torch.float32) - rest
-
-
-def mean_of_residue(param: Tensor, residue: Tensor, grid: float) -> Tensor:
-    """The mean that int16 keep beside its iterate; the iterate where there is none."""
-    known, _, _, away = places_of(param, residue, grid)
-    return torch.where(known, param + away * grid, param)
-
-
-def like_rows(numbers: Tensor, param: Tensor) -> Tensor:
-    """Numbers of rows [N] that broadcast with a parameter [N, ...]."""
-    return numbers.view(-1, *[1] * (param.dim() - 1))
 
 
 # -- which rows an event fades ---------------------------------------------------------------------

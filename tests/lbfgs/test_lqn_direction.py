@@ -15,9 +15,9 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from opt3dgs_optim import cuda
-from opt3dgs_optim.backend import obstacle
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
 from opt3dgs_optim.lbfgs import pairs as columns_of
+from opt3dgs_optim.lbfgs.backend import obstacle
 from opt3dgs_optim.lbfgs.history import laid_out
 
 # inductor imports parts of torch that torch itself has deprecated

@@ -12,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import Parameter
 
-from opt3dgs_optim import Averaging, Course, PhaseScheduler
+from opt3dgs_optim import Averaging, PhaseScheduler, Training
+from opt3dgs_optim.mean import GRIDS, places_of
 from opt3dgs_optim.moments import CODES
-from opt3dgs_optim.step import GRIDS, Step, places_of
+from opt3dgs_optim.step import Step
 
 TOTAL, ROWS = 300, 6
 
@@ -41,8 +42,8 @@ def test_where_the_mean_begins_and_where_it_is_put(total: int) -> None:
 def test_what_it_says_of_a_step(iteration: int, mean: bool | None) -> None:
     """Whether the iterate goes into the mean, and whether the mean is put."""
     step = Step(torch.zeros(1), torch.zeros(1), "means", "", {}, {}, iteration, iteration - 1)
-    Averaging().plan(step, Course([], TOTAL))
-    assert step.mean is mean
+    Averaging().plan(step, Training([], TOTAL))
+    assert step.put is mean
 
 
 @settings(max_examples=20)

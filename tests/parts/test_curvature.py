@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from opt3dgs_optim import Course, Curvature, LQNAdam, PhaseScheduler
+from opt3dgs_optim import Curvature, LQNAdam, PhaseScheduler, Training
 from opt3dgs_optim.parts.curvature import HISTORY
 
 SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": ()}
@@ -56,7 +56,7 @@ def test_the_share_is_over_all_parameters_of_a_step() -> None:
     """One whose pairs are refused, one whose are taken."""
     curvature = Curvature(names=("means", "scales"))
     assert curvature.accepted_share is None
-    assert curvature.numbers(Course([])) == {}
+    assert curvature.numbers(Training([])) == {}
     x, y = Parameter(torch.zeros(3, 3)), Parameter(torch.zeros(5, 3))
     groups = [{"params": [x], "name": "xyz"}, {"params": [y], "name": "scaling"}]
     phases = PhaseScheduler(10, 0, parts=[curvature])

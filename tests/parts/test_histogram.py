@@ -16,7 +16,7 @@ import pytest
 import torch
 from oracles import LoopHistogram, MovingHistogram
 
-from opt3dgs_optim import Course, EnergyHistogram, Phase, PhaseScheduler
+from opt3dgs_optim import EnergyHistogram, Phase, PhaseScheduler, Training
 from opt3dgs_optim.step import Step
 
 FIXED: dict[str, Any] = {"energy_range": (0.0, 1.0), "temperature": 0.05, "warmup": 4}
@@ -127,20 +127,20 @@ def test_on_a_device_nu_stays_there(options: dict[str, Any]) -> None:
     histogram = EnergyHistogram(**options)
     nus_of(histogram, stream(10))
     energy = torch.empty((), device="meta")
-    nu, course = histogram.observe(energy), Course([], 10)
+    nu, training = histogram.observe(energy), Training([], 10)
     step = Step(torch.zeros(1), torch.zeros(1), "means", "", {}, {}, 0, -1)
-    histogram.plan(step, course)
+    histogram.plan(step, training)
     for each in (nu, step.factor, histogram.mean_multiplier, histogram.multiplier_std):
         assert (each.device.type, each.dtype, each.shape) == ("meta", torch.float32, ())
     histogram.num_observed = 1_000
-    assert histogram.numbers(course)["nu"] is nu
+    assert histogram.numbers(training)["nu"] is nu
 
 
 def test_on_a_cpu_the_factor_is_a_float_that_multiplies() -> None:
-    histogram, course = EnergyHistogram(warmup=4), Course([], 10)
+    histogram, training = EnergyHistogram(warmup=4), Training([], 10)
     nus_of(histogram, stream(20))
     step = Step(torch.zeros(1), torch.zeros(1), "means", "", {}, {}, 0, -1, factor=2.0)
-    histogram.plan(step, course)
+    histogram.plan(step, training)
     assert type(step.factor) is float
     assert step.factor == 2.0 * float(histogram.multiplier)
 
@@ -337,6 +337,6 @@ def test_says_what_it_is() -> None:
 def test_it_acts_while_exploring_and_serves_one_training() -> None:
     histogram = EnergyHistogram()
     assert (histogram.during, histogram.learns) == (Phase.EXPLORATION, True)
-    Course([histogram])
+    Training([histogram])
     with pytest.raises(ValueError, match="serves another training"):
-        Course([histogram])
+        Training([histogram])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from opt3dgs_optim import EnergyHistogram
-from opt3dgs_optim.partitions import MEAN_ABS
+from opt3dgs_optim.parts.partitions import MEAN_ABS
 
 COUNT, FIRST = 1_000, 250
 K = np.arange(COUNT)

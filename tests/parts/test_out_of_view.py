@@ -88,7 +88,7 @@ def test_the_share_is_the_mean_of_about_a_hundred_views(
         step(params, optimizers, slice(in_view))
         found.append(float(phases.numbers()["visible_share"]))
         if counted and iteration == 1:  # as after some 10,000 looks at 300,000 points
-            seen = phases.scratch[OutOfView, ""]
+            seen = phases.unsaved[OutOfView, ""]
             seen.counter.fill_(counted)
             seen.counted = counted
     share = max(in_view / points, 0.01)

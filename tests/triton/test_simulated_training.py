@@ -170,7 +170,7 @@ def test_a_strangers_rate_on_the_device_is_read_there() -> None:
     class Rate(Part):
         names = None
 
-        def plan(self, step: Any, course: Any) -> None:
+        def plan(self, step: Any, training: Any) -> None:
             step.factor = step.param.new_full((), 0.5) if step.name != "means" else 1.0
 
     with SimulatedDevice() as gpu:

@@ -2,8 +2,8 @@
 
 Importing this module compiles nothing and touches no driver. A kernel is compiled by NVRTC for the
 device it is launched on, once per machine (cuda.core's disk cache) and loaded once per process.
-Nothing here checks its arguments: `opt3dgs_optim.lbfgs` has, and `opt3dgs_optim.backend` says where
-the kernels run.
+Nothing here checks its arguments: `opt3dgs_optim.lbfgs` has, and its `backend` says where the
+kernels run.
 """
 
 import functools

@@ -21,8 +21,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.backend import obstacle
 from opt3dgs_optim.checks import check_count
+from opt3dgs_optim.lbfgs.backend import obstacle
 from opt3dgs_optim.lbfgs.pairs import BITS, bits_of, columns, normalised, overwrite
 
 MAX_HISTORY = 16

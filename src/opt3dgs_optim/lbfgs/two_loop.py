@@ -4,8 +4,8 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim import cuda
-from opt3dgs_optim.backend import BACKENDS, Backend, obstacle
 from opt3dgs_optim.checks import check_choice
+from opt3dgs_optim.lbfgs.backend import BACKENDS, Backend, obstacle
 from opt3dgs_optim.lbfgs.history import Cells, cells_of, check_alike, check_history, take_pairs
 from opt3dgs_optim.lbfgs.pairs import (
     columns,

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from opt3dgs_optim.checks import check_number, set_options
-from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import GAUSSIAN, canonical_name, check_names
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.step import Step
+from opt3dgs_optim.training import Training
 
 CALL = "Annealing"
 ANNEALED = tuple(name for name in GAUSSIAN if name != "means")
@@ -22,7 +22,7 @@ class Annealing(Part):
         factor(t) = peak^(1 - t) * final^t,    t = iteration / total_steps in 0..1
 
     3DGS keeps all learning rates but the positions' constant: too small to get far in the first
-    iterations, too large to settle in the last. The factor comes on top of the trainer's own
+    iterations, too large to read_back in the last. The factor comes on top of the trainer's own
     schedule; the learning rates in `param_groups` stay as they are. It costs no memory.
 
     The positions are left alone, and the opacities have a peak of their own, since either would
@@ -66,10 +66,10 @@ class Annealing(Part):
         t = min(max(progress, 0.0), 1.0)
         return peak ** (1.0 - t) * self.final**t
 
-    def plan(self, step: Step, course: Course) -> None:
+    def plan(self, step: Step, training: Training) -> None:
         """Scale the rate."""
-        step.factor = step.factor * self.at(step.name, course.progress)
+        step.factor = step.factor * self.at(step.name, training.progress)
 
-    def numbers(self, course: Course) -> Mapping[str, float]:
+    def numbers(self, training: Training) -> Mapping[str, float]:
         """`annealing`: the factor on the steps of the first of its parameters."""
-        return {"annealing": self.at(self.names[0], course.progress)}
+        return {"annealing": self.at(self.names[0], training.progress)}

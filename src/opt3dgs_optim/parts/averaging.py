@@ -6,9 +6,9 @@ import functools
 import math
 from dataclasses import dataclass
 
-from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.step import Step
+from opt3dgs_optim.training import Training
 
 SHARE = 1 / 30  # of the run
 
@@ -39,14 +39,14 @@ class Averaging(Part):
         """The first iteration after which the mean is in the parameters' place."""
         return _window(total_steps)[1]
 
-    def plan(self, step: Step, course: Course) -> None:
+    def plan(self, step: Step, training: Training) -> None:
         """Take the iterate into the mean."""
-        total, now = course.total_steps, step.iteration
-        if total is None or course.finished:
+        total, now = training.total_steps, step.iteration
+        if total is None or training.finished:
             return
         start, put = _window(total)
         if start <= now < total:
-            step.mean = now >= put
+            step.put = now >= put
 
 
 @functools.lru_cache(maxsize=8)  # every step asks

@@ -9,14 +9,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.backend import BACKENDS, Backend
 from opt3dgs_optim.checks import check_choice, check_count, check_number
-from opt3dgs_optim.course import Course
+from opt3dgs_optim.clock import Phase
+from opt3dgs_optim.lbfgs.backend import BACKENDS, Backend
 from opt3dgs_optim.lbfgs.history import MAX_HISTORY, history_shape
 from opt3dgs_optim.lbfgs.two_loop import lqn_direction
 from opt3dgs_optim.names import check_names
-from opt3dgs_optim.part import Part, Phase
+from opt3dgs_optim.part import Part
 from opt3dgs_optim.step import Step
+from opt3dgs_optim.training import Training
 
 HISTORY = "curvature.history"
 
@@ -74,7 +75,7 @@ class Curvature(Part):
         """Share of the last step's candidate pairs that were accepted, 0-d; None before any."""
         return None if self._tally is None else self._tally[0] / self._tally[1].clamp(min=1)
 
-    def plan(self, step: Step, course: Course) -> None:
+    def plan(self, step: Step, training: Training) -> None:
         """Store the pairs that this step completes; feed Adam the pseudo-gradient."""
         param = step.param
         if not param.numel():
@@ -99,7 +100,7 @@ class Curvature(Part):
         self._counted_in = step.iteration
         step.grad = fed.reshape(step.grad.shape)
 
-    def numbers(self, course: Course) -> Mapping[str, float | Tensor]:
+    def numbers(self, training: Training) -> Mapping[str, float | Tensor]:
         """`accepted`: the share of the candidate pairs that the last step accepted."""
         share = self.accepted_share
         return {} if share is None else {"accepted": share}

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.checks import check_count, check_number, set_options
-from opt3dgs_optim.course import Course
 from opt3dgs_optim.names import GAUSSIAN, check_names
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.step import Fade, Step, chosen_rows, mixed
+from opt3dgs_optim.training import Training
 
 CALL = "Fading"
 MAX_POINTS_OF_ALL_EVENTS = 10_000  # of more points, fewer of the events happen
@@ -74,9 +74,9 @@ class Fading(Part):
             names=check_names(CALL, self.names),
         )
 
-    def plan(self, step: Step, course: Course) -> None:
+    def plan(self, step: Step, training: Training) -> None:
         """Fade by the newest event since this parameter's last step, if there was one."""
-        total = course.total_steps
+        total = training.total_steps
         if total is None:
             return
         options = total, self.start, self.stop, self.events
@@ -109,9 +109,9 @@ class Fading(Part):
         """Which points an event fades, [num_points] bool: the same in every parameter."""
         return chosen_rows(self.fade(event), num_points, device)
 
-    def numbers(self, course: Course) -> Mapping[str, float]:
+    def numbers(self, training: Training) -> Mapping[str, float]:
         """`faded`: the share of up to 10,000 points that the present iteration's event fades."""
-        now, total = course.iteration, course.total_steps or 1
+        now, total = training.iteration, training.total_steps or 1
         happened = self.events_before(now + 1, total) > self.events_before(now, total)
         return {"faded": self.share * happened}
 

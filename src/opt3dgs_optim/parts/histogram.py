@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.checks import as_float, check_count, check_energy, check_interval, check_number
-from opt3dgs_optim.course import Course
-from opt3dgs_optim.part import Part, Phase
-from opt3dgs_optim.partitions import FixedPartitions, MovingPartitions
+from opt3dgs_optim.clock import Phase
+from opt3dgs_optim.part import Part
+from opt3dgs_optim.parts.partitions import FixedPartitions, MovingPartitions
 from opt3dgs_optim.step import Step
+from opt3dgs_optim.training import Training
 
 # The temperature is not given in the paper; zeta * tau / du = 1.5 at its zeta and du.
 PAPER: dict[str, Any] = {"energy_range": (0.0, 0.2), "temperature": 2e-3, "warmup": 2500}
@@ -116,17 +117,17 @@ class EnergyHistogram(Part):
 
     @torch.no_grad()
     def observe(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self, energy: Tensor | float, course: Course | None = None
+        self, energy: Tensor | float, training: Training | None = None
     ) -> Tensor:
         """Take one energy; return nu, 0-d on its device, of the weights before their update.
 
         Args:
             energy: the training loss of this iteration, 0-d (or one element; ValueError of more).
                 One that is not finite changes nothing. A GPU is not waited for.
-            course: the training's; while it exploits, energies are left alone.
+            training: the training's; while it exploits, energies are left alone.
         """
         value = check_energy(f"{CALL}.observe", "energy", energy, torch.float64)
-        if course is not None and course.phase is not self.during:
+        if training is not None and training.phase is not self.during:
             return self._nu
         if value.device != self._nu.device:  # a trainer's GPU, or resumed from a checkpoint
             learnt = self.state_dict()["learnt"]
@@ -144,12 +145,12 @@ class EnergyHistogram(Part):
         self._sums = self._sums + counts * torch.stack([torch.ones_like(nu), nu, nu * nu])
         return nu
 
-    def plan(self, step: Step, course: Course) -> None:
+    def plan(self, step: Step, training: Training) -> None:
         """Scale the rate by nu: a float, or where energies lie on a device a tensor of it, 0-d."""
         if self.num_observed:
             step.factor = step.factor * self._factor()
         elif step.iteration > 0:  # one may come after the first step
-            course.warn_once(
+            training.messages.warn_once(
                 CALL,
                 f"{CALL}: no energy has been observed, so that nu is 1; call phases.observe(loss) "
                 "before the steps, with AWSGLD histogram.observe(loss) or step(closure)",
@@ -180,9 +181,9 @@ class EnergyHistogram(Part):
         count, total, squares = self._sums
         return (squares / count - (total / count) ** 2).nan_to_num(0.0).clamp(min=0).sqrt()
 
-    def numbers(self, course: Course | None = None) -> dict[str, float | Tensor]:
+    def numbers(self, training: Training | None = None) -> dict[str, float | Tensor]:
         """`nu`, after as many energies as the warm-up has, while it acts."""
-        acts = course is None or course.phase is self.during
+        acts = training is None or training.phase is self.during
         return {"nu": self._factor()} if acts and self.num_observed > self.warmup else {}
 
     def state_dict(self) -> dict[str, Any]:

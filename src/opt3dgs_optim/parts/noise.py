@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.checks import check_choice, check_number, set_options
-from opt3dgs_optim.course import Course
-from opt3dgs_optim.part import Part, Phase
+from opt3dgs_optim.clock import Phase
+from opt3dgs_optim.part import Part
 from opt3dgs_optim.step import Frame, Step, axes_of, into_frame, out_of_frame
+from opt3dgs_optim.training import Training
 
 GaussianTensors = Mapping[str, Tensor] | torch.nn.ParameterDict
 GATE_SHARPNESS = 100.0  # k of eq. 2's gate
@@ -59,12 +60,12 @@ class PositionNoise(Part):
         during = "" if self.during is None else f", during={self.during}"
         return f"PositionNoise(scale={self.scale:g}{during})"
 
-    def after(self, step: Step, course: Course) -> None:
+    def after(self, step: Step, training: Training) -> None:
         """Add the noise to the positions [N, 3] in place."""
         found = self._tensors()
         if found is None:
             names = ("scales", "quats", "opacities")
-            found = {name: course.param_of(step.set, name) for name in names}
+            found = {name: training.param_of(step.set, name) for name in names}
         self._add(step.param, step.group["lr"], found)
 
     @torch.no_grad()
@@ -122,7 +123,7 @@ class IsotropicNoise(Part):
         name = "std" if self.temperature is None else "temperature"
         set_options(self, **{name: check_number("IsotropicNoise", name, getattr(self, name), 0.0)})
 
-    def after(self, step: Step, course: Course) -> None:
+    def after(self, step: Step, training: Training) -> None:
         """Add the noise to the parameter (any shape) in place."""
         deviation, param = self.std, step.param
         if self.temperature is not None:

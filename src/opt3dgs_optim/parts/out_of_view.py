@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim import triton
-from opt3dgs_optim.course import Course, Reading
+from opt3dgs_optim.device import Reading
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.step import Hold, Step
+from opt3dgs_optim.training import Training
 
 GOLDEN_RATIO = (5**0.5 - 1) / 2
 SHARE_LOOKED_AT = 1 / 4  # of the views
@@ -42,28 +43,28 @@ class OutOfView(Part):
 
     names = ("means", "scales", "opacities")
 
-    def plan(self, step: Step, course: Course) -> None:
+    def plan(self, step: Step, training: Training) -> None:
         """See at the positions [N, 3] who is out of view; hold the others' second moments."""
-        seen = course.scratch.get((OutOfView, step.set))
+        seen = training.unsaved.get((OutOfView, step.set))
         if seen is None:
-            seen = _Seen(f"share {step.set}".rstrip(), course.notes_of(self))
-            course.scratch[OutOfView, step.set] = seen
+            seen = _Seen(f"share {step.set}".rstrip(), training.notes_of(self))
+            training.unsaved[OutOfView, step.set] = seen
         if seen.iteration != step.iteration:
-            seen.look(step, course)
+            seen.look(step, training)
         if seen.rows is not None and step.name != "means" and len(seen.rows) == len(step.param):
             step.hold = Hold(seen.rows, MAX_SEEN_SHARE / seen.notes[seen.note])
 
-    def settle(self, course: Course) -> None:
+    def read_back(self, training: Training) -> None:
         """Take the share that is on its way."""
-        for place, seen in course.scratch.items():
+        for place, seen in training.unsaved.items():
             if place[0] is OutOfView and seen.reading is not None:
                 if seen.reading.source.is_cuda:
                     torch.cuda.synchronize()
                 seen.take()
 
-    def numbers(self, course: Course) -> Mapping[str, float]:
+    def numbers(self, training: Training) -> Mapping[str, float]:
         """`visible_share`: the mean share of the points that a view sees, the least of all sets."""
-        return {"visible_share": min(course.notes_of(self).values(), default=1.0)}
+        return {"visible_share": min(training.notes_of(self).values(), default=1.0)}
 
 
 class _Seen:
@@ -85,19 +86,19 @@ class _Seen:
         self.reading: Reading | None = None
         self._mask: Tensor | None = None
 
-    def look(self, step: Step, course: Course) -> None:
+    def look(self, step: Step, training: Training) -> None:
         """Look at the positions' gradient of this iteration."""
         self.iteration, self.rows = step.iteration, None
         if self.reading is not None:
             self.take()
-        means = course.param_of(step.set, "means")
+        means = training.param_of(step.set, "means")
         grad = None if means is None else means.grad
         # Multiples of the golden ratio keep step with no order of views, as of a rig of cameras.
         looks = self.reading is None and step.iteration * GOLDEN_RATIO % 1.0 < SHARE_LOOKED_AT
         holds = self.notes.setdefault(self.note, 1.0) < MAX_SEEN_SHARE
         if grad is None or not len(grad) or not (looks or holds):
             return
-        state = course.state_of_param(step.set, "means") if looks else None
+        state = training.state_of_param(step.set, "means") if looks else None
         counter = self._counter(grad.device) if looks else None
         if holds:
             self.rows = self._rows(grad)
@@ -113,8 +114,8 @@ class _Seen:
         counted = None if self.reading is None else self.reading.take()
         if counted is None:
             return
-        self.reading, new = None, (int(counted) - self.counted) % 2**64
-        self.counted = int(counted)
+        self.reading, new = None, (counted[0] - self.counted) % 2**64
+        self.counted = counted[0]
         share = (new >> 32) / max(new % 2**32, 1)
         if share > 0:  # a gradient that is zero everywhere is of no view
             mean = self.notes.setdefault(self.note, 1.0)  # a load has none before its first look

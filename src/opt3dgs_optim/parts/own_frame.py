@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from opt3dgs_optim.checks import check_number, set_options
-from opt3dgs_optim.course import Course
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.step import Frame, Step
+from opt3dgs_optim.training import Training
 
 CALL = "OwnFrame"
 
@@ -91,10 +91,10 @@ class OwnFrame(Part):
         """Standard deviations of a full step, where that share of the run is over."""
         return self.rate * self.final ** min(max(progress, 0.0), 1.0)
 
-    def plan(self, step: Step, course: Course) -> None:
+    def plan(self, step: Step, training: Training) -> None:
         """Step the positions [N, 3] in their own frames."""
-        quats = course.param_of(step.set, "quats")
-        scales = course.param_of(step.set, "scales")
+        quats = training.param_of(step.set, "quats")
+        scales = training.param_of(step.set, "scales")
         rows = len(step.param)
         if (
             quats is None or scales is None
@@ -104,21 +104,21 @@ class OwnFrame(Part):
                 n: None if t is None else tuple(t.shape)
                 for n, t in (("scales", scales), ("quats", quats))
             }
-            course.warn_once(
+            training.messages.warn_once(
                 CALL,
                 f"{CALL}: positions [{rows}, 3] need scales [N, 3] and quats [N, 4] of the same "
                 f"points among the upgraded optimizers, which hold {found}; Adam steps them",
             )
             return
-        rate = self.at(course.progress) if step.group["lr"] else 0.0
+        rate = self.at(training.progress) if step.group["lr"] else 0.0
         least = self.min_aspect
         if least is None:
-            least = min_aspect_of(course.total_steps)
+            least = min_aspect_of(training.total_steps)
         step.frame = Frame(rate, least, quats, scales)
 
-    def numbers(self, course: Course) -> Mapping[str, float]:
+    def numbers(self, training: Training) -> Mapping[str, float]:
         """`own_frame_rate`: standard deviations of a full step."""
-        return {"own_frame_rate": self.at(course.progress)}
+        return {"own_frame_rate": self.at(training.progress)}
 
 
 @functools.lru_cache(maxsize=64)  # every step asks

@@ -16,8 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.checks import LOGGER
 from opt3dgs_optim.cuda import several_gpus
+from opt3dgs_optim.mean import Mean
+from opt3dgs_optim.messages import LOGGER
 from opt3dgs_optim.moments import CODES
 from opt3dgs_optim.step import Hyper, Step
 
@@ -26,6 +27,7 @@ WARPS = {"step_rows": 8, "step_in_own_frame": 2, "look_at_positions": 4}  # fast
 DTYPES = (torch.float32, CODES)  # of the kernels
 MAX_WIDTH = 2**20 - ROWS_BLOCK  # numbers of a row: see `kernels.rows_of`
 NO_FADE = (0, 0.0, 1.0, 1.0)
+NO_MEAN: Any = Mean(False, 0, None, None)  # pyright: ignore
 _COMPILED: dict[Any, Any] = {}  # what Triton has compiled, by what it depends on
 CHECK = "opt3dgs_optim.triton.check"  # run as a program, with Triton's interpreter
 
@@ -142,12 +144,12 @@ def launch(step: Step, hyper: Hyper) -> None:
         size *= factor
     if not step.plain:
         size /= hyper.correction1
-    mean, began = (None, None) if step.mean is None else (hyper.mean, hyper.began)
-    number, put = float(hyper.count), 1.0 if step.mean else 0.0
+    kept = NO_MEAN if hyper.mean is None else hyper.mean
+    mean, began, number, put = kept.tensor, kept.began, float(kept.count), 1.0 if kept.put else 0.0
     coded = hyper.exp_avg.dtype is CODES, mean is not None and mean.dtype is CODES
     adam = (
-        hyper.beta2, 1 - hyper.beta1, 1 - hyper.beta2, hyper.eps, hyper.root2, hyper.shrink,
-        hyper.decay, hyper.key and _signed(hyper.key),
+        hyper.beta2, 1 - hyper.beta1, 1 - hyper.beta2, hyper.eps, hyper.sqrt_correction2,
+        hyper.shrink, hyper.decay, hyper.key and _signed(hyper.key),
     )  # fmt: skip
     if frame is not None:
         _run(
@@ -164,7 +166,7 @@ def launch(step: Step, hyper: Hyper) -> None:
         "step_rows", -(-numbers // ROWS_BLOCK),
         (param, step.grad, m, v, mean, began, held, on_device, hyper.nonfinite),
         (numbers, numbers // param.shape[0] if param.dim() else 1, size, *adam,
-         key and _signed(key), share, fade_m, fade_v, weight, number, put, hyper.grid),
+         key and _signed(key), share, fade_m, fade_v, weight, number, put, kept.grid),
         coded,
     )  # fmt: skip
 

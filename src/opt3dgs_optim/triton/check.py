@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim import triton
+from opt3dgs_optim.mean import Mean, like_rows, mean_of_residue
 from opt3dgs_optim.moments import CODES, NEAREST, decoded, encode
 from opt3dgs_optim.step import (
     Fade,
@@ -20,8 +21,6 @@ from opt3dgs_optim.step import (
     Hold,
     Hyper,
     Step,
-    like_rows,
-    mean_of_residue,
     mixed,
     take_step,
 )
@@ -80,13 +79,12 @@ def case(
         shrink, decay, nonfinite=torch.zeros(1, dtype=torch.int32), key=mixed(steps),
     )  # fmt: skip
     if mean:
-        step.mean, hyper.count = put, steps
-        began = torch.randint(0, steps, (rows,), generator=generator).to(torch.float32)
-        hyper.mean, hyper.began = (param + 0.1 * draw(*shape)), began
-        hyper.mean.mul_(like_rows(began > 0, param))  # others begin with this step
+        began, grid = torch.randint(0, steps, (rows,), generator=generator).to(torch.float32), 1.0
+        kept = (param + 0.1 * draw(*shape)).mul_(like_rows(began > 0, param))  # others begin now
         if coded and not frame:
-            hyper.grid = 2.0**-12
-            hyper.mean = (hyper.mean / hyper.grid).to(torch.int32).to(CODES)
+            grid = 2.0**-12
+            kept = (kept / grid).to(torch.int32).to(CODES)
+        hyper.mean = Mean(put, steps, kept, began, grid)
     return step, hyper
 
 
@@ -96,12 +94,12 @@ def tensors(step: Step, hyper: Hyper) -> list[Tensor]:
     if hyper.exp_avg.dtype == CODES:
         moments = list(decoded(*moments))
     found = [step.param, *moments]
-    if hyper.mean is None or hyper.began is None:
+    if hyper.mean is None:
         return found
-    mean = hyper.mean
+    mean = hyper.mean.tensor
     if mean.dtype == CODES:
-        mean = mean_of_residue(step.param, mean, hyper.grid)
-    return [*found, mean, hyper.began]
+        mean = mean_of_residue(step.param, mean, hyper.mean.grid)
+    return [*found, mean, hyper.mean.began]
 
 
 def both(options: dict[str, Any], shape: tuple[int, ...], seed: int = 0) -> tuple[Any, Any]:

@@ -148,7 +148,8 @@ def rows_of(first, width):
 @triton.jit
 def _step_rows(
     p, g, m, v, mean, began, held, factor, nonfinite, at, row, inside, size, beta2, ones1, ones2,
-    eps, root2, shrink, decay, round_key, key, share, fade_m, fade_v, weight, number, put, grid,
+    eps, sqrt_correction2, shrink, decay, round_key, key, share, fade_m, fade_v, weight, number,
+    put, grid,
 ):  # fmt: skip
     grad = finite(tl.load(g + at, inside), nonfinite, inside)
     value = tl.load(p + at, inside) * shrink
@@ -170,7 +171,7 @@ def _step_rows(
             exp_avg_sq = larger(exp_avg_sq, least)
         exp_avg = exp_avg + (grad - exp_avg) * ones1
         exp_avg_sq = exp_avg_sq * beta2 + grad * grad * ones2
-        value = value - size * exp_avg / (tl.sqrt(exp_avg_sq) / root2 + eps)
+        value = value - size * exp_avg / (tl.sqrt(exp_avg_sq) / sqrt_correction2 + eps)
         store_moments(m, v, at, inside, exp_avg, exp_avg_sq, round_key)
     if mean is not None:
         if mean.dtype.element_ty == tl.int16:
@@ -183,7 +184,8 @@ def _step_rows(
 @triton.jit(do_not_specialize=PLAIN_INTS)
 def step_rows(
     p, g, m, v, mean, began, held, factor, nonfinite, numbers, width, size, beta2, ones1, ones2,
-    eps, root2, shrink, decay, round_key, key, share, fade_m, fade_v, weight, number, put, grid,
+    eps, sqrt_correction2, shrink, decay, round_key, key, share, fade_m, fade_v, weight, number,
+    put, grid,
 ):  # fmt: skip
     """Step a parameter [rows, width], ROWS_BLOCK of its numbers in a program.
 
@@ -210,15 +212,15 @@ def step_rows(
         at = first + tl.arange(0, ROWS_BLOCK)
         _step_rows(
             p, g, m, v, mean, began, held, factor, nonfinite, at, row, None, size,
-            beta2, ones1, ones2, eps, root2, shrink, decay, round_key, key, share, fade_m, fade_v,
-            weight, number, put, grid,
+            beta2, ones1, ones2, eps, sqrt_correction2, shrink, decay, round_key, key, share,
+            fade_m, fade_v, weight, number, put, grid,
         )  # fmt: skip
     else:  # in 64 bits, since the place of a number that is not there may need them
         last = first.to(tl.int64) + tl.arange(0, ROWS_BLOCK)
         _step_rows(
             p, g, m, v, mean, began, held, factor, nonfinite, last, row, last < numbers, size,
-            beta2, ones1, ones2, eps, root2, shrink, decay, round_key, key, share, fade_m, fade_v,
-            weight, number, put, grid,
+            beta2, ones1, ones2, eps, sqrt_correction2, shrink, decay, round_key, key, share,
+            fade_m, fade_v, weight, number, put, grid,
         )  # fmt: skip
 
 
@@ -230,19 +232,19 @@ def turned(w, x, y, z, a, b, c):
 
 
 @triton.jit
-def adam(grad, m, v, at, inside, size, beta2, ones1, ones2, eps, root2, round_key):
+def adam(grad, m, v, at, inside, size, beta2, ones1, ones2, eps, sqrt_correction2, round_key):
     """Adam's step of one number, whose moments are written."""
     exp_avg, exp_avg_sq = moments_of(m, v, at, inside)
     exp_avg = exp_avg + (grad - exp_avg) * ones1
     exp_avg_sq = exp_avg_sq * beta2 + grad * grad * ones2
     store_moments(m, v, at, inside, exp_avg, exp_avg_sq, round_key)
-    return size * exp_avg / (tl.sqrt(exp_avg_sq) / root2 + eps)
+    return size * exp_avg / (tl.sqrt(exp_avg_sq) / sqrt_correction2 + eps)
 
 
 @triton.jit(do_not_specialize=PLAIN_INTS)
 def step_in_own_frame(
     p, g, m, v, quats, scales, mean, began, factor, nonfinite, rows, min_aspect, size, beta2,
-    ones1, ones2, eps, root2, shrink, decay, round_key, number, put,
+    ones1, ones2, eps, sqrt_correction2, shrink, decay, round_key, number, put,
 ):  # fmt: skip
     """Step positions along each Gaussian's axes, mu <- mu - B Adam(B^T g), FRAME_BLOCK a program.
 
@@ -284,9 +286,9 @@ def step_in_own_frame(
     gz = tl.where(tl.abs(gz) <= LARGEST, gz, 0.0)
     if factor is not None:
         size = size * tl.load(factor)
-    dx = sx * adam(gx, m, v, i, inside, size, beta2, ones1, ones2, eps, root2, round_key)
-    dy = sy * adam(gy, m, v, j, inside, size, beta2, ones1, ones2, eps, root2, round_key)
-    dz = sz * adam(gz, m, v, k, inside, size, beta2, ones1, ones2, eps, root2, round_key)
+    dx = sx * adam(gx, m, v, i, inside, size, beta2, ones1, ones2, eps, sqrt_correction2, round_key)
+    dy = sy * adam(gy, m, v, j, inside, size, beta2, ones1, ones2, eps, sqrt_correction2, round_key)
+    dz = sz * adam(gz, m, v, k, inside, size, beta2, ones1, ones2, eps, sqrt_correction2, round_key)
     dx, dy, dz = turned(w, x, y, z, dx, dy, dz)
     px = px - tl.where(tl.abs(dx) < INFINITY, dx, 0.0)
     py = py - tl.where(tl.abs(dy) < INFINITY, dy, 0.0)

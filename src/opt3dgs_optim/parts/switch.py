@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from opt3dgs_optim.course import Course
-from opt3dgs_optim.part import Part, Phase
+from opt3dgs_optim.clock import Phase
+from opt3dgs_optim.part import Part
 from opt3dgs_optim.step import Step
+from opt3dgs_optim.training import Training
 
 
 @dataclass(frozen=True, repr=False)
@@ -35,8 +36,8 @@ class FreshMoments(Part):
 
     during = Phase.EXPLOITATION
 
-    def plan(self, step: Step, course: Course) -> None:
+    def plan(self, step: Step, training: Training) -> None:
         """Begin anew in the parameter's first step after the switch."""
-        switch = course.switch_step
+        switch = training.switch_step
         if switch is not None and step.stepped_in < switch <= step.iteration:
             step.fresh = True

@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import functools
 import inspect
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, MutableMapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.lane import MOMENTS, Lane
+from opt3dgs_optim.mean import like_rows, take_into_mean
+from opt3dgs_optim.moments import MOMENTS
 from opt3dgs_optim.step import (
     Axes,
     Step,
@@ -23,15 +25,10 @@ from opt3dgs_optim.step import (
     chosen_rows,
     finite,
     into_frame,
-    like_rows,
     out_of_frame,
-    take_into_mean,
 )
-
-if TYPE_CHECKING:
-    from opt3dgs_optim.adam import StepAdam
-    from opt3dgs_optim.course import Course
-
+from opt3dgs_optim.stepper import ParamStepper
+from opt3dgs_optim.training import Training
 
 _signature = functools.lru_cache(maxsize=8)(inspect.signature)  # every step asks
 
@@ -47,40 +44,45 @@ def check_arguments(call: str, step: Any, *args: Any) -> None:
 
 @torch.no_grad()
 def step_around(
-    optimizer: StepAdam, iteration: int, args: tuple[Any, ...], masks: dict[str, Any]
+    steppers: list[ParamStepper],
+    states: MutableMapping[Tensor, dict[str, Any]],
+    iteration: int,
+    step_itself: Callable[[], Any],
 ) -> None:
     """Have the optimizer's own class make a step as the parts say; put back what it was given."""
-    steps: list[tuple[Lane, Step, float]] = []
-    undo: list[tuple[Lane, Tensor, float, Tensor, Axes | None]] = []
+    steps: list[tuple[ParamStepper, Step, float]] = []
+    undo: list[tuple[ParamStepper, Tensor, float, Tensor, Axes | None]] = []
     try:
-        for lane in optimizer.present_lanes():
-            if lane.param.grad is not None:
-                step = optimizer.plan(lane, iteration)
+        for stepper in steppers:
+            if stepper.param.grad is not None:
+                step = stepper.plan(states[stepper.param], iteration)
                 axes = None if step.frame is None else axes_of(step.frame)
-                steps.append((lane, step, float(step.state["step"])))
-                undo.append((lane, lane.param.grad, lane.group["lr"], lane.param.data, axes))
-                _give(step, axes, optimizer.course)
-        optimizer.own_class_step(*args, **masks)
+                steps.append((stepper, step, float(step.state["step"])))
+                undo.append(
+                    (stepper, stepper.param.grad, stepper.group["lr"], stepper.param.data, axes)
+                )
+                _give(step, axes, stepper.training)
+        step_itself()
     finally:
-        for lane, grad, lr, position, axes in undo:
-            lane.param.grad, lane.group["lr"] = grad, lr
-            if axes is not None and lane.param.data_ptr() != position.data_ptr():
-                moved, lane.param.data = lane.param.data, position
-                lane.param.add_(out_of_frame(axes, moved))
-    for lane, step, count in steps:
+        for stepper, grad, lr, position, axes in undo:
+            stepper.param.grad, stepper.group["lr"] = grad, lr
+            if axes is not None and stepper.param.data_ptr() != position.data_ptr():
+                moved, stepper.param.data = stepper.param.data, position
+                stepper.param.add_(out_of_frame(axes, moved))
+    for stepper, step, count in steps:
         if step.state["step"] == count:  # gsplat's and INRIA's kernels need no count, and keep none
             step.state["step"] += 1
-        if step.mean is not None:
+        if step.put is not None:
             made = int(step.state["step"])  # steps, not iterations
-            take_into_mean(made, step.mean, step.param, *lane.mean_of(step.state))
-        lane.finish(step, optimizer.course)
+            take_into_mean(stepper.mean(step.state, step.put, made), step.param)
+        stepper.finish(step)
 
 
-def _give(step: Step, axes: Axes | None, course: Course) -> None:
+def _give(step: Step, axes: Axes | None, training: Training) -> None:
     """Have the step find the gradient, the rate and the moments that the parts say."""
     param, state = step.param, step.state
-    grad, bad = finite(step.grad, course.counter_on(param.device))
-    course.count_nonfinite(bad)
+    grad, bad = finite(step.grad, training.bad_numbers.counter_on(param.device))
+    training.bad_numbers.add(bad)
     if step.fade is not None:
         chosen = like_rows(chosen_rows(step.fade, len(param), param.device), param)
         for key, factor in zip(MOMENTS, step.fade[2:], strict=True):

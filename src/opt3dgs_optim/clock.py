@@ -1,0 +1,102 @@
+"""Where a training is: its iteration, its phase, and which share of it is over."""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass
+
+
+class Phase(enum.Enum):
+    """What a training is doing."""
+
+    EXPLORATION = "exploration"
+    EXPLOITATION = "exploitation"
+
+
+@dataclass(slots=True)
+class Ticket:
+    """What the clock knows of an optimizer.
+
+    Attributes:
+        next_iteration: the one that it steps next.
+        has_means: whether it holds positions: the clock counts its steps.
+    """
+
+    next_iteration: int = 0
+    has_means: bool = False
+
+
+class Clock:
+    """Optimizers count their own steps: an iteration begins with the first that steps again.
+
+    Args:
+        total_steps: iterations of the training; None: it has no end.
+        switch_step: the iteration in which exploitation starts; None: never.
+
+    Attributes:
+        iteration: the present one, from 0; -1 before the first step.
+        exploiting: whether it is past the switch. exploits_next: whether the next one is.
+        progress: the share of the training that is over, 0..1; 0 where it has no end.
+        counts_means: whether one of the optimizers holds positions: it alone counts.
+    """
+
+    def __init__(self, total_steps: int | None = None, switch_step: int | None = None) -> None:
+        self.total_steps, self.switch_step = total_steps, switch_step
+        self._switch = math.inf if switch_step is None else switch_step
+        self.iteration, self.exploiting, self.exploits_next = -1, False, self._switch <= 0
+        self.progress, self.counts_means = 0.0, False
+        self._means_at = -1  # the iteration of the positions' last step
+        self._means_open = False  # whether they were stepped first there
+        self._begun = -1  # the iteration of the last step: `observe` puts the clock beyond it
+        self._resumed = False  # whether the present iteration is over, for all optimizers
+
+    @property
+    def phase(self) -> Phase:
+        """Of the present iteration."""
+        return Phase.EXPLOITATION if self.exploiting else Phase.EXPLORATION
+
+    def begin(self, ticket: Ticket) -> int:
+        """The iteration of a step that an optimizer is about to make.
+
+        Another optimizer than that of the positions may step first in an iteration, never or
+        several times: it begins one only if the positions have been stepped in the one before.
+        """
+        present = self.iteration + self._resumed
+        iteration = max(ticket.next_iteration, present, 0)
+        if ticket.has_means:
+            if iteration > self._means_at:  # of two sets' optimizers the first
+                self._means_open = iteration > self._begun
+            self._means_at = iteration
+        elif self.counts_means and iteration > present:  # it has stepped in the present one
+            begins = self._means_at >= present and not self._means_open
+            iteration = max(present + begins, 0)
+        self._resumed, self._begun = False, iteration
+        ticket.next_iteration = iteration + 1
+        if iteration > self.iteration:
+            self.go_to(iteration)
+            self.advanced()
+        return iteration
+
+    def put_on(self, iteration: int) -> None:
+        """Put the clock forward, to where the trainer's own count is."""
+        if iteration > self.iteration:
+            self.go_to(iteration)
+            self._resumed = False
+            self.advanced()
+
+    def resume(self, iteration: int) -> None:
+        """Go on at an iteration, which is the next one that is made."""
+        self.go_to(iteration - 1)
+        self._means_at = self._begun = iteration - 1
+        self._means_open, self._resumed = False, True
+
+    def go_to(self, iteration: int) -> None:
+        """Be at that iteration."""
+        self.iteration, self.exploiting = iteration, iteration >= self._switch
+        self.exploits_next = iteration + 1 >= self._switch
+        if self.total_steps:
+            self.progress = min(max(iteration / self.total_steps, 0.0), 1.0)
+
+    def advanced(self) -> None:
+        """Called once in each iteration, before its first step."""

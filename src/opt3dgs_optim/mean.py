@@ -1,0 +1,133 @@
+"""The running mean of the last iterates: where it lies, how an iterate goes into it, how it is put.
+
+Beside moments of 32 bits it is a tensor like the parameter. Beside moments of 16 bits it has as
+many, the lower bits of its place on a grid, except that of positions, for which no grid can be
+named: they are in the units of the scene.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from opt3dgs_optim.moments import CODES
+
+MEAN, BEGAN = "averaging.mean", "averaging.began"  # in the optimizer's state, of the rows
+RESIDUE = "averaging.residue"  # in the place of the mean, beside moments of 16 bits
+OF_MEAN = (MEAN, RESIDUE, BEGAN)
+# The grids of means of 16 bits, see `take_into_residue`. They reach for 2, 2, 16, 2 and 1, further
+# than parameters go in the last thirtieth at a hundred times the usual rates.
+GRIDS = {"scales": 2**-14, "quats": 2**-14, "opacities": 2**-11, "sh0": 2**-14, "shN": 2**-15}
+MAX_PLACE = 2.0**23  # on a grid, from which on float32 has no fractions
+MAX_AWAY = 24_576.0  # places of a mean from its iterate; a step may have another 8,192
+
+
+@dataclass(slots=True)
+class Mean:
+    """The running mean of a parameter, and what this step does with it."""
+
+    put: bool  # whether it takes the parameter's place
+    count: int  # Adam's steps of the parameter with this one, by which the mean counts
+    tensor: Tensor  # [N, ...] like the parameter, or int16: see `take_into_residue`
+    began: Tensor  # [N] the `count` with which a row's mean began; 0: not yet
+    grid: float = 1.0  # of a mean of int16
+
+
+def like_rows(numbers: Tensor, param: Tensor) -> Tensor:
+    """Numbers of rows [N] that broadcast with a parameter [N, ...]."""
+    return numbers.view(-1, *[1] * (param.dim() - 1))
+
+
+def take_into_mean(
+    mean: Mean, param: Tensor, rows: Any = ..., chance: Tensor | None = None
+) -> None:
+    """Take an iterate, these rows of the parameter, into the mean.
+
+    An iterate that is not finite leaves its mean alone; a mean that is not begins with it. A row
+    that has `began` with 0 begins now. `chance` is of a mean of int16, see `take_into_residue`.
+    """
+    tensor, began = mean.tensor[rows], mean.began[rows]
+    began.masked_fill_(began == 0, mean.count)
+    weight = like_rows(1.0 / (mean.count + 1 - began), param)
+    if tensor.dtype == CODES:
+        assert chance is not None
+        take_into_residue(mean.put, param, tensor, weight, mean.grid, chance)
+        return
+    if param.is_cpu and math.isfinite((param.sum() + tensor.sum()).item()):
+        tensor.lerp_(param, weight.to(param.dtype))
+        if mean.put:
+            param.copy_(tensor)
+        return
+    known = torch.isfinite(param)
+    start = torch.where(torch.isfinite(tensor), tensor, param)
+    # The old mean in the place of a number that is not finite moves nothing.
+    tensor.copy_(torch.where(known, start.lerp(torch.where(known, param, start), weight), tensor))
+    if mean.put:
+        param.copy_(torch.where(known, tensor, param))
+
+
+def take_into_residue(
+    put: bool, param: Tensor, residue: Tensor, weight: Tensor, grid: float, chance: Tensor
+) -> None:
+    """`take_into_mean` in 16 bits: the lower bits of the mean's place on a grid.
+
+    The mean is read as the one of the places with these bits that is nearest to the iterate. Each
+    place is rounded by chance; after a thousand iterates they are off by seven. A mean further away
+    than `MAX_AWAY` places follows its iterate. Numbers beyond `MAX_PLACE` places have no mean. A
+    trainer that moves a number by more than 32,768 places at once, in the last thirtieth, has to
+    tell by `reset_rows`.
+
+    Args:
+        put: whether the mean takes the parameter's place.
+        param: the iterate [n, ...] float32.
+        residue: [n, ...] int16.
+        weight: of the iterate in the mean.
+        grid: the distance of two places.
+        chance: of the rounding, as of `moments.chances`.
+    """
+    known, lower, rest, away = places_of(param, residue, grid)
+    away = (away * (1.0 - weight)).clamp_(-MAX_AWAY, MAX_AWAY)
+    chance = ((chance >> 16) & 0xFFFF).to(torch.float32) * 2.0**-16
+    moved = lower + (rest + away + chance).floor_().to(torch.int32)
+    residue.copy_(torch.where(known, moved.to(CODES), residue))
+    if put:
+        param.copy_(torch.where(known, param + away * grid, param))
+
+
+def places_of(param: Tensor, residue: Tensor, grid: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Where iterates, and their means of int16, lie on a grid.
+
+    Returns:
+        Whether the number has a mean, bool; its place, whole as int32, and the rest of it; how many
+        places its mean is from it. All [n, ...].
+    """
+    place = param / grid
+    known = place.abs() < MAX_PLACE
+    place = torch.where(known, place, 0.0)
+    lower = place.to(torch.int32)
+    rest = place - lower
+    return known, lower, rest, (residue.to(torch.int32) - lower).to(CODES).to(torch.float32) - rest
+
+
+def mean_of_residue(param: Tensor, residue: Tensor, grid: float) -> Tensor:
+    """The mean that int16 keep beside its iterate; the iterate where there is none."""
+    known, _, _, away = places_of(param, residue, grid)
+    return torch.where(known, param + away * grid, param)
+
+
+def put_mean(param: Tensor, state: Mapping[str, Tensor], grid: float | None) -> bool:
+    """Put a parameter's mean in its place, if it has one; whether it has."""
+    mean, residue = state.get(MEAN), state.get(RESIDUE)
+    if residue is not None and grid is not None and residue.shape == param.shape:
+        mean = mean_of_residue(param, residue.to(CODES), grid)
+    if mean is None or mean.shape != param.shape:
+        return False
+    known = torch.isfinite(param) & torch.isfinite(mean)
+    known &= like_rows(state[BEGAN] > 0, param)
+    param.copy_(torch.where(known, mean, param))
+    return True

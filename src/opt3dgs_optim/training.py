@@ -1,0 +1,134 @@
+"""What the steps of a training share: its clock, its tensors by name, and what its parts know."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple, TypeVar
+
+from torch import Tensor
+from torch.optim import Optimizer
+
+from opt3dgs_optim.checks import check_choice
+from opt3dgs_optim.clock import Clock, Ticket
+from opt3dgs_optim.device import BadNumbers
+from opt3dgs_optim.messages import Messages
+
+LOOK_INTERVAL = 100  # iterations between two looks at the numbers that were not finite
+AnyPart = TypeVar("AnyPart")
+
+
+class Member(NamedTuple):
+    """Who holds a Gaussian parameter: an optimizer, in which of its groups, and its ticket."""
+
+    optimizer: Optimizer
+    at: int
+    ticket: Ticket
+
+
+class Training(Clock):
+    """A training: parts, and what they share.
+
+    Args:
+        parts: `Part` objects, what the steps have, in order.
+        total_steps, switch_step: as in `Clock`.
+        moments: bits of each of Adam's moments of a number, 32 or 16.
+
+    Attributes:
+        changes_steps: whether the steps are others than torch's.
+        members: by set and gsplat's name, who holds a Gaussian parameter.
+        finished: whether the training has been ended early.
+        messages: what has been said, each thing once.
+        bad_numbers: how many numbers of gradients were not finite.
+        unsaved: what parts keep from step to step, and never save.
+    """
+
+    def __init__(
+        self,
+        parts: Iterable[Any],
+        total_steps: int | None = None,
+        switch_step: int | None = None,
+        moments: int = 32,
+    ) -> None:
+        super().__init__(total_steps, switch_step)
+        self.parts = tuple(parts)  # `part` needs this class for its own hints
+        self.moments = check_choice(type(self).__name__, "moments", moments, (32, 16))
+        self.changes_steps = bool(self.parts) or moments != 32
+        self.members: dict[tuple[str, str], Member] = {}
+        self.finished = False
+        self.messages, self.bad_numbers = Messages(), BadNumbers()
+        self.unsaved: dict[Any, Any] = {}
+        self._notes: dict[str, dict[str, Any]] = {type(part).__name__: {} for part in self.parts}
+        self._look_at = LOOK_INTERVAL  # the iteration of the next look
+        self.observers = [part for part in self.parts if part.overrides("observe")]
+        for part in self.parts:
+            if part.learns:
+                if vars(part).get("_training") is not None:
+                    raise ValueError(
+                        f"{type(self).__name__}: {type(part).__name__} serves another training "
+                        f"already, and has learnt there; make a new one, {type(part).__name__}(...)"
+                    )
+                part._training = self
+
+    def part(self, kind: type[AnyPart]) -> AnyPart | None:
+        """The part of that class, or None."""
+        return next((part for part in self.parts if isinstance(part, kind)), None)
+
+    def notes_of(self, part: Any) -> dict[str, Any]:
+        """What a part knows of this training: plain numbers by name, saved with the optimizers."""
+        return self._notes[type(part).__name__]
+
+    def param_of(self, set_name: str, name: str) -> Tensor | None:
+        """The present tensor of a Gaussian parameter, by gsplat's name; None if nobody holds it."""
+        member = self.members.get((set_name, name))
+        return None if member is None else member[0].param_groups[member[1]]["params"][0]
+
+    def state_of_param(self, set_name: str, name: str) -> dict[str, Any] | None:
+        """The optimizer's state of a Gaussian parameter; None before its first step."""
+        member, param = self.members.get((set_name, name)), self.param_of(set_name, name)
+        return None if member is None or param is None else member[0].state.get(param) or None
+
+    def clocks(self) -> list[int]:
+        """Of each optimizer whose steps are counted, the iteration that it steps next."""
+        tickets = [member.ticket for member in self.members.values()]
+        return [each.next_iteration for each in tickets if each.has_means or not self.counts_means]
+
+    def numbers(self) -> dict[str, float | Tensor]:
+        """What the parts say of the present iteration."""
+        found: dict[str, float | Tensor] = {}
+        for part in self.parts:
+            found.update(part.numbers(self))
+        return found
+
+    def observe(self, loss: Any) -> None:
+        """Give the loss of this iteration to the parts that read it."""
+        for part in self.observers:
+            part.observe(loss, self)
+
+    def rows_removed(self, count: int) -> None:
+        """Gaussians have disappeared since the last step."""
+
+    def go_to(self, iteration: int) -> None:
+        """Be at that iteration; now and then look for numbers that were not finite."""
+        super().go_to(iteration)
+        if iteration >= self._look_at or iteration + 1 == self.total_steps:
+            self._look_at = iteration + LOOK_INTERVAL
+            self.look_at_numbers()
+
+    def look_at_numbers(self) -> None:
+        """Say once that gradients have not been finite."""
+        if bad := self.bad_numbers.look():
+            self.messages.warn_once(
+                "nonfinite",
+                f"opt3dgs_optim: iteration {self.iteration}: {bad} numbers of gradients have "
+                "not been finite (NaN or infinite) since the start, and counted as zero; look for "
+                "the first NaN of the loss",
+            )
+
+    def read_back(self) -> None:
+        """Have what is on its way from a device in the parts' notes."""
+        for part in self.parts:
+            part.read_back(self)
+
+    def __getstate__(self) -> dict[str, Any]:
+        self.read_back()
+        return {**vars(self), "unsaved": {}}
