@@ -1,27 +1,38 @@
-"""The optimizer: `torch.optim.Adam` whose steps have the parts of a training."""
+"""The optimizer: `torch.optim.Adam` whose steps have the parts of a training.
+
+What torch does around a step stays torch's: hooks, the range in profiles, what wraps `step` on the
+instance, load hooks. Where there is nothing of it, none of it is paid for.
+"""
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from typing import Any, cast
 
 import torch
 from torch import Tensor
-from torch.optim import Adam
+from torch.optim import Adam, Optimizer
+from torch.optim.optimizer import _global_optimizer_post_hooks, _global_optimizer_pre_hooks
 
 from opt3dgs_optim.checkpoint import (
     STATE_KEY,
     check_loaded,
+    drop_other_means,
+    iteration_by_counts,
+    note_in_groups,
     numbers_of,
     restore_notes,
     restore_parts,
+    say_other_names,
+    take_from_groups,
 )
 from opt3dgs_optim.clock import Ticket
-from opt3dgs_optim.contract import Slots, check_supported, own_step
-from opt3dgs_optim.mean import BEGAN, OF_MEAN, put_mean
+from opt3dgs_optim.contract import Slots, check_held, check_supported, own_step
+from opt3dgs_optim.mean import put_mean
 from opt3dgs_optim.moments import MOMENTS, as_numbers, recode
 from opt3dgs_optim.names import split_name
-from opt3dgs_optim.sparse_adam import check_arguments, step_around
+from opt3dgs_optim.sparse_adam import check_arguments, refuse_mask, step_around
 from opt3dgs_optim.stepper import KEPT, ParamStepper
 from opt3dgs_optim.training import Member, Training
 
@@ -32,15 +43,18 @@ class StepAdam(Adam):
     Made by `PhaseScheduler.upgrade`, `AWSGLD` and `LQNAdam`. An upgraded optimizer is an instance
     of this class *and* of the class that it had. Without parts its step is that class's own.
 
-    What it keeps lies beside Adam's moments in `state[param]`, rows first, and as plain numbers in
-    `param_groups[0]["opt3dgs"]`, so that `state_dict()` and `torch.save` carry it.
+    What it keeps lies beside Adam's moments in `state[param]`, rows first, and as a line of JSON in
+    `param_groups[i]["opt3dgs"]`, so that `state_dict()` and `torch.save` carry it.
     """
 
     training: Training
     ticket: Ticket
     coded = False  # whether its moments are codes of 16 bits, see `moments`
+    _on_gpu = False
+    _implementations: list[Any] = []  # noqa: RUF012  (`fused` and `foreach` of the trainer's groups)
     _base: type[Adam] = Adam  # the class whose optimizer it was
     _steppers: list[ParamStepper] = []  # noqa: RUF012  (made anew, never changed)
+    _in_order: list[ParamStepper] = []  # noqa: RUF012  (the same, as they step)
     _slots: Slots
     # Where it has not stepped since a load: of every parameter, the iteration of its last step, and
     # the sets whose positions' moments are those of the own frame.
@@ -55,6 +69,7 @@ class StepAdam(Adam):
             self.ticket = Ticket()
         self._masked = own_step(self._base) is not None
         self._step_supports_amp_scaling = False  # a GradScaler unscales, and leaves steps out
+        self._on_gpu = any(p.is_cuda for group in self.param_groups for p in group["params"])
         self._name_groups()
         self._count_on_host()
 
@@ -62,6 +77,8 @@ class StepAdam(Adam):
         """Say in each group which Gaussian parameter it holds, by gsplat's name, or None."""
         for at, (which, name) in enumerate(self._slots):
             self.param_groups[at]["gaussian"] = name
+            # Always there, since flattened states are loaded by the keys that a group has.
+            self.param_groups[at].setdefault(STATE_KEY, "")
             if name is not None:
                 self.training.members[which, name] = Member(self, at, self.ticket)
         self.ticket.has_means = any(name == "means" for _, name in self._slots)
@@ -71,6 +88,8 @@ class StepAdam(Adam):
         """Keep Adam's count of steps on the host, which reads it in every step of ours."""
         if not self.training.changes_steps:
             return
+        own = [(group.get("fused"), group.get("foreach")) for group in self.param_groups]
+        self._implementations = [*self._implementations, *own[len(self._implementations) :]]
         for group in self.param_groups:
             group["fused"], group["foreach"] = False, False
         for state in self.state.values():
@@ -94,31 +113,47 @@ class StepAdam(Adam):
 
     # -- a step ----------------------------------------------------------------------------------
 
-    def step(self, closure: Any = None, *masked: Any, **masks: Any) -> Any:  # pyright: ignore
+    def step(self, *args: Any, **options: Any) -> Any:
         """One step of every parameter that has a gradient; return the closure's value.
 
         Args:
             closure: evaluates the model and returns the loss, or None. gsplat's SelectiveAdam and
                 INRIA's SparseGaussianAdam get their mask, and what goes with it, unchanged.
         """
+        self._opt_called = True  # what learning-rate schedulers would note by wrapping this method
+        if torch.compiler.is_compiling():
+            return _uncompiled_step(self, *args, **options)
+        if (
+            self._optimizer_step_pre_hooks or self._optimizer_step_post_hooks
+            or _global_optimizer_pre_hooks or _global_optimizer_post_hooks
+            or torch.autograd._profiler_enabled()  # pyright: ignore
+        ):  # fmt: skip
+            return _hooked_step(self, *args, **options)
+        return self._step(*args, **options)
+
+    # Learning-rate schedulers, which would wrap `step` on the instance, need not: `step` tells.
+    step._wrapped_by_lr_sched = True  # pyright: ignore[reportFunctionMemberAccess]
+    # torch's own wrapper, for hooks and profiles, takes longer than all else that Python does here.
+    step.hooked = True  # pyright: ignore[reportFunctionMemberAccess]
+
+    def _step(self, closure: Any = None, *masked: Any, **masks: Any) -> Any:
         given: tuple[Any, ...] = ()
         if self._masked:
             given = () if closure is None and not masked else (closure, *masked)
             check_arguments(type(self).__name__, self._base.step, self, *given, masks)
         elif masked or masks or isinstance(closure, Tensor):
-            raise TypeError(
-                f"{type(self).__name__}.step: a mask was given, but torch's Adam steps all rows; "
-                "use gsplat's SelectiveAdam or INRIA's SparseGaussianAdam for masked steps"
-            )
-        self._opt_called = True  # what learning-rate schedulers would note by wrapping this method
-        for hook in self._optimizer_step_pre_hooks.values():
-            hook(self, (closure, *masked), masks)
+            refuse_mask(type(self).__name__)
         loss, training = None, self.training
         if callable(closure):
             with torch.enable_grad():
                 loss = closure()
             if loss is not None and training.observers:
                 training.observe(loss)
+        if self._on_gpu and torch.cuda.is_current_stream_capturing():
+            raise RuntimeError(
+                f"{type(self).__name__}.step: a CUDA graph is being captured, which would repeat "
+                "this one iteration's numbers for ever; capture the rendering alone"
+            )
         iteration = training.begin(self.ticket)
         if not training.changes_steps:
             self.own_class_step(*given, **masks)
@@ -129,30 +164,22 @@ class StepAdam(Adam):
             with_grad = torch.is_grad_enabled()
             torch._C._set_grad_enabled(False)  # in a tenth of the time of `with torch.no_grad()`
             try:
-                for stepper in self.steppers():
-                    if stepper.param.grad is not None:
-                        stepper.step(self.state[stepper.param], iteration)
+                self.steppers()
+                for stepper in self._in_order:
+                    param = stepper.param()
+                    if param is not None and param.grad is not None:
+                        stepper.step(param, self.state[param], iteration)
             finally:
                 torch._C._set_grad_enabled(with_grad)
-        for hook in self._optimizer_step_post_hooks.values():
-            hook(self, (closure, *masked), masks)
         return loss
-
-    # Learning-rate schedulers, which would wrap `step` on the instance, need not: `step` tells.
-    step._wrapped_by_lr_sched = True  # pyright: ignore[reportFunctionMemberAccess]
-    # torch's own wrapper, for hooks and profiles, takes longer than all else that Python does here.
-    step.hooked = True  # pyright: ignore[reportFunctionMemberAccess]
 
     def steppers(self) -> list[ParamStepper]:
         """The steppers of all parameters; looked up again when groups or Parameters are new."""
         steppers, i = self._steppers, 0
         for group in self.param_groups:
             for param in group["params"]:
-                if (
-                    i == len(steppers)
-                    or steppers[i].param is not param
-                    or steppers[i].group is not group
-                ):
+                known = steppers[i] if i < len(steppers) else None
+                if known is None or known.param() is not param or known.group is not group:
                     return self._new_steppers()
                 i += 1
         return steppers if i == len(steppers) else self._new_steppers()
@@ -170,7 +197,7 @@ class StepAdam(Adam):
                 stepper = ParamStepper(call, self.training, group, param, slot)
                 state = self.state.get(param, {})
                 if i < len(old):
-                    stepper.follow(old[i], state)
+                    stepper.follow(old[i], param, state)
                 else:
                     # One that has not stepped yet counts as having stepped in the iteration before
                     # the present one: events of earlier ones are not made up for.
@@ -178,10 +205,11 @@ class StepAdam(Adam):
                     stepper.stepped_in = self._last[i] if i < len(self._last) else now - 1
                     if state:
                         stepper.framed = stepper.name == "means" and stepper.set in self._own_frame
-                    stepper.drop_moved(state, False, False)
-                stepper.check_rows(state)
+                stepper.check_rows(param, state)
                 made.append(stepper)
         self._steppers = made
+        # Positions first: they step in frames of the shapes that the gradient is of.
+        self._in_order = sorted(made, key=lambda stepper: stepper.name != "means")
         return made
 
     def own_class_step(self, *args: Any, **options: Any) -> Any:
@@ -201,9 +229,11 @@ class StepAdam(Adam):
             param: one of the optimizer's parameters [N, ...].
             rows: their indices, or an [N] bool mask.
         """
+        check_held(f"{type(self).__name__}.reset_rows", self, param)
+        state = self.state.get(param, {})
         for key in (*MOMENTS, *KEPT):
-            if key in self.state[param]:
-                self.state[param][key][rows] = 0
+            if key in state:
+                state[key][rows] = 0
 
     @torch.no_grad()
     def put_means(self) -> int:
@@ -216,29 +246,40 @@ class StepAdam(Adam):
         for stepper in self.steppers():
             if end is not None and stepper.stepped_in > end:  # trainers that count from 1 end there
                 continue
-            state = self.state.get(stepper.param, {})
-            found += put_mean(stepper.param, state, stepper.grid)
+            param = stepper.param()
+            if param is not None:
+                found += put_mean(param, self.state.get(param, {}), stepper.name)
         return found
 
     def state_dict(self) -> dict[str, Any]:
-        """As torch's, with the training's numbers in `param_groups[0]["opt3dgs"]`."""
+        """As torch's, with what is ours in each group, `"opt3dgs"`: a line of JSON.
+
+        Any Adam may load it, and has the trainer's `fused` and `foreach` again. Moments of 16 bits
+        are float32 in it, on the host; their codes are the same again.
+        """
         if not self.training.changes_steps:
             return super().state_dict()
         self._drop_moved()
-        self.param_groups[0][STATE_KEY] = self.numbers()
+        own = [dict(group) for group in self.param_groups]
+        self.note_in_groups()
+        for group, own_kind in zip(self.param_groups, self._implementations, strict=True):
+            group["fused"], group["foreach"] = own_kind
         try:
             found = super().state_dict()
         finally:  # it is of this moment
-            del self.param_groups[0][STATE_KEY]
-        if self.coded:  # any Adam may load it; the codes of these numbers are the same again
+            for group, was in zip(self.param_groups, own, strict=True):
+                group.clear()
+                group.update(was)
+        if self.coded:
             found["state"] = {at: as_numbers(state) for at, state in found["state"].items()}
         return found
 
-    def numbers(self) -> dict[str, Any]:
-        """What a checkpoint has beside tensors."""
+    def note_in_groups(self) -> None:
+        """Put into each group what a checkpoint has beside tensors."""
         counts = (int(state["step"]) for state in self.state.values() if "step" in state)
-        steps = max(counts, default=0)
-        return numbers_of(self.training, self.ticket, steps, self.last_steps(), self.own_frame())
+        common = numbers_of(self.training, self.ticket, max(counts, default=0))
+        last, now = self.last_steps(), self.ticket.next_iteration - 1
+        note_in_groups(self.param_groups, self._slots, common, last, now, self.own_frame())
 
     def _drop_moved(self) -> None:
         """Drop what was kept for rows that are others since the last step: a copy knows no more."""
@@ -248,27 +289,44 @@ class StepAdam(Adam):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """As torch's; the training goes on where the checkpoint was.
 
-        Of a checkpoint of a stock Adam, the place is the number of Adam's own steps.
+        Of a checkpoint of a stock Adam, the place is the number of Adam's own steps. Load hooks run
+        first: they may order or drop groups.
 
         Raises:
             ValueError: it is damaged, or of another version; nothing has been changed.
         """
-        call = f"{type(self).__name__}.load_state_dict"
-        saved = check_loaded(call, state_dict, self.param_groups)
-        if saved is not None:
-            restore_parts(self.training, saved)
-        own = [dict(group) for group in self.param_groups]
-        super().load_state_dict(state_dict)
-        self.coded = False  # unless the training's numbers say so
-        for group, was in zip(self.param_groups, own, strict=True):
-            for key, value in was.items():
-                group.setdefault(key, value)  # an option that older versions of torch did not have
-        self._count_on_host()
-        self.resume()
+        call, own = f"{type(self).__name__}.load_state_dict", [dict(g) for g in self.param_groups]
+        if not isinstance(state_dict, Mapping):
+            raise ValueError(f"{call}: {state_dict!r:.100}, but what state_dict() gives is needed")
+
+        def check(_: Any, given: dict[str, Any]) -> None:
+            saved = check_loaded(call, given, own)
+            if saved is not None:
+                restore_parts(self.training, saved)
+
+        def go_on(_: Any) -> None:
+            self.coded = False  # unless the training's numbers say so
+            for group, was in zip(self.param_groups, own, strict=True):
+                for key, value in was.items():
+                    group.setdefault(key, value)  # an option that torch did not always have
+            say_other_names(self.training, self.param_groups, own)
+            self._count_on_host()
+            self.resume()
+
+        handles = [
+            self.register_load_state_dict_pre_hook(check),
+            self.register_load_state_dict_post_hook(go_on, prepend=True),
+        ]
+        try:
+            super().load_state_dict(state_dict)
+        finally:
+            for handle in handles:
+                handle.remove()
 
     def resume(self) -> None:
         """Go on where the state says that the training is: after a load."""
-        training, saved = self.training, self.param_groups[0].pop(STATE_KEY, None)
+        training = self.training
+        saved, last, own_frame = take_from_groups(self.param_groups, self._slots)
         counts = [int(state["step"]) for state in self.state.values() if "step" in state]
         missed = 0 if saved is None else max(counts, default=0) - saved["steps"]
         if missed:
@@ -277,57 +335,33 @@ class StepAdam(Adam):
                 "what was kept beside its moments begins anew"
             )
         ours = None if missed else saved  # what it says of the moments holds
-        self._own_frame = frozenset(() if ours is None else ours["own_frame"])
-        self._last = () if ours is None else tuple(ours["last"])
-        dropped = KEPT if ours is None or ours["total_steps"] != training.total_steps else ()
-        if ours is not None and ours["moments"] != training.moments:
-            dropped = dropped or OF_MEAN
-            if any(BEGAN in state for state in self.state.values()):
-                bits = f"at {training.moments} bits"
-                training.messages.say_once(
-                    f"opt3dgs_optim: the mean of the last iterates begins anew, {bits}"
-                )
-        for state in self.state.values():  # of the end of another run, or in another form
-            for key in dropped:
-                state.pop(key, None)
+        self._last, self._own_frame = ((), frozenset()) if ours is None else (last, own_frame)
+        drop_other_means(self.state.values(), ours, training)
         if saved is not None:
             iteration = saved["iteration"] + max(missed, 0)
         else:
-            iteration = self._iteration_by_counts(counts)
+            iteration = iteration_by_counts(type(self).__name__, counts, training)
         self._steppers, self.ticket.next_iteration = [], iteration
         clocks = training.clocks()
         if saved is not None or (counts and (self.ticket.has_means or not any(clocks))):
             training.resume(max([iteration, *clocks]))  # one that steps now and then lags
         if saved is not None:
             restore_notes(training, saved)
-        self._recode(tell=saved is None or saved["moments"] != training.moments)
+        found = [recode(s, self.coded, training.moments, p.dtype) for p, s in self.state.items()]
+        was, self.coded = self.coded, training.moments == 16
+        if (
+            any(found)
+            and was != self.coded
+            and (saved is None or saved["moments"] != training.moments)
+        ):
+            training.messages.say_once(
+                f"opt3dgs_optim: the moments that were there are now at {training.moments} bits"
+            )
         if self._own_frame and not training.changes_steps:
-            for stepper in self.steppers():
-                if stepper.framed:
+            for group, (which, name) in zip(self.param_groups, self._slots, strict=True):
+                if name == "means" and which in self._own_frame:
                     for key in MOMENTS:
-                        self.state[stepper.param][key].zero_()
-
-    def _iteration_by_counts(self, counts: list[int]) -> int:
-        """The iteration that comes next, by Adam's own counts of steps."""
-        if not counts:  # one that is made anew under way steps first in the next iteration
-            return self.training.iteration + 1
-        if not any(counts):
-            self.training.messages.warn_once(
-                "uncounted",
-                f"{type(self).__name__}: it has moments, but does not count its steps, so that the "
-                "clock begins at 0; call phases.observe(iteration=...) where the training goes on",
-            )
-        return max(counts)
-
-    def _recode(self, tell: bool) -> None:
-        """Have the moments at as many bits as the training says; rounded where they had more."""
-        bits = self.training.moments
-        found = [recode(s, self.coded, bits, p.dtype) for p, s in self.state.items()]
-        if tell and any(found) and self.coded != (bits == 16):
-            self.training.messages.say_once(
-                f"opt3dgs_optim: the moments that were there are now at {bits} bits"
-            )
-        self.coded = bits == 16
+                        self.state[group["params"][0]][key].zero_()
 
     def last_steps(self) -> tuple[int, ...]:
         """Of every parameter, the iteration of its last step."""
@@ -343,9 +377,8 @@ class StepAdam(Adam):
 
     def __getstate__(self) -> dict[str, Any]:
         self._drop_moved()
-        own = {
-            key: getattr(self, key) for key in ("training", "ticket", "_slots", "_masked", "coded")
-        }
+        kept = ("training", "ticket", "_slots", "_masked", "coded", "_on_gpu", "_implementations")
+        own = {key: getattr(self, key) for key in kept}
         own |= {"_steppers": [], "_last": self.last_steps(), "_own_frame": self.own_frame()}
         return {**super().__getstate__(), **own}
 
@@ -357,6 +390,13 @@ class StepAdam(Adam):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self._step_supports_amp_scaling = False
+        if "training" in vars(self):  # a copy, whose training does not know it, or a load
+            self._name_groups()
+
+
+_hooked_step: Any = Optimizer.profile_hook_step(StepAdam._step)
+# It reads numbers, which is not to be traced. `torch.compiler.disable` would import the compiler.
+_uncompiled_step: Any = torch._disable_dynamo(StepAdam._step)  # pyright: ignore
 
 
 def _made_again(kind: type[StepAdam] | None, base: type[Adam]) -> StepAdam:

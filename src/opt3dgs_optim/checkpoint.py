@@ -2,36 +2,38 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from typing import Any
 
 from torch import Tensor
 
 from opt3dgs_optim.checks import as_float, check_choice, check_count, check_number
 from opt3dgs_optim.clock import Ticket
-from opt3dgs_optim.contract import REFUSED
-from opt3dgs_optim.mean import BEGAN, MEAN, RESIDUE
+from opt3dgs_optim.contract import REFUSED, Slots
+from opt3dgs_optim.mean import BEGAN, MEAN, OF_MEAN, RESIDUE, REST
 from opt3dgs_optim.moments import CODES, MOMENTS
 from opt3dgs_optim.stepper import KEPT
 from opt3dgs_optim.training import Training
 
-STATE_KEY = "opt3dgs"  # in `param_groups[0]`: what a checkpoint needs beside tensors
-FORMAT = 3
-NUMBERS = {"format", "iteration", "total_steps", "own_frame", "steps", "moments", "last"}
-NUMBERS |= {"notes", "parts"}
+# In each group of a checkpoint, as a line of JSON, so that a group may be moved or dropped, and
+# that who takes nested states apart (torch.distributed.checkpoint) finds one leaf.
+STATE_KEY = "opt3dgs"
+FORMAT = 4
+COMMON = {"format", "iteration", "total_steps", "steps", "moments", "notes", "parts"}
+OF_GROUP = {"last", "own_frame"}
 
 
-def numbers_of(
-    training: Training, ticket: Ticket, steps: int, last: Iterable[int], own_frame: Iterable[str]
-) -> dict[str, Any]:
-    """What a checkpoint of an optimizer has beside tensors: plain numbers and lists.
+def numbers_of(training: Training, ticket: Ticket, steps: int) -> dict[str, Any]:
+    """What all groups of a checkpoint have beside tensors: plain numbers and lists.
+
+    A group has besides `last`, of every parameter the iteration of its last step, and `own_frame`,
+    whether the moments of its positions are the own frame's.
 
     Args:
         ticket: the optimizer's.
         steps: that Adam has made, of its parameters the most.
-        last: of every parameter, the iteration of its last step.
-        own_frame: the sets whose positions' moments are those of the own frame.
     """
     training.read_back()
     training.look_at_numbers()
@@ -41,13 +43,75 @@ def numbers_of(
         "format": FORMAT,
         "iteration": max(ticket.next_iteration, training.iteration),  # it may have been put on
         "total_steps": training.total_steps,
-        "own_frame": sorted(own_frame),
         "steps": steps,
         "moments": training.moments,
-        "last": list(last),
         "notes": notes,
         "parts": {type(p).__name__: p.state_dict() for p in training.parts if p.learns},
     }
+
+
+def note_in_groups(
+    groups: list[dict[str, Any]],
+    slots: Slots,
+    common: dict[str, Any],
+    last: Iterable[int],
+    now: int,
+    own_frame: Container[str],
+) -> None:
+    """Put into each group what it has beside tensors.
+
+    Args:
+        common: of all groups, see `numbers_of`.
+        last: of every parameter, the iteration of its last step; `now` where it is not known.
+        own_frame: the sets whose positions' moments are the own frame's.
+    """
+    steps = iter(last)
+    for group, (which, name) in zip(groups, slots, strict=True):
+        of_group = {
+            "last": [next(steps, now) for _ in group["params"]],
+            "own_frame": name == "means" and which in own_frame,
+        }
+        group[STATE_KEY] = json.dumps({**common, **of_group})
+
+
+def take_from_groups(groups: list[dict[str, Any]], slots: Slots) -> Any:
+    """What `note_in_groups` has put there, which is no more there then.
+
+    Returns:
+        of the first group that has it all that it has, or None; of every parameter, the iteration
+        of its last step; the sets whose positions' moments are the own frame's.
+    """
+    found = [saved_numbers(group.get(STATE_KEY)) for group in groups]
+    for group in groups:
+        group[STATE_KEY] = ""
+    first = next((each for each in found if each is not None), None)
+    if first is None:
+        return None, (), frozenset()
+    known = [first if each is None else each for each in found]
+    last = tuple(number for each in known for number in each["last"])
+    pairs = zip(found, slots, strict=True)
+    return first, last, frozenset(which for each, (which, _) in pairs if each and each["own_frame"])
+
+
+def say_other_names(
+    training: Training, groups: list[dict[str, Any]], own: list[dict[str, Any]]
+) -> None:
+    """Say that groups have been loaded into others, by their names."""
+    for group, was in zip(groups, own, strict=True):
+        if group.get("name") != was.get("name"):
+            training.messages.say_once(
+                f"opt3dgs_optim: the checkpoint's group {group.get('name')!r} is loaded into the "
+                f"group {was.get('name')!r}, which has its place; a load hook "
+                "(register_load_state_dict_pre_hook) may put groups into another order"
+            )
+
+
+def saved_numbers(line: Any) -> dict[str, Any] | None:
+    """What a group of a checkpoint has; None: it is a stock Adam's."""
+    try:
+        return json.loads(line) if line else None
+    except (TypeError, ValueError):
+        return {}  # of no version
 
 
 def restore_parts(training: Training, saved: Mapping[str, Any]) -> None:
@@ -66,6 +130,42 @@ def restore_notes(training: Training, saved: Mapping[str, Any]) -> None:
             notes.update(saved["notes"][type(part).__name__])
 
 
+def drop_other_means(
+    states: Iterable[dict[str, Any]], saved: Mapping[str, Any] | None, training: Training
+) -> None:
+    """Drop means, and what else is kept for rows, of another end of training, or in another form.
+
+    Args:
+        states: of the optimizer's parameters.
+        saved: what the checkpoint says; None: nothing that holds.
+    """
+    states = list(states)
+    dropped = KEPT if saved is None or saved["total_steps"] != training.total_steps else ()
+    if saved is not None and saved["moments"] != training.moments:
+        dropped = dropped or OF_MEAN
+        if any(BEGAN in state for state in states):
+            training.messages.say_once(
+                "opt3dgs_optim: the mean of the last iterates begins anew, at "
+                f"{training.moments} bits"
+            )
+    for state in states:
+        for key in dropped:
+            state.pop(key, None)
+
+
+def iteration_by_counts(call: str, counts: list[int], training: Training) -> int:
+    """The iteration that comes next, by Adam's own counts of steps, of a stock checkpoint."""
+    if not counts:  # one that is made anew under way steps first in the next iteration
+        return training.iteration + 1
+    if not any(counts):
+        training.messages.warn_once(
+            "uncounted",
+            f"{call}: it has moments, but does not count its steps, so that the clock begins at 0; "
+            "call phases.observe(iteration=...) where the training goes on",
+        )
+    return max(counts)
+
+
 # -- what is loaded --------------------------------------------------------------------------------
 
 
@@ -76,29 +176,36 @@ def check_loaded(call: str, state_dict: Any, groups: list[dict[str, Any]]) -> An
         What `numbers_of` has put into it; None: it is a stock Adam's.
     """
     check_tensors(call, state_dict, groups)
-    saved = next((g[STATE_KEY] for g in state_dict["param_groups"] if STATE_KEY in g), None)
-    if saved is not None:
-        check_numbers(call, saved)
-    return saved
+    return check_groups(call, state_dict["param_groups"])
 
 
-def check_numbers(call: str, saved: Any) -> None:
-    """ValueError unless this is what `numbers_of` gives."""
-    if not isinstance(saved, Mapping) or set(saved) != NUMBERS or saved["format"] != FORMAT:
+def check_groups(call: str, groups: list[dict[str, Any]]) -> Any:
+    """`check_loaded` of what is ours in the groups."""
+    found = [saved_numbers(group.get(STATE_KEY)) for group in groups]
+    for saved, group in zip(found, groups, strict=True):
+        if saved is not None:
+            check_numbers(call, saved, len(group["params"]))
+    return next((saved for saved in found if saved is not None), None)
+
+
+def check_numbers(call: str, saved: Any, count: int) -> None:
+    """ValueError unless this is what a group of so many parameters has."""
+    known = isinstance(saved, dict) and set(saved) == COMMON | OF_GROUP
+    if not known or saved["format"] != FORMAT:
         raise ValueError(
-            f"{call}: param_groups[0][{STATE_KEY!r}] is not of this version (format {FORMAT}); "
-            f"load a checkpoint that it has written, or remove the key to begin with Adam's "
-            "moments alone"
+            f"{call}: {STATE_KEY!r} in a group is not of this version (format {FORMAT}); load a "
+            "checkpoint that it has written, or remove the key from all groups to begin with "
+            "Adam's moments alone"
         )
     check_count(call, "iteration", saved["iteration"], 0)
     if saved["total_steps"] is not None:
         check_count(call, "total_steps", saved["total_steps"], 1)
     check_count(call, "steps", saved["steps"], 0)
     check_choice(call, "moments", saved["moments"], (32, 16))
-    for key, kind in (("last", int), ("own_frame", str)):
-        found = saved[key]
-        if not isinstance(found, list) or any(type(each) is not kind for each in found):
-            raise ValueError(f"{call}: {key}={found!r}, but a list of {kind} is needed")
+    last = saved["last"]
+    if not isinstance(last, list) or [type(each) for each in last] != [int] * count:
+        raise ValueError(f"{call}: last={last!r}, but a list of {count} integers is needed")
+    check_choice(call, "own_frame", saved["own_frame"])
     for kind in ("notes", "parts"):
         if not isinstance(saved[kind], Mapping) or not all(
             isinstance(each, Mapping) for each in saved[kind].values()
@@ -143,8 +250,8 @@ def check_group(call: str, group: Any, count: int) -> None:
     params = group.get("params") if isinstance(group, Mapping) else None
     if not isinstance(params, list) or len(params) != count:
         raise ValueError(f"{call} has params={params!r}, but a list of {count} is needed")
-    if not all(type(each) is int for each in params):
-        raise ValueError(f"{call} has params={params!r}, but integers are needed")
+    if not all(isinstance(each, (int, str)) for each in params):
+        raise ValueError(f"{call} has params={params!r}, but indices or names are needed")
     for option in REFUSED:
         if group.get(option):
             raise ValueError(f"{call} has {option}={group[option]!r}, which is not taken")
@@ -177,12 +284,14 @@ def check_moments(call: str, state: Any) -> None:
             raise ValueError(f"{call} has {key}={value!r}, but a tensor of real numbers is needed")
         shapes[key] = tuple(value.shape)
     one = shapes["exp_avg"]
-    if any(shapes.get(key, one) != one for key in ("exp_avg_sq", MEAN, RESIDUE)) or any(
-        shapes.get(key, one)[:1] != one[:1] for key in KEPT
+    rows = one[:1] or (1,)  # a scalar is one row
+    like = ("exp_avg_sq", MEAN, RESIDUE, REST)
+    if any(shapes.get(key, one) != one for key in like) or any(
+        shapes.get(key, rows)[:1] not in (rows, one[:1]) for key in KEPT if key not in like
     ):
         raise ValueError(f"{call} has shapes {shapes}, but the same rows are needed in all")
     means = (MEAN in shapes) + (RESIDUE in shapes)
-    if means != (BEGAN in shapes) or shapes.get(BEGAN, one[:1]) != one[:1]:
+    if means != (BEGAN in shapes) or shapes.get(BEGAN, rows) not in (rows, one[:1]):
         raise ValueError(f"{call} has shapes {shapes}, but {BEGAN} needs a number for each row")
 
 

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.optim import Adam, AdamW, Optimizer
+
+from opt3dgs_optim.names import split_name
+from opt3dgs_optim.part import Part
+from opt3dgs_optim.parts.curvature import Curvature
+from opt3dgs_optim.parts.own_frame import OwnFrame
 
 OWN_STEPS = ("SelectiveAdam", "SparseGaussianAdam")  # gsplat's and 3DGRUT's, and INRIA's
 Slots = list[tuple[str, str | None]]  # by group: the set of Gaussians, which parameter of it
@@ -15,8 +21,17 @@ REFUSED = ("amsgrad", "maximize", "differentiable", "capturable")
 
 def own_step(kind: type) -> type | None:
     """The class of a step that is not torch's: gsplat's SelectiveAdam, INRIA's; else None."""
-    owner = next(each for each in kind.__mro__ if "step" in vars(each) and issubclass(each, Adam))
-    return None if owner in (Adam, AdamW) else owner
+    for owner in kind.__mro__:
+        if "step" in vars(owner) and issubclass(owner, Adam):
+            # torch wraps, for hooks, the step of the class of the first optimizer in a process.
+            if _bare(vars(owner)["step"]) in (_bare(Adam.step), _bare(AdamW.step)):
+                return None
+            return owner
+    return None
+
+
+def _bare(step: Any) -> Any:
+    return step.__wrapped__ if getattr(step, "hooked", False) else step
 
 
 def check_supported(optimizer: Any, slots: Slots, moments: int = 32) -> None:
@@ -37,6 +52,7 @@ def check_supported(optimizer: Any, slots: Slots, moments: int = 32) -> None:
             f"upgrade: {kind.__name__} is no optimizer; pass the trainer's own, or a dict or list "
             "of them"
         )
+    _check_bare(optimizer)
     owner = (
         own_step(kind._base if hasattr(kind, "_base") else kind)
         if isinstance(optimizer, Adam)
@@ -80,6 +96,39 @@ def check_supported(optimizer: Any, slots: Slots, moments: int = 32) -> None:
         raise ValueError(f"upgrade: its parameters lie on {sorted(devices)}; one device is needed")
 
 
+def check_held(call: str, optimizer: Optimizer, param: Tensor) -> None:
+    """ValueError unless a tensor is one of the optimizer's parameters."""
+    if not any(param is each for group in optimizer.param_groups for each in group["params"]):
+        raise ValueError(
+            f"{call}: a tensor {tuple(param.shape)} that is none of this optimizer's parameters; "
+            "call it on the optimizer that steps it, with its present Parameter"
+        )
+
+
+def _check_bare(optimizer: Any) -> None:
+    """Refuse a wrapper around an optimizer, and a function over its step."""
+    kind = type(optimizer)
+    within = getattr(optimizer, "optimizer", None) or getattr(optimizer, "_optimizer", None)
+    if isinstance(within, Optimizer):
+        raise TypeError(
+            f"upgrade: {kind.__name__} is a wrapper around a {type(within).__name__}, whose own "
+            "step would be left out; give what is within, `.optimizer`, or upgrade it before the "
+            "trainer prepares (Lightning, Fabric, Accelerate) its optimizers"
+        )
+    wrapped = vars(optimizer).get("step")
+    if wrapped is not None and not hasattr(kind, "_base") and not of_scheduler(wrapped, kind):
+        raise ValueError(
+            f"upgrade: a function has been put over this {kind.__name__}'s step, and it calls "
+            "torch's; upgrade the optimizer first, and wrap its step then"
+        )
+
+
+def of_scheduler(step: Any, kind: type) -> bool:
+    """Whether it is what a learning-rate scheduler puts over a step, to see that it is called."""
+    known = hasattr(step, "_wrapped_by_lr_sched") or hasattr(step, "_with_counter")
+    return known and _bare(getattr(step, "__wrapped__", None)) is _bare(getattr(kind, "step", None))
+
+
 def _check_bits(optimizer: Any, owner: type | None, slots: Slots, moments: int) -> None:
     """ValueError where moments of 16 bits are not for an optimizer."""
     if moments == 32:
@@ -99,3 +148,48 @@ def _check_bits(optimizer: Any, owner: type | None, slots: Slots, moments: int) 
     dtypes = {param.dtype for group in optimizer.param_groups for param in group["params"]}
     if dtypes - {torch.float32}:
         raise ValueError(f"upgrade: moments=16 with {sorted(map(str, dtypes))}; use float32")
+
+
+# -- parts, and the names of groups ----------------------------------------------------------------
+
+
+def check_parts(call: str, parts: Any) -> Sequence[Part]:
+    """The parts; TypeError for what is none, ValueError for two of one class."""
+    if not isinstance(parts, (list, tuple)):
+        raise TypeError(
+            f"{call}: parts={parts!r}, but a list of parts is needed, parts=[Averaging()]"
+        )
+    for part in parts:
+        if not isinstance(part, Part):
+            cure = f"; write parts=[{part.__name__}()]" if isinstance(part, type) else ""
+            raise TypeError(f"{call}: {part!r} in parts is no Part object{cure}")
+    kinds = [type(part) for part in parts]
+    if OwnFrame in kinds and Curvature in kinds:
+        raise ValueError(
+            f"{call}: OwnFrame steps the positions in other units, in which Curvature's pairs are "
+            "none; leave one of the two out"
+        )
+    for kind in kinds:
+        if kinds.count(kind) > 1:
+            raise ValueError(
+                f"{call}: {kind.__name__} is there twice in parts; give one part of each class"
+            )
+    return parts
+
+
+def named(optimizers: Any) -> list[tuple[str | None, Any]]:
+    """The optimizers, each with its key in a dict."""
+    if isinstance(optimizers, Mapping):
+        return [(str(key), each) for key, each in optimizers.items()]
+    if isinstance(optimizers, (list, tuple)):
+        return [(None, each) for each in optimizers]
+    return [(None, optimizers)]
+
+
+def slots_of(key: str | None, optimizer: Any) -> Slots:
+    """By group: the set of Gaussians and which of its parameters it holds."""
+    groups = getattr(optimizer, "param_groups", [])
+    found = [split_name(group.get("name")) for group in groups]
+    if key is not None and len(groups) == 1 and found[0][1] is None:
+        found = [split_name(key)]
+    return found

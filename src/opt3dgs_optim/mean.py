@@ -2,7 +2,8 @@
 
 Beside moments of 32 bits it is a tensor like the parameter. Beside moments of 16 bits it has as
 many, the lower bits of its place on a grid, except that of positions, for which no grid can be
-named: they are in the units of the scene.
+named: they are in the units of the scene. Far from the origin a position has few digits for its
+fractions, so that a second tensor has what rounding leaves of its mean (Kahan 1965).
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from opt3dgs_optim.moments import CODES
 
 MEAN, BEGAN = "averaging.mean", "averaging.began"  # in the optimizer's state, of the rows
 RESIDUE = "averaging.residue"  # in the place of the mean, beside moments of 16 bits
-OF_MEAN = (MEAN, RESIDUE, BEGAN)
+REST = "averaging.rest"  # of the mean of positions: what float32 has no digits for
+OF_MEAN = (MEAN, RESIDUE, REST, BEGAN)
 # The grids of means of 16 bits, see `take_into_residue`. They reach for 2, 2, 16, 2 and 1, further
 # than parameters go in the last thirtieth at a hundred times the usual rates.
 GRIDS = {"scales": 2**-14, "quats": 2**-14, "opacities": 2**-11, "sh0": 2**-14, "shN": 2**-15}
@@ -36,6 +38,32 @@ class Mean:
     tensor: Tensor  # [N, ...] like the parameter, or int16: see `take_into_residue`
     began: Tensor  # [N] the `count` with which a row's mean began; 0: not yet
     grid: float = 1.0  # of a mean of int16
+    rest: Tensor | None = None  # [N, 3] of positions, beside the mean
+
+
+def mean_of(param: Tensor, state: dict[str, Any], name: str | None, put: bool, count: int) -> Mean:
+    """The running mean of a parameter, in the form that goes with its moments; made if need be.
+
+    Args:
+        param: [N, ...]. state: the optimizer's of it.
+        name: gsplat's name of the Gaussian parameter, or None.
+        put, count: as in `Mean`.
+    """
+    grid = GRIDS.get(name or "") if state["exp_avg"].dtype is CODES else None
+    key = MEAN if grid is None else RESIDUE
+    found = state.get(key), state.get(BEGAN), state.get(REST)
+    mean, began, rest = found
+    if mean is None or began is None or (rest is None and name == "means"):
+        for each in OF_MEAN:
+            state.pop(each, None)
+        mean = torch.zeros_like(param, dtype=None if grid is None else CODES)
+        began = torch.zeros(param.shape[:1], dtype=param.dtype, device=param.device)
+        rest = torch.zeros_like(param) if name == "means" else None
+        kept = {key: mean, BEGAN: began, REST: rest}
+        state.update({k: v for k, v in kept.items() if v is not None})
+    elif mean.dtype is not CODES and grid is not None:
+        mean = state[key] = mean.to(CODES)  # an edit of rows, and torch's loading, make it float32
+    return Mean(put, count, mean, began, grid or 1.0, rest)
 
 
 def like_rows(numbers: Tensor, param: Tensor) -> Tensor:
@@ -58,6 +86,9 @@ def take_into_mean(
         assert chance is not None
         take_into_residue(mean.put, param, tensor, weight, mean.grid, chance)
         return
+    if mean.rest is not None:
+        take_with_rest(mean.put, param, tensor, mean.rest[rows], weight.to(param.dtype))
+        return
     if param.is_cpu and math.isfinite((param.sum() + tensor.sum()).item()):
         tensor.lerp_(param, weight.to(param.dtype))
         if mean.put:
@@ -69,6 +100,19 @@ def take_into_mean(
     tensor.copy_(torch.where(known, start.lerp(torch.where(known, param, start), weight), tensor))
     if mean.put:
         param.copy_(torch.where(known, tensor, param))
+
+
+def take_with_rest(put: bool, param: Tensor, mean: Tensor, rest: Tensor, weight: Tensor) -> None:
+    """`take_into_mean` where the mean is the sum of two tensors, exact to one rounding."""
+    known = torch.isfinite(param)
+    lost = ~torch.isfinite(mean)
+    start, more = torch.where(lost, param, mean), torch.where(lost, 0.0, rest)
+    more = more + ((param - start) - more) * weight
+    moved = start + more
+    mean.copy_(torch.where(known, moved, mean))
+    rest.copy_(torch.where(known, more - (moved - start), rest))
+    if put:
+        param.copy_(torch.where(known, mean, param))
 
 
 def take_into_residue(
@@ -120,10 +164,10 @@ def mean_of_residue(param: Tensor, residue: Tensor, grid: float) -> Tensor:
     return torch.where(known, param + away * grid, param)
 
 
-def put_mean(param: Tensor, state: Mapping[str, Tensor], grid: float | None) -> bool:
+def put_mean(param: Tensor, state: Mapping[str, Tensor], name: str | None) -> bool:
     """Put a parameter's mean in its place, if it has one; whether it has."""
-    mean, residue = state.get(MEAN), state.get(RESIDUE)
-    if residue is not None and grid is not None and residue.shape == param.shape:
+    mean, residue, grid = state.get(MEAN), state.get(RESIDUE), GRIDS.get(name or "")
+    if residue is not None and grid is not None:
         mean = mean_of_residue(param, residue.to(CODES), grid)
     if mean is None or mean.shape != param.shape:
         return False

@@ -66,24 +66,27 @@ def _signed(number: int) -> int:
     return (number + 2**31) % 2**32 - 2**31
 
 
-# -- the state of a parameter ----
+# -- the state of a parameter ----------------------------------------------------------------------
 
 
 def as_numbers(state: dict[str, Any]) -> dict[str, Any]:
-    """A parameter's state with float32 moments in the place of codes."""
+    """A parameter's state with float32 moments, on the host, in the place of codes.
+
+    A checkpoint is written from the host; on a device they would need four times the codes' memory.
+    """
     if "exp_avg" not in state:
         return state
-    codes = [state[key].to(CODES) for key in MOMENTS]
+    codes = [state[key].to("cpu", CODES) for key in MOMENTS]
     return {**state, **dict(zip(MOMENTS, decoded(codes[0], codes[1]), strict=True))}
 
 
 def as_codes(state: dict[str, Any]) -> None:
-    """Have the codes of a parameter's moments, and its mean of 16 bits, as integers again.
+    """Have the codes of a parameter's moments as integers again.
 
     An edit of rows, and torch's loading, make them float32, with the same values.
     """
-    for key in (*MOMENTS, "averaging.residue"):
-        if key in state and state[key].dtype != CODES:
+    for key in MOMENTS:
+        if state[key].dtype != CODES:
             state[key] = state[key].to(CODES)
 
 

@@ -31,10 +31,13 @@ class Part:
         during: the phase in which the part acts; None: in both.
         names: the Gaussian parameters that it acts on, gsplat's names; None: every parameter.
         learns: whether the object itself changes in a training.
+        later: what it may put into a step that the first step has not, of "factor" (on a device),
+            "hold" and "mean": a GPU's kernels for it are compiled at the first step.
     """
 
     during: ClassVar[Phase | None] = None
     learns: ClassVar[bool] = False
+    later: ClassVar[tuple[str, ...]] = ()
     names: Any = GAUSSIAN  # tuple[str, ...] | None
 
     def plan(self, step: Step, training: Training) -> None:

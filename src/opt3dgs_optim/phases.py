@@ -12,16 +12,23 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from opt3dgs_optim.adam import StepAdam, upgraded_class
-from opt3dgs_optim.checkpoint import STATE_KEY, check_numbers, restore_parts
+from opt3dgs_optim.checkpoint import check_groups, restore_parts
 from opt3dgs_optim.checks import check_count, check_energy, check_number
 from opt3dgs_optim.clock import Phase
-from opt3dgs_optim.contract import Slots, check_supported
-from opt3dgs_optim.device import mean_over_ranks, num_ranks
+from opt3dgs_optim.contract import (
+    Slots,
+    check_parts,
+    check_supported,
+    named,
+    own_step,
+    slots_of,
+)
+from opt3dgs_optim.device import Rows, mean_over_ranks, num_ranks
 from opt3dgs_optim.messages import LOGGER, End, say
-from opt3dgs_optim.names import GAUSSIAN_NAMES, split_name
+from opt3dgs_optim.names import GAUSSIAN_NAMES
 from opt3dgs_optim.part import Part
+from opt3dgs_optim.parts.annealing import Annealing
 from opt3dgs_optim.parts.averaging import Averaging
-from opt3dgs_optim.parts.curvature import Curvature
 from opt3dgs_optim.parts.fading import Fading
 from opt3dgs_optim.parts.own_frame import OwnFrame
 from opt3dgs_optim.presets import DEFAULTS, PAPER_STEPS, PAPER_SWITCH, paper_parts
@@ -98,11 +105,16 @@ class PhaseScheduler(Training):
         else:
             switch_step = round(check_number(CALL, "switch", switch, 0.0, 1.0) * total_steps)
         self._chosen = parts is not None  # by the user
-        super().__init__(_checked_parts(parts), total_steps, switch_step, moments)
+        super().__init__(
+            DEFAULTS if parts is None else check_parts(CALL, parts),
+            total_steps,
+            switch_step,
+            moments,
+        )
         if log is not None and not hasattr(log, "step"):
             raise TypeError(f"{CALL}: log={log!r}, but a RunLog or None is needed")
         self.log, self._loss = log, None
-        self._group = process_group
+        self._group, self._rows = process_group, Rows()
         own = (part for part in self.parts if part.overrides("pixel_loss"))
         self._pixel: Part | None = next(own, None)
         averaging = self.part(Averaging)
@@ -131,9 +143,10 @@ class PhaseScheduler(Training):
             TypeError, ValueError: an optimizer is outside of what is taken (`check_supported`), or
                 none holds Gaussians; nothing has been changed.
         """
-        given = _named(optimizers)
-        slots = [_slots_of(key, optimizer) for key, optimizer in given]
+        given = named(optimizers)
+        slots = [slots_of(key, optimizer) for key, optimizer in given]
         held = [slot for each in slots for slot in each if slot[1] is not None]
+        saved: list[Any] = []
         for (key, optimizer), its in zip(given, slots, strict=True):
             if not isinstance(getattr(optimizer, "training", self), PhaseScheduler):
                 raise TypeError(
@@ -148,9 +161,7 @@ class PhaseScheduler(Training):
                 raise type(error)(
                     f"{error}; or leave {key!r} out, which holds no Gaussians"
                 ) from None
-            if (saved := optimizer.param_groups[0].get(STATE_KEY)) is not None:
-                check_numbers(f"{CALL}.upgrade", saved)
-                restore_parts(self, saved)
+            saved.append(check_groups(f"{CALL}.upgrade", optimizer.param_groups))
         if not held:
             names = [g.get("name") or key for key, o in given for g in o.param_groups]
             raise ValueError(
@@ -170,9 +181,13 @@ class PhaseScheduler(Training):
                 f"{CALL}.upgrade: {doubled[0][1]!r} is held twice; for two sets of Gaussians name "
                 "the groups 'first#means', 'second#means', or make a scheduler for each"
             )
+        for each in saved:
+            if each is not None:
+                restore_parts(self, each)
         self._end.upgraded = True
         for (_, optimizer), its in zip(given, slots, strict=True):
             self._upgrade(optimizer, its)
+        self._warn_of_what_was_given([optimizer for _, optimizer in given], slots)
         self._say_upgraded(" ".join(name for _, name in held if name))
         return optimizers
 
@@ -186,12 +201,40 @@ class PhaseScheduler(Training):
         listed = ", ".join(parts) or "no parts"
         say(f"opt3dgs_optim: {self.total_steps} iterations, {listed}, in the steps of {names}")
 
+    def _warn_of_what_was_given(self, optimizers: list[Any], slots: list[Slots]) -> None:
+        """Say what of it will not do what a user may expect."""
+        groups = [
+            (group, name)
+            for optimizer, its in zip(optimizers, slots, strict=True)
+            for group, (_, name) in zip(optimizer.param_groups, its, strict=True)
+        ]
+        rows = {len(group["params"][0]) for group, name in groups if name and group["params"]}
+        others = [
+            str(group.get("name"))
+            for group, name in groups
+            if name is None
+            and any(p.dim() and len(p) > 1 and len(p) in rows for p in group["params"])
+        ]
+        if others:
+            self.messages.warn_once(
+                "names",
+                f"{CALL}.upgrade: the groups {others} have a row for each Gaussian, but names that "
+                "are not known, so that plain Adam steps them; name them as one of "
+                f"{', '.join(GAUSSIAN_NAMES)} (other trainers' names too) where they are these",
+            )
+        if self.part(Annealing) is not None and any(own_step(type(o)._base) for o in optimizers):
+            self.messages.warn_once(
+                "masked",
+                f"{CALL}.upgrade: Annealing with a masked Adam lost 0.4 to 1.1 dB in our trials; "
+                "leave it out of parts, or have the trainer make a torch.optim.Adam",
+            )
+
     def _upgrade(self, optimizer: Any, slots: Slots) -> None:
         if isinstance(optimizer, StepAdam):
             if optimizer.training is self:  # its groups are others now
                 optimizer.follow(self, slots)
                 return
-            optimizer.param_groups[0][STATE_KEY] = optimizer.numbers()
+            optimizer.note_in_groups()
             optimizer.training._end.finished = True  # pyright: ignore[reportAttributeAccessIssue]
         else:
             vars(optimizer).pop("step", None)  # as learning-rate schedulers of old have wrapped it
@@ -291,7 +334,8 @@ class PhaseScheduler(Training):
                 numbers["loss"], self._loss = self._loss, None
             self.log.step(self.iteration, phase=self.phase.value, **numbers)
         assert self.total_steps is not None
-        if self.iteration == self._end.mean_at < self.total_steps and not self.finished:
+        ends = not self.averages or self.finished
+        if self.iteration == self._end.mean_at < self.total_steps and not ends:
             say(
                 f"opt3dgs_optim: iteration {self.iteration + 1} of {self.total_steps}: from this "
                 "step on the parameters are the mean of the last thirtieth's iterates"
@@ -308,21 +352,28 @@ class PhaseScheduler(Training):
                 f"{CALL}: iteration {self.iteration} comes after finish(): the parameters are no "
                 "mean any more; call it after the last step",
             )
-        if self.iteration == 0 and self._group is None and num_ranks() > 1:
+        if self.iteration == 0 and self.observers and self._group is None and num_ranks() > 1:
             self.messages.warn_once(
                 "ranks",
                 f"{CALL}: {num_ranks()} ranks train, but process_group=None: parts that read the "
                 "loss would differ between them; give process_group=torch.distributed.group.WORLD",
             )
 
-    def rows_removed(self, count: int) -> None:
-        """Gaussians have disappeared, under parts that are made for relocation."""
-        if not self._chosen:
+    def rows_edited(self, means: Tensor, rows_before: int) -> None:
+        """See whether Gaussians disappear, under parts that are made for relocation.
+
+        Relocation keeps the rows of those that stay; after pruning other Gaussians are in them. So
+        it shows although clones outnumber what is pruned.
+        """
+        if self._chosen:
+            return
+        removed = rows_before - len(means)
+        if removed > 0 or (self._rows.shifted(means) and self.iteration > 0):
             self.messages.warn_once(
                 "removed",
-                f"{CALL}: {count} Gaussians were removed at iteration {self.iteration}, but the "
-                "default parts are made for 3DGS-MCMC's relocation; for clone, split and prune "
-                "give parts=DEFAULTS_ADC",
+                f"{CALL}: {max(removed, 0) or 'some'} Gaussians were removed by iteration "
+                f"{self.iteration}, but the default parts are made for 3DGS-MCMC's relocation; for "
+                "clone, split and prune give parts=DEFAULTS_ADC",
             )
 
     def end_line(self) -> str | None:
@@ -331,54 +382,10 @@ class PhaseScheduler(Training):
 
     def __getstate__(self) -> dict[str, Any]:
         # Two would write into one file; another process has groups of its own.
-        return {**super().__getstate__(), "log": None, "_group": None}
+        return {**super().__getstate__(), "log": None, "_group": None, "_rows": Rows()}
 
     def __repr__(self) -> str:
         clock = f"iteration {self.iteration} of {self.total_steps}"
         if any(part.during is not None for part in self.parts):
             clock += f", {self.phase.value}"
         return "\n".join([f"{CALL}(", f"  {clock}", *(f"  {part!r}" for part in self.parts), ")"])
-
-
-def _checked_parts(parts: Any) -> Sequence[Part]:
-    """The parts; TypeError for what is none, ValueError for two of one class."""
-    if parts is None:
-        return DEFAULTS
-    if not isinstance(parts, (list, tuple)):
-        raise TypeError(
-            f"{CALL}: parts={parts!r}, but a list of parts is needed, parts=[Averaging()]"
-        )
-    for part in parts:
-        if not isinstance(part, Part):
-            cure = f"; write parts=[{part.__name__}()]" if isinstance(part, type) else ""
-            raise TypeError(f"{CALL}: {part!r} in parts is no Part object{cure}")
-    kinds = [type(part) for part in parts]
-    if OwnFrame in kinds and Curvature in kinds:
-        raise ValueError(
-            f"{CALL}: OwnFrame steps the positions in other units, in which Curvature's pairs are "
-            "none; leave one of the two out"
-        )
-    for kind in kinds:
-        if kinds.count(kind) > 1:
-            raise ValueError(
-                f"{CALL}: {kind.__name__} is there twice in parts; give one part of each class"
-            )
-    return parts
-
-
-def _named(optimizers: Any) -> list[tuple[str | None, Any]]:
-    """The optimizers, each with its key in a dict."""
-    if isinstance(optimizers, Mapping):
-        return [(str(key), each) for key, each in optimizers.items()]
-    if isinstance(optimizers, (list, tuple)):
-        return [(None, each) for each in optimizers]
-    return [(None, optimizers)]
-
-
-def _slots_of(key: str | None, optimizer: Any) -> Slots:
-    """By group: the set of Gaussians and which of its parameters it holds."""
-    groups = getattr(optimizer, "param_groups", [])
-    found = [split_name(group.get("name")) for group in groups]
-    if key is not None and len(groups) == 1 and found[0][1] is None:
-        found = [split_name(key)]
-    return found

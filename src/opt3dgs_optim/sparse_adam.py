@@ -16,10 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from opt3dgs_optim.mean import like_rows, take_into_mean
+from opt3dgs_optim.mean import like_rows
 from opt3dgs_optim.moments import MOMENTS
 from opt3dgs_optim.step import (
-    Axes,
     Step,
     axes_of,
     chosen_rows,
@@ -27,7 +26,7 @@ from opt3dgs_optim.step import (
     into_frame,
     out_of_frame,
 )
-from opt3dgs_optim.stepper import ParamStepper
+from opt3dgs_optim.stepper import FRAME_EPS, ParamStepper
 from opt3dgs_optim.training import Training
 
 _signature = functools.lru_cache(maxsize=8)(inspect.signature)  # every step asks
@@ -42,6 +41,14 @@ def check_arguments(call: str, step: Any, *args: Any) -> None:
         raise TypeError(f"{call}.step: {error}; it needs its mask, as before the upgrade") from None
 
 
+def refuse_mask(call: str) -> None:
+    """TypeError where a mask is given to torch's Adam."""
+    raise TypeError(
+        f"{call}.step: a mask was given, but torch's Adam steps all rows; use gsplat's "
+        "SelectiveAdam or INRIA's SparseGaussianAdam for masked steps"
+    )
+
+
 @torch.no_grad()
 def step_around(
     steppers: list[ParamStepper],
@@ -51,46 +58,62 @@ def step_around(
 ) -> None:
     """Have the optimizer's own class make a step as the parts say; put back what it was given."""
     steps: list[tuple[ParamStepper, Step, float]] = []
-    undo: list[tuple[ParamStepper, Tensor, float, Tensor, Axes | None]] = []
+    undo: list[Callable[[], None]] = []
     try:
         for stepper in steppers:
-            if stepper.param.grad is not None:
-                step = stepper.plan(states[stepper.param], iteration)
-                axes = None if step.frame is None else axes_of(step.frame)
+            param = stepper.param()
+            if param is not None and param.grad is not None:
+                step = stepper.plan(param, states[param], iteration)
                 steps.append((stepper, step, float(step.state["step"])))
-                undo.append(
-                    (stepper, stepper.param.grad, stepper.group["lr"], stepper.param.data, axes)
-                )
-                _give(step, axes, stepper.training)
+                undo.append(_give(step, stepper.training))
         step_itself()
     finally:
-        for stepper, grad, lr, position, axes in undo:
-            stepper.param.grad, stepper.group["lr"] = grad, lr
-            if axes is not None and stepper.param.data_ptr() != position.data_ptr():
-                moved, stepper.param.data = stepper.param.data, position
-                stepper.param.add_(out_of_frame(axes, moved))
+        for put_back in undo:
+            put_back()
     for stepper, step, count in steps:
         if step.state["step"] == count:  # gsplat's and INRIA's kernels need no count, and keep none
             step.state["step"] += 1
-        if step.put is not None:
-            made = int(step.state["step"])  # steps, not iterations
-            take_into_mean(stepper.mean(step.state, step.put, made), step.param)
-        stepper.finish(step)
+        stepper.after(step, int(step.state["step"]))  # steps, not iterations
 
 
-def _give(step: Step, axes: Axes | None, training: Training) -> None:
-    """Have the step find the gradient, the rate and the moments that the parts say."""
-    param, state = step.param, step.state
+def _give(step: Step, training: Training) -> Callable[[], None]:
+    """Have the step find the gradient, the rate and the moments that the parts say.
+
+    In the own frame, and where the factor is a device's number, it steps from zeros.
+
+    Returns:
+        what puts back what was there, and has what the step says in it.
+    """
+    param, group, state, factor = step.param, step.group, step.state, step.factor
+    was = param.grad, group["lr"], group["eps"], param.data
+    axes = None if step.frame is None else axes_of(step.frame)
     grad, bad = finite(step.grad, training.bad_numbers.counter_on(param.device))
     training.bad_numbers.add(bad)
     if step.fade is not None:
         chosen = like_rows(chosen_rows(step.fade, len(param), param.device), param)
-        for key, factor in zip(MOMENTS, step.fade[2:], strict=True):
-            state[key].copy_(torch.where(chosen, state[key] * factor, state[key]))
-    if step.frame is not None and axes is not None:
-        grad = into_frame(axes, grad)
+        for key, share in zip(MOMENTS, step.fade[2:], strict=True):
+            state[key].copy_(torch.where(chosen, state[key] * share, state[key]))
+
+    def put_back() -> None:
+        param.grad, group["lr"], group["eps"], position = was
+        if param.data_ptr() == position.data_ptr():
+            return
+        moved, param.data = param.data, position
+        moved = moved if axes is None else out_of_frame(axes, moved)
+        param.add_(moved * factor if isinstance(factor, Tensor) else moved)
+
+    try:
+        if axes is not None:
+            grad = into_frame(axes, grad)
+    except BaseException:
+        put_back()
+        raise
+    known = 1.0 if isinstance(factor, Tensor) else factor
+    if step.frame is not None:
+        group["lr"], group["eps"] = step.frame.rate * known, FRAME_EPS
+    elif known != 1.0:
+        group["lr"] = group["lr"] * known
+    if axes is not None or isinstance(factor, Tensor):
         param.data = torch.zeros_like(param.data)
-        step.group["lr"] = step.frame.rate * step.factor
-    elif not (isinstance(step.factor, float) and step.factor == 1.0):
-        step.group["lr"] = step.group["lr"] * float(step.factor)
     param.grad = grad
+    return put_back

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from typing import Any, cast
 
 import torch
@@ -9,28 +10,32 @@ from torch import Tensor
 
 from opt3dgs_optim import triton
 from opt3dgs_optim.clock import Phase
-from opt3dgs_optim.mean import BEGAN, GRIDS, MEAN, OF_MEAN, RESIDUE, Mean
+from opt3dgs_optim.mean import OF_MEAN, Mean, mean_of, take_into_mean
 from opt3dgs_optim.messages import LOGGER
 from opt3dgs_optim.moments import CODES, MOMENTS, as_codes
 from opt3dgs_optim.step import Hyper, Step, mixed, take_step
 from opt3dgs_optim.training import Training
 
 KEPT = (*OF_MEAN, "curvature.history")  # what a checkpoint may hold for rows beside moments
+FRAME_EPS = 1e-15  # of 3DGS; torch's 1e-8 is large beside a gradient times a standard deviation
 
 
 class ParamStepper:
     """Makes the steps of one parameter of an optimizer, and knows how the last one has left it.
 
+    The rule of rows: a new Parameter, another length of it, or another `exp_avg` means that a
+    trainer has edited rows, and what was kept for them begins anew. An edit in place does not show,
+    and has to be told by `reset_rows`.
+
     Attributes:
+        param: the Parameter, a weak reference: an old one lives no longer than the trainer wants.
+        rows: how many it has.
         name, set: which Gaussian parameter it is, and of which set of Gaussians.
         acting: by `Training.exploiting`: the parts with a `plan`, with a `before`, with an `after`.
-        grid: of its mean at 16 bits; None: it has none of these.
+        later: what parts may put into its steps that the first has not, see `Part.later`.
         counter: where its device counts numbers that are not finite; None on a CPU.
         stepped_in: the iteration of its last step; -1: none.
         framed: whether its moments are those of the own frame; None: it has none yet.
-        keeps: whether parts keep something for its rows.
-        noted: what they keep, by name, with the version of the tensor after the last step.
-        version: of the Parameter then.
     """
 
     def __init__(
@@ -41,11 +46,13 @@ class ParamStepper:
         param: Tensor,
         slot: tuple[str, str | None],
     ) -> None:
-        self.call, self.training, self.group, self.param = call, training, group, param
+        self.call, self.training, self.group = call, training, group
+        self.param, self.rows = weakref.ref(param), len(param) if param.dim() else 1
         self.counter = training.bad_numbers.counter_on(param.device)
         self.set, self.name = slot
-        parts = training.parts
-        mine = [p for p in parts if p.names is None or (self.name and self.name in p.names)]
+        mine = [
+            p for p in training.parts if p.names is None or (self.name and self.name in p.names)
+        ]
         self.acting = tuple(
             tuple(
                 [p for p in mine if p.overrides(hook) and p.during in (None, phase)]
@@ -53,64 +60,68 @@ class ParamStepper:
             )
             for phase in (Phase.EXPLORATION, Phase.EXPLOITATION)
         )
-        self.grid = GRIDS.get(self.name or "")
+        self.later = tuple(sorted({each for p in mine for each in p.later}))
         self.stepped_in = -1
         self.framed: bool | None = None
-        self.keeps = False
-        self.noted: dict[str, tuple[Tensor, int]] = {}
-        self.version = param._version
+        self._exp_avg: Any = None  # a weak reference to that beside which something is kept
 
     # -- a step ----------------------------------------------------------------------------------
 
-    def step(self, state: dict[str, Any], iteration: int) -> None:
-        """Plan the step, make it, and note how it has left the parameter."""
-        step, training, group = self.plan(state, iteration), self.training, self.group
-        count = state["step"].numpy()  # torch's own addition takes as long as a launch
+    def step(self, param: Tensor, state: dict[str, Any], iteration: int) -> None:
+        """Plan the step and make it; `state` is the optimizer's of the parameter."""
+        step, training, group = self.plan(param, state, iteration), self.training, self.group
+        try:
+            count = state["step"].numpy()  # torch's own addition takes as long as a launch
+        except TypeError:  # a trainer has it on its device
+            state["step"] = state["step"].to("cpu", torch.float32)
+            count = state["step"].numpy()
         count[()] += 1
         t, (beta1, beta2) = count.item(), group["betas"]
-        lr, decay = group["lr"], group["weight_decay"]
+        # A launcher would take an integer, or a number of numpy, for another kind of argument.
+        lr, decay, eps = float(group["lr"]), group["weight_decay"], float(group["eps"])
         coded = training.moments == 16
         if coded:
             as_codes(state)
         hyper = Hyper(
-            lr, beta1, beta2, group["eps"], 1 - beta1**t, (1 - beta2**t) ** 0.5,
-            state["exp_avg"], state["exp_avg_sq"], nonfinite=self.counter,
-            key=mixed(int(t)) if coded else 0,
+            lr, float(beta1), float(beta2), eps if step.frame is None else FRAME_EPS,
+            1.0 - beta1**t, (1.0 - beta2**t) ** 0.5, state["exp_avg"], state["exp_avg_sq"],
+            nonfinite=self.counter, key=mixed(int(t)) if coded else 0,
         )  # fmt: skip
         if decay:
             if group.get("decoupled_weight_decay"):
-                hyper.shrink = 1 - lr * decay
+                hyper.shrink = 1.0 - lr * decay
             else:
-                hyper.decay = decay
+                hyper.decay = float(decay)
         if step.put is not None:
-            hyper.mean = self.mean(state, step.put, int(t))
-        if self.counter is not None and triton.takes(step):
-            triton.take_step(step, hyper)
+            hyper.mean = self.mean(step, int(t))
+        if self.counter is not None and triton.takes(step, hyper):
+            triton.take_step(step, hyper, self.later)
         elif bad := take_step(step, hyper):
             training.bad_numbers.add(bad)
-        if self.keeps or self.acting[training.exploiting][2]:
-            self.finish(step)
+        for part in self.acting[training.exploiting][2]:
+            part.after(step, training)
 
-    def plan(self, state: dict[str, Any], iteration: int) -> Step:
-        """What the step has, as the parts say; `state` is the optimizer's of the parameter."""
-        param, training = self.param, self.training
-        grad = cast(Tensor, param.grad)
-        rows = param.numel()  # shapes take five times as long to compare
-        if grad.layout is not torch.strided or grad.numel() != rows:
+    def after(self, step: Step, count: int) -> None:
+        """What comes after a step that another has made, which was Adam's so many-th."""
+        if step.put is not None and (mean := self.mean(step, count)) is not None:
+            take_into_mean(mean, step.param)
+        for part in self.acting[self.training.exploiting][2]:
+            part.after(step, self.training)
+
+    def plan(self, param: Tensor, state: dict[str, Any], iteration: int) -> Step:
+        """What the step has, as the parts say."""
+        training, grad = self.training, cast(Tensor, param.grad)
+        numbers = param.numel()  # shapes take five times as long to compare
+        if grad.layout is not torch.strided or grad.numel() != numbers:
             raise ValueError(
                 f"{self.call}.step: the gradient of {self.name or 'a parameter'} "
                 f"{tuple(param.shape)} is {tuple(grad.shape)}, {grad.layout}; have the trainer "
                 "make dense gradients of these rows (gsplat: no sparse_grad)"
             )
         if not state:
-            state["step"] = torch.zeros((), dtype=torch.float32, device="cpu")
-            dtype = CODES if training.moments == 16 else None
-            for key in MOMENTS:
-                state[key] = torch.zeros_like(
-                    param, dtype=dtype, memory_format=torch.preserve_format
-                )
-        elif state["exp_avg"].numel() != rows or state["exp_avg_sq"].numel() != rows:
-            self.check_rows(state)
+            self._begin(param, state)
+        elif state["exp_avg"].numel() != numbers or state["exp_avg_sq"].numel() != numbers:
+            self.check_rows(param, state)
         step = Step(
             param, grad, self.name, self.set, self.group, state, iteration, self.stepped_in,
             self.keep,
@@ -126,7 +137,11 @@ class ParamStepper:
         if framed:
             step.fade = None  # a faded step would be half a standard deviation long
         if framed is not self.framed:
-            self._change_units(step, framed)
+            if self.framed is not None:
+                step.fresh = True
+                LOGGER.info("iteration %d: moments of the positions begin anew, in %s units",
+                            iteration, "the own frame's" if framed else "world")  # fmt: skip
+            self.framed = framed
         if step.fresh:
             state["step"].zero_()
             for key in MOMENTS:
@@ -136,89 +151,70 @@ class ParamStepper:
         self.stepped_in = iteration
         return step
 
-    def _change_units(self, step: Step, framed: bool) -> None:
-        """Have the moments in the own frame's units from now on, or in the world's."""
-        if self.framed is not None:
-            step.fresh = True
-            LOGGER.info("iteration %d: moments of the positions begin anew, in %s units",
-                        step.iteration, "the own frame's" if framed else "world")  # fmt: skip
-        self.framed = framed
-
-    def finish(self, step: Step) -> None:
-        """What comes after the arithmetic: parts of one's own, and a note of what is left.
-
-        By the note, edits of rows show at the next step.
-        """
-        for part in self.acting[self.training.exploiting][2]:
-            part.after(step, self.training)
-        if self.keeps:
-            self.version, state = self.param._version, step.state
-            for key in KEPT:
-                if (kept := state.get(key)) is not None:
-                    self.noted[key] = kept, kept._version
+    def _begin(self, param: Tensor, state: dict[str, Any]) -> None:
+        state["step"] = torch.zeros((), dtype=torch.float32, device="cpu")
+        dtype = CODES if self.training.moments == 16 else None
+        for key in MOMENTS:
+            state[key] = torch.zeros_like(param, dtype=dtype, memory_format=torch.preserve_format)
 
     # -- what is kept for its rows ---------------------------------------------------------------
 
-    def keep(
-        self, state: dict[str, Any], key: str, shape: tuple[int, ...], dtype: Any = None
-    ) -> Tensor:
-        """What is kept for the rows under a name; a row of zeros: nothing is kept for it."""
-        tensor, self.keeps = state.get(key), True
+    def keep(self, state: dict[str, Any], key: str, shape: tuple[int, ...]) -> Tensor:
+        """What a part keeps for the rows under a name; a row of zeros: nothing is kept for it."""
+        self.begin_edited_rows_anew(state)
+        tensor = state.get(key)
         if tensor is None or tensor.shape != shape:
-            tensor = state[key] = torch.zeros(
-                shape, dtype=dtype or self.param.dtype, device=self.param.device
-            )
+            like = state["exp_avg"]
+            dtype = torch.float32 if like.dtype is CODES else like.dtype
+            tensor = state[key] = torch.zeros(shape, dtype=dtype, device=like.device)
         return tensor
 
-    def mean(self, state: dict[str, Any], put: bool, count: int) -> Mean:
-        """The running mean, in the form that goes with the moments; see `mean`."""
-        coded = self.grid is not None and state["exp_avg"].dtype is CODES
-        key, param = RESIDUE if coded else MEAN, self.param
-        mean, began = state.get(key), state.get(BEGAN)
-        if mean is None or began is None or began.numel() != param.size(0):  # rows are others now
-            for each in OF_MEAN:
-                state.pop(each, None)
-            mean = self.keep(state, key, tuple(param.shape), CODES if coded else None)
-            began = self.keep(state, BEGAN, tuple(param.shape[:1]))
-        self.keeps = True
-        return Mean(put, count, mean, began, self.grid or 1.0)
+    def mean(self, step: Step, count: int) -> Mean | None:
+        """The running mean; None where there is no room for it."""
+        if not self.training.averages:
+            return None
+        self.begin_edited_rows_anew(step.state)
+        try:
+            return mean_of(step.param, step.state, self.name, bool(step.put), count)
+        except torch.cuda.OutOfMemoryError:
+            self.training.end_averaging()
+            return None
 
-    def follow(self, before: ParamStepper, state: dict[str, Any]) -> None:
+    def begin_edited_rows_anew(self, state: dict[str, Any]) -> None:
+        """Drop what is kept for rows, unless `exp_avg` is the one beside which it was."""
+        exp_avg = state["exp_avg"]
+        if self._exp_avg is not None and self._exp_avg() is exp_avg:
+            return
+        if self._exp_avg is not None:
+            drop_kept(state)
+        self._exp_avg = weakref.ref(exp_avg)
+
+    def follow(self, before: ParamStepper, param: Tensor, state: dict[str, Any]) -> None:
         """Go on where the one before was, whose Parameter may be another."""
-        self.stepped_in, self.framed, self.noted = before.stepped_in, before.framed, before.noted
-        new = before.param is not self.param
-        self.drop_moved(state, new, new and before.param._version != before.version)
-        if self.name == "means" and len(self.param) < len(before.param):
-            self.training.rows_removed(len(before.param) - len(self.param))
+        self.stepped_in, self.framed = before.stepped_in, before.framed
+        if before.param() is param:
+            self._exp_avg = before._exp_avg
+            return
+        drop_kept(state)
+        if self.name == "means":
+            self.training.rows_edited(param, before.rows)
 
-    def drop_moved(self, state: dict[str, Any], new: bool, written: bool) -> None:
-        """Drop what is kept for rows that are others now, if the Parameter is new.
-
-        Trainers that edit rows edit every tensor of the state so (gsplat's family), or none but
-        Adam's moments (INRIA's): what they have left as it was belongs to other rows. gsplat's
-        relocation writes rows of the old Parameter, and edits the state of others: `written`.
-        """
-        rows = len(self.param) if self.param.dim() else 1
-        for key in KEPT:
-            now, was = state.get(key), self.noted.get(key)
-            if now is None:
-                continue
-            as_it_was = was is not None and now is was[0] and now._version == was[1]
-            if len(now) != rows or (new and (as_it_was or written)):
-                for each in OF_MEAN if key in OF_MEAN else (key,):  # they belong together
-                    state.pop(each, None)
-
-    def check_rows(self, state: dict[str, Any]) -> None:
+    def check_rows(self, param: Tensor, state: dict[str, Any]) -> None:
         """Refuse moments of other rows than the parameter has, as a checkpoint may bring them."""
         for key in MOMENTS:
             moment = state.get(key)
-            if moment is not None and moment.shape != self.param.shape:
+            if moment is not None and moment.shape != param.shape:
                 raise ValueError(
-                    f"{self.call}.step: {self.name or 'a parameter'} is "
-                    f"{tuple(self.param.shape)}, but its {key} is {tuple(moment.shape)}: "
-                    f"{len(moment)} rows for {len(self.param)}; load the checkpoint of these "
-                    "Gaussians, or edit their moments with them"
+                    f"{self.call}.step: {self.name or 'a parameter'} is {tuple(param.shape)}, but "
+                    f"its {key} is {tuple(moment.shape)}: {len(moment)} rows for {len(param)}; "
+                    "load the checkpoint of these Gaussians, or edit their moments with them"
                 )
+
+
+def drop_kept(state: dict[str, Any]) -> None:
+    """Have nothing kept for rows beside Adam's moments."""
+    for key in KEPT:
+        state.pop(key, None)
 
 
 def checked_gradient(part: Any, found: Any, grad: Tensor) -> Tensor:

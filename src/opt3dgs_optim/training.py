@@ -11,6 +11,7 @@ from torch.optim import Optimizer
 from opt3dgs_optim.checks import check_choice
 from opt3dgs_optim.clock import Clock, Ticket
 from opt3dgs_optim.device import BadNumbers
+from opt3dgs_optim.mean import OF_MEAN
 from opt3dgs_optim.messages import Messages
 
 LOOK_INTERVAL = 100  # iterations between two looks at the numbers that were not finite
@@ -37,6 +38,7 @@ class Training(Clock):
         changes_steps: whether the steps are others than torch's.
         members: by set and gsplat's name, who holds a Gaussian parameter.
         finished: whether the training has been ended early.
+        averages: whether there is room for the mean of the last iterates.
         messages: what has been said, each thing once.
         bad_numbers: how many numbers of gradients were not finite.
         unsaved: what parts keep from step to step, and never save.
@@ -54,7 +56,7 @@ class Training(Clock):
         self.moments = check_choice(type(self).__name__, "moments", moments, (32, 16))
         self.changes_steps = bool(self.parts) or moments != 32
         self.members: dict[tuple[str, str], Member] = {}
-        self.finished = False
+        self.finished, self.averages = False, True
         self.messages, self.bad_numbers = Messages(), BadNumbers()
         self.unsaved: dict[Any, Any] = {}
         self._notes: dict[str, dict[str, Any]] = {type(part).__name__: {} for part in self.parts}
@@ -104,8 +106,22 @@ class Training(Clock):
         for part in self.observers:
             part.observe(loss, self)
 
-    def rows_removed(self, count: int) -> None:
-        """Gaussians have disappeared since the last step."""
+    def rows_edited(self, means: Tensor, rows_before: int) -> None:
+        """Density control has edited the positions since the last step, which were so many."""
+
+    def end_averaging(self) -> None:
+        """Go on without the mean of the last iterates, for which a device has no room."""
+        self.averages = False
+        for optimizer in {id(m.optimizer): m.optimizer for m in self.members.values()}.values():
+            for state in optimizer.state.values():
+                for key in OF_MEAN:
+                    state.pop(key, None)
+        self.messages.warn_once(
+            "memory",
+            f"opt3dgs_optim: iteration {self.iteration}: the device has no room for the mean of "
+            "the last iterates, a copy of the parameters; the training goes on without it, and "
+            "ends at the last iterate; moments=16 halves what is needed",
+        )
 
     def go_to(self, iteration: int) -> None:
         """Be at that iteration; now and then look for numbers that were not finite."""
@@ -130,5 +146,6 @@ class Training(Clock):
             part.read_back(self)
 
     def __getstate__(self) -> dict[str, Any]:
+        # A copy of an optimizer tells its training itself that it is a member.
         self.read_back()
-        return {**vars(self), "unsaved": {}}
+        return {**vars(self), "unsaved": {}, "members": {}}

@@ -22,12 +22,14 @@ class Averaging(Part):
     run. In the last tenth of that, in the last two iterations at least, the mean takes the
     parameters' place, because trainers save before their last step. Until then nothing is changed.
 
-    Rows that density control edits begin anew, the others are spared. After a relocation of
-    gsplat's, which does not say what it wrote, all begin anew: it should end before. Iterates that
-    are not finite are left out. In the last thirtieth it takes the memory of the parameters once
-    more, and one number a row. Beside moments of 16 bits each number of the mean has 16, too,
-    except positions.
+    After an edit of rows the means of the edited parameters begin anew: density control should end
+    before. Iterates that are not finite are left out. In the last thirtieth it takes the memory of
+    the parameters once more, and four numbers a row. Beside moments of 16 bits each number of the
+    mean has 16, too, except positions. Where a GPU has no room for it, the training goes on
+    without, which is said.
     """
+
+    later = ("mean",)
 
     @staticmethod
     def start(total_steps: int) -> int:

@@ -61,6 +61,7 @@ class EnergyHistogram(Part):
 
     during = Phase.EXPLORATION
     learns = True
+    later = ("factor",)
 
     def __init__(
         self,
@@ -189,7 +190,11 @@ class EnergyHistogram(Part):
     def state_dict(self) -> dict[str, Any]:
         """All that `observe` has learnt, as plain numbers and lists. Synchronises."""
         parts = self._taken.reshape(1), self._nu.reshape(1), self._sums, self._partitions.state
-        return {"energy_range": self.energy_range, "learnt": torch.cat(parts).tolist()}
+        span = self.energy_range
+        return {
+            "energy_range": span if span == "auto" else list(span),
+            "learnt": torch.cat(parts).tolist(),
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore `state_dict()`.
@@ -200,7 +205,7 @@ class EnergyHistogram(Part):
         learnt: Any = state.get("learnt")
         needed = 5 + len(self._partitions.state)
         fits = (
-            state.get("energy_range") == self.energy_range
+            state.get("energy_range") == self.state_dict()["energy_range"]
             and isinstance(learnt, list)
             and len(learnt) == needed
             and all(math.isfinite(as_float(number)) for number in learnt)

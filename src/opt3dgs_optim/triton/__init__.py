@@ -6,8 +6,10 @@ tensor on a GPU. Where it is missing, or cannot compile, `opt3dgs_optim.step.tak
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import importlib
+import itertools
 import os
 import subprocess
 import sys
@@ -17,10 +19,10 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.cuda import several_gpus
-from opt3dgs_optim.mean import Mean
+from opt3dgs_optim.mean import Mean, mean_of
 from opt3dgs_optim.messages import LOGGER
 from opt3dgs_optim.moments import CODES
-from opt3dgs_optim.step import Hyper, Step
+from opt3dgs_optim.step import Hold, Hyper, Step
 
 ROWS_BLOCK, FRAME_BLOCK, LOOK_BLOCK = 1024, 128, 1024  # as in `kernels`
 WARPS = {"step_rows": 8, "step_in_own_frame": 2, "look_at_positions": 4}  # fastest on an H200
@@ -29,23 +31,24 @@ MAX_WIDTH = 2**20 - ROWS_BLOCK  # numbers of a row: see `kernels.rows_of`
 NO_FADE = (0, 0.0, 1.0, 1.0)
 NO_MEAN: Any = Mean(False, 0, None, None)  # pyright: ignore
 _COMPILED: dict[Any, Any] = {}  # what Triton has compiled, by what it depends on
+_PREPARED: set[Any] = set()  # for which parameters' steps it has
 CHECK = "opt3dgs_optim.triton.check"  # run as a program, with Triton's interpreter
 
 
-@functools.cache
 def missing() -> str | None:
-    """Why no kernel runs on this machine's GPU, in a sentence; None: they run.
-
-    The first call makes a launch, by which it shows whether Triton can compile here.
-    """
-    try:
-        _kernels()
-    except Exception as error:  # of a Triton for another machine, anything
-        return f"Triton cannot be imported ({error}), so that a step on a GPU is many launches."
+    """Why no kernel runs on this machine's GPU, in a sentence; None: they run."""
     if not torch.cuda.is_available():
-        return "torch sees no GPU, so that a step is plain torch."
+        return _import_error() or "torch sees no GPU, so that a step is plain torch."
+    return missing_on(torch.device("cuda", torch.cuda.current_device()))
+
+
+@functools.cache
+def missing_on(device: torch.device) -> str | None:
+    """`missing` on a GPU. The first call launches a kernel: it shows whether Triton compiles."""
+    if (error := _import_error()) is not None:
+        return error
     try:
-        p, g, m, v = torch.zeros(4, 1, device="cuda")
+        p, g, m, v = torch.zeros(4, 1, device=device)
         hyper = Hyper(0.0, 0.9, 0.999, 1.0, 1.0, 1.0, m, v)
         for _ in range(2):  # by Triton's launcher, and as in all later steps
             launch(Step(p, g, None, "", {}, {}, 0, -1), hyper)
@@ -57,9 +60,17 @@ def missing() -> str | None:
     return None
 
 
+def _import_error() -> str | None:
+    try:
+        _kernels()
+    except Exception as error:  # of a Triton for another machine, anything
+        return f"Triton cannot be imported ({error}), so that a step on a GPU is many launches."
+    return None
+
+
 @functools.cache
-def _runs() -> bool:
-    reason = missing()
+def _runs(device: torch.device) -> bool:
+    reason = missing_on(device)
     if reason is not None:
         LOGGER.warning("opt3dgs_optim: %s", reason)
     return reason is None
@@ -70,23 +81,27 @@ def _kernels() -> Any:
     return importlib.import_module("opt3dgs_optim.triton.kernels")
 
 
-def takes(step: Step) -> bool:
+def takes(step: Step, hyper: Hyper) -> bool:
     """Whether the kernels make this step: float32 without gaps, on a GPU with Triton."""
-    return step.param.is_cuda and _runs() and fits(step)
+    return step.param.is_cuda and _runs(step.param.device) and fits(step, hyper)
 
 
-def fits(step: Step) -> bool:
+def fits(step: Step, hyper: Hyper) -> bool:
     """`takes`, wherever the tensors lie."""
-    state, frame = step.state, step.frame
-    for tensor in (step.param, step.grad, state["exp_avg"], state["exp_avg_sq"]):
+    frame, hold, mean = step.frame, step.hold, hyper.mean
+    for tensor in (step.param, step.grad, hyper.exp_avg, hyper.exp_avg_sq):
         if tensor.dtype not in DTYPES or not tensor.is_contiguous():
             return False
+    kept = () if mean is None else (mean.tensor, mean.began, mean.rest)
+    kept = kept if hold is None else (*kept, hold.rows)
+    if not all(tensor is None or tensor.is_contiguous() for tensor in kept):
+        return False
     if frame is None:
         numbers = step.param.numel()
         if numbers > MAX_WIDTH and numbers > MAX_WIDTH * step.param.shape[0]:
             return False
-        return not step.plain or (step.fade is None and step.hold is None)
-    if step.plain or step.fade is not None or step.hold is not None:
+        return not step.plain or (step.fade is None and hold is None)
+    if step.plain or step.fade is not None or hold is not None:
         return False  # none of our parts says so of positions in their own frames
     return _plain(frame.quats) and _plain(frame.scales) and 4 * step.param.shape[0] < 2**31
 
@@ -95,20 +110,48 @@ def _plain(tensor: Tensor) -> bool:
     return tensor.dtype is torch.float32 and tensor.is_contiguous()
 
 
-def take_step(step: Step, hyper: Hyper) -> None:
+def take_step(step: Step, hyper: Hyper, later: tuple[str, ...] = ()) -> None:
     """Make the step in one launch: what `opt3dgs_optim.step.take_step` means.
 
     Numbers that are not finite are added to `hyper.nonfinite` [1] int32. Nothing waits for the
-    device, and nothing is allocated there.
+    device, and nothing is allocated there. With the first of the parameter's steps the kernels of
+    those are compiled that have what is in `later`, see `Part.later`.
     """
+    if later and (step.name, hyper.exp_avg.dtype, later, step.frame is None) not in _PREPARED:
+        _PREPARED.add((step.name, hyper.exp_avg.dtype, later, step.frame is None))
+        for forms in _subsets(later):
+            launch(*_stand_in(step, hyper, forms))
     launch(step, hyper)
     # Autograd is to see that a parameter has changed, as after an operator of torch's.
     torch.autograd.graph.increment_version(step.param)
 
 
+def _subsets(later: tuple[str, ...]) -> list[tuple[str, ...]]:
+    return [c for size in range(len(later) + 1) for c in itertools.combinations(later, size)]
+
+
+def _stand_in(step: Step, hyper: Hyper, forms: tuple[str, ...]) -> tuple[Step, Hyper]:
+    """A step of one row that changes nothing of the training, and compiles what others need."""
+    param = step.param
+    one: Any = torch.zeros((1, *param.shape[1:]) if param.dim() else (), device=param.device)
+    made = dataclasses.replace(step, param=one, grad=torch.zeros_like(one), fade=None, hold=None)
+    if step.frame is not None:
+        quats, scales = one.new_zeros(1, 4), one.new_zeros(1, 3)
+        made.frame = step.frame._replace(quats=quats, scales=scales)
+    if "factor" in forms:
+        made.factor = torch.ones((), device=one.device)
+    if "hold" in forms:
+        made.hold = Hold(torch.zeros(1, dtype=torch.bool, device=one.device), 1.0)
+    m, v = (torch.zeros_like(one, dtype=hyper.exp_avg.dtype) for _ in range(2))
+    numbers = dataclasses.replace(hyper, exp_avg=m, exp_avg_sq=v, mean=None)
+    if "mean" in forms:
+        numbers.mean = mean_of(one, {"exp_avg": m}, step.name, False, 1)
+    return made, numbers
+
+
 def looks(grad: Tensor) -> bool:
     """Whether `look` takes the positions' gradient."""
-    return grad.is_cuda and _runs() and _plain(grad) and 4 * len(grad) < 2**31
+    return grad.is_cuda and _runs(grad.device) and _plain(grad) and 4 * len(grad) < 2**31
 
 
 def look(
@@ -145,7 +188,8 @@ def launch(step: Step, hyper: Hyper) -> None:
     if not step.plain:
         size /= hyper.correction1
     kept = NO_MEAN if hyper.mean is None else hyper.mean
-    mean, began, number, put = kept.tensor, kept.began, float(kept.count), 1.0 if kept.put else 0.0
+    mean, began, rest = kept.tensor, kept.began, kept.rest
+    number, put = float(kept.count), 1.0 if kept.put else 0.0
     coded = hyper.exp_avg.dtype is CODES, mean is not None and mean.dtype is CODES
     adam = (
         hyper.beta2, 1 - hyper.beta1, 1 - hyper.beta2, hyper.eps, hyper.sqrt_correction2,
@@ -155,7 +199,7 @@ def launch(step: Step, hyper: Hyper) -> None:
         _run(
             "step_in_own_frame", -(-param.shape[0] // FRAME_BLOCK),
             (param, step.grad, hyper.exp_avg, hyper.exp_avg_sq, frame.quats, frame.scales, mean,
-             began, on_device, hyper.nonfinite),
+             rest, began, on_device, hyper.nonfinite),
             (param.shape[0], frame.min_aspect, size, *adam, number, put), coded,
         )  # fmt: skip
         return
@@ -164,7 +208,7 @@ def launch(step: Step, hyper: Hyper) -> None:
     m, v = (None, None) if step.plain else (hyper.exp_avg, hyper.exp_avg_sq)
     _run(
         "step_rows", -(-numbers // ROWS_BLOCK),
-        (param, step.grad, m, v, mean, began, held, on_device, hyper.nonfinite),
+        (param, step.grad, m, v, mean, rest, began, held, on_device, hyper.nonfinite),
         (numbers, numbers // param.shape[0] if param.dim() else 1, size, *adam,
          key and _signed(key), share, fade_m, fade_v, weight, number, put, kept.grid),
         coded,

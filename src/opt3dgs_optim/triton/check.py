@@ -84,7 +84,9 @@ def case(
         if coded and not frame:
             grid = 2.0**-12
             kept = (kept / grid).to(torch.int32).to(CODES)
-        hyper.mean = Mean(put, steps, kept, began, grid)
+        sums = kept.dtype != CODES and shape[1:] == (3,)  # as positions have it
+        rest = 1e-8 * draw(*shape) if sums else None
+        hyper.mean = Mean(put, steps, kept, began, grid, rest)
     return step, hyper
 
 
@@ -99,7 +101,8 @@ def tensors(step: Step, hyper: Hyper) -> list[Tensor]:
     mean = hyper.mean.tensor
     if mean.dtype == CODES:
         mean = mean_of_residue(step.param, mean, hyper.mean.grid)
-    return [*found, mean, hyper.mean.began]
+    rest = [] if hyper.mean.rest is None else [hyper.mean.rest]
+    return [*found, mean, *rest, hyper.mean.began]
 
 
 def both(options: dict[str, Any], shape: tuple[int, ...], seed: int = 0) -> tuple[Any, Any]:
@@ -108,7 +111,7 @@ def both(options: dict[str, Any], shape: tuple[int, ...], seed: int = 0) -> tupl
     for kernels in (False, True):
         step, hyper = case(shape, torch.Generator().manual_seed(seed), **options)
         if kernels:
-            assert triton.fits(step), options
+            assert triton.fits(step, hyper), options
             triton.launch(step, hyper)
         else:
             bad = take_step(step, hyper)

@@ -16,7 +16,7 @@ import triton
 import triton.language as tl
 
 INFINITY = tl.constexpr(float("inf"))
-MAX_PLACE, MAX_AWAY = tl.constexpr(8388608.0), tl.constexpr(24576.0)  # as in `step`
+MAX_PLACE, MAX_AWAY = tl.constexpr(8388608.0), tl.constexpr(24576.0)  # as in `mean`
 LARGEST = tl.constexpr(9.223371761976868e18)  # float32's in `step.LARGEST`: its square is finite
 ROWS_BLOCK = tl.constexpr(1024)  # numbers of a program
 FRAME_BLOCK = tl.constexpr(128)  # Gaussians of a program
@@ -98,14 +98,22 @@ def store_moments(m, v, at, inside, exp_avg, exp_avg_sq, key):
 
 
 @triton.jit
-def into_mean(value, mean, began, row, at, inside, number, put):
-    """`step.take_into_mean` of one number; what the parameter is afterwards."""
+def into_mean(value, mean, rest, began, row, at, inside, number, put):
+    """`mean.take_into_mean` of one number; what the parameter is afterwards."""
     weight = weight_in_mean(began, row, inside, number)
     old = tl.load(mean + at, inside)
     known = tl.abs(value) < INFINITY
-    start = tl.where(tl.abs(old) < INFINITY, old, value)
-    way = value - start
-    moved = tl.where(weight < 0.5, start + way * weight, value - way * (1.0 - weight))
+    has = tl.abs(old) < INFINITY
+    start = tl.where(has, old, value)
+    if rest is None:
+        way = value - start
+        moved = tl.where(weight < 0.5, start + way * weight, value - way * (1.0 - weight))
+    else:  # `mean.take_with_rest`
+        left = tl.load(rest + at, inside)
+        more = tl.where(has, left, 0.0)
+        more = more + ((value - start) - more) * weight
+        moved = start + more
+        tl.store(rest + at, tl.where(known, more - (moved - start), left), inside)
     moved = tl.where(known, moved, old)
     tl.store(mean + at, moved, inside)
     if put > 0.0:
@@ -115,7 +123,7 @@ def into_mean(value, mean, began, row, at, inside, number, put):
 
 @triton.jit
 def into_residue(value, mean, began, row, at, inside, number, put, grid, round_key):
-    """`step.take_into_residue` of one number; what the parameter is afterwards."""
+    """`mean.take_into_residue` of one number; what the parameter is afterwards."""
     weight = weight_in_mean(began, row, inside, number)
     old = tl.load(mean + at, inside)
     place = value / grid
@@ -147,9 +155,9 @@ def rows_of(first, width):
 
 @triton.jit
 def _step_rows(
-    p, g, m, v, mean, began, held, factor, nonfinite, at, row, inside, size, beta2, ones1, ones2,
-    eps, sqrt_correction2, shrink, decay, round_key, key, share, fade_m, fade_v, weight, number,
-    put, grid,
+    p, g, m, v, mean, rest, began, held, factor, nonfinite, at, row, inside, size, beta2, ones1,
+    ones2, eps, sqrt_correction2, shrink, decay, round_key, key, share, fade_m, fade_v, weight,
+    number, put, grid,
 ):  # fmt: skip
     grad = finite(tl.load(g + at, inside), nonfinite, inside)
     value = tl.load(p + at, inside) * shrink
@@ -177,22 +185,23 @@ def _step_rows(
         if mean.dtype.element_ty == tl.int16:
             value = into_residue(value, mean, began, row, at, inside, number, put, grid, round_key)
         else:
-            value = into_mean(value, mean, began, row, at, inside, number, put)
+            value = into_mean(value, mean, rest, began, row, at, inside, number, put)
     tl.store(p + at, value, inside)
 
 
 @triton.jit(do_not_specialize=PLAIN_INTS)
 def step_rows(
-    p, g, m, v, mean, began, held, factor, nonfinite, numbers, width, size, beta2, ones1, ones2,
-    eps, sqrt_correction2, shrink, decay, round_key, key, share, fade_m, fade_v, weight, number,
-    put, grid,
+    p, g, m, v, mean, rest, began, held, factor, nonfinite, numbers, width, size, beta2, ones1,
+    ones2, eps, sqrt_correction2, shrink, decay, round_key, key, share, fade_m, fade_v, weight,
+    number, put, grid,
 ):  # fmt: skip
     """Step a parameter [rows, width], ROWS_BLOCK of its numbers in a program.
 
     Args:
         p, g, m, v, mean: numbers float32: parameter, gradient, moments (or codes int16; None: the
             step is the gradient times the rate), mean (or None).
-            A mean of int16 is what `step.take_into_residue` keeps, with its `grid`.
+            A mean of int16 is what `mean.take_into_residue` keeps, with its `grid`.
+        rest: numbers float32, of a mean that is the sum of both; or None.
         began: [rows] float32, the number with which a row's mean began, 0: it begins now; or None.
         held: [rows] uint8, not 0: raise the second moment to (weight * gradient)^2; or None.
         factor: one float32 on the device, on the size; or None.
@@ -211,14 +220,14 @@ def step_rows(
     if first <= numbers - ROWS_BLOCK:
         at = first + tl.arange(0, ROWS_BLOCK)
         _step_rows(
-            p, g, m, v, mean, began, held, factor, nonfinite, at, row, None, size,
+            p, g, m, v, mean, rest, began, held, factor, nonfinite, at, row, None, size,
             beta2, ones1, ones2, eps, sqrt_correction2, shrink, decay, round_key, key, share,
             fade_m, fade_v, weight, number, put, grid,
         )  # fmt: skip
     else:  # in 64 bits, since the place of a number that is not there may need them
         last = first.to(tl.int64) + tl.arange(0, ROWS_BLOCK)
         _step_rows(
-            p, g, m, v, mean, began, held, factor, nonfinite, last, row, last < numbers, size,
+            p, g, m, v, mean, rest, began, held, factor, nonfinite, last, row, last < numbers, size,
             beta2, ones1, ones2, eps, sqrt_correction2, shrink, decay, round_key, key, share,
             fade_m, fade_v, weight, number, put, grid,
         )  # fmt: skip
@@ -243,7 +252,7 @@ def adam(grad, m, v, at, inside, size, beta2, ones1, ones2, eps, sqrt_correction
 
 @triton.jit(do_not_specialize=PLAIN_INTS)
 def step_in_own_frame(
-    p, g, m, v, quats, scales, mean, began, factor, nonfinite, rows, min_aspect, size, beta2,
+    p, g, m, v, quats, scales, mean, rest, began, factor, nonfinite, rows, min_aspect, size, beta2,
     ones1, ones2, eps, sqrt_correction2, shrink, decay, round_key, number, put,
 ):  # fmt: skip
     """Step positions along each Gaussian's axes, mu <- mu - B Adam(B^T g), FRAME_BLOCK a program.
@@ -294,9 +303,9 @@ def step_in_own_frame(
     py = py - tl.where(tl.abs(dy) < INFINITY, dy, 0.0)
     pz = pz - tl.where(tl.abs(dz) < INFINITY, dz, 0.0)
     if mean is not None:
-        px = into_mean(px, mean, began, row, i, inside, number, put)
-        py = into_mean(py, mean, began, row, j, inside, number, put)
-        pz = into_mean(pz, mean, began, row, k, inside, number, put)
+        px = into_mean(px, mean, rest, began, row, i, inside, number, put)
+        py = into_mean(py, mean, rest, began, row, j, inside, number, put)
+        pz = into_mean(pz, mean, rest, began, row, k, inside, number, put)
     tl.store(p + i, px, inside)
     tl.store(p + j, py, inside)
     tl.store(p + k, pz, inside)
