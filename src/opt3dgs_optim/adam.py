@@ -7,6 +7,7 @@ instance, load hooks. Where there is nothing of it, none of it is paid for.
 from __future__ import annotations
 
 import functools
+import operator
 from collections.abc import Mapping
 from typing import Any, cast
 
@@ -69,7 +70,7 @@ class StepAdam(Adam):
             self.ticket = Ticket()
         self._masked = own_step(self._base) is not None
         self._step_supports_amp_scaling = False  # a GradScaler unscales, and leaves steps out
-        self._on_gpu = any(p.is_cuda for group in self.param_groups for p in group["params"])
+        self._on_gpu = self.param_groups[0]["params"][0].is_cuda  # one device is needed
         self._name_groups()
         self._count_on_host()
 
@@ -81,8 +82,8 @@ class StepAdam(Adam):
             self.param_groups[at].setdefault(STATE_KEY, "")
             if name is not None:
                 self.training.members[which, name] = Member(self, at, self.ticket)
-        self.ticket.has_means = any(name == "means" for _, name in self._slots)
-        self.training.counts_means |= self.ticket.has_means
+            if name == "means":
+                self.ticket.has_means = self.training.counts_means = True
 
     def _count_on_host(self) -> None:
         """Keep Adam's count of steps on the host, which reads it in every step of ours."""
@@ -326,6 +327,10 @@ class StepAdam(Adam):
     def resume(self) -> None:
         """Go on where the state says that the training is: after a load."""
         training = self.training
+        if not self.state and not any(map(operator.itemgetter(STATE_KEY), self.param_groups)):
+            self._steppers, self.coded = [], training.moments == 16
+            self.ticket.next_iteration = training.iteration + 1  # made anew, perhaps under way
+            return
         saved, last, own_frame = take_from_groups(self.param_groups, self._slots)
         counts = [int(state["step"]) for state in self.state.values() if "step" in state]
         missed = 0 if saved is None else max(counts, default=0) - saved["steps"]

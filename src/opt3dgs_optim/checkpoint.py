@@ -155,8 +155,6 @@ def drop_other_means(
 
 def iteration_by_counts(call: str, counts: list[int], training: Training) -> int:
     """The iteration that comes next, by Adam's own counts of steps, of a stock checkpoint."""
-    if not counts:  # one that is made anew under way steps first in the next iteration
-        return training.iteration + 1
     if not any(counts):
         training.messages.warn_once(
             "uncounted",
@@ -181,11 +179,13 @@ def check_loaded(call: str, state_dict: Any, groups: list[dict[str, Any]]) -> An
 
 def check_groups(call: str, groups: list[dict[str, Any]]) -> Any:
     """`check_loaded` of what is ours in the groups."""
-    found = [saved_numbers(group.get(STATE_KEY)) for group in groups]
-    for saved, group in zip(found, groups, strict=True):
-        if saved is not None:
+    first = None
+    for group in groups:
+        if line := group.get(STATE_KEY):
+            saved = saved_numbers(line)
             check_numbers(call, saved, len(group["params"]))
-    return next((saved for saved in found if saved is not None), None)
+            first = saved if first is None else first
+    return first
 
 
 def check_numbers(call: str, saved: Any, count: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -19,6 +20,7 @@ Slots = list[tuple[str, str | None]]  # by group: the set of Gaussians, which pa
 REFUSED = ("amsgrad", "maximize", "differentiable", "capturable")
 
 
+@functools.cache
 def own_step(kind: type) -> type | None:
     """The class of a step that is not torch's: gsplat's SelectiveAdam, INRIA's; else None."""
     for owner in kind.__mro__:

@@ -40,6 +40,10 @@ class Part:
     later: ClassVar[tuple[str, ...]] = ()
     names: Any = GAUSSIAN  # tuple[str, ...] | None
 
+    def begins(self, training: Training) -> int:
+        """The first iteration in which it acts."""
+        return 0
+
     def plan(self, step: Step, training: Training) -> None:
         """Say what the step has, before it is made, by setting attributes of `step`."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import weakref
 from typing import Any, cast
 
@@ -53,17 +54,25 @@ class ParamStepper:
         mine = [
             p for p in training.parts if p.names is None or (self.name and self.name in p.names)
         ]
-        self.acting = tuple(
-            tuple(
-                [p for p in mine if p.overrides(hook) and p.during in (None, phase)]
-                for hook in ("plan", "before", "after")
-            )
-            for phase in (Phase.EXPLORATION, Phase.EXPLOITATION)
-        )
+        self.parts = mine
+        self._arrange(-1)
         self.later = tuple(sorted({each for p in mine for each in p.later}))
         self.stepped_in = -1
         self.framed: bool | None = None
         self._exp_avg: Any = None  # a weak reference to that beside which something is kept
+
+    def _arrange(self, iteration: int) -> None:
+        """Have the parts that act from this iteration on, until another begins."""
+        begun = [part for part in self.parts if part.begins(self.training) <= max(iteration, 0)]
+        self.acting = tuple(
+            tuple(
+                [p for p in begun if p.overrides(hook) and p.during in (None, phase)]
+                for hook in ("plan", "before", "after")
+            )
+            for phase in (Phase.EXPLORATION, Phase.EXPLOITATION)
+        )
+        others = [p.begins(self.training) for p in self.parts if p not in begun]
+        self._arranged_until = min(others, default=math.inf)
 
     # -- a step ----------------------------------------------------------------------------------
 
@@ -126,6 +135,8 @@ class ParamStepper:
             param, grad, self.name, self.set, self.group, state, iteration, self.stepped_in,
             self.keep,
         )  # fmt: skip
+        if iteration >= self._arranged_until:
+            self._arrange(iteration)
         plans, befores, _ = self.acting[training.exploiting]
         for part in plans:
             part.plan(step, training)
@@ -143,11 +154,7 @@ class ParamStepper:
                             iteration, "the own frame's" if framed else "world")  # fmt: skip
             self.framed = framed
         if step.fresh:
-            state["step"].zero_()
-            for key in MOMENTS:
-                state[key].zero_()
-            for key in OF_MEAN:
-                state.pop(key, None)
+            begin_moments_anew(state)
         self.stepped_in = iteration
         return step
 
@@ -173,7 +180,8 @@ class ParamStepper:
         """The running mean; None where there is no room for it."""
         if not self.training.averages:
             return None
-        self.begin_edited_rows_anew(step.state)
+        if self._exp_avg is None or self._exp_avg() is not step.state["exp_avg"]:
+            self.begin_edited_rows_anew(step.state)
         try:
             return mean_of(step.param, step.state, self.name, bool(step.put), count)
         except torch.cuda.OutOfMemoryError:
@@ -209,6 +217,15 @@ class ParamStepper:
                     f"its {key} is {tuple(moment.shape)}: {len(moment)} rows for {len(param)}; "
                     "load the checkpoint of these Gaussians, or edit their moments with them"
                 )
+
+
+def begin_moments_anew(state: dict[str, Any]) -> None:
+    """Have Adam know nothing of the steps before, and the mean nothing of their iterates."""
+    state["step"].zero_()
+    for key in MOMENTS:
+        state[key].zero_()
+    for key in OF_MEAN:
+        state.pop(key, None)
 
 
 def drop_kept(state: dict[str, Any]) -> None:

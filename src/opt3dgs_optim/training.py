@@ -130,6 +130,11 @@ class Training(Clock):
             self._look_at = iteration + LOOK_INTERVAL
             self.look_at_numbers()
 
+    def resume(self, iteration: int) -> None:
+        """Go on at an iteration; what was kept from step to step is of another one."""
+        super().resume(iteration)
+        self.unsaved.clear()
+
     def look_at_numbers(self) -> None:
         """Say once that gradients have not been finite."""
         if bad := self.bad_numbers.look():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import json
 from typing import Any
 
 import pytest
@@ -87,7 +88,9 @@ def test_the_share_is_the_mean_of_about_a_hundred_views(
     for iteration in range(1, 400):
         step(params, optimizers, slice(in_view))
         found.append(float(phases.numbers()["visible_share"]))
-        if counted and iteration == 1:  # as after some 10,000 looks at 300,000 points
+        if (
+            counted and iteration == 4
+        ):  # nothing is on its way; as after some 10,000 looks at 300,000 points
             seen = phases.unsaved[OutOfView, ""]
             seen.counter.fill_(counted)
             seen.counted = counted
@@ -132,16 +135,17 @@ def test_second_moments_out_of_view_are_raised_below_a_third(share: float) -> No
 
 
 def test_a_load_of_a_start_begins_with_a_share_of_one() -> None:
-    """A look that is on its way then counts as the first."""
+    """What was on its way then belongs to another training."""
     params, optimizers, phases = scene(4)
     start = copy.deepcopy(optimizers["means"].state_dict())
-    step(params, optimizers, slice(None))
-    for _ in range(2):
+    for _ in range(6):
         step(params, optimizers, slice(1))
-    assert float(phases.numbers()["visible_share"]) == 1.0
     optimizers["means"].load_state_dict(start)
-    step(params, optimizers, slice(1))
-    assert float(phases.numbers()["visible_share"]) == pytest.approx(1 - 0.75 / 25)
+    found = []
+    for _ in range(5):
+        step(params, optimizers, slice(None))
+        found.append(float(phases.numbers()["visible_share"]))
+    assert found == [1.0] * 5
 
 
 @pytest.mark.parametrize("name", ["scales", "opacities"])
@@ -184,19 +188,19 @@ def test_without_a_gradient_of_the_positions_it_does_nothing(frozen: str) -> Non
 
 @pytest.mark.parametrize("way", ["a save", "a copy"])
 def test_a_save_and_a_copy_lose_no_look(way: str) -> None:
-    """The third view's look is on its way for an iteration; what is saved has it already."""
+    """A share that counts two iterations later is saved as one that does not count yet."""
     params, optimizers, phases = scene(4)
-    step(params, optimizers, slice(None))
-    step(params, optimizers, slice(1))
-    optimizers["means"].state_dict()  # nothing is on its way
-    step(params, optimizers, slice(1))
+    for seen in (slice(None), slice(1)):
+        step(params, optimizers, seen)
+    optimizers["means"].state_dict()  # which changes nothing
     assert phases.numbers() == {"visible_share": 1.0}
     if way == "a save":
-        notes = optimizers["means"].state_dict()["param_groups"][0]["opt3dgs"]["notes"]["OutOfView"]
+        saved = optimizers["means"].state_dict()["param_groups"][0]["opt3dgs"]
+        notes = json.loads(saved)["notes"]["OutOfView"]
     else:
         copied = copy.deepcopy(phases)
         notes = copied.notes_of(copied.parts[0])
-    assert notes == {"share": pytest.approx(1 - 0.75 / 25)}
+    assert notes == {"share": 1.0, "due of share": 2, "view's share": 1.0}
 
 
 def test_each_set_of_gaussians_has_a_share_of_its_own() -> None:

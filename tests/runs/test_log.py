@@ -311,31 +311,29 @@ def test_no_autograd_graph_is_kept(tmp_path):
         assert alive() is None
 
 
-class FakeEvent:
-    """Stands for a torch.cuda.Event: completes when told to, or when waited for."""
+class FakeReading:
+    """Numbers on their way from a GPU: they come when told to, or when waited for."""
 
-    def __init__(self):
-        self.done = False
+    def __init__(self, value: float, count: int):
+        self.done, self.numbers = False, [value] * count
 
-    def query(self):
-        return self.done
-
-    def synchronize(self):
-        self.done = True
+    def take(self, wait: bool):
+        self.done |= wait
+        return self.numbers if self.done else None
 
 
 @pytest.fixture
 def gpu(monkeypatch):
     """On a machine without CUDA: every tensor plays the part of a CUDA one."""
-    events = []
+    readings = []
 
-    def to_pinned(values):
-        events.append(FakeEvent())
-        return torch.full((len(values),), float(len(events)), dtype=torch.float64), events[-1]
+    def reading_of(values):
+        readings.append(FakeReading(float(len(readings) + 1), len(values)))
+        return readings[-1]
 
-    monkeypatch.setattr(log_module, "_to_pinned", to_pinned)
+    monkeypatch.setattr(log_module, "_reading_of", reading_of)
     monkeypatch.setattr(log_module, "_on_gpu", lambda value: isinstance(value, torch.Tensor))
-    return events
+    return readings
 
 
 def test_lines_wait_for_the_gpu_in_order_without_waiting_for_it(tmp_path, gpu):

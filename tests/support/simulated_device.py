@@ -77,12 +77,13 @@ class SimulatedDevice(TorchFunctionMode):
 
     Attributes:
         synchronisations: "KIND at FILE:LINE" of the package's innermost line, or "" elsewhere.
+        capturing: whether a CUDA graph is being captured.
         operators: how often each of torch's operators was launched. launches: of Triton's kernels.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self._patches = contextlib.ExitStack()
+        self._patches, self.capturing = contextlib.ExitStack(), False
         self.forget()
 
     def forget(self) -> None:
@@ -104,10 +105,14 @@ class SimulatedDevice(TorchFunctionMode):
                 run(name, grid, [on_host(a) if isinstance(a, Tensor) else a for a in args], kwargs)
 
         kernels.run = launch
-        patch.setattr(triton, "_runs", lambda: True)
+        patch.setattr(triton, "_runs", lambda _: True)
+        patch.setattr(triton, "_PREPARED", set())
         patch.setattr(torch.cuda, "is_available", lambda: True)
         patch.setattr(torch.cuda, "current_device", lambda: 0)
         patch.setattr(torch.cuda, "Event", Event)
+        patch.setattr(torch.cuda, "current_stream", lambda *_: None)
+        patch.setattr(torch.cuda, "is_current_stream_capturing", lambda: self.capturing)
+        patch.setattr(Event, "waited", staticmethod(lambda: self._wait("event")))
         patch.setattr(torch.cuda, "synchronize", lambda *_: self._wait("synchronize"))
         return super().__enter__()
 
@@ -187,7 +192,7 @@ class Event:
     pending: list[tuple[Tensor, Tensor]] = []  # noqa: RUF012
     launched = 0
 
-    def record(self) -> None:
+    def record(self, _: Any = None) -> None:
         """What was begun before belongs to it."""
         self.since, self.copies, Event.pending = Event.launched, Event.pending, []
 
@@ -197,6 +202,16 @@ class Event:
         if done:
             _finish(self.copies)
         return done
+
+    @staticmethod
+    def waited() -> None:
+        """The host waits for one."""
+
+    def synchronize(self) -> None:
+        """Wait for it."""
+        if not self.query():
+            self.waited()
+            _finish(self.copies)
 
     @classmethod
     def finish_all(cls) -> None:

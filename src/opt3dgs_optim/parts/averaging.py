@@ -41,6 +41,10 @@ class Averaging(Part):
         """The first iteration after which the mean is in the parameters' place."""
         return _window(total_steps)[1]
 
+    def begins(self, training: Training) -> int:
+        """The first iteration that is averaged."""
+        return self.start(training.total_steps) if training.total_steps else 0
+
     def plan(self, step: Step, training: Training) -> None:
         """Take the iterate into the mean."""
         total, now = training.total_steps, step.iteration

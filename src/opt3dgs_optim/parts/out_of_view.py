@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +20,9 @@ GOLDEN_RATIO = (5**0.5 - 1) / 2
 SHARE_LOOKED_AT = 1 / 4  # of the views
 WEIGHT = 1 / 25  # of a view that is looked at: the mean is of the last 100 views or so
 MAX_SEEN_SHARE = 1 / 3  # above it nothing is changed
+# Iterations after which a share counts, whatever a device has done by then: two runs are the same,
+# and so are two ranks. By then it has nearly always come.
+LAG = 2
 MIN_SEEN_SHARE = 0.01  # a view counts as seeing at least so much
 
 
@@ -55,23 +59,23 @@ class OutOfView(Part):
             step.hold = Hold(seen.rows, MAX_SEEN_SHARE / seen.notes[seen.note])
 
     def read_back(self, training: Training) -> None:
-        """Take the share that is on its way."""
+        """Have a share that is on its way in the notes."""
         for place, seen in training.unsaved.items():
-            if place[0] is OutOfView and seen.reading is not None:
-                if seen.reading.source.is_cuda:
-                    torch.cuda.synchronize()
-                seen.take()
+            if place[0] is OutOfView:
+                seen.arrive()
 
     def numbers(self, training: Training) -> Mapping[str, float]:
         """`visible_share`: the mean share of the points that a view sees, the least of all sets."""
-        return {"visible_share": min(training.notes_of(self).values(), default=1.0)}
+        notes = training.notes_of(self)
+        return {"visible_share": min((notes[k] for k in notes if k.startswith("share")), default=1)}
 
 
 class _Seen:
     """What was found of a set of Gaussians.
 
     Attributes:
-        notes: of the part, with the mean share of this set under the name `note`.
+        notes: of the part, with the mean share of this set under the name `note`, and the share of
+            a view that was looked at, with the iteration that takes it into the mean.
         iteration: in which it was looked at last; None: not yet.
         rows: [N] bool, out of view; None where views see enough.
         counter: [1] int64, 2^32 for each point in view and 1 for each that is or was, of all looks.
@@ -79,7 +83,7 @@ class _Seen:
     """
 
     def __init__(self, note: str, notes: dict[str, Any]) -> None:
-        self.note, self.notes = note, notes
+        self.note, self.notes, self.due = note, notes, f"due of {note}"
         self.iteration: int | None = None
         self.rows: Tensor | None = None
         self.counter: Tensor | None = None
@@ -89,12 +93,13 @@ class _Seen:
     def look(self, step: Step, training: Training) -> None:
         """Look at the positions' gradient of this iteration."""
         self.iteration, self.rows = step.iteration, None
-        if self.reading is not None:
+        if step.iteration >= self.notes.get(self.due, math.inf):
             self.take()
         means = training.param_of(step.set, "means")
         grad = None if means is None else means.grad
         # Multiples of the golden ratio keep step with no order of views, as of a rig of cameras.
-        looks = self.reading is None and step.iteration * GOLDEN_RATIO % 1.0 < SHARE_LOOKED_AT
+        is_due = step.iteration * GOLDEN_RATIO % 1.0 < SHARE_LOOKED_AT
+        looks = is_due and self.due not in self.notes
         holds = self.notes.setdefault(self.note, 1.0) < MAX_SEEN_SHARE
         if grad is None or not len(grad) or not (looks or holds):
             return
@@ -108,15 +113,22 @@ class _Seen:
         if counter is not None:
             self.reading = Reading(counter)
             self.reading.ask()
+            self.notes[self.due] = step.iteration + LAG
 
-    def take(self) -> None:
-        """Take the share of a view into the mean, if it has come."""
-        counted = None if self.reading is None else self.reading.take()
+    def arrive(self) -> None:
+        """Have the share of the view that was looked at last in the notes."""
+        counted = None if self.reading is None else self.reading.take(wait=True)
         if counted is None:
             return
         self.reading, new = None, (counted[0] - self.counted) % 2**64
         self.counted = counted[0]
-        share = (new >> 32) / max(new % 2**32, 1)
+        self.notes[f"view's {self.note}"] = (new >> 32) / max(new % 2**32, 1)
+
+    def take(self) -> None:
+        """Take the share of a view into the mean."""
+        self.arrive()
+        del self.notes[self.due]
+        share = self.notes.pop(f"view's {self.note}", 0)
         if share > 0:  # a gradient that is zero everywhere is of no view
             mean = self.notes.setdefault(self.note, 1.0)  # a load has none before its first look
             self.notes[self.note] = mean + WEIGHT * (max(share, MIN_SEEN_SHARE) - mean)

@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.checks import check_count, check_energy
+from opt3dgs_optim.device import Reading
 from opt3dgs_optim.runs.lines import read_run
 
 Number = float | Tensor | np.number | np.bool_  # of one element
@@ -33,8 +34,7 @@ class _Pending(NamedTuple):
 
     line: dict[str, Any]
     names: list[str]
-    host: Tensor | None = None  # [len(names)] float64, pinned
-    ready: Any = None  # torch.cuda.Event, recorded after the copy into `host`
+    reading: Reading | None = None  # of these names' numbers
 
 
 class RunLog(AbstractContextManager["RunLog"]):
@@ -185,20 +185,18 @@ class RunLog(AbstractContextManager["RunLog"]):
                 sent[name] = one
             else:
                 line[name] = _plain(float(one))
-        waiting = _to_pinned([*sent.values()]) if sent else ()
-        self._pending.append(_Pending(line, [*sent], *waiting))
+        reading = _reading_of([*sent.values()]) if sent else None
+        self._pending.append(_Pending(line, [*sent], reading))
         self._drain(wait=wait)
 
     def _drain(self, *, wait: bool) -> None:
         """Write pending lines in order, up to the first whose numbers have not arrived."""
         while self._pending:
-            line, names, host, ready = self._pending[0]
-            if host is not None:
-                if wait:
-                    ready.synchronize()
-                elif not ready.query():
+            line, names, reading = self._pending[0]
+            if reading is not None:
+                if (found := reading.take(wait)) is None:
                     return
-                line |= zip(names, map(_plain, host.tolist()), strict=True)
+                line |= zip(names, map(_plain, found), strict=True)
             self._pending.popleft()
             self._file.write(_encoded(line))
 
@@ -230,11 +228,8 @@ def _on_gpu(value: Any) -> bool:
     return isinstance(value, Tensor) and value.is_cuda
 
 
-def _to_pinned(values: list[Tensor]) -> tuple[Tensor, Any]:
-    """Copy CUDA scalars to the host in stream order: (pinned [n] float64, event of completion)."""
-    packed = torch.stack([value.to(torch.float64) for value in values])
-    host = torch.empty(len(values), dtype=torch.float64, device="cpu", pin_memory=True)
-    host.copy_(packed, non_blocking=True)
-    ready = torch.cuda.Event()
-    ready.record(torch.cuda.current_stream(packed.device))
-    return host, ready
+def _reading_of(values: list[Tensor]) -> Reading:
+    """Numbers of a GPU, [n] float64, on their way."""
+    reading = Reading(torch.stack([value.to(torch.float64) for value in values]))
+    reading.ask()
+    return reading

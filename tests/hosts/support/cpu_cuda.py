@@ -48,6 +48,10 @@ class Event:
         """Milliseconds to the other event."""
         return 1e3 * (other.at - self.at)
 
+    def query(self) -> bool:
+        """All is done at once."""
+        return True
+
     def synchronize(self) -> None:
         """Nothing to wait for."""
 
@@ -64,6 +68,7 @@ def install() -> None:
         "memory_reserved": 0,
         "max_memory_reserved": 0,
         "is_current_stream_capturing": False,
+        "current_stream": None,
         "is_bf16_supported": False,
         "get_device_capability": (0, 0),
     }
