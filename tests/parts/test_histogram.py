@@ -8,7 +8,6 @@ import json
 import math
 import pickle
 import re
-import warnings
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import LoopHistogram, MovingHistogram
 
-from opt3dgs_optim import Course, EnergyHistogram, Phase, PhaseScheduler
+from opt3dgs_optim import Course, EnergyHistogram, PhaseScheduler
 from opt3dgs_optim.partitions import FLOOR, MEAN_ABS, FixedPartitions, MovingPartitions
 from opt3dgs_optim.step import Step
 
@@ -79,11 +78,6 @@ def test_the_papers_update_is_its_loops(energies: list[float], zeta: float) -> N
     assert taken(partitions, energies) == pytest.approx(expected, rel=1e-9, abs=1e-9)
     # 40 float64 updates of well-scaled numbers
     assert partitions.weights.tolist() == pytest.approx(oracle.theta, rel=1e-12)
-
-
-def test_the_first_multiplier_is_one_and_not_minus_3973() -> None:
-    """Erratum: "theta(J - 1) v 1" is an index clamp."""
-    assert take(fixed(200, (0.0, 0.2), tau=1.0), 0.1, 1) == 1.0
 
 
 @pytest.mark.parametrize("seen", [0, 1, 1000, 100_000])
@@ -350,18 +344,6 @@ def test_it_scales_the_steps_until_the_switch_and_then_looks_no_more() -> None:
     assert learnt[-1] == learnt[20]  # the first loss after the switch comes before its step
 
 
-def test_without_energies_it_says_so_once_and_nu_is_one() -> None:
-    x, adam, _ = upgraded(EnergyHistogram())
-    x.grad = torch.ones(4, 3)
-    adam.step()  # an energy may come after it
-    with pytest.warns(UserWarning, match=r"no energy has been observed.*call phases\.observe"):
-        adam.step()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        adam.step()
-    assert float(x.detach()[0, 0]) == pytest.approx(-0.3, rel=1e-4)
-
-
 @KINDS
 def test_on_a_device_nu_stays_there(options: dict[str, Any]) -> None:
     """On torch's device without memory whatever reads a number raises; it moves there first."""
@@ -428,14 +410,6 @@ def test_what_is_no_energy() -> None:
     assert not EnergyHistogram().observe(graph).requires_grad
 
 
-def test_it_acts_while_exploring_and_serves_one_training() -> None:
-    histogram = EnergyHistogram()
-    assert (histogram.during, histogram.learns) == (Phase.EXPLORATION, True)
-    Course([histogram])
-    with pytest.raises(ValueError, match="serves another training"):
-        Course([histogram])
-
-
 # -- saved -----------------------------------------------------------------------------------------
 
 
@@ -500,26 +474,6 @@ def test_what_does_not_fit_is_refused_and_nothing_changed(options: dict[str, Any
 
 
 # -- options ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {**FIXED, "num_partitions": 3},
-        {**FIXED, "zeta": 0.0},
-        {**FIXED, "zeta": 1.0},
-        {**FIXED, "temperature": 0.0},
-        {**FIXED, "warmup": 0, "clamp": (1.0, 1.0 + 1e-9)},
-        {"num_partitions": 24, "clamp": (0.5, 1.0)},
-        {"warmup": 4},
-        {"zeta": 0.01},
-    ],
-    ids=str,
-)
-def test_the_ends_of_what_is_allowed_work(options: dict[str, Any]) -> None:
-    histogram = EnergyHistogram(**options)
-    assert np.isfinite(nus_of(histogram, stream(30))).all()
-    assert float(histogram.weights.sum()) == pytest.approx(1.0, abs=1e-12)
 
 
 @pytest.mark.parametrize(
