@@ -15,7 +15,7 @@ from PIL import Image
 
 from opt3dgs_optim.hosts import diff
 
-ON_CPU = Path(__file__).resolve().parents[2] / "examples/hosts/cpu/on_cpu.py"
+ON_CPU = Path(__file__).resolve().parent / "on_cpu.py"
 TRAINERS = Path(os.environ.get("OPT3DGS_TRAINERS", "/no/trainers"))
 EVERY_POINT = 12  # of the scene's sparse points, one in so many: seconds instead of minutes
 LIMIT = 3600  # seconds a training
