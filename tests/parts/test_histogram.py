@@ -51,9 +51,7 @@ def moving(dtype: torch.dtype = torch.float64, zeta: float = 0.75) -> MovingPart
     return made
 
 
-def take(
-    partitions: FixedPartitions | MovingPartitions, energy: float, count: int, valid: bool = True
-) -> float:
+def take(partitions: Any, energy: float, count: int) -> float:
     """Nu, unclamped, and the update, as `EnergyHistogram` has them made."""
     like: Any = {"dtype": partitions.state.dtype}
     value, number = torch.tensor(energy, **like), torch.tensor(float(count), **like)
