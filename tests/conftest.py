@@ -9,14 +9,10 @@ from collections.abc import Iterator
 
 import pytest
 import torch
-from hypothesis import Phase, settings
+from hypothesis import settings
 
 settings.register_profile("fixed", derandomize=True, deadline=None)
 settings.register_profile("random", derandomize=False, deadline=None)
-# For mutants.py: a failure is enough, nobody reads the smallest one.
-settings.register_profile(
-    "mutants", derandomize=True, deadline=None, phases=(Phase.explicit, Phase.generate)
-)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
 
 torch.set_num_threads(1)  # tensors are small, and other processes of the test run need the cores

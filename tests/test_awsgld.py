@@ -147,16 +147,6 @@ def test_position_noise_moves_the_positions_only() -> None:
         assert [bool(param.any()) for param in params] == moves
 
 
-def test_position_noise_finds_the_other_tensors_among_the_groups() -> None:
-    tensors = {"means": torch.zeros(4, 3), **dim()}
-    splats = {name: Parameter(value) for name, value in tensors.items()}
-    groups = [{"params": [param], "name": name} for name, param in splats.items()]
-    optimizer = AWSGLD(groups, lr=0.1, noise=PositionNoise(scale=1.0))
-    splats["means"].grad = torch.zeros(4, 3)
-    optimizer.step()
-    assert bool(splats["means"].all())
-
-
 # -- energies --------------------------------------------------------------------------------------
 
 
@@ -184,20 +174,6 @@ def test_a_closure_is_evaluated_once_and_its_value_is_returned_and_taken(on: boo
         assert histogram.num_observed == 2
         with pytest.raises(ValueError, match="one real number is needed"):
             optimizer.step(lambda: torch.ones(2))
-
-
-def test_an_energy_that_is_not_finite_leaves_nu() -> None:
-    x, histogram = Parameter(torch.zeros(1)), EnergyHistogram(warmup=4)
-    walk = AWSGLD([x], lr=0.1, preconditioner="none", histogram=histogram)
-    for energy in np.random.default_rng(0).normal(size=12):
-        histogram.observe(float(energy))
-    steps = []
-    for energy in (0.3, float("nan"), None):
-        if energy is not None:
-            histogram.observe(energy)
-        steps.append(moved_by(walk, x, [1.0])[0])
-    assert steps == pytest.approx([0.1 * float(histogram.multiplier)] * 3)
-    assert abs(steps[0] - 0.1) > 1e-3
 
 
 def test_without_any_energy_it_says_so_once() -> None:
@@ -283,21 +259,6 @@ def test_a_checkpoint_of_stock_adam_loads() -> None:
     assert ours.training.iteration == 1
 
 
-def test_a_damaged_histogram_is_refused_with_nothing_changed() -> None:
-    params = parameters([(5, 3)])
-    optimizer = made(params)
-    go(optimizer, params, 0, 8)
-    state = copy.deepcopy(optimizer.state_dict())
-    state["param_groups"][0]["opt3dgs"]["parts"]["EnergyHistogram"]["learnt"][0] = -1.0
-    state["state"][0]["exp_avg"].zero_()
-    before = copy.deepcopy(optimizer.state_dict())
-    with pytest.raises(ValueError, match="load_state_dict: it is damaged"):
-        optimizer.load_state_dict(state)
-    after = optimizer.state_dict()
-    assert torch.equal(after["state"][0]["exp_avg"], before["state"][0]["exp_avg"])
-    assert after["param_groups"] == before["param_groups"]
-
-
 # -- groups, schedules, options --------------------------------------------------------------------
 
 
@@ -321,49 +282,6 @@ def test_groups_may_be_added_and_are_stepped_with_nu() -> None:
             optimizer.add_param_group(wrong)
         assert len(optimizer.param_groups) == 2
     moved_by(optimizer, params[1], [1.0, 1.0])
-
-
-SCHEDULES: dict[str, Any] = {
-    "ExponentialLR": lambda o: torch.optim.lr_scheduler.ExponentialLR(o, 0.9),
-    "OneCycleLR": lambda o: torch.optim.lr_scheduler.OneCycleLR(o, 0.1, total_steps=20),
-    "LambdaLR": lambda o: torch.optim.lr_scheduler.LambdaLR(o, lambda k: 1 / (1 + k)),
-}
-
-
-@pytest.mark.parametrize("name", SCHEDULES)
-@pytest.mark.parametrize("preconditioner", ["adam", "none"])
-def test_schedules_of_the_rate(name: str, preconditioner: Any) -> None:
-    """Warnings are errors, also torch's on the order of the calls."""
-    x, y = parameters([(5, 3)]), parameters([(5, 3)])
-    ours = AWSGLD(x, lr=0.1, preconditioner=preconditioner, histogram=EnergyHistogram(warmup=99))
-    theirs = torch.optim.Adam(y, lr=0.1, foreach=False)
-    rates = [SCHEDULES[name](each) for each in (ours, theirs)]
-    ours.histogram.observe(0.1)  # pyright: ignore[reportOptionalMemberAccess]
-    for step in range(6):
-        set_gradients(x, step)
-        set_gradients(y, step)
-        before, lr = x[0].detach().clone(), ours.param_groups[0]["lr"]
-        for optimizer, rate in zip((ours, theirs), rates, strict=True):
-            optimizer.step()
-            rate.step()
-        if preconditioner == "none":
-            torch.testing.assert_close(x[0].detach(), before - lr * x[0].grad)  # pyright: ignore
-    assert ours.param_groups[0]["lr"] == theirs.param_groups[0]["lr"] != 0.1
-    if preconditioner == "adam":
-        assert torch.equal(x[0], y[0])
-
-
-def test_the_options_defaults_are_adams() -> None:
-    x = [Parameter(torch.zeros(1, 3))]
-    ours, theirs = AWSGLD(x).defaults, torch.optim.Adam(x).defaults
-    for name in ("lr", "betas", "eps", "weight_decay"):
-        assert ours[name] == theirs[name], name
-
-
-@pytest.mark.parametrize("option", ["amsgrad", "maximize", "foreach", "fused", "capturable"])
-def test_other_options_of_torch_are_type_errors(option: str) -> None:
-    with pytest.raises(TypeError, match=option):
-        AWSGLD([Parameter(torch.zeros(1))], **{option: True})  # pyright: ignore
 
 
 def test_wrong_options_are_named() -> None:

@@ -196,57 +196,6 @@ def test_the_state_is_plain_and_of_the_moment() -> None:
     assert equal(saved, through_a_file(saved))
 
 
-@pytest.mark.parametrize("upgraded_first", [True, False])
-@pytest.mark.parametrize("single", [True, False])
-def test_what_parts_have_learnt_is_restored(upgraded_first: bool, single: bool) -> None:
-    """gsplat's and nerfstudio's order, and INRIA's: a new Adam, load_state_dict, upgrade."""
-
-    def make(params: Any) -> Any:
-        return adam_of(params) if single else adams_of(params)
-
-    def run(phases: PhaseScheduler, given: Any, params: Any, first: int, last: int) -> None:
-        for iteration in range(first, last):
-            phases.observe(0.1 + 0.01 * (iteration % 7))
-            steps({"all": given} if single else given, params, 1, seed=iteration)
-
-    def start() -> PhaseScheduler:
-        return PhaseScheduler(90, 80, [OutOfView(), EnergyHistogram(warmup=5), Averaging()])
-
-    params, phases = parameters(ROWS, *NAMES), start()
-    whole = phases.upgrade(make(params))
-    run(phases, whole, params, 0, 45)
-    listed = [whole] if single else list(whole.values())
-    saved = through_a_file([each.state_dict() for each in listed])
-    rows = {name: param.detach().clone() for name, param in params.items()}
-    run(phases, whole, params, 45, 90)
-    again = {name: torch.nn.Parameter(each) for name, each in rows.items()}
-    phases, resumed = start(), make(again)
-    if upgraded_first:
-        phases.upgrade(resumed)
-    for optimizer, state in zip([resumed] if single else resumed.values(), saved, strict=True):
-        optimizer.load_state_dict(state)
-    if not upgraded_first:
-        phases.upgrade(resumed)
-    run(phases, resumed, again, 45, 90)
-    assert same_tensors(params, again)
-
-
-def test_a_longer_run_knows_nothing_of_the_first_ones_end() -> None:
-    """Trained to 60, and on to 180: the mean is of the last thirtieth of the second run."""
-    _, optimizer, params = trained(60)
-    phases = PhaseScheduler(180, parts=[Averaging()])
-    fresh = phases.upgrade(adam_of(params))
-    fresh.load_state_dict(optimizer.state_dict())
-    assert phases.iteration == 59
-    assert not any("averaging.mean" in state for state in fresh.state.values())
-    last: list[Tensor] = []
-    for iteration in range(60, 180):
-        steps({"all": fresh}, params, 1, seed=iteration)
-        if iteration >= 174:
-            last.append(params["scales"].detach().clone())
-    assert fresh.state[params["scales"]]["averaging.began"].tolist() == [175.0] * ROWS
-
-
 def test_a_stock_adam_loads_ours_and_goes_on() -> None:
     _, optimizer, params = trained()
     stock = adam_of(params)

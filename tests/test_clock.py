@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import pytest
@@ -46,16 +45,6 @@ def test_three_lines_are_enough(parts: Any) -> None:
             if observe:
                 phases.observe(torch.tensor(0.1 * iteration), iteration=iteration)
             steps(optimizers, params, 1, seed=iteration)
-        ends.append({name: param.detach() for name, param in params.items()})
-    assert same_tensors(*ends)
-
-
-def test_one_adam_of_six_groups_or_six_adams() -> None:
-    ends = []
-    for make in (adam_of, adams_of):
-        params = parameters(20)
-        made = PhaseScheduler(TOTAL).upgrade(make(params))
-        steps(made if isinstance(made, dict) else {"all": made}, params, TOTAL)
         ends.append({name: param.detach() for name, param in params.items()})
     assert same_tensors(*ends)
 
@@ -119,27 +108,6 @@ def test_the_mean_is_in_place_before_the_last_step() -> None:
     optimizers = PhaseScheduler(300, parts=[Averaging()]).upgrade(adams_of(params))
     steps(optimizers, params, 299)
     assert torch.equal(params["sh0"], optimizers["sh0"].state[params["sh0"]]["averaging.mean"])
-
-
-@pytest.mark.parametrize("upgraded_first", [True, False])
-@pytest.mark.parametrize("stock", [True, False])
-def test_a_resume_takes_the_clock(upgraded_first: bool, stock: bool) -> None:
-    params = parameters(5)
-    optimizer: Any = adam_of(params)
-    if not stock:
-        optimizer = PhaseScheduler(TOTAL).upgrade(optimizer)
-    steps({"all": optimizer}, params, 50)
-    saved = copy.deepcopy(optimizer.state_dict())
-    phases = PhaseScheduler(TOTAL)
-    fresh = adam_of(params)
-    if upgraded_first:
-        phases.upgrade(fresh)
-    fresh.load_state_dict(saved)
-    if not upgraded_first:
-        phases.upgrade(fresh)
-    assert phases.iteration == 49
-    steps({"all": fresh}, params, 1)
-    assert phases.iteration == 50
 
 
 def test_a_second_upgrade_changes_nothing() -> None:

@@ -5,27 +5,20 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from oracles import rotation_matrix
 from simulated_device import on_device, on_host
 from torch import Tensor
 
 from opt3dgs_optim import step as module
+from opt3dgs_optim.mean import Mean, places_of, take_into_mean
 from opt3dgs_optim.moments import CODES, chances
 from opt3dgs_optim.step import (
     Axes,
-    Fade,
-    Hyper,
-    Step,
-    chosen_rows,
     finite,
     into_frame,
     mixed,
     out_of_frame,
-    places_of,
-    take_into_mean,
     take_step,
 )
 from opt3dgs_optim.triton.check import case, tensors
@@ -46,68 +39,18 @@ def stepped(device: bool = False, rows: int = 50, seed: int = 0, **options: Any)
     if device:
         for owner, names in (
             (step, ("param", "grad")),
-            (hyper, ("exp_avg", "exp_avg_sq", "mean", "began", "nonfinite")),
+            (hyper, ("exp_avg", "exp_avg_sq", "nonfinite")),
         ):
             for name in names:
                 given = getattr(owner, name)
                 setattr(owner, name, given if given is None else on_device(given))
+        if (mean := hyper.mean) is not None:
+            mean.tensor, mean.began = on_device(mean.tensor), on_device(mean.began)
+            mean.rest = None if mean.rest is None else on_device(mean.rest)
     bad = take_step(step, hyper)
     assert hyper.nonfinite is not None
     assert bad == 0 or not device  # nobody waits
     return [on_host(each) for each in (*tensors(step, hyper), hyper.nonfinite + bad)]
-
-
-def by_rows(step: Step, hyper: Hyper) -> list[np.ndarray]:
-    """What a step leaves, one Gaussian at a time, in the order of the module's docstring."""
-    given = step.param, step.grad, hyper.exp_avg, hyper.exp_avg_sq, hyper.mean, hyper.began
-    x, g, m, v, mean, began = (each.double().numpy().copy() for each in given if each is not None)
-    fade, hold, frame, put = step.fade, step.hold, step.frame, step.mean
-    faded = chosen_rows(fade, len(x), CPU) if fade else torch.zeros(len(x))
-    g[~np.isfinite(g)] = 0.0
-    for i in range(len(x)):
-        if fade and faded[i]:
-            m[i], v[i] = m[i] * fade.exp_avg, v[i] * fade.exp_avg_sq
-        x[i] *= hyper.shrink
-        g[i] += hyper.decay * x[i]
-        axes, rate = np.eye(3), hyper.lr
-        if frame:
-            deviations = np.exp(frame.scales[i].numpy())
-            deviations = np.maximum(deviations, frame.min_aspect * deviations.max())
-            axes, rate = rotation_matrix(frame.quats[i].numpy()) * deviations, frame.rate
-        g[i] = axes.T @ g[i]
-        if hold and hold.rows[i]:
-            v[i] = np.maximum(v[i], (hold.weight * g[i]) ** 2)
-        z = g[i]
-        if not step.plain:
-            m[i] = hyper.beta1 * m[i] + (1 - hyper.beta1) * g[i]
-            v[i] = hyper.beta2 * v[i] + (1 - hyper.beta2) * g[i] ** 2
-            z = m[i] / hyper.correction1 / (np.sqrt(v[i]) / hyper.sqrt_correction2 + hyper.eps)
-        x[i] -= axes @ (rate * step.factor * z)
-        if put is not None:
-            began[i] = began[i] or hyper.count
-            mean[i] += (x[i] - mean[i]) / (hyper.count + 1 - began[i])
-            x[i] = mean[i] if put else x[i]
-    return [x, m, v, mean, began]
-
-
-@each_kind
-@pytest.mark.parametrize("put", [False, True])
-def test_a_step_is_what_the_docstring_says(kind: dict[str, Any], put: bool) -> None:
-    step, hyper = case(
-        (50, 3), torch.Generator().manual_seed(1), **kind, mean=True, put=put, factor=0.7, bad=3
-    )
-    for owner, names in ((step, ("param", "grad")), (hyper, ("exp_avg", "exp_avg_sq", "mean"))):
-        for name in names:
-            setattr(owner, name, getattr(owner, name).double())
-    if step.frame is not None:
-        step.frame = step.frame._replace(
-            quats=step.frame.quats.double(), scales=step.frame.scales.double()
-        )
-    expected = by_rows(step, hyper)
-    take_step(step, hyper)
-    for ours, theirs in zip(tensors(step, hyper), expected, strict=True):
-        # Sums of nine terms, which may cancel, and weights of the mean, which are float32.
-        np.testing.assert_allclose(ours.numpy(), theirs, rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -153,22 +96,12 @@ def test_a_device_steps_as_a_cpu(kind: dict[str, Any]) -> None:
     assert on_host(finite(grad, None)[0]).tolist() == [1.0, 0.0]  # where nobody counts
 
 
-@each_kind
-def test_a_factor_scales_the_step(kind: dict[str, Any]) -> None:
-    """And nothing else."""
-    still, whole, half = (stepped(**kind, factor=factor) for factor in (0.0, 1.0, 0.5))
-    torch.testing.assert_close(half[0] - still[0], 0.5 * (whole[0] - still[0]))
-    assert not torch.equal(whole[0], still[0])
-    for one, other in zip(whole[1:], half[1:], strict=True):
-        assert torch.equal(one, other)
-
-
 @pytest.mark.parametrize("value", [NAN, INF, -INF])
 def test_a_number_that_is_not_finite_costs_no_other_its_place_in_the_mean(value: float) -> None:
     """An iterate leaves its mean alone, and is not put over; a mean begins with its iterate."""
     mean, began = torch.tensor([[2.0, 2.0], [value, 2.0], [7.0, 2.0]]), torch.tensor([1.0, 1.0, 0])
     param = torch.tensor([[8.0, value], [8.0, 8.0], [8.0, 8.0]])
-    take_into_mean(3, True, param, mean, began)
+    take_into_mean(Mean(True, 3, mean, began), param)
     assert mean.tolist() == [[4.0, 2.0], [8.0, 4.0], [8.0, 8.0]]
     torch.testing.assert_close(
         param, torch.tensor([[4.0, value], [8.0, 4.0], [8.0, 8.0]]), equal_nan=True
@@ -198,7 +131,7 @@ def test_a_mean_at_16_bits_is_that_of_a_thousand_iterates(centre: float) -> None
         if number == 600:
             began[1], residue[1] = 0.0, 0
         chance = chances(x, mixed(number), 0)
-        take_into_mean(number, False, x, residue, began, GRID, chance)
+        take_into_mean(Mean(False, number, residue, began, GRID), x, chance=chance)
     for row, first in ((0, 0), (1, 599)):
         exact = torch.stack(iterates[first:]).mean(0)[row]
         off = (mean_of(x, residue)[row] - exact) / GRID
@@ -206,30 +139,8 @@ def test_a_mean_at_16_bits_is_that_of_a_thousand_iterates(centre: float) -> None
         assert abs(off.mean()) < 5 * off.std() / 2_000**0.5 + 0.1  # no drift
     assert began.tolist() == [1.0, 600.0]
     exact = torch.stack([*iterates, x.double()]).mean(0)[0]
-    take_into_mean(1_001, True, x, residue, began, GRID, chance)
+    take_into_mean(Mean(True, 1_001, residue, began, GRID), x, chance=chance)
     assert (x[0] - exact).abs().max() < 40 * GRID
-
-
-def test_what_moves_an_iterate_between_steps_leaves_its_mean_at_16_bits() -> None:
-    """A trainer that clamps after every step, from which Adam moves away again each time."""
-    x = torch.full((1, 500), 1.0)
-    residue, began = torch.zeros(1, 500, dtype=CODES), torch.zeros(1)
-    for number in range(1, 1_001):
-        x += 0.01
-        take_into_mean(number, False, x, residue, began, GRID, chances(x, mixed(number), 0))
-        x.clamp_(max=1.0)
-    assert (mean_of(x, residue) - 1.01).abs().max() < 40 * GRID
-
-
-def test_a_mean_at_16_bits_of_what_stands_still_stands_still() -> None:
-    """Also where it stands between two places: no rounding has a side."""
-    x = torch.tensor([[0.0, 1.0, 3.5 * GRID, -200.25 * GRID]]).repeat(4_000, 1)
-    residue, began = torch.zeros(4_000, 4, dtype=CODES), torch.zeros(4_000)
-    for number in range(1, 1_001):
-        take_into_mean(number, False, x, residue, began, GRID, chances(x, mixed(number), 0))
-    off = (mean_of(x, residue) - x) / GRID
-    assert not off[:, :2].any()
-    assert (off.mean(0).abs() < 5 * (off.std(0) + 1e-9) / 4_000**0.5).all()
 
 
 def test_a_mean_at_16_bits_that_is_too_far_follows_its_iterate() -> None:
@@ -238,7 +149,9 @@ def test_a_mean_at_16_bits_that_is_too_far_follows_its_iterate() -> None:
     residue, began = torch.zeros(1, 500, dtype=CODES), torch.zeros(1)
     for number in range(1, 1_001):
         x += 100 * GRID
-        take_into_mean(number, False, x, residue, began, GRID, chances(x, mixed(number), 0))
+        take_into_mean(
+            Mean(False, number, residue, began, GRID), x, chance=chances(x, mixed(number), 0)
+        )
     away = (mean_of(x, residue) - x) / GRID
     assert (away + 24_576).abs().max() <= 1
 
@@ -250,7 +163,9 @@ def test_an_iterate_without_a_place_leaves_its_mean_alone(value: float) -> None:
     residue, began = torch.zeros(1, 2, dtype=CODES), torch.zeros(1)
     for number, iterate in ((1, 1.0), (2, value), (3, 2.0)):
         x[0, 0] = iterate
-        take_into_mean(number, number == 2, x, residue, began, GRID, chances(x, mixed(number), 0))
+        take_into_mean(
+            Mean(number == 2, number, residue, began, GRID), x, chance=chances(x, mixed(number), 0)
+        )
         if number == 2:
             assert x[0, 0].isnan() if math.isnan(value) else x[0, 0] == value
             assert x[0, 1] == 1.0
@@ -267,39 +182,13 @@ def test_a_mean_at_16_bits_is_the_same_mean(put: bool) -> None:
     )
     assert hyper.mean is not None
     assert hyper2.mean is not None
-    hyper.grid = hyper2.grid = GRID
-    hyper2.mean = mean_of(step2.param, hyper2.mean)
+    hyper.mean.grid = GRID
+    hyper2.mean.tensor = mean_of(step2.param, hyper2.mean.tensor)
     take_step(step, hyper)
     take_step(step2, hyper2)
     torch.testing.assert_close(step.param, step2.param, rtol=1e-6, atol=1e-6)
-    near = mean_of(step2.param, hyper.mean) - hyper2.mean
+    near = mean_of(step2.param, hyper.mean.tensor) - hyper2.mean.tensor
     assert near.abs().max() <= GRID
-
-
-# -- which rows ------------------------------------------------------------------------------------
-
-# By Wellons' C. A resumed training repeats its events and its rounding by them.
-LOWBIAS32 = {1: 0x688990C0, 2: 0xD1132181, 2**16: 0xDCAFAE10, 2**31: 0xCC4B4124}
-LOWBIAS32 |= {0: 0, 2**32 - 1: 0x6768824A}
-
-
-def test_the_hash_is_lowbias32() -> None:
-    assert [mixed(number) for number in LOWBIAS32] == list(LOWBIAS32.values())
-    assert mixed(torch.tensor(list(LOWBIAS32))).tolist() == list(LOWBIAS32.values())
-
-
-@pytest.mark.parametrize("key", [0, 7, 2**32 - 1])
-def test_a_row_fades_where_its_number_is_below_the_share(key: int) -> None:
-    """Of a share of 0 none, of 1 all; a row's own number is not below itself."""
-
-    def chosen(share: float) -> Tensor:
-        return chosen_rows(Fade(key, share, 0.5, 0.5), 1000, CPU)
-
-    numbers = torch.tensor([(mixed(row ^ key) >> 8) / 2**24 for row in range(1000)])
-    for share in (0.0, float(numbers[7]), 1.0):
-        assert torch.equal(chosen(share), numbers < share)
-    assert not chosen(0.0).any()
-    assert chosen(1.0).all()
 
 
 # -- own frames ------------------------------------------------------------------------------------

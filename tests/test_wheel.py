@@ -156,14 +156,6 @@ def test_what_an_index_shows_leads_nowhere_wrong(wheel: Path) -> None:
     assert "Project-URL: Paper" in metadata_of(wheel)
 
 
-def test_an_index_takes_both(wheel: Path, tmp_path: Path) -> None:
-    pytest.importorskip("twine", reason="twine is not installed")
-    sdist = build(ROOT, "sdist", tmp_path)
-    command = [sys.executable, "-m", "twine", "check", "--strict", str(wheel), str(sdist)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-
-
 def test_the_command_is_installed_and_knows_its_version(
     installed: Path, wheel: Path, tmp_path: Path
 ) -> None:

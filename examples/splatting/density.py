@@ -52,7 +52,7 @@ class MCMCDensityControl:
         """Fit the stock schedule (500, 25,000, 100 of 30,000 iterations) to a run of any length.
 
         Start and stop scale with the run. The cadence does too, but stays within 20 to 100
-        iterations: Adam's first moment needs some ten updates to read_back after a move. That leaves
+        iterations: Adam's first moment needs some ten updates to settle after a move. That leaves
         a short run fewer refinements than the 244 of a stock one (61 of 1,500 iterations, enough
         for a factor of 19.6 at 5 %). Where 5 % would not reach the cap half-way between start and
         stop, the growth is raised until it does.

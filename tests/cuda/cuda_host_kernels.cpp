@@ -1,5 +1,5 @@
 // The kernels as plain functions for ctypes. Compiled once per history size and precision:
-// -D HISTORY_SIZE=K [-D IN_FLOAT64], with -I to the folder of the (possibly mutated) sources.
+// -D HISTORY_SIZE=K [-D IN_FLOAT64], with -I to the folder of the sources.
 #include "cuda_host_shim.h"
 
 #include "two_loop.cuh"

@@ -1,12 +1,9 @@
-"""NVRTC and nvcc compile the kernels for every architecture, without spills. No GPU is needed."""
+"""NVRTC compiles the kernels for every architecture, without spills. No GPU is needed."""
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import re
-import shutil
-import subprocess
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +19,11 @@ MAX_REGISTERS = 96
 SIZES = (1, 3, 4, 5)
 
 
+@pytest.fixture
+def core() -> object:
+    return pytest.importorskip("cuda.core", reason="cuda.core is not installed (extra 'cuda')")
+
+
 class Compiled(NamedTuple):
     """What ptxas said, and the PTX."""
 
@@ -29,29 +31,7 @@ class Compiled(NamedTuple):
     ptx: str
 
 
-def with_nvcc(name: str, arch: str, dtype: torch.dtype, size: int, folder: Path) -> Compiled:
-    source = folder / "kernel.cu"
-    source.write_text(cuda.source(name))
-    defines = [f"-D{key}={value}" for key, value in cuda.macros(dtype, size)]
-    command = ["nvcc", "-std=c++17", *defines, str(source), "-o"]
-    usage = subprocess.run(
-        [*command, str(folder / "k.cubin"), "-cubin", f"-arch=sm_{arch}", "-Xptxas=-v"],
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    ptx = folder / "k.ptx"
-    subprocess.run([*command, str(ptx), "-ptx", f"-arch=compute_{arch}"], check=True)
-    return Compiled(usage.stdout + usage.stderr, ptx.read_text())
-
-
-def with_nvrtc(
-    name: str,
-    arch: str,
-    dtype: torch.dtype,
-    size: int,
-    folder: Path,
-) -> Compiled:
+def compiled_for(name: str, arch: str, dtype: torch.dtype, size: int) -> Compiled:
     log = io.StringIO()
     options = {"history_size": size, "ptxas_options": ["-v"]}
     code = cuda.compile_cubin(name, dtype, f"sm_{arch}", logs=log, **options)
@@ -72,29 +52,6 @@ def nvrtc_ptx(name: str, arch: str, dtype: torch.dtype, size: int) -> str:
     ptx = b" " * length
     nvrtc.nvrtcGetPTX(program, ptx)
     return ptx.decode()
-
-
-def has_cuda_core() -> bool:
-    try:
-        return importlib.util.find_spec("cuda.core") is not None
-    except ModuleNotFoundError:
-        return False
-
-
-TOOLS = [
-    pytest.param(
-        with_nvcc,
-        id="nvcc",
-        marks=pytest.mark.skipif(shutil.which("nvcc") is None, reason="nvcc is not installed"),
-    ),
-    pytest.param(
-        with_nvrtc,
-        id="nvrtc",
-        marks=pytest.mark.skipif(
-            not has_cuda_core(), reason="cuda.core is not installed (extra 'cuda')"
-        ),
-    ),
-]
 
 
 def vector_bytes(ptx: str) -> int:
@@ -121,24 +78,20 @@ def check(compiled: Compiled, dtype: torch.dtype, vector_loads: int) -> None:
         assert re.search(r"\.f64\b", compiled.ptx) is None
 
 
-@pytest.mark.parametrize("tool", TOOLS)
 @pytest.mark.parametrize("arch", ARCHITECTURES)
-def test_float32_kernels(tool, arch: str, tmp_path: Path) -> None:
-    for size in SIZES if tool is with_nvrtc else (5,):  # nvcc takes a second for each
-        compiled = tool("lqn.cu", arch, torch.float32, size, tmp_path)
-        check(compiled, torch.float32, 2 * size)
-        check(tool("two_loop.cu", arch, torch.float32, size, tmp_path), torch.float32, 2 * size)
+def test_float32_kernels(core: object, arch: str) -> None:
+    for size in SIZES:
+        for name in ("lqn.cu", "two_loop.cu"):
+            check(compiled_for(name, arch, torch.float32, size), torch.float32, 2 * size)
 
 
-@pytest.mark.parametrize("tool", TOOLS)
-def test_float64_kernels_for_tests(tool, tmp_path: Path) -> None:
-    check(tool("lqn.cu", "80", torch.float64, 5, tmp_path), torch.float64, 20)
+def test_float64_kernels_for_tests(core: object) -> None:
+    check(compiled_for("lqn.cu", "80", torch.float64, 5), torch.float64, 20)
     # Of each vector of three coordinates two; the spare lane beside the third is not read.
-    check(tool("two_loop.cu", "80", torch.float64, 5, tmp_path), torch.float64, 10)
+    check(compiled_for("two_loop.cu", "80", torch.float64, 5), torch.float64, 10)
 
 
-@pytest.mark.skipif(not has_cuda_core(), reason="cuda.core is not installed (extra 'cuda')")
-def test_compiled_kernels_are_cached_on_disk(tmp_path: Path) -> None:
+def test_compiled_kernels_are_cached_on_disk(core: object, tmp_path: Path) -> None:
     from cuda.core.utils import FileStreamProgramCache  # pyright: ignore[reportMissingImports]
 
     compiled_now = True

@@ -48,7 +48,7 @@ def test_a_step_is_that_of_a_cpu(at: int) -> None:
         step, hyper = case(shape, torch.Generator().manual_seed(0), **options)
         if gpu:
             on_gpu(step, hyper)
-            assert triton.takes(step)
+            assert triton.takes(step, hyper)
             triton.take_step(step, hyper)
         else:
             bad = take_step(step, hyper)

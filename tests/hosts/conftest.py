@@ -1,4 +1,4 @@
-"""The scene that the trainers are tried with, and the path of the support for the CPU."""
+"""The scene that the trainers are tried with, and the path of what runs them on a CPU."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-HERE = Path(__file__).resolve().parent
-BESIDE = HERE.parents[1].parent / "shared" / "scenes" / "banana"
-sys.path.insert(0, str(HERE / "support"))
+ROOT = Path(__file__).resolve().parents[2]
+BESIDE = ROOT.parent / "shared" / "scenes" / "banana"
+sys.path.insert(0, str(ROOT / "examples/hosts/cpu"))
 
 
 @pytest.fixture(scope="session")

@@ -12,10 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import Parameter
 
-from opt3dgs_optim import Averaging, PhaseScheduler, Training
+from opt3dgs_optim import Averaging, PhaseScheduler
 from opt3dgs_optim.mean import GRIDS, places_of
 from opt3dgs_optim.moments import CODES
-from opt3dgs_optim.step import Step
 
 TOTAL, ROWS = 300, 6
 
@@ -33,17 +32,6 @@ def test_where_the_mean_begins_and_where_it_is_put(total: int) -> None:
     start, put = Averaging.start(total), Averaging.put_from(total)
     assert total - start == int(1 / 30 * total)
     assert total - put == min(total - start, max(2, int((total - start) / 10)))
-
-
-@pytest.mark.parametrize(
-    ("iteration", "mean"),
-    [(289, None), (290, False), (297, False), (298, True), (300, None)],
-)
-def test_what_it_says_of_a_step(iteration: int, mean: bool | None) -> None:
-    """Whether the iterate goes into the mean, and whether the mean is put."""
-    step = Step(torch.zeros(1), torch.zeros(1), "means", "", {}, {}, iteration, iteration - 1)
-    Averaging().plan(step, Training([], TOTAL))
-    assert step.put is mean
 
 
 @settings(max_examples=20)
@@ -95,36 +83,6 @@ def test_the_line_is_not_said_after_an_early_finish(caplog: Any) -> None:
         steps(optimizers, params, TOTAL)
     assert "averaging.mean" not in optimizers["sh0"].state[params["sh0"]]
     assert not any("are the mean" in record.getMessage() for record in caplog.records)
-
-
-def test_until_the_mean_is_put_nothing_is_changed() -> None:
-    ends = []
-    for parts in ([Averaging()], []):
-        params = parameters(ROWS, "sh0")
-        optimizers = PhaseScheduler(TOTAL, parts=parts).upgrade(adams_of(params))
-        steps(optimizers, params, Averaging.put_from(TOTAL))
-        ends.append(params["sh0"].detach().clone())
-    assert torch.equal(*ends)
-
-
-@pytest.mark.parametrize("moments", [32, 16])
-@pytest.mark.parametrize("inria", [False, True])
-def test_an_edit_of_rows_in_the_last_thirtieth(inria: bool, moments: Any) -> None:
-    """gsplat's family edits every tensor: other rows are spared. INRIA's: all begin anew."""
-    params = parameters(ROWS, "sh0")
-
-    def edit(optimizer: Any) -> None:
-        gone = row_edits.removed(torch.tensor([1]))
-        row_edits.apply(gone, params, [optimizer], ["sh0"], inria)
-
-    phases = PhaseScheduler(TOTAL, parts=[Averaging()], moments=moments)
-    optimizer = phases.upgrade(adam_of(params))
-    for iteration in range(296):
-        if iteration == 295:
-            edit(optimizer)
-        steps({"all": optimizer}, params, 1, seed=iteration)
-    began = optimizer.state[params["sh0"]]["averaging.began"]
-    assert began.tolist() == [296.0 if inria else 291.0] * (ROWS - 1)  # steps
 
 
 @pytest.mark.parametrize("moments", [32, 16])
@@ -234,39 +192,6 @@ def test_new_rows_begin_with_their_first_iterate(between: int, moments: Any) -> 
     assert away[:ROWS].abs().min() > 1
 
 
-def test_rows_moved_in_place_end_where_they_were_put() -> None:
-    params = {"means": Parameter(torch.zeros(4, 3))}
-    goal = torch.zeros(4, 3)
-    optimizer = PhaseScheduler(TOTAL, parts=[Averaging()]).upgrade(adam_of(params))
-    for iteration in range(TOTAL):
-        if iteration == 295:
-            params["means"].data[0] = goal[0] = torch.full((3,), 10.0)
-            optimizer.reset_rows(params["means"], torch.tensor([0]))
-        params["means"].grad = params["means"].detach() - goal
-        optimizer.step()
-    assert torch.allclose(params["means"], goal, atol=0.05)
-
-
-@pytest.mark.parametrize(("name", "moments"), [("means", 32), ("scales", 32), ("scales", 16)])
-@pytest.mark.parametrize("when", [291, 294, 297])
-def test_iterates_that_are_not_finite_stay_out_of_the_mean(
-    when: int, name: str, moments: Any
-) -> None:
-    """A number becomes NaN in the last thirtieth, and the trainer repairs it."""
-    params = {name: Parameter(torch.full((4, 3), 5.0))}
-    phases = PhaseScheduler(TOTAL, parts=[Averaging()], moments=moments)
-    optimizer = phases.upgrade(adam_of(params))
-    optimizer.param_groups[0]["lr"] = 1e-4
-    for iteration in range(TOTAL):
-        if iteration == when:
-            params[name].data[0, 1] = torch.nan
-        if iteration == when + 2:
-            params[name].data[0, 1] = 5.0
-        params[name].grad = torch.ones(4, 3)
-        optimizer.step()
-    assert bool(((params[name] - 5.0).abs() < 0.05).all())
-
-
 def test_it_costs_nothing_before_the_last_thirtieth() -> None:
     params = parameters(ROWS, "sh0")
     optimizers = PhaseScheduler(TOTAL, parts=[Averaging()]).upgrade(adams_of(params))
@@ -274,38 +199,6 @@ def test_it_costs_nothing_before_the_last_thirtieth() -> None:
     assert set(optimizers["sh0"].state[params["sh0"]]) == {"step", "exp_avg", "exp_avg_sq"}
     steps(optimizers, params, 1)
     assert optimizers["sh0"].state[params["sh0"]]["averaging.began"].shape == (ROWS,)
-
-
-def test_finish_takes_the_mean_early_and_averages_no_more() -> None:
-    params = parameters(ROWS, "sh0")
-    phases = PhaseScheduler(TOTAL, parts=[Averaging()])
-    optimizers = phases.upgrade(adams_of(params))
-    steps(optimizers, params, 294)
-    mean = optimizers["sh0"].state[params["sh0"]]["averaging.mean"].clone()
-    assert not torch.equal(params["sh0"], mean)
-    phases.finish()
-    assert torch.equal(params["sh0"], mean)
-    with pytest.warns(UserWarning, match="comes after finish"):
-        steps(optimizers, params, 6)
-    assert not torch.equal(params["sh0"], optimizers["sh0"].state[params["sh0"]]["averaging.mean"])
-
-
-def test_the_mean_is_of_the_steps_that_were_made() -> None:
-    """taming-3dgs steps its harmonics in every 16th iteration: each of those counts alike."""
-    params = parameters(ROWS, "means", "shN")
-    often, seldom = adam_of({"means": params["means"]}), adam_of({"shN": params["shN"]})
-    PhaseScheduler(3000, parts=[Averaging()]).upgrade([often, seldom])
-    iterates = []
-    for iteration in range(2985):
-        params["means"].grad = torch.ones_like(params["means"])
-        often.step()
-        if iteration % 16 == 15:
-            params["shN"].grad = torch.ones_like(params["shN"])
-            seldom.step()
-            if iteration >= 2900:
-                iterates.append(params["shN"].detach().clone())
-    mean = seldom.state[params["shN"]]["averaging.mean"]
-    torch.testing.assert_close(mean, torch.stack(iterates).mean(0))
 
 
 def test_rows_that_gsplat_teleports_forget_where_they_were() -> None:

@@ -6,8 +6,7 @@ import itertools
 
 import pytest
 import torch
-from gaussians import adams_of, parameters, steps
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from torch.nn import Parameter
 from torch.optim import Adam
@@ -34,14 +33,6 @@ def test_a_share_of_the_points_is_chosen(event: int, seed: int, share: float) ->
         assert abs(both - share**2) < 0.03
 
 
-@given(event=st.integers(0, 10_000), few=st.integers(0, 500), more=st.integers(0, 500))
-def test_a_points_fate_does_not_depend_on_how_many_there_are(
-    event: int, few: int, more: int
-) -> None:
-    part = Fading()
-    assert torch.equal(part.chosen(event, few, CPU), part.chosen(event, few + more, CPU)[:few])
-
-
 @given(
     total=st.integers(1, 50_000),
     events=st.integers(1, 5_000),
@@ -63,13 +54,6 @@ def test_events_are_in_their_stretch_and_four_iterations_apart(
     assert all(b - a <= 1 for a, b in zip(counts, counts[3:], strict=False))
 
 
-@settings(max_examples=20)
-@given(count=st.integers(1, 2_000_000))
-def test_of_more_than_ten_thousand_points_some_events_happen(count: int) -> None:
-    happened = sum(Fading().happens(event, count) for event in range(300))
-    assert happened == int(300 * max(min(1.0, 10_000 / count) ** (2 / 3), 1 / 3))
-
-
 @pytest.mark.parametrize(
     ("steps_of_run", "points", "times"),
     [
@@ -84,37 +68,6 @@ def test_of_more_than_ten_thousand_points_some_events_happen(count: int) -> None
 def test_how_many_events_a_run_has(steps_of_run: int, points: int, times: int) -> None:
     """A third where points are many. In 600 iterations, 4 apart in 67 % of them."""
     assert Fading().num_events(steps_of_run, points) == times
-
-
-def test_from_ten_thousand_and_one_points_on_the_first_event_does_not_happen() -> None:
-    assert Fading().happens(0, 10_000)
-    assert not Fading().happens(0, 10_001)
-
-
-def test_every_event_fades_once_and_the_log_says_when() -> None:
-    """Events at the 24th, 32nd, 40th and 48th of 64 steps: the end of each quarter of the stretch.
-
-    The gradient is zero from the second step on, so that moments change by their decay and events.
-    """
-    param = Parameter(torch.zeros(100, 1))
-    part = Fading(0.4, 0.5, 0.25, events=4, start=0.25, stop=0.75, names=("scales",))
-    phases = PhaseScheduler(64, parts=[part])
-    optimizer = phases.upgrade(
-        Adam([{"params": [param], "name": "scales"}], lr=1.0, betas=(0.5, 0.5))
-    )
-    before, event = {"exp_avg": torch.zeros(100), "exp_avg_sq": torch.zeros(100)}, 0
-    for step in range(1, 65):
-        param.grad = torch.full((100, 1), float(step == 1))
-        optimizer.step()
-        faded = torch.zeros(100, dtype=torch.bool)
-        if step in (24, 32, 40, 48):
-            faded, event = part.chosen(event, 100, CPU), event + 1
-        assert phases.numbers() == {"faded": 0.4 if step in (24, 32, 40, 48) else 0.0}
-        for (name, was), factor in zip(before.items(), (0.5, 0.25), strict=True):
-            now = optimizer.state[param][name].flatten().clone()
-            if step > 1:
-                assert torch.equal(now, was * torch.where(faded, factor, 1.0) * 0.5), step
-            before[name] = now
 
 
 def test_a_faded_step_is_as_long_as_before_then_up_to_five_times() -> None:
@@ -135,23 +88,6 @@ def test_a_faded_step_is_as_long_as_before_then_up_to_five_times() -> None:
     assert torch.equal(faded, part.chosen(0, 1000, CPU))
     assert max(float(each.amax()) for each in lengths) <= 5.0
     assert max(float(each.amax()) for each in lengths) > 3.0
-
-
-def test_all_parameters_fade_the_same_points() -> None:
-    params = parameters(500)
-    part = Fading()
-    optimizers = PhaseScheduler(100, parts=[part]).upgrade(adams_of(params))
-    steps(optimizers, params, next(i for i in range(100) if part.events_before(i + 1, 100)))
-    before = {n: optimizers[n].state[p]["exp_avg_sq"].clone() for n, p in params.items()}
-    for param in params.values():
-        param.grad = torch.zeros_like(param)
-    rows = set()
-    for optimizer in optimizers.values():
-        optimizer.step()
-    for name, param in params.items():
-        now = optimizers[name].state[param]["exp_avg_sq"]
-        rows.add(tuple((now < 0.5 * before[name]).reshape(500, -1).all(1).tolist()))
-    assert rows == {tuple(part.chosen(0, 500, CPU).tolist())}
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""`EnergyHistogram`: what it promises of nu, as a part of a training, saved and on a device."""
+"""`EnergyHistogram` and its partitions: against loops, on scripted energies, in a training."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ import json
 import math
 import pickle
 import re
-import warnings
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from oracles import LoopHistogram, MovingHistogram
 
-from opt3dgs_optim import EnergyHistogram, Phase, PhaseScheduler, Training
+from opt3dgs_optim import EnergyHistogram, PhaseScheduler, Training
+from opt3dgs_optim.parts.partitions import FLOOR, MEAN_ABS, FixedPartitions, MovingPartitions
 from opt3dgs_optim.step import Step
 
 FIXED: dict[str, Any] = {"energy_range": (0.0, 1.0), "temperature": 0.05, "warmup": 4}
@@ -32,7 +34,245 @@ def nus_of(histogram: EnergyHistogram, energies: Any) -> np.ndarray:
     return np.array([float(histogram.observe(energy)) for energy in energies])
 
 
-# -- nu --------------------------------------------------------------------------------------------
+# -- the paper's partitions, and the default's, by themselves --------------------------------------
+
+
+def fixed(
+    num_partitions: int = 8, ends: tuple[float, float] = (0.0, 1.0), **options: Any
+) -> FixedPartitions:
+    made = FixedPartitions(num_partitions, ends, **{"zeta": 0.75, "tau": 0.05, **options})
+    made.place(torch.device("cpu"), torch.float64)
+    return made
+
+
+def moving(dtype: torch.dtype = torch.float64, zeta: float = 0.75) -> MovingPartitions:
+    made = MovingPartitions(48, zeta)
+    made.place(torch.device("cpu"), dtype)
+    return made
+
+
+def take(partitions: Any, energy: float, count: int) -> float:
+    """Nu, unclamped, and the update, as `EnergyHistogram` has them made."""
+    like: Any = {"dtype": partitions.state.dtype}
+    value, number = torch.tensor(energy, **like), torch.tensor(float(count), **like)
+    found = partitions.take(value, torch.tensor(True), number)
+    assert found.shape == ()
+    return float(found)
+
+
+def taken(partitions: Any, energies: Any) -> list[float]:
+    return [take(partitions, float(energy), k) for k, energy in enumerate(energies, 1)]
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(st.one_of(st.floats(-2.0, 3.0), st.integers(0, 8).map(lambda i: i / 8)), max_size=40),
+    st.sampled_from([0.0, 0.5, 0.75, 1.0]),
+)
+def test_the_papers_update_is_its_loops(energies: list[float], zeta: float) -> None:
+    """Eighths lie exactly on the edges."""
+    partitions, oracle = fixed(zeta=zeta), LoopHistogram(8, (0.0, 1.0), zeta, 0.05, 0, None)
+    expected = [oracle.observe(energy) for energy in energies]
+    assert taken(partitions, energies) == pytest.approx(expected, rel=1e-9, abs=1e-9)
+    # 40 float64 updates of well-scaled numbers
+    assert partitions.weights.tolist() == pytest.approx(oracle.theta, rel=1e-12)
+
+
+@pytest.mark.parametrize("seen", [0, 1, 1000, 100_000])
+def test_the_step_size_decays(seen: int) -> None:
+    """lambda = min(1e-2, 10 / (k^0.8 + 100)), seen on the weights of four partitions."""
+    partitions = fixed(4)
+    take(partitions, 0.3, seen + 1)
+    rate = min(1e-2, 10 / (seen**0.8 + 100)) * 0.25**0.75
+    expected = [0.25 + rate * ((k == 1) - 0.25) for k in range(4)]
+    assert partitions.weights.tolist() == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_weight_below_the_floor_is_lifted() -> None:
+    partitions = fixed(10)
+    partitions.state = torch.tensor([1e-300, *[1 / 9] * 9], dtype=torch.float64)
+    take(partitions, 0.95, 1)
+    assert float(partitions.weights[0]) == pytest.approx(FLOOR, rel=1e-6)
+    assert float(partitions.weights.sum()) == pytest.approx(1.0, abs=1e-15)
+
+
+def test_theta_estimates_the_density_to_a_power() -> None:
+    """theta -> p^(1 / (1 - zeta)), not the cumulative density as the paper's text says."""
+    partitions = fixed(4, (0.0, 4.0), zeta=0.5, tau=1.0)
+    p = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
+    generator = torch.Generator().manual_seed(1)
+    draws = torch.multinomial(p, 4_000, replacement=True, generator=generator)
+    mean = torch.zeros(4, dtype=torch.float64)
+    for k, j in enumerate(draws.tolist(), 1):
+        take(partitions, j + 0.5, k)
+        mean += partitions.weights / 2_500 * (k > 1_500)
+    # 1 / (1 - .5) = 2; deviation of the time average over 2,500 correlated draws: about 0.02.
+    assert torch.allclose(mean, p**2 / (p**2).sum(), atol=0.05)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    # Not within 1e-20 of zero: a deviation below 1e-30 is that, here.
+    st.lists(st.floats(-2.0, 3.0).map(lambda e: round(e, 20)), min_size=1, max_size=40)
+)
+def test_the_default_is_its_loops(energies: list[float]) -> None:
+    partitions, oracle = moving(), MovingHistogram(0, None)
+    expected = [oracle.observe(energy) for energy in energies]
+    # Rounding, over slopes of up to 1 / 0.4^2 per deviation.
+    assert taken(partitions, energies) == pytest.approx(expected, abs=1e-9)
+    mean, deviation = partitions.state[:2].tolist()
+    deviation /= MEAN_ABS
+    assert deviation == pytest.approx(oracle.deviation, rel=1e-9, abs=1e-15)
+    assert mean == pytest.approx(oracle.mean, rel=1e-9, abs=1e-8 * deviation)
+
+
+def test_the_default_is_its_loops_when_it_forgets() -> None:
+    """After a hundred energies the oldest weigh less and less."""
+    oracle = MovingHistogram(0, None)
+    expected = [oracle.observe(energy) for energy in stream(300)]
+    assert taken(partitions := moving(), stream(300)) == pytest.approx(expected, abs=1e-9)
+    assert partitions.state[3:].tolist() == pytest.approx(oracle.q.tolist(), abs=1e-12)
+
+
+def test_theta_is_a_power_of_the_density_and_an_even_share() -> None:
+    """Theta = q^(1 / (1 - zeta)), and nu does not depend on that exponent."""
+    flat, steep = moving(zeta=0.5), moving(zeta=0.75)
+    assert taken(flat, stream(60)) == taken(steep, stream(60))
+    q = 0.95 * steep.state[3:] + 0.05 / 48
+    torch.testing.assert_close(steep.weights, q**4 / (q**4).sum(), rtol=1e-9, atol=0)
+    torch.testing.assert_close(flat.weights, q**2 / (q**2).sum(), rtol=1e-9, atol=0)
+
+
+DIGITS = np.random.default_rng(2)
+NARROW = {
+    "stationary": DIGITS.normal(0.5, 0.1, 200),
+    "falling": np.exp(-np.arange(200) / 50 + 0.1 * DIGITS.normal(size=200)),
+    "negative": DIGITS.normal(-5, 0.3, 200),
+    "few digits": np.round(DIGITS.normal(0.5, 0.1, 200), 2),
+    "spike at once": np.r_[300, 1, DIGITS.normal(0.5, 0.1, 198)],
+    "spike after three alike": np.r_[0.5, 0.5, 0.5, 300, DIGITS.normal(0.5, 0.1, 196)],
+}
+
+
+@pytest.mark.parametrize("name", NARROW)
+def test_float32_of_a_device_has_its_digits(name: str) -> None:
+    energies = torch.tensor(NARROW[name], dtype=torch.float32)  # the same numbers for both
+    found, expected = (taken(moving(dtype), energies) for dtype in (torch.float32, torch.float64))
+    # Exponents of up to 100 in float32, before softmax takes the largest away: 6e-6.
+    assert found == pytest.approx(expected, abs=2e-5)
+
+
+# -- scripted energies with known answers ----------------------------------------------------------
+
+
+COUNT, FIRST = 1_000, 250
+K = np.arange(COUNT)
+RANDOM = np.random.default_rng(1)
+Z, HEAVY = RANDOM.normal(size=COUNT), RANDOM.standard_t(2, size=COUNT)
+VIEWS = RANDOM.normal(size=40)[RANDOM.permuted(np.tile(np.arange(40), (25, 1)), axis=1).ravel()]
+FALL = 10 ** (-4 * K / 3_000)
+
+
+def spiked(at: int) -> np.ndarray:
+    """One energy 1,000 deviations off."""
+    energies = 5 + 0.3 * Z
+    energies[at] += 300
+    return energies
+
+
+# name: (energies, bounds of nu's mean, bounds of its deviation), from the 250th energy on. By
+# design they are 1 and 1/2 for a Gaussian, which 750 draws and a memory of 100 know to 0.05. The
+# deviation that a jump leaves is forgotten by a hundredth an energy, and nu is nearer to 1 so long.
+SCRIPTS: dict[str, tuple[np.ndarray, tuple[float, float], tuple[float, float]]] = {
+    "stationary": (5 + 0.3 * Z, (0.95, 1.05), (0.4, 0.6)),
+    "falls by a decade": (FALL * np.exp(0.2 * Z), (0.95, 1.05), (0.3, 0.6)),
+    "falls, views": (FALL * (1 + 0.2 * VIEWS), (0.95, 1.05), (0.3, 0.6)),
+    "falls without noise": (FALL, (0.95, 1.05), (0.0, 0.1)),
+    "falls fast, then noise": (np.exp(-K / 30) + 0.1 + 0.01 * Z, (0.95, 1.1), (0.35, 0.6)),
+    "a few views": (0.1 + 0.02 * VIEWS, (0.95, 1.05), (0.35, 0.65)),
+    "heavy tails": (1 + 0.1 * HEAVY, (0.95, 1.05), (0.4, 0.65)),
+    "skewed": (np.exp(Z), (0.95, 1.05), (0.35, 0.6)),
+    "down by 100 deviations": (50 + 0.3 * Z - 30 * (K > 600), (0.95, 1.1), (0.3, 0.6)),
+    "a spike at once": (spiked(0), (0.95, 1.05), (0.4, 0.6)),
+    "a spike while measuring": (spiked(60), (0.95, 1.05), (0.4, 0.6)),
+    "a spike later": (spiked(500), (0.95, 1.05), (0.4, 0.6)),
+    "far from zero": (1e8 + 0.3 * Z, (0.95, 1.05), (0.4, 0.6)),
+}
+
+
+def run(energies: np.ndarray, **options: object) -> tuple[np.ndarray, EnergyHistogram]:
+    histogram = EnergyHistogram(**options)  # pyright: ignore[reportArgumentType]
+    nus = [float(histogram.observe(energy)) for energy in energies.tolist()]
+    return np.array(nus[FIRST:]), histogram
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_scripted_energies(name: str) -> None:
+    energies, mean, deviation = SCRIPTS[name]
+    nus, histogram = run(energies)
+    assert mean[0] <= nus.mean() <= mean[1]
+    assert deviation[0] <= nus.std() <= deviation[1]
+    assert ((nus <= -1) | (nus >= 3)).mean() < 0.01
+    assert float(histogram.weights.sum()) == pytest.approx(1.0)
+    assert float(histogram.weights.min()) > 0
+
+
+def test_two_deviations_out_nu_is_one_off() -> None:
+    """nu - 1 = -z / 2 on a stationary Gaussian energy."""
+    nus, histogram = run(0.3 + 0.02 * Z)
+    slope, _ = np.polyfit(Z[FIRST:], nus, 1)
+    assert slope == pytest.approx(-0.5, rel=0.2)
+    # Mean and deviation of about 100 energies: known to 10 and 7 %.
+    mean, deviation = histogram._partitions.state[:2].tolist()
+    assert mean == pytest.approx(0.3, abs=0.01)
+    assert deviation / MEAN_ABS == pytest.approx(0.02, rel=0.35)
+
+
+@pytest.mark.parametrize("unit", [2.0**-40, 2.0**40])
+def test_the_unit_does_not_matter(unit: float) -> None:
+    """A loss scaled by 1e-12 or 1e12."""
+    energies = 5 + 0.3 * Z[:400]
+    np.testing.assert_array_equal(run(energies * unit)[0], run(energies)[0])
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-30, 0.25, 1e30, -3.0])
+def test_a_constant_energy_gives_one(value: float) -> None:
+    nus, _ = run(np.full(300, value))
+    np.testing.assert_allclose(nus, 1.0, rtol=0, atol=1e-12)
+
+
+def test_an_energy_that_begins_to_vary_is_followed() -> None:
+    """Exactly constant for 300 energies, as when a training renders nothing yet."""
+    nus, _ = run(np.where(K < 300, 0.25, 0.25 + 0.01 * Z))
+    np.testing.assert_allclose(nus[:50], 1.0, rtol=0, atol=1e-12)
+    late = nus[400:]
+    assert 0.9 < late.mean() < 1.1
+    assert 0.3 < late.std() < 0.6
+
+
+@pytest.mark.parametrize("far", [-1e300, -1e12, 1e12, 1e300])
+@pytest.mark.parametrize("make", [EnergyHistogram, EnergyHistogram.paper])
+def test_energies_that_are_far_off(make: type[EnergyHistogram], far: float) -> None:
+    """The end partitions are open: nu is near 1 there, and the weights stay weights."""
+    histogram = make(warmup=20)
+    for k in range(60):
+        histogram.observe(0.1 + 0.01 * math.sin(k * k))
+    assert float(histogram.observe(far)) == pytest.approx(1.0, abs=0.3)
+    for _ in range(60):
+        assert math.isfinite(float(histogram.observe(far)))
+    assert abs(float(histogram.weights.sum()) - 1) < 1e-12
+    assert float(histogram.weights.min()) > 0
+    assert math.isfinite(float(histogram.observe(0.1)))
+
+
+@pytest.mark.parametrize("first", [[], [0.3, 0.3 - 1e-6, 0.25], [0.25, 0.2501, 0.3], [9, 9, 0.2]])
+def test_the_first_energies_do_not_own_the_multiplier(first: list[float]) -> None:
+    """The slope of an energy whose deviation is not known yet has no bound."""
+    nus, _ = run(np.r_[first, 0.2 + 0.02 * Z[:400]])
+    assert abs(nus[:150].mean() - 1) < 0.15
+
+
+# -- what it says of nu ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("clamp", [None, (0.9, 1.1)])
@@ -74,13 +314,6 @@ def test_the_papers_settings() -> None:
     assert EnergyHistogram.paper(zeta=0.5).zeta == 0.5
 
 
-def test_the_defaults_settings() -> None:
-    histogram = EnergyHistogram()
-    assert (histogram.num_partitions, histogram.zeta, histogram.warmup) == (48, 0.75, 250)
-    assert histogram.clamp == (-1.0, 3.0)
-    assert EnergyHistogram(energy_range=(0.0, 1.0), temperature=0.1).num_partitions == 200
-
-
 # -- in a training ---------------------------------------------------------------------------------
 
 
@@ -109,18 +342,6 @@ def test_it_scales_the_steps_until_the_switch_and_then_looks_no_more() -> None:
     assert learnt[-1] == learnt[20]  # the first loss after the switch comes before its step
 
 
-def test_without_energies_it_says_so_once_and_nu_is_one() -> None:
-    x, adam, _ = upgraded(EnergyHistogram())
-    x.grad = torch.ones(4, 3)
-    adam.step()  # an energy may come after it
-    with pytest.warns(UserWarning, match=r"no energy has been observed.*call phases\.observe"):
-        adam.step()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        adam.step()
-    assert float(x.detach()[0, 0]) == pytest.approx(-0.3, rel=1e-4)
-
-
 @KINDS
 def test_on_a_device_nu_stays_there(options: dict[str, Any]) -> None:
     """On torch's device without memory whatever reads a number raises; it moves there first."""
@@ -134,15 +355,6 @@ def test_on_a_device_nu_stays_there(options: dict[str, Any]) -> None:
         assert (each.device.type, each.dtype, each.shape) == ("meta", torch.float32, ())
     histogram.num_observed = 1_000
     assert histogram.numbers(training)["nu"] is nu
-
-
-def test_on_a_cpu_the_factor_is_a_float_that_multiplies() -> None:
-    histogram, training = EnergyHistogram(warmup=4), Training([], 10)
-    nus_of(histogram, stream(20))
-    step = Step(torch.zeros(1), torch.zeros(1), "means", "", {}, {}, 0, -1, factor=2.0)
-    histogram.plan(step, training)
-    assert type(step.factor) is float
-    assert step.factor == 2.0 * float(histogram.multiplier)
 
 
 class Elsewhere(torch.Tensor):
@@ -234,16 +446,6 @@ def test_under_a_longer_warm_up_nu_is_one_until_it_is_over(left: int) -> None:
     assert 1.0 not in nus[left:]
 
 
-def test_a_variance_that_rounding_makes_negative_is_zero() -> None:
-    """As where nu lies at its clamp all the time."""
-    histogram = EnergyHistogram()
-    nus_of(histogram, stream(10))
-    state = histogram.state_dict()
-    state["learnt"][2:5] = 3.0, 3 * 0.7, 3 * 0.7**2 - 1e-15  # of nu^0, nu and nu^2
-    histogram.load_state_dict(state)
-    assert float(histogram.multiplier_std) == 0.0
-
-
 def changed(state: dict[str, Any], place: int, value: Any) -> dict[str, Any]:
     learnt = [*state["learnt"]]
     learnt[place] = value
@@ -270,26 +472,6 @@ def test_what_does_not_fit_is_refused_and_nothing_changed(options: dict[str, Any
 
 
 # -- options ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {**FIXED, "num_partitions": 3},
-        {**FIXED, "zeta": 0.0},
-        {**FIXED, "zeta": 1.0},
-        {**FIXED, "temperature": 0.0},
-        {**FIXED, "warmup": 0, "clamp": (1.0, 1.0 + 1e-9)},
-        {"num_partitions": 24, "clamp": (0.5, 1.0)},
-        {"warmup": 4},
-        {"zeta": 0.01},
-    ],
-    ids=str,
-)
-def test_the_ends_of_what_is_allowed_work(options: dict[str, Any]) -> None:
-    histogram = EnergyHistogram(**options)
-    assert np.isfinite(nus_of(histogram, stream(30))).all()
-    assert float(histogram.weights.sum()) == pytest.approx(1.0, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -332,11 +514,3 @@ def test_says_what_it_is() -> None:
     nus_of(histogram, stream(10))
     assert re.search(r": nu [-\d.]+, mean [\d.]+ \+- [\d.]+$", repr(histogram))
     assert "energy_range=(0.0, 0.2), temperature=0.002" in repr(EnergyHistogram.paper())
-
-
-def test_it_acts_while_exploring_and_serves_one_training() -> None:
-    histogram = EnergyHistogram()
-    assert (histogram.during, histogram.learns) == (Phase.EXPLORATION, True)
-    Training([histogram])
-    with pytest.raises(ValueError, match="serves another training"):
-        Training([histogram])

@@ -14,7 +14,7 @@ from torch.nn import Parameter
 
 from opt3dgs_optim import Annealing, IsotropicNoise, Phase, PhaseScheduler, PositionNoise
 from opt3dgs_optim.names import GAUSSIAN
-from opt3dgs_optim.parts.noise import GATE_OPACITY, GATE_SHARPNESS, covariance_noise
+from opt3dgs_optim.parts.noise import covariance_noise
 
 
 def gaussians(n: int, seed: int = 0) -> dict[str, Tensor]:
@@ -50,17 +50,6 @@ def test_is_gate_times_covariance_times_eta() -> None:
         np.testing.assert_allclose(noise[i], gate * sigma @ eta[i].numpy(), rtol=1e-9, atol=1e-13)
 
 
-def test_gate_is_the_trainers_op_sigmoid() -> None:
-    """op_sigmoid(1 - o, k=100, x0=0.995) of 3dgs-mcmc, and its noise_lr."""
-    opacity = torch.tensor([0.0005, 0.005, 0.05, 0.9], dtype=torch.float64)
-    ones = torch.ones(4, 3, dtype=torch.float64)
-    quats = torch.tensor([[1.0, 0, 0, 0]] * 4, dtype=torch.float64)
-    noise = covariance_noise(0 * ones, quats, opacity.logit(), ones)[:, 0]
-    expected = 1 / (1 + torch.exp(-100 * ((1 - opacity) - 0.995)))
-    torch.testing.assert_close(noise, expected, rtol=1e-9, atol=1e-15)
-    assert (PositionNoise().scale, GATE_SHARPNESS, GATE_OPACITY) == (5e5, 100.0, 0.005)
-
-
 def test_opacities_may_have_a_second_dimension() -> None:
     g, eta = gaussians(5), torch.ones(5, 3, dtype=torch.float64)
     flat = covariance_noise(g["scales"], g["quats"], g["opacities"], eta)
@@ -80,21 +69,6 @@ def test_rows_of_nonsense_do_not_move_and_move_no_other() -> None:
 # -- what is added ---------------------------------------------------------------------------------
 
 
-def test_added_noise_has_the_covariance_squared() -> None:
-    """Cov(gate Sigma eta) = gate^2 Sigma^2, times (lr scale)^2."""
-    n = 20_000
-    one = {key: value[:1].expand(n, *value.shape[1:]) for key, value in gaussians(1, 3).items()}
-    one["opacities"] = torch.full((n,), -12.0, dtype=torch.float64)
-    means = zeros(n)
-    torch.manual_seed(0)  # by default torch's own generator
-    PositionNoise(one, scale=20.0).add_to(means, 0.05)
-    sigma = covariance(one["scales"][0].numpy(), one["quats"][0].numpy())
-    gate = 1 / (1 + np.exp(100 * (1 / (1 + np.exp(12.0)) - 0.005)))
-    expected = gate**2 * sigma @ sigma
-    # relative standard error of a second moment from 20,000 draws: 1 %
-    np.testing.assert_allclose(np.cov(means.numpy().T), expected, atol=0.05 * expected.max())
-
-
 def test_added_noise_is_scale_times_learning_rate_times_the_draw() -> None:
     g = gaussians(7)
     start = torch.randn(7, 3, generator=draw(1), dtype=torch.float64)
@@ -103,16 +77,6 @@ def test_added_noise_is_scale_times_learning_rate_times_the_draw() -> None:
     eta = torch.randn(7, 3, generator=draw(), dtype=torch.float64)
     expected = start + 0.25 * 0.05 * covariance_noise(**g, eta=eta)
     torch.testing.assert_close(means, expected, rtol=1e-12, atol=1e-15)
-
-
-def test_the_trainers_dict_is_read_anew() -> None:
-    g = gaussians(4)
-    noise = PositionNoise(g, scale=1.0)
-    g.update(gaussians(6))
-    noise.add_to(means := zeros(6), 1.0)
-    PositionNoise(lambda: g, scale=1.0).add_to(others := zeros(6), 1.0)
-    assert bool(means.any())
-    assert bool(others.any())
 
 
 @pytest.mark.parametrize("rows", [1, 3, 5])
@@ -202,15 +166,6 @@ def test_its_size_goes_by_the_trainers_rate_without_any_factor() -> None:
     others = {name: splats[name].detach() for name in ("scales", "quats", "opacities")}
     expected = 2.0 * 0.03 * covariance_noise(**others, eta=eta)
     torch.testing.assert_close(moved(splats, adams), expected, rtol=1e-4, atol=1e-6)
-
-
-def test_it_follows_an_edit_of_the_rows() -> None:
-    splats = dim()
-    _, adams = upgraded(splats, PositionNoise(scale=1.0))
-    for name in list(splats):
-        splats[name] = Parameter(splats[name].detach()[:5])
-        adams[name].param_groups[0]["params"] = [splats[name]]
-    assert moved(splats, adams).shape == (5, 3)
 
 
 def test_without_the_other_tensors_it_says_which() -> None:

@@ -10,53 +10,12 @@ from typing import Any
 import pytest
 import torch
 from gaussians import adams_of, parameters, same_tensors
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch.nn import Parameter
 
 from opt3dgs_optim import OutOfView, PhaseScheduler
 
 TOTAL = 30_000
 NAMES = ("means", "scales", "opacities")
-
-
-def train(
-    part: bool,
-    seen_share: float,
-    iterations: int,
-    *,
-    rows: int = 200,
-    pull: float = 1e-3,
-    frozen: int = 0,
-    emptied_at: int = -1,
-) -> tuple[dict[str, Any], PhaseScheduler]:
-    """Each view sees a share of the points; regularisers pull at all scales and opacities."""
-    params: dict[str, Any] = parameters(rows, *NAMES)
-    phases = PhaseScheduler(TOTAL, parts=[OutOfView()] if part else [])
-    optimizers = phases.upgrade(adams_of(params))
-    generator = torch.Generator().manual_seed(0)
-    for iteration in range(iterations):
-        seen = (torch.rand(rows, generator=generator) < seen_share).float()
-        for name, param in params.items():
-            grad = torch.randn(param.shape, generator=generator)
-            grad = grad * seen.reshape(-1, *[1] * (grad.dim() - 1))
-            param.grad = grad + (0.0 if name == "means" else pull)
-        params["means"].grad[:frozen] = 0.0
-        if iteration == emptied_at:  # as relocation and fading do it
-            for name in ("scales", "opacities"):
-                optimizers[name].state[params[name]]["exp_avg_sq"].zero_()
-        for optimizer in optimizers.values():
-            optimizer.step()
-    return params, phases
-
-
-@settings(max_examples=4)
-@given(share=st.floats(0.45, 1.0))
-def test_where_views_see_more_than_a_third_nothing_is_changed(share: float) -> None:
-    ours, phases = train(True, share, 200)
-    theirs, _ = train(False, share, 200)
-    assert same_tensors(ours, theirs)
-    assert phases.numbers()["visible_share"] > 1 / 3
 
 
 def scene(rows: int) -> tuple[dict[str, Parameter], dict[str, Any], PhaseScheduler]:
@@ -116,24 +75,6 @@ def test_looks_keep_step_with_no_order_of_views() -> None:
             assert 0.1 < sum(i % cameras == camera for i in looks) / views < 0.4
 
 
-@pytest.mark.parametrize("share", [0.02, 0.1, 0.32, 1 / 3])
-def test_second_moments_out_of_view_are_raised_below_a_third(share: float) -> None:
-    """To (gradient / (3 s))^2; also after an edit of the rows."""
-    params, optimizers, phases = scene(8)
-    phases.notes_of(phases.parts[0])["share"] = share
-    for rows in (8, 5):
-        for name in params:
-            params[name] = Parameter(torch.zeros(rows, 3).double())
-            optimizers[name].param_groups[0]["params"] = [params[name]]
-        step(params, optimizers, slice(2))
-        seen = float(phases.numbers()["visible_share"])
-        expected = torch.full((rows, 3), 0.5 * 0.1**2).double()
-        if seen < 1 / 3:
-            expected[2:] += 0.5 * (0.1 / (3 * seen)) ** 2
-        found = optimizers["scales"].state[params["scales"]]["exp_avg_sq"]
-        torch.testing.assert_close(found, expected)
-
-
 def test_a_load_of_a_start_begins_with_a_share_of_one() -> None:
     """What was on its way then belongs to another training."""
     params, optimizers, phases = scene(4)
@@ -148,26 +89,12 @@ def test_a_load_of_a_start_begins_with_a_share_of_one() -> None:
     assert found == [1.0] * 5
 
 
-@pytest.mark.parametrize("name", ["scales", "opacities"])
-def test_steps_of_a_point_out_of_view_are_about_three_shares_of_a_full_one(name: str) -> None:
-    """After relocation has emptied its second moment; plain Adam makes full steps."""
-    ends = [train(on, 0.05, 401, emptied_at=399)[0] for on in (True, False)]
-    before = [train(on, 0.05, 400)[0] for on in (True, False)]
-    moved = [(b[name] - a[name]).detach().abs().median() for a, b in zip(before, ends, strict=True)]
-    assert moved[0] < 0.5 * moved[1]
-
-
 def test_frozen_positions_are_not_out_of_view() -> None:
     """A mask on the positions' gradient; every view sees all points."""
-    ours, phases = train(True, 1.0, 300, frozen=180)
-    theirs, _ = train(False, 1.0, 300, frozen=180)
-    assert phases.numbers()["visible_share"] == 1.0
-    assert same_tensors(ours, theirs)
-
-
-def test_a_view_of_nothing_does_not_count() -> None:
-    _, phases = train(True, 0.0, 100)
-    assert phases.numbers()["visible_share"] == 1.0
+    params, optimizers, phases = scene(200)
+    for _ in range(300):
+        step(params, optimizers, slice(20))
+    assert phases.numbers() == {"visible_share": 1.0}
 
 
 @pytest.mark.parametrize("frozen", ["no gradient", "no means"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import pytest
@@ -26,30 +25,6 @@ def step(x: Parameter, optimizer: Any, iteration: int) -> None:
     optimizer.step()
 
 
-def test_moments_begin_anew_at_the_switch() -> None:
-    """From there on the steps are those of a new Adam."""
-    x, optimizer, _ = made()
-    for i in range(SWITCH):
-        step(x, optimizer, i)
-    assert float(optimizer.state[x]["step"]) == SWITCH
-    y = Parameter(x.detach().clone())
-    plain = torch.optim.Adam([y], lr=0.1, foreach=False)
-    for i in range(SWITCH, TOTAL):
-        step(x, optimizer, i)
-        step(y, plain, i)
-        assert float(optimizer.state[x]["step"]) == i + 1 - SWITCH
-    assert torch.equal(x, y)
-    assert torch.equal(optimizer.state[x]["exp_avg_sq"], plain.state[y]["exp_avg_sq"])
-
-
-@pytest.mark.parametrize("switch", [0, SWITCH, TOTAL])
-def test_wherever_the_switch_is(switch: int) -> None:
-    x, optimizer, _ = made(switch)
-    for i in range(TOTAL):
-        step(x, optimizer, i)
-    assert float(optimizer.state[x]["step"]) == (TOTAL - switch if switch < TOTAL else TOTAL)
-
-
 def test_a_parameter_without_a_gradient_there_begins_anew_later() -> None:
     x, optimizer, phases = made()
     for i in range(SWITCH - 1):
@@ -57,21 +32,6 @@ def test_a_parameter_without_a_gradient_there_begins_anew_later() -> None:
     phases.observe(iteration=SWITCH + 2)
     step(x, optimizer, SWITCH + 2)
     assert float(optimizer.state[x]["step"]) == 1.0
-
-
-@pytest.mark.parametrize("saved_at", [SWITCH - 1, SWITCH, SWITCH + 2])
-def test_a_resume_begins_anew_only_where_it_would_have_been(saved_at: int) -> None:
-    x, optimizer, _ = made()
-    for i in range(saved_at):
-        step(x, optimizer, i)
-    y, resumed, _ = made()
-    y.data.copy_(x.data)
-    resumed.load_state_dict(copy.deepcopy(optimizer.state_dict()))
-    for i in range(saved_at, TOTAL):
-        step(x, optimizer, i)
-        step(y, resumed, i)
-    assert torch.equal(x, y)
-    assert float(resumed.state[y]["step"]) == TOTAL - SWITCH
 
 
 def test_an_edit_of_the_rows_after_the_switch_does_not_begin_anew() -> None:
@@ -84,15 +44,6 @@ def test_an_edit_of_the_rows_after_the_switch_does_not_begin_anew() -> None:
     optimizer.state[fewer], optimizer.param_groups[0]["params"] = state, [fewer]
     step(fewer, optimizer, SWITCH + 2)
     assert float(optimizer.state[fewer]["step"]) == 3.0
-
-
-def test_the_photometric_term_is_squared_from_the_switch_on() -> None:
-    x, optimizer, phases = made(SWITCH, SquaredLoss())
-    render, target = torch.tensor([0.5, 0.0]), torch.tensor([0.1, 0.0])
-    for i in range(TOTAL):
-        expected = 0.2 if i < SWITCH else 0.08
-        assert float(phases.pixel_loss(render, target)) == pytest.approx(expected)
-        step(x, optimizer, i)
 
 
 class Fourth(Part):

@@ -16,8 +16,6 @@ from hypothesis import strategies as st
 from opt3dgs_optim.runs import RunLog, read_run, report
 from opt3dgs_optim.runs.stats import compare, higher_is_better
 
-NAN = "nan"
-
 
 def write_run(path, arm, seed, points, *, steps=(), metric="psnr", **metadata):
     """A log with evaluations at (iteration, seconds, value) and steps at (iteration, nu, phase)."""
@@ -79,15 +77,6 @@ def test_numbers_match_hand_computed_ones(tmp_path):
     assert faded.numbers["iterations"].mean == 100
     assert faded.numbers["seconds"].mean == 200.0
     assert arms["mcmc"].numbers["psnr gain at equal seconds"] is None
-
-
-def test_a_gain_is_over_the_seeds_that_both_have(tmp_path):
-    runs = two_arms(tmp_path)
-    for seed, end in ((1, 26.0), (8, 28.0)):
-        points = [(0, 0.0, 20.0), (10, 50.0, end)]
-        runs += [write_run(tmp_path / f"{seed}.jsonl", "x", seed, points)]
-    gain = arms_of(runs)[1]["x"].numbers["psnr gain at equal seconds"]
-    assert (gain.mean, gain.error, gain.n) == (pytest.approx(26.0 - 23.0), None, 1)  # at 50 s
 
 
 def test_another_baseline_and_lower_is_better(tmp_path):
@@ -245,14 +234,6 @@ def test_two_runs_of_one_arm_and_seed_are_refused(tmp_path):
     assert compare(seeded(tmp_path, [None, None], "x", 25.0))[0].arms[0].runs
 
 
-def test_means_of_nu_and_accepted_share(tmp_path):
-    steps = [(1, 1.0, "exploration"), (2, 2.0, "exploration"), (3, NAN, "exploitation")]
-    run = write_run(tmp_path / "a.jsonl", "a", 0, [(3, 3.0, 20.0)], steps=steps)
-    arm = arms_of([run])[1]["a"]
-    assert arm.numbers["mean nu"].mean == 1.5
-    assert arm.numbers["mean accepted"].mean == 0.25
-
-
 def test_the_table_shows_the_numbers(tmp_path):
     runs = two_arms(tmp_path)
     _, arms = arms_of(runs)
@@ -294,21 +275,6 @@ def test_picture_opens_and_shows_curves_without_touching_matplotlib(tmp_path):
     for colour in ((0x33, 0x33, 0x33), (0x00, 0x72, 0xB2), (0xD5, 0x5E, 0x00)):
         near = np.abs(image * 255 - np.array(colour)).max(axis=-1) < 3
         assert near.sum() > 200, colour  # a legend handle and a line at least
-
-
-@pytest.mark.parametrize(
-    ("points", "shown"),
-    [([], "– |"), ([(5, 5.0, 20.0)], "20.00"), ([(5, 5.0, 20.0), (9, 9.0, NAN)], "nan")],
-)
-def test_what_a_run_lacks_shows(tmp_path, points, shown):
-    steps = [(1, 1.0, "exploration")]
-    runs = two_arms(tmp_path)
-    runs += [write_run(tmp_path / "odd.jsonl", "odd", 0, points, steps=steps)]
-    report.write_report(runs, tmp_path / "out")
-    (row,) = [
-        line for line in (tmp_path / "out/report.md").read_text().split("\n") if "odd" in line
-    ]
-    assert shown in row
 
 
 def test_empty_log_and_mixed_metrics(tmp_path):

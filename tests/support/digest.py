@@ -82,7 +82,10 @@ def train(number: int) -> str:
     def made() -> tuple[Any, list[Any]]:
         optimizers = make(params, kind, **options)
         phases = package.PhaseScheduler(
-            total, draw.choice([0.5, 29 / 30]), copy.deepcopy(parts), moments=moments
+            total,
+            draw.choice([0.5, 29 / 30]),
+            copy.deepcopy(parts),
+            moments=moments,  # pyright: ignore
         )
         phases.upgrade(optimizers)
         return phases, [optimizers] if one else list(optimizers.values())
@@ -104,7 +107,8 @@ def train(number: int) -> str:
         for optimizer in optimizers:
             for group in optimizer.param_groups:
                 group["lr"] = rates[group["gaussian"]]
-            optimizer.step(*(masked(kind, visible) if kind not in (Adam, AdamW) else ()))
+            given: Any = () if kind in (Adam, AdamW) else masked(kind, visible)  # pyright: ignore
+            optimizer.step(*given)
         if edits and iteration % 7 == 6 and iteration < 0.8 * total and draw.random() < 0.7:
             names = ["opacities"] if draw.random() < 0.2 else list(params)
             edit = edit_of(draw, count) if len(names) > 1 else forgotten()

@@ -61,15 +61,16 @@ def test_means_of_16_bits_are_the_same_codes(put: bool) -> None:
         step, hyper = case((301, 5), torch.Generator().manual_seed(3), **options)
         step.param[:4, 0] = torch.tensor([float("inf"), float("nan"), 3e38, -3_000.0])
         assert hyper.mean is not None
-        hyper.mean[5, :2] = torch.tensor([-32_768, 32_767])
-        before = hyper.mean.clone()
+        kept = hyper.mean.tensor
+        kept[5, :2] = torch.tensor([-32_768, 32_767])
+        before = kept.clone()
         if kernels:
             triton.launch(step, hyper)
         else:
             take_step(step, hyper)
-        made.append(hyper.mean)
-        assert torch.equal(hyper.mean[:4, 0], before[:4, 0])
-        assert not torch.equal(hyper.mean[4:], before[4:])
+        made.append(kept)
+        assert torch.equal(kept[:4, 0], before[:4, 0])
+        assert not torch.equal(kept[4:], before[4:])
     assert torch.equal(*made)
 
 
@@ -186,18 +187,6 @@ def test_numbers_that_are_not_finite_go_the_same_way(value: float, place: str) -
             assert close[ours.isfinite()].all()
 
 
-def test_a_gaussian_whose_axes_are_not_finite_is_not_moved() -> None:
-    step, hyper = case((9, 3), torch.Generator().manual_seed(0), frame=True)
-    assert step.frame is not None
-    step.frame.scales[2, 0] = float("nan")
-    step.frame.scales[3, 1] = 200.0  # its standard deviation overflows
-    step.frame.quats[5, 3] = float("nan")
-    before = step.param.clone()
-    triton.launch(step, hyper)
-    moved = (step.param != before).any(1)
-    assert moved.tolist() == [True, True, False, False, True, False, True, True, True]
-
-
 @pytest.mark.parametrize("options", [{}, {"frame": True}], ids=str)
 def test_eps_is_in_the_denominator(options: dict[str, Any]) -> None:
     """One that counts beside the root of the second moment."""
@@ -251,8 +240,11 @@ def test_nothing_beside_the_numbers_is_read_or_written(options: dict[str, Any]) 
     step, hyper = case(shape, torch.Generator().manual_seed(0), mean=True, **options)
     apart, hyper2 = case(shape, torch.Generator().manual_seed(0), mean=True, **options)
     whole: list[torch.Tensor] = []
-    for name in ("exp_avg", "exp_avg_sq", "mean", "began", "nonfinite"):
+    for name in ("exp_avg", "exp_avg_sq", "nonfinite"):
         setattr(hyper, name, amid(getattr(hyper, name)))
+    assert hyper.mean is not None
+    hyper.mean.tensor, hyper.mean.began = amid(hyper.mean.tensor), amid(hyper.mean.began)
+    hyper.mean.rest = hyper.mean.rest if hyper.mean.rest is None else amid(hyper.mean.rest)
     step.param, step.grad = amid(step.param), amid(step.grad)
     triton.launch(step, hyper)
     triton.launch(apart, hyper2)
@@ -268,22 +260,23 @@ def test_nothing_beside_the_numbers_is_read_or_written(options: dict[str, Any]) 
 def test_what_it_takes() -> None:
     """Anything else is made by plain torch."""
     draw = torch.Generator().manual_seed(0)
-    assert triton.fits(case((8, 3), draw, frame=True, mean=True)[0])
-    assert triton.fits(case((8, 3), draw, fade=True, hold=True)[0])
-    assert triton.fits(case((8, 3), draw, plain=True, mean=True)[0])
-    assert not triton.fits(case((8, 3), draw, frame=True, fade=True)[0])
-    assert not triton.fits(case((8, 3), draw, frame=True, hold=True)[0])
-    assert not triton.fits(case((8, 3), draw, plain=True, fade=True)[0])
+    assert triton.fits(*case((8, 3), draw, frame=True, mean=True))
+    assert triton.fits(*case((8, 3), draw, fade=True, hold=True))
+    assert triton.fits(*case((8, 3), draw, plain=True, mean=True))
+    assert not triton.fits(*case((8, 3), draw, frame=True, fade=True))
+    assert not triton.fits(*case((8, 3), draw, frame=True, hold=True))
+    assert not triton.fits(*case((8, 3), draw, plain=True, fade=True))
     for change in (torch.Tensor.double, lambda x: x.t().contiguous().t()):
         for name in ("param", "grad", "exp_avg"):
-            step, _ = case((8, 3), draw)
-            owner: Any = step.state if name == "exp_avg" else step
-            if name == "exp_avg":
-                owner[name] = change(owner[name])
-            else:
-                setattr(owner, name, change(getattr(owner, name)))
-            assert not triton.fits(step), name
-    assert not triton.takes(case((8, 3), draw)[0])  # of a CPU
+            step, hyper = case((8, 3), draw)
+            owner: Any = hyper if name == "exp_avg" else step
+            setattr(owner, name, change(getattr(owner, name)))
+            assert not triton.fits(step, hyper), name
+    step, hyper = case((8, 3), draw, mean=True, hold=True)
+    assert hyper.mean is not None
+    hyper.mean.tensor = hyper.mean.tensor.t().contiguous().t()
+    assert not triton.fits(step, hyper)
+    assert not triton.takes(*case((8, 3), draw))  # of a CPU
 
 
 @pytest.mark.parametrize("rows", [1, 8, 1025])

@@ -13,6 +13,7 @@ from fake_driver import FakeDriver, fake_driver
 from interpreted import fresh_kernels
 
 from opt3dgs_optim import triton
+from opt3dgs_optim.mean import Mean
 from opt3dgs_optim.triton import FRAME_BLOCK, ROWS_BLOCK
 from opt3dgs_optim.triton.check import case
 
@@ -166,7 +167,7 @@ def test_codes_are_read_four_at_a_time(driver: FakeDriver) -> None:
     for mean in (False, True):
         launched(driver, (64, 4), coded=True, mean=mean)
     step, hyper = case((64, 4), torch.Generator().manual_seed(0), coded=True, mean=True)
-    hyper.mean = torch.zeros(64, 4)
+    hyper.mean = Mean(False, 10, torch.zeros(64, 4), torch.zeros(64))
     triton.launch(step, hyper)
     assert len(driver.loaded) == 3
     reads = ROWS_BLOCK // (4 * 32 * triton.WARPS["step_rows"])

@@ -10,12 +10,9 @@ from typing import Any
 
 import pytest
 import torch
-from relocation_oracle import printed_equation
 from splatting.density import MCMCDensityControl, add_noise, regularisers
 from splatting.gaussians import gaussians_from_points
 from splatting.relocation import relocated_values
-
-F64 = torch.float64
 
 
 def _gaussians(count: int, dtype: torch.dtype = torch.float32, dead: int = 0):
@@ -45,53 +42,6 @@ def _control(**overrides: Any) -> MCMCDensityControl:
     return MCMCDensityControl(**options)
 
 
-def test_relocation_moves_the_dead_and_edits_the_state_as_gsplat_does():
-    gaussians = _gaussians(40, dead=6)
-    optimizers = _optimizers(gaussians)
-    old = dict(gaussians)
-    before = {name: p.detach().clone() for name, p in gaussians.items()}
-    pointers = {name: p.data_ptr() for name, p in gaussians.items()}
-    assert _control(cap_max=0).step(600, gaussians, optimizers) == 6
-    assert len(gaussians["means"]) == 40
-    changed = (gaussians["opacities"] != before["opacities"])[6:].nonzero()[:, 0] + 6
-    kept = [i for i in range(6, 40) if i not in changed.tolist()]
-    assert 1 <= len(changed) <= 6
-    for name, parameter in gaussians.items():
-        assert parameter is not old[name]
-        assert parameter.requires_grad
-        assert parameter.is_leaf
-        assert parameter.data_ptr() == pointers[name]  # same storage, as upstream
-        for row in range(6):  # every dead row is now a copy of a sampled one
-            assert any(torch.equal(parameter[row], parameter[source]) for source in changed)
-        assert torch.equal(parameter[kept], before[name][kept])
-        (held,) = optimizers[name].param_groups[0]["params"]
-        assert held is parameter
-        assert list(optimizers[name].state) == [parameter]
-        state = optimizers[name].state[parameter]
-        assert state["step"] == 1
-        for key in ("exp_avg", "exp_avg_sq"):
-            assert (state[key][changed] == 0).all()
-            assert (state[key][:6] != 0).all()  # the moved rows keep theirs, on purpose upstream
-            assert (state[key][kept] != 0).all()
-
-
-def test_relocation_shares_opacity_and_scale_between_the_copies():
-    gaussians = _gaussians(8, torch.float64, dead=7)  # one is alive: it gets all seven copies
-    opacity = float(torch.sigmoid(gaussians["opacities"].detach()[7]))
-    scale = gaussians["scales"][7].detach().exp()
-    _control(cap_max=0).step(600, gaussians, _optimizers(gaussians, steps=0))
-    new, factor = printed_equation(opacity, 8)
-    shared = torch.sigmoid(gaussians["opacities"].detach())
-    torch.testing.assert_close(shared, torch.full((8,), new, dtype=F64), rtol=1e-9, atol=0)
-    torch.testing.assert_close(
-        gaussians["scales"].detach().exp(), (factor * scale).expand(8, 3), rtol=1e-9, atol=0
-    )
-    # rendered at the common centre: alpha of eight copies against alpha of the one
-    torch.testing.assert_close(
-        1 - (1 - shared).prod(), torch.tensor(opacity, dtype=F64), rtol=1e-12, atol=0
-    )
-
-
 def test_new_opacities_are_clipped_to_the_dead_limit():
     gaussians = _gaussians(30, dead=29)
     gaussians["opacities"].data[29] = math.log(0.02 / 0.98)
@@ -104,30 +54,6 @@ def test_new_opacities_are_clipped_to_the_dead_limit():
     saturated["opacities"].data.fill_(60.0)
     _control(growth=1.5).step(600, saturated, _optimizers(saturated))
     assert torch.isfinite(saturated["opacities"]).all()
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_growth_appends_rows_with_zero_state(dtype):
-    gaussians = _gaussians(100, dtype)
-    optimizers = _optimizers(gaussians)
-    for name, parameter in gaussians.items():  # an optimizer's own entry, any trailing shape
-        optimizers[name].state[parameter]["history"] = torch.ones(100, 5, 8)
-    old = dict(gaussians)
-    before = gaussians["means"].detach().clone()
-    assert _control().step(600, gaussians, optimizers) == 0
-    assert torch.equal(gaussians["means"][:100], before)  # growth moves nothing
-    for name, parameter in gaussians.items():
-        assert parameter is not old[name]
-        assert len(parameter) == 105
-        assert parameter.dtype == dtype
-        state = optimizers[name].state[parameter]
-        assert list(optimizers[name].state) == [parameter]
-        for key in ("exp_avg", "exp_avg_sq", "history"):
-            assert len(state[key]) == 105
-            assert (state[key][100:] == 0).all()
-            assert (state[key][:100] != 0).all()  # upstream does not reset the sources here
-        parameter.grad = torch.ones_like(parameter)
-        optimizers[name].step()
 
 
 def test_growth_stops_at_the_cap_and_never_shrinks():
@@ -163,14 +89,6 @@ def test_none_and_one(count, dead):
     assert torch.isfinite(gaussians["means"]).all()
 
 
-def test_all_dead_stay_where_they_are():
-    gaussians = _gaussians(5, dead=5)
-    before = gaussians["means"].detach().clone()
-    optimizers = _optimizers(gaussians, steps=0)
-    assert _control(cap_max=0).step(600, gaussians, optimizers) == 0
-    assert torch.equal(gaussians["means"], before)
-
-
 def test_a_seeded_generator_repeats_and_leaves_the_global_one_alone():
     torch.manual_seed(0)
     results = []
@@ -183,15 +101,6 @@ def test_a_seeded_generator_repeats_and_leaves_the_global_one_alone():
     drawn = torch.rand(3)
     torch.manual_seed(0)
     assert torch.equal(drawn, torch.rand(3))
-
-
-def test_opacities_with_a_trailing_dimension():
-    flat, column = _gaussians(40, dead=4), _gaussians(40, dead=4)
-    column["opacities"] = torch.nn.Parameter(column["opacities"].data[:, None])
-    _control().step(600, flat, _optimizers(flat))
-    _control().step(600, column, _optimizers(column))
-    assert column["opacities"].shape == (42, 1)
-    assert torch.equal(column["opacities"][:, 0], flat["opacities"])
 
 
 @pytest.mark.parametrize("iterations", [100, 1500, 3000, 7000, 30_000, 90_000])

@@ -8,7 +8,6 @@ import pytest
 import torch
 from splatting.gaussians import (
     DEFAULT_PRESET,
-    MCMC_PRESET,
     gaussians_from_points,
     neighbour_distance,
     stock_learning_rates,
@@ -72,14 +71,6 @@ def test_shapes_and_activations(sh_degree):
     assert points.abs().sum() > 0  # the parameters are copies
 
 
-def test_the_mcmc_preset_is_the_default():
-    points, colors = _cloud(20)
-    plain = gaussians_from_points(points, colors)
-    preset = gaussians_from_points(points, colors, **MCMC_PRESET)
-    assert all(torch.equal(plain[key], preset[key]) for key in plain)
-    torch.testing.assert_close(torch.sigmoid(plain["opacities"]), torch.full((20,), 0.5))
-
-
 def test_a_subset_follows_the_generator_and_keeps_points_with_their_colours():
     points, colors = _cloud(40)
     first, second = (
@@ -95,12 +86,6 @@ def test_a_subset_follows_the_generator_and_keeps_points_with_their_colours():
     shown = 0.5 + 0.28209479177387814 * first["sh0"][:, 0]
     torch.testing.assert_close(shown, colors[torch.stack(rows)])
     assert len(gaussians_from_points(points, colors, num_points=99)["means"]) == 40
-
-
-def test_float64_points_give_float64_parameters():
-    points, colors = _cloud(5, torch.float64)
-    gaussians = gaussians_from_points(points, colors, sh_degree=1)
-    assert {p.dtype for p in gaussians.values()} == {torch.float64}
 
 
 def test_stock_learning_rates():

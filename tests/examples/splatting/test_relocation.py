@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
-from relocation_oracle import printed_equation
 from splatting.relocation import relocated_values
 
 F64 = torch.float64
+
+
+def printed_equation(opacity: float, copies: int) -> tuple[float, float]:
+    """Eq. 9 of the 3DGS-MCMC paper as it is printed: new opacity and factor on the scale."""
+    new = 1.0 - (1.0 - opacity) ** (1.0 / copies)
+    total = 0.0
+    for i in range(1, copies + 1):
+        for k in range(i):
+            total += math.comb(i - 1, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1)
+    return new, opacity / total
 
 
 @pytest.mark.parametrize("opacity", [0.005, 0.1, 0.5, 0.9, 0.999])

@@ -23,7 +23,7 @@ from opt3dgs_optim import cuda
 from opt3dgs_optim.cuda import BLOCK, macros
 from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history
 
-HERE = Path(__file__).parent
+SHIM = Path(__file__).parents[1] / "cuda"  # what makes the kernels a library of the host
 SOURCES = Path(cuda.__file__).parent
 GUARD_ROWS = 300  # written by nobody: more than one block beyond the last row
 GUARD = 77
@@ -45,10 +45,10 @@ def compile_host(
     """Compile the kernels for one history size: a library, or a program for the sanitizers."""
     defines = [f"-D{name}={value}" for name, value in macros(dtype, size)]
     program = any(flag.startswith("-fsanitize") for flag in extra)
-    library = ["-shared", "-fPIC", str(HERE / "cuda_host_kernels.cpp")]
-    what = [str(HERE / "cuda_host_main.cpp")] if program else library
+    library = ["-shared", "-fPIC", str(SHIM / "cuda_host_kernels.cpp")]
+    what = [str(SHIM / "cuda_host_main.cpp")] if program else library
     flags = ["-std=c++17", "-O1", "-Wall", "-Werror", "-Wno-unknown-pragmas", *extra]
-    command = ["g++", *flags, *defines, f"-I{HERE}", f"-I{sources}", *what, "-o", str(out)]
+    command = ["g++", *flags, *defines, f"-I{SHIM}", f"-I{sources}", *what, "-o", str(out)]
     subprocess.run(command, check=True, capture_output=True, text=True)
     return out
 
@@ -78,7 +78,7 @@ def built(size: int, dtype: torch.dtype, *extra: str) -> Path:
 @cache
 def _digest() -> str:
     """Of all that a build is made of."""
-    files = sorted([*SOURCES.glob("*.cu*"), *HERE.glob("cuda_host_*"), Path(__file__)])
+    files = sorted([*SOURCES.glob("*.cu*"), *SHIM.glob("cuda_host_*"), Path(__file__)])
     version = subprocess.run(["g++", "--version"], check=True, capture_output=True).stdout
     contents = b"".join(file.name.encode() + file.read_bytes() for file in files)
     return hashlib.sha256(version + contents).hexdigest()

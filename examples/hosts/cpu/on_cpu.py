@@ -1,7 +1,7 @@
 """Run a trainer's real script on a machine without a GPU, to try it before renting one.
 
-    python tests/hosts/support/on_cpu.py simple_trainer.py mcmc --data_dir SCENE --max_steps 100
-    python tests/hosts/support/on_cpu.py train.py -s SCENE --iterations 100
+    python examples/hosts/cpu/on_cpu.py simple_trainer.py mcmc --data_dir SCENE --max_steps 100
+    python examples/hosts/cpu/on_cpu.py train.py -s SCENE --iterations 100
 
 What follows the script's path is the script's own. CUDA is mapped to the CPU, the CUDA rasterizers
 are replaced by the examples' own (`pip install "opt3dgs_optim[examples]"`), viewers and loggers
@@ -24,7 +24,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
+EXAMPLES = Path(__file__).resolve().parents[2]
 
 
 def prepare(script: Path) -> None:

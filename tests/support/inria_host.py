@@ -94,11 +94,6 @@ class SimulatedModel:
         """[N, 3], world units."""
         return torch.exp(self._scaling)
 
-    @property
-    def get_xyz(self) -> Tensor:
-        """[N, 3], world units."""
-        return self._xyz
-
     def _exchange(self, group: dict, value: Tensor, edit: Any) -> None:
         old = group["params"][0]
         state = self.optimizer.state.get(old, None)
@@ -114,11 +109,6 @@ class SimulatedModel:
     def _splat_groups(self) -> list[dict]:
         return [g for g in self.optimizer.param_groups if g["name"] in ATTRIBUTES]
 
-    def prune_points(self, mask: Tensor) -> None:
-        """Remove the points of `mask`."""
-        for group in self._splat_groups():
-            self._exchange(group, group["params"][0][~mask], lambda v: v[~mask])
-
     def append(self, sources: Tensor) -> None:
         """Append copies of the points `sources`, with zero moments."""
         for group in self._splat_groups():
@@ -127,11 +117,6 @@ class SimulatedModel:
             self._exchange(
                 group, torch.cat([old, old[sources]]), lambda v, z=zeros: torch.cat([v, z])
             )
-
-    def reset_opacity(self) -> None:
-        """Opacities to at most 0.01, with new moments."""
-        group = next(g for g in self.optimizer.param_groups if g["name"] == "opacity")
-        self._exchange(group, torch.logit(self.get_opacity.clamp(max=0.01)), torch.zeros_like)
 
     def relocate_gs(self, dead_mask: Tensor) -> None:
         """Move the dead onto the living: moments of the *sampled* rows zeroed, in place."""

@@ -1,7 +1,7 @@
 """Optimizers, density control and checkpoints of trainers whose renderers need CUDA, on a CPU.
 
-    python tests/hosts/support/without_renderer.py 3dgrut TRAINERS/3dgrut
-    python tests/hosts/support/without_renderer.py fvdb TRAINERS/fvdb-0.6.0
+    python examples/hosts/cpu/without_renderer.py 3dgrut TRAINERS/3dgrut
+    python examples/hosts/cpu/without_renderer.py fvdb TRAINERS/fvdb-0.6.0
 
 The folder of fVDB is one into which `pip install --no-deps fvdb-reality-capture==0.6.0` has put the
 package. 3DGRUT needs hydra-core.
@@ -26,7 +26,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "examples"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import cpu_cuda
 import cpu_stand_ins
