@@ -87,18 +87,19 @@ class ParamStepper:
         count[()] += 1
         t, (beta1, beta2) = count.item(), group["betas"]
         # A launcher would take an integer, or a number of numpy, for another kind of argument.
-        lr, decay, eps = float(group["lr"]), group["weight_decay"], float(group["eps"])
+        beta1, beta2, lr, eps = float(beta1), float(beta2), float(group["lr"]), float(group["eps"])
+        decay = group["weight_decay"]
         coded = training.moments == 16
         if coded:
             as_codes(state)
         hyper = Hyper(
-            lr, float(beta1), float(beta2), eps if step.frame is None else FRAME_EPS,
+            lr, beta1, beta2, eps if step.frame is None else FRAME_EPS,
             1.0 - beta1**t, (1.0 - beta2**t) ** 0.5, state["exp_avg"], state["exp_avg_sq"],
             nonfinite=self.counter, key=mixed(int(t)) if coded else 0,
         )  # fmt: skip
         if decay:
             if group.get("decoupled_weight_decay"):
-                hyper.shrink = 1.0 - lr * decay
+                hyper.shrink = float(1.0 - lr * decay)
             else:
                 hyper.decay = float(decay)
         if step.put is not None:
