@@ -218,3 +218,15 @@ def test_rows_that_gsplat_teleports_forget_where_they_were() -> None:
     optimizer.state[params["sh0"]] = state
     steps({"all": optimizer}, params, 5)
     assert (params["sh0"][0] - 50.0).abs().max() < 1.0
+
+
+@pytest.mark.parametrize("began", [None, torch.ones(ROWS - 1)], ids=["gone", "of fewer rows"])
+@pytest.mark.parametrize("moments", [32, 16])
+def test_a_saved_mean_needs_to_know_when_each_row_began(began: Any, moments: Any) -> None:
+    _, optimizer = averaged(parameters(ROWS, "sh0"), 293, moments)
+    saved = optimizer.state_dict()
+    del saved["state"][0]["averaging.began"]
+    if began is not None:
+        saved["state"][0]["averaging.began"] = began
+    with pytest.raises(ValueError, match=r"load_state_dict: .*(a number for each row|same rows)"):
+        optimizer.load_state_dict(saved)

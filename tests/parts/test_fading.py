@@ -6,6 +6,7 @@ import itertools
 
 import pytest
 import torch
+from gaussians import adams_of, parameters, steps
 from hypothesis import given
 from hypothesis import strategies as st
 from torch.nn import Parameter
@@ -68,6 +69,19 @@ def test_events_are_in_their_stretch_and_four_iterations_apart(
 def test_how_many_events_a_run_has(steps_of_run: int, points: int, times: int) -> None:
     """A third where points are many. In 600 iterations, 4 apart in 67 % of them."""
     assert Fading().num_events(steps_of_run, points) == times
+
+
+def test_the_log_says_in_which_steps_an_event_fades() -> None:
+    """The 24th, 32nd, 40th and 48th of 64: the end of each quarter of the stretch."""
+    params = parameters(4, "scales")
+    phases = PhaseScheduler(64, parts=[Fading(0.4, events=4, start=0.25, stop=0.75)])
+    optimizers, said = phases.upgrade(adams_of(params)), {}
+    for step in range(1, 65):
+        steps(optimizers, params, 1)
+        said[step] = phases.numbers()["faded"]
+    assert {step: share for step, share in said.items() if share} == dict.fromkeys(
+        (24, 32, 40, 48), 0.4
+    )
 
 
 def test_a_faded_step_is_as_long_as_before_then_up_to_five_times() -> None:
