@@ -125,7 +125,8 @@ def default_step(
         # parameter's place in the last tenth of that.
         window = int(1 / 30 * total)
         if name in parts.get("averaging", ()) and total - window <= iteration < total:
-            take_into_mean(param, own, iteration - (total - window) + 1)
+            far = name == "means"  # from the origin, for the digits of float32
+            take_into_mean(param, own, iteration - (total - window) + 1, far)
             if iteration >= total - int(max(2, window / 10)):
                 put_mean(param, own)
 
@@ -134,19 +135,20 @@ def views(grad: Tensor | None, state: dict, iteration: int) -> tuple[Tensor | No
     """Which points are out of view, [N] bool, and the mean share s of the points that views see.
 
     A point is out of view if its position has no gradient. The mean is over the last 100 views or
-    so, of which one in four is looked at. A look counts in the next iteration, since the number
-    lies on a GPU. Points that have never had a gradient do not count.
+    so, of which one in four is looked at. A look counts two iterations later, since the number lies
+    on a GPU. Points that have never had a gradient do not count.
     """
-    share, looked = state.get("share", 1.0), state.pop("looked", 0.0)
-    if looked > 0:
-        share += 1 / 25 * (max(looked, 0.01) - share)
+    share, (looked, due) = state.get("share", 1.0), state.get("look", (0.0, iteration))
+    if iteration >= due:
+        share += 1 / 25 * (max(looked, 0.01) - share) if looked > 0 else 0.0
+        state.pop("look", None)
     state["share"] = share
     if grad is None or len(grad) == 0:
         return None, share
     in_view = (grad != 0).any(1)
-    if iteration * ((5**0.5 - 1) / 2) % 1 < 1 / 4:
+    if "look" not in state and iteration * ((5**0.5 - 1) / 2) % 1 < 1 / 4:
         known = in_view | (state["means"]["exp_avg_sq"] != 0).any(1)
-        state["looked"] = int(in_view.sum()) / max(int(known.sum()), 1)
+        state["look"] = int(in_view.sum()) / max(int(known.sum()), 1), iteration + 2
     return ~in_view, share
 
 
@@ -219,18 +221,25 @@ def adam_in_frame_(z: Tensor, grad: Tensor, own: dict, rate: float) -> None:
     z.copy_(own["exp_avg"] / root_of(own) * (rate / (1 - BETA1 ** own["step"])))
 
 
-def take_into_mean(param: Tensor, own: dict, number: int) -> None:
+def take_into_mean(param: Tensor, own: dict, number: int, far: bool) -> None:
     """Take the iterate of that number, from 1, into the mean.
 
-    Rows that the trainer has edited are zero in `began`: their mean begins with this iterate. What
-    is not finite is left out.
+    Rows that the trainer has reset are zero in `began`: their mean begins with this iterate. What
+    is not finite is left out. Far from the origin the mean is the sum of two numbers.
     """
     mean = own.setdefault("mean", torch.zeros_like(param))
     began = own.setdefault("began", torch.zeros(len(param), dtype=param.dtype))
     began[began == 0] = number
     weight = (1 / (number + 1 - began)).reshape(-1, *[1] * (param.dim() - 1))
-    start = torch.where(mean.isfinite(), mean, param)
-    mean.copy_(torch.where(param.isfinite(), start.lerp(param, weight), mean))
+    start, known = torch.where(mean.isfinite(), mean, param), param.isfinite()
+    if not far:
+        mean.copy_(torch.where(known, start.lerp(param, weight), mean))
+        return
+    rest = own.setdefault("rest", torch.zeros_like(param))
+    more = torch.where(mean.isfinite(), rest, 0.0)
+    more = more + ((param - start) - more) * weight
+    rest.copy_(torch.where(known, more - (start + more - start), rest))
+    mean.copy_(torch.where(known, start + more, mean))
 
 
 def put_mean(param: Tensor, own: dict) -> None:

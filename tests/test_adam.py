@@ -428,7 +428,7 @@ def test_a_mask_that_is_missing_or_too_much_changes_nothing() -> None:
             optimizer.step(*wrong)
         assert same_tensors(params, start)
         assert phases.iteration == -1
-        assert calls == []
+        assert calls == ["before"]  # as torch's own
         assert not optimizer.state
 
 

@@ -39,7 +39,13 @@ from opt3dgs_optim import DEFAULTS, DEFAULTS_ADC, PhaseScheduler, paper_parts
 
 NAMES = ("means", "scales", "quats", "opacities", "sh0")
 PRESETS = {"relocation": (DEFAULTS, RELOCATION), "adc": (DEFAULTS_ADC, CLONE_AND_SPLIT)}
-OF_THE_END = ("mean", "began", "pairs", "visible_before")  # what is dropped with the end of a run
+OF_THE_END = (
+    "mean",
+    "rest",
+    "began",
+    "pairs",
+    "visible_before",
+)  # what is dropped with the end of a run
 SEEDS = st.integers(0, 2**20)
 
 
@@ -165,7 +171,8 @@ class WholeLife(RuleBasedStateMachine):
             for name in names:
                 own = self.state.get(name)
                 if own is not None:
-                    edit_own(edit, own, self.inria)
+                    edit_own(edit, own)
+                    self.drop_of(own)
                 self.theirs[name] = edit.param(self.theirs[name])
         if self.inria and edits:
             self.train(1, seed, 1.0, (), names)
@@ -183,7 +190,7 @@ class WholeLife(RuleBasedStateMachine):
             holder.reset_rows(self.params[name], row)
             own = self.state.get(name)
             if own is not None:
-                edit_own(row_edits.Edit(lambda p: p, lambda t: zeroed(t, row)), own, False)
+                edit_own(row_edits.Edit(lambda p: p, lambda t: zeroed(t, row)), own)
         self.train(1, seed, 1.0)
 
     @rule(name=st.sampled_from(["means", "scales", "sh0"]), seed=SEEDS)
@@ -240,14 +247,15 @@ class WholeLife(RuleBasedStateMachine):
         """Adam's own state alone: its steps are the clock, and its moments are in world units."""
         states = self.saved()
         for each in states:
-            each["param_groups"][0].pop("opt3dgs", None)
+            for group in each["param_groups"]:
+                group.pop("opt3dgs", None)
             for own in each["state"].values():
                 for key in set(own) - {"step", *row_edits.MOMENTS}:
                     del own[key]
         self.load(states, upgraded_first)
         self.drop(*OF_THE_END)
         self.state.pop("share", None)
-        self.state.pop("looked", None)
+        self.state.pop("look", None)
         # The positions' optimizer is the clock; one of all has the steps of all.
         made = [self.state.get(name, {}).get("step", 0) for name in NAMES]
         self.iteration = max(made) if self.inria else made[NAMES.index("means")] or max(made)
@@ -257,6 +265,12 @@ class WholeLife(RuleBasedStateMachine):
             if self.preset == "relocation" and name == "means":
                 own |= new_moments(self.theirs[name])
         self.train(1, seed, 1.0)
+
+    @staticmethod
+    def drop_of(own: dict[str, Any]) -> None:
+        """What is kept for rows begins anew with a new Parameter."""
+        for key in OF_THE_END:
+            own.pop(key, None)
 
     def drop(self, *keys: str) -> None:
         for name in NAMES:
@@ -313,14 +327,10 @@ def zeroed(tensor: Tensor, rows: Tensor) -> Tensor:
     return tensor
 
 
-def edit_own(edit: row_edits.Edit, own: dict[str, Any], inria: bool) -> None:
-    """What the reference keeps for the rows, in a trainer of one family or the other."""
-    for key in row_edits.MOMENTS:
-        own[key] = edit.kept(own[key])
-    for key in OF_THE_END:
-        if inria:
-            own.pop(key, None)
-        elif key == "pairs" and key in own:
+def edit_own(edit: row_edits.Edit, own: dict[str, Any]) -> None:
+    """What the reference keeps for the rows."""
+    for key in (*row_edits.MOMENTS, *OF_THE_END):
+        if key == "pairs" and key in own:
             x, g, s, y = own[key]
             own[key] = (*map(edit.kept, (x, g)), *(list(map(edit.kept, each)) for each in (s, y)))
         elif key in own:

@@ -248,8 +248,9 @@ class StepAdam(Adam):
             if end is not None and stepper.stepped_in > end:  # trainers that count from 1 end there
                 continue
             param = stepper.param()
-            if param is not None:
-                found += put_mean(param, self.state.get(param, {}), stepper.name)
+            if param is not None and (state := self.state.get(param)):
+                stepper.begin_edited_rows_anew(state)
+                found += put_mean(param, state, stepper.name)
         return found
 
     def state_dict(self) -> dict[str, Any]:

@@ -167,7 +167,7 @@ def mean_of_residue(param: Tensor, residue: Tensor, grid: float) -> Tensor:
 def put_mean(param: Tensor, state: Mapping[str, Tensor], name: str | None) -> bool:
     """Put a parameter's mean in its place, if it has one; whether it has."""
     mean, residue, grid = state.get(MEAN), state.get(RESIDUE), GRIDS.get(name or "")
-    if residue is not None and grid is not None:
+    if residue is not None and grid is not None and residue.shape == param.shape:
         mean = mean_of_residue(param, residue.to(CODES), grid)
     if mean is None or mean.shape != param.shape:
         return False

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from opt3dgs_optim.checks import check_count
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.parts.annealing import Annealing
@@ -20,33 +18,20 @@ PAPER_SWITCH = 29_000 / PAPER_STEPS
 PAPER_WARMUP = 2_500 / PAPER_STEPS
 
 
-class Preset(tuple[Part, ...]):
-    """Parts that are put together; none of them learns, so that trainings may share them."""
-
-    def __add__(self, other: Any) -> Any:  # pyright: ignore
-        raise TypeError(
-            "a preset cannot be added to; write parts=[*DEFAULTS, YourPart()], which says the order"
-        )
-
-
 # For 3DGS-MCMC's relocation (docs/evidence.md).
-DEFAULTS = Preset(
-    [
-        OwnFrame(),
-        Fading(names=("scales", "quats", "opacities", "sh0", "shN")),
-        OutOfView(),
-        Averaging(),
-    ]
+DEFAULTS: tuple[Part, ...] = (
+    OwnFrame(),
+    Fading(names=("scales", "quats", "opacities", "sh0", "shN")),
+    OutOfView(),
+    Averaging(),
 )
 # For clone, split and prune: longer steps let scales grow until they are pruned as too big. It was
 # trained with events in the first half alone.
-DEFAULTS_ADC = Preset(
-    [
-        Annealing(names=("quats", "opacities", "sh0", "shN")),
-        Fading(stop=0.5, names=("means", "quats", "opacities", "sh0", "shN")),
-        OutOfView(),
-        Averaging(),
-    ]
+DEFAULTS_ADC: tuple[Part, ...] = (
+    Annealing(names=("quats", "opacities", "sh0", "shN")),
+    Fading(stop=0.5, names=("means", "quats", "opacities", "sh0", "shN")),
+    OutOfView(),
+    Averaging(),
 )
 
 

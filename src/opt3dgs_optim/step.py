@@ -1,9 +1,9 @@
 """The step of one parameter: what it has (`Step`), and how it is made (`take_step`).
 
 Parts of a training fill in a `Step` with plain values, and may put another gradient in the place of
-the parameter's (`Part.before`). The arithmetic is here, once: in plain torch operations, the
-reference, which runs on every device, and as one Triton launch on a GPU, in `opt3dgs_optim.triton`.
-Without any of the parts it is `torch.optim.Adam`, bit for bit on a CPU.
+the parameter's (`Part.before`). The arithmetic is here, in plain torch, which runs on every device;
+`opt3dgs_optim.triton` makes the same step in one launch on a GPU. Without any of the parts it is
+`torch.optim.Adam`, bit for bit on a CPU.
 
 A row is one Gaussian: dimension 0 of a parameter. In the order in which it is made:
 
@@ -74,13 +74,14 @@ class Step:
         group, state: torch's parameter group and the optimizer's state of the parameter.
         iteration: of the training, from 0.
         stepped_in: the iteration of the parameter's step before this one; -1: none.
-        keep: `keep(state, key, shape)` is what a part keeps for the rows, see `lane.Lane.keep`.
+        keep: `keep(state, key, shape)` is what a part keeps for the rows, see
+            `ParamStepper.keep`.
         factor: on the learning rate; on a device it may be a tensor of one element.
         fresh: Adam's moments begin anew before the step.
         plain: no moments and no frame: the step is the gradient times the rate.
         fade, frame, hold: see there; None: not in this step.
         put: whether the running mean, with this iterate in it, takes the parameter's place; None:
-            this iterate is none of the mean's.
+            this iterate is not averaged.
     """
 
     param: Tensor

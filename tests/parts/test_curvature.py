@@ -79,25 +79,6 @@ def test_no_row_one_row_and_a_number(shape: tuple[int, ...], accepted: float | N
     assert optimizer.accepted_share == accepted
 
 
-def test_rows_that_the_trainer_adds_begin_without_pairs() -> None:
-    """Rows that it keeps go on bit for bit."""
-    (x, ours), (y, twin) = positions(), positions()
-    for _ in range(6):
-        quadratic_step(x, ours)
-        quadratic_step(y, twin)
-    state = ours.state.pop(x)
-    more = Parameter(torch.cat([x.detach(), torch.ones(2, 3)]))
-    for key, value in state.items():
-        if key != "step":  # as gsplat does
-            state[key] = torch.cat([value, torch.zeros(2, *value.shape[1:])])
-    ours.state[more], ours.param_groups[0]["params"] = state, [more]
-    for _ in range(4):
-        quadratic_step(more, ours)
-        quadratic_step(y, twin)
-    assert torch.equal(more[:6], y)
-    assert float((more[6:] - 1).detach().abs().max()) < 0.2
-
-
 @pytest.mark.parametrize(("saved", "ours"), [(3, 4), (4, 3), (3, 5), (5, 3)])
 def test_pairs_of_another_history_are_refused(saved: int, ours: int) -> None:
     """Of three coordinates, three pairs take as much room as four: the shape does not tell."""

@@ -168,12 +168,13 @@ def test_numbers_that_are_not_finite_go_the_same_way(value: float, place: str) -
         for run in (take_step, triton.launch):
             options: Any = {"frame": frame, "mean": True, "put": True, "hold": not frame}
             step, hyper = case((40, 3), torch.Generator().manual_seed(1), **options)
-            holders: list[Any] = [hyper, step.frame, step]
-            owner = next((each for each in holders if hasattr(each, place)), None)
+            holders: list[Any] = [hyper.mean if place == "mean" else hyper, step.frame, step]
+            name = "tensor" if place == "mean" else place
+            owner = next((each for each in holders if hasattr(each, name)), None)
             if owner is None:
                 return
             before = step.param.clone()
-            getattr(owner, place)[7, 1] = value
+            getattr(owner, name)[7, 1] = value
             run(step, hyper)
             made.append(tensors(step, hyper))
             if place in ("quats", "scales") and not abs(value) < 1e30:
