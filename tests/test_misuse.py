@@ -169,11 +169,6 @@ SCHEDULERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         ValueError,
         "leave one of the two out",
     ),
-    "more than a preset": (
-        lambda: DEFAULTS + [Fading()],  # noqa: RUF005
-        TypeError,
-        r"can only concatenate tuple",
-    ),
     "no log": (lambda: PhaseScheduler(9, log="run.jsonl"), TypeError, "a RunLog or None is needed"),  # pyright: ignore
 }
 

@@ -226,11 +226,15 @@ def test_states_of_distributed_checkpoints_resume(flat: bool, tmp_path: Any) -> 
     params, optimizers, _ = upgraded()
     steps(optimizers, params, 20)
     saved = of.get_optimizer_state_dict(Model(params), optimizers["all"], options=options)
-    checkpoint.save({"optimizer": saved}, checkpoint_id=tmp_path)
+    checkpoint.save(  # pyright: ignore
+        {"optimizer": saved}, checkpoint_id=tmp_path
+    )
     mine = {name: Parameter(param.detach().clone()) for name, param in params.items()}
     adam, model = PhaseScheduler(TOTAL).upgrade(adam_of(mine)), Model(mine)
     found = {"optimizer": of.get_optimizer_state_dict(model, adam, options=options)}
-    checkpoint.load(found, checkpoint_id=tmp_path)
+    checkpoint.load(  # pyright: ignore
+        found, checkpoint_id=tmp_path
+    )
     of.set_optimizer_state_dict(model, adam, found["optimizer"], options=options)
     steps(optimizers, params, 20, seed=1)
     steps({"all": adam}, mine, 20, seed=1)
@@ -310,7 +314,7 @@ def test_what_is_kept_begins_anew_after_an_edit(edit: str) -> None:
     else:
         state["exp_avg"] = state["exp_avg"].clone()
     fed: list[Any] = []
-    before = stepper.take_step
+    before = stepper.take_step  # pyright: ignore
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
             stepper, "take_step", lambda s, h: [fed.append(s.grad.clone()), before(s, h)][1]
@@ -355,7 +359,7 @@ def test_without_room_for_the_mean_a_training_goes_on(monkeypatch: Any) -> None:
             raise torch.cuda.OutOfMemoryError("CUDA out of memory")
         return mean_of(param, state, name, *rest)
 
-    mean_of = stepper.mean_of
+    mean_of = stepper.mean_of  # pyright: ignore
     monkeypatch.setattr(stepper, "mean_of", full)
     with pytest.warns(UserWarning, match="no room for the mean of the last iterates"):
         steps(optimizers, params, 1)

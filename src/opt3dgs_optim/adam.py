@@ -23,15 +23,17 @@ from opt3dgs_optim.checkpoint import (
     iteration_by_counts,
     note_in_groups,
     numbers_of,
+    recode_all,
     restore_notes,
     restore_parts,
     say_other_names,
+    steps_of_a_stock_adam,
     take_from_groups,
 )
 from opt3dgs_optim.clock import Ticket
-from opt3dgs_optim.contract import Slots, check_held, check_supported, own_step
+from opt3dgs_optim.contract import Slots, bare, check_held, check_supported, own_step
 from opt3dgs_optim.mean import put_mean
-from opt3dgs_optim.moments import MOMENTS, as_numbers, recode
+from opt3dgs_optim.moments import MOMENTS, as_numbers
 from opt3dgs_optim.names import split_name
 from opt3dgs_optim.sparse_adam import check_arguments, refuse_mask, step_around
 from opt3dgs_optim.stepper import KEPT, ParamStepper
@@ -51,7 +53,6 @@ class StepAdam(Adam):
     training: Training
     ticket: Ticket
     coded = False  # whether its moments are codes of 16 bits, see `moments`
-    _on_gpu = False
     _implementations: list[Any] = []  # noqa: RUF012  (`fused` and `foreach` of the trainer's groups)
     _base: type[Adam] = Adam  # the class whose optimizer it was
     _steppers: list[ParamStepper] = []  # noqa: RUF012  (made anew, never changed)
@@ -70,7 +71,7 @@ class StepAdam(Adam):
             self.ticket = Ticket()
         self._masked = own_step(self._base) is not None
         self._step_supports_amp_scaling = False  # a GradScaler unscales, and leaves steps out
-        self._on_gpu = self.param_groups[0]["params"][0].is_cuda  # one device is needed
+        self._on_gpu = any(p.is_cuda for group in self.param_groups for p in group["params"])
         self._name_groups()
         self._count_on_host()
 
@@ -215,10 +216,7 @@ class StepAdam(Adam):
 
     def own_class_step(self, *args: Any, **options: Any) -> Any:
         """The step of the class that it had, without torch's hooks, which `step` runs already."""
-        step: Any = self._base.step
-        return (step.__wrapped__ if getattr(step, "hooked", False) else step)(
-            self, *args, **options
-        )
+        return bare(self._base.step)(self, *args, **options)
 
     # -- rows and checkpoints ----------------------------------------------------------------------
 
@@ -261,7 +259,6 @@ class StepAdam(Adam):
         """
         if not self.training.changes_steps:
             return super().state_dict()
-        self._drop_moved()
         own = [dict(group) for group in self.param_groups]
         self.note_in_groups()
         for group, own_kind in zip(self.param_groups, self._implementations, strict=True):
@@ -283,11 +280,6 @@ class StepAdam(Adam):
         last, now = self.last_steps(), self.ticket.next_iteration - 1
         note_in_groups(self.param_groups, self._slots, common, last, now, self.own_frame())
 
-    def _drop_moved(self) -> None:
-        """Drop what was kept for rows that are others since the last step: a copy knows no more."""
-        if self._steppers:
-            self.steppers()
-
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """As torch's; the training goes on where the checkpoint was.
 
@@ -297,7 +289,7 @@ class StepAdam(Adam):
         Raises:
             ValueError: it is damaged, or of another version; nothing has been changed.
         """
-        call, own = f"{type(self).__name__}.load_state_dict", [dict(g) for g in self.param_groups]
+        call, own = f"{type(self).__name__}.load_state_dict", [{**g} for g in self.param_groups]
         if not isinstance(state_dict, Mapping):
             raise ValueError(f"{call}: {state_dict!r:.100}, but what state_dict() gives is needed")
 
@@ -334,12 +326,7 @@ class StepAdam(Adam):
             return
         saved, last, own_frame = take_from_groups(self.param_groups, self._slots)
         counts = [int(state["step"]) for state in self.state.values() if "step" in state]
-        missed = 0 if saved is None else max(counts, default=0) - saved["steps"]
-        if missed:
-            training.messages.say_once(
-                f"opt3dgs_optim: a stock Adam has gone on for {missed} steps with this checkpoint; "
-                "what was kept beside its moments begins anew"
-            )
+        missed = steps_of_a_stock_adam(counts, saved, training)
         ours = None if missed else saved  # what it says of the moments holds
         self._last, self._own_frame = ((), frozenset()) if ours is None else (last, own_frame)
         drop_other_means(self.state.values(), ours, training)
@@ -353,16 +340,8 @@ class StepAdam(Adam):
             training.resume(max([iteration, *clocks]))  # one that steps now and then lags
         if saved is not None:
             restore_notes(training, saved)
-        found = [recode(s, self.coded, training.moments, p.dtype) for p, s in self.state.items()]
-        was, self.coded = self.coded, training.moments == 16
-        if (
-            any(found)
-            and was != self.coded
-            and (saved is None or saved["moments"] != training.moments)
-        ):
-            training.messages.say_once(
-                f"opt3dgs_optim: the moments that were there are now at {training.moments} bits"
-            )
+        recode_all(self.state, self.coded, saved, training)
+        self.coded = training.moments == 16
         if self._own_frame and not training.changes_steps:
             for group, (which, name) in zip(self.param_groups, self._slots, strict=True):
                 if name == "means" and which in self._own_frame:
@@ -371,6 +350,8 @@ class StepAdam(Adam):
 
     def last_steps(self) -> tuple[int, ...]:
         """Of every parameter, the iteration of its last step."""
+        if self._steppers:
+            self.steppers()  # what is kept for rows that are others now goes: a copy knows no more
         return tuple(stepper.stepped_in for stepper in self._steppers) or self._last
 
     def own_frame(self) -> frozenset[str]:
@@ -382,7 +363,6 @@ class StepAdam(Adam):
     # -- copies ------------------------------------------------------------------------------------
 
     def __getstate__(self) -> dict[str, Any]:
-        self._drop_moved()
         kept = ("training", "ticket", "_slots", "_masked", "coded", "_on_gpu", "_implementations")
         own = {key: getattr(self, key) for key in kept}
         own |= {"_steppers": [], "_last": self.last_steps(), "_own_frame": self.own_frame()}
@@ -401,8 +381,7 @@ class StepAdam(Adam):
 
 
 _hooked_step: Any = Optimizer.profile_hook_step(StepAdam._step)
-# It reads numbers, which is not to be traced. `torch.compiler.disable` would import the compiler.
-_uncompiled_step: Any = torch._disable_dynamo(StepAdam._step)  # pyright: ignore
+_uncompiled_step: Any = torch._disable_dynamo(StepAdam._step)  # pyright: ignore  (it reads numbers)
 
 
 def _made_again(kind: type[StepAdam] | None, base: type[Adam]) -> StepAdam:

@@ -13,7 +13,7 @@ from opt3dgs_optim.checks import as_float, check_choice, check_count, check_numb
 from opt3dgs_optim.clock import Ticket
 from opt3dgs_optim.contract import REFUSED, Slots
 from opt3dgs_optim.mean import BEGAN, MEAN, OF_MEAN, RESIDUE, REST
-from opt3dgs_optim.moments import CODES, MOMENTS
+from opt3dgs_optim.moments import CODES, MOMENTS, recode
 from opt3dgs_optim.stepper import KEPT
 from opt3dgs_optim.training import Training
 
@@ -153,8 +153,43 @@ def drop_other_means(
             state.pop(key, None)
 
 
+def recode_all(
+    states: Mapping[Tensor, dict[str, Any]],
+    coded: bool,
+    saved: Mapping[str, Any] | None,
+    training: Training,
+) -> None:
+    """Have moments, which are codes or not, at as many bits as the training has; tell of a change.
+
+    Args:
+        states: of the optimizer, by parameter.
+        saved: what the checkpoint says, or None.
+    """
+    bits = training.moments
+    found = [recode(state, coded, bits, param.dtype) for param, state in states.items()]
+    if any(found) and coded != (bits == 16) and (saved is None or saved["moments"] != bits):
+        training.messages.say_once(
+            f"opt3dgs_optim: the moments that were there are now at {bits} bits"
+        )
+
+
+def steps_of_a_stock_adam(
+    counts: list[int], saved: Mapping[str, Any] | None, training: Training
+) -> int:
+    """How many steps a stock Adam has made with a checkpoint of ours; tell of them."""
+    missed = 0 if saved is None else max(counts, default=0) - saved["steps"]
+    if missed:
+        training.messages.say_once(
+            f"opt3dgs_optim: a stock Adam has gone on for {missed} steps with this checkpoint; "
+            "what was kept beside its moments begins anew"
+        )
+    return missed
+
+
 def iteration_by_counts(call: str, counts: list[int], training: Training) -> int:
     """The iteration that comes next, by Adam's own counts of steps, of a stock checkpoint."""
+    if not counts:
+        return training.iteration + 1
     if not any(counts):
         training.messages.warn_once(
             "uncounted",

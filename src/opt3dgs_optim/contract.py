@@ -26,13 +26,14 @@ def own_step(kind: type) -> type | None:
     for owner in kind.__mro__:
         if "step" in vars(owner) and issubclass(owner, Adam):
             # torch wraps, for hooks, the step of the class of the first optimizer in a process.
-            if _bare(vars(owner)["step"]) in (_bare(Adam.step), _bare(AdamW.step)):
+            if bare(vars(owner)["step"]) in (bare(Adam.step), bare(AdamW.step)):
                 return None
             return owner
     return None
 
 
-def _bare(step: Any) -> Any:
+def bare(step: Any) -> Any:
+    """A step without what torch puts around it, for hooks and profiles."""
     return step.__wrapped__ if getattr(step, "hooked", False) else step
 
 
@@ -128,7 +129,7 @@ def _check_bare(optimizer: Any) -> None:
 def of_scheduler(step: Any, kind: type) -> bool:
     """Whether it is what a learning-rate scheduler puts over a step, to see that it is called."""
     known = hasattr(step, "_wrapped_by_lr_sched") or hasattr(step, "_with_counter")
-    return known and _bare(getattr(step, "__wrapped__", None)) is _bare(getattr(kind, "step", None))
+    return known and bare(getattr(step, "__wrapped__", None)) is bare(getattr(kind, "step", None))
 
 
 def _check_bits(optimizer: Any, owner: type | None, slots: Slots, moments: int) -> None:
