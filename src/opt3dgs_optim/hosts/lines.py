@@ -13,13 +13,19 @@ from pathlib import Path
 
 from opt3dgs_optim.hosts.diff import ANY, edited
 from opt3dgs_optim.hosts.pages import PAGES
+from opt3dgs_optim.hosts.schedules import schedule, shortened
 from opt3dgs_optim.hosts.trainers import TRAINERS
 
 WIDTH = 100
 
 
-def text(name: str) -> str:
-    """All that is known of a trainer. KeyError for an unknown name."""
+def text(name: str, iterations: int | None = None) -> str:
+    """All that is known of a trainer, and its schedule shortened to so many iterations.
+
+    Raises:
+        KeyError: no trainer of this name is known.
+        ValueError: no schedule of it is known, or not for so many iterations.
+    """
     trainer = TRAINERS[name]
     notes = "\n".join(
         textwrap.fill(
@@ -27,7 +33,13 @@ def text(name: str) -> str:
         )
         for topic, said in trainer.notes.items()
     )
-    return "\n\n".join([trainer.head, trainer.block, notes])
+    head = textwrap.fill(trainer.head, WIDTH, break_on_hyphens=False)
+    if iterations is None:
+        return "\n\n".join([head, trainer.block, notes])
+    if (stock := schedule(trainer)) is None:
+        known = ", ".join(each for each, one in TRAINERS.items() if schedule(one))
+        raise ValueError(f"--iterations is for {known}; the schedule of {name} was not read")
+    return "\n\n".join([head, trainer.block, shortened(stock, iterations), notes])
 
 
 def _plain(said: str) -> str:
@@ -53,8 +65,8 @@ def put(path: Path, *, write: bool) -> tuple[str, str]:
         shutil.copy2(path, kept)
         path.write_bytes(new.encode())
         done = f"written, the old file is {kept}"
-    pair = (each.replace("\r", "").split("\n") for each in (old, new))
-    changes = "\n".join(difflib.unified_diff(*pair, str(path), str(path), lineterm=""))
+    before, after = (each.replace("\r", "").split("\n") for each in (old, new))
+    changes = "\n".join(difflib.unified_diff(before, after, str(path), str(path), lineterm=""))
     return changes, f"{trainer.title}: {done}"
 
 
@@ -74,16 +86,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--write", action="store_true", help="write them; the old file stays as FILE.orig"
     )
+    parser.add_argument(
+        "--iterations",
+        type=int,
+        metavar="N",
+        help="with NAME: also what shortens the whole schedule of its trainer to N iterations",
+    )
     options = parser.parse_args(arguments)
     word = options.trainer
     is_file = word is not None and (Path(word).exists() or word.endswith(".py"))
     if options.write and (word in TRAINERS or not is_file):
         parser.error("--write needs the path of a trainer's script")
+    if options.iterations is not None and word not in TRAINERS:
+        parser.error("--iterations needs the name of a trainer")
     if word is None:
         print("\n".join(f"{name:18} {trainer.title}" for name, trainer in TRAINERS.items()))
         print(f"\nAny other trainer:\n\n{ANY}")
     elif word in TRAINERS:
-        print(text(word))
+        try:
+            print(text(word, options.iterations))
+        except ValueError as error:
+            parser.error(str(error))
     elif is_file:
         try:
             changes, done = put(Path(word), write=options.write)
