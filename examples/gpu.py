@@ -5,7 +5,7 @@ On a machine with an NVIDIA GPU, torch for it and `pip install -e ".[cuda,test]"
 1. `opt3dgs doctor`, and the tests marked `cuda`;
 2. what a step costs beside six fused torch Adams: time, launches, waits for the device, memory;
 3. with `--gsplat PATH/examples/simple_trainer.py` and `--scene DIR`, gsplat's own `mcmc` training,
-   stock and with the lines of `opt3dgs hosts diff`.
+   stock and with the lines of `opt3dgs lines`.
 
 Writes `report.md` and `report.json` to `--out`. With `--device cpu` the first two run on a CPU, at
 smaller sizes, which says nothing about a GPU.
@@ -82,12 +82,12 @@ def training(script: Path, scene: Path, out: Path, iterations: int) -> dict[str,
 
 
 def trainings(script: Path, scene: Path, out: Path, iterations: int) -> dict[str, Any]:
-    """gsplat's training as it is, and with the lines that `opt3dgs hosts diff` puts into a copy."""
+    """gsplat's training as it is, and with the lines that `opt3dgs lines` puts into a copy."""
     edited = out / "edited"
     shutil.rmtree(edited, ignore_errors=True)
     plain = shutil.ignore_patterns(".git", "*.png", "*.jpg", "*.gif", "*.mp4", "results")
     shutil.copytree(script.parent, edited, ignore=plain)
-    code, said, _ = run([*PACKAGE, "hosts", "diff", str(edited / script.name), "--write"], out)
+    code, said, _ = run([*PACKAGE, "lines", str(edited / script.name), "--write"], out)
     if code:
         return {"failed": said.strip()}
     scripts = {"stock": script, "with the lines": edited / script.name}

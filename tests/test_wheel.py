@@ -176,7 +176,9 @@ def test_version_comes_from_git(
     """Never one that the changelog does not have: the last release's, with the commit after it."""
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, tmp_path)
-    shutil.copytree(ROOT / "src", tmp_path / "src", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("src", "docs/hosts"):
+        plain = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=plain)
     if tags is not None:
         (tmp_path / ".gitignore").write_text("out/\n__pycache__/\n")
         who = ["-c", "user.name=x", "-c", "user.email=x@example.org", "-c", "commit.gpgsign=false"]
@@ -206,6 +208,13 @@ def test_wheel_trains_in_an_empty_environment(installed: Path, tmp_path: Path) -
     done = run(installed, tmp_path, "-c", SMOKE.format(place=place))
     assert done.returncode == 0, done.stderr
     assert done.stdout.endswith("trained\n")
+
+
+def test_a_trainers_lines_and_notes_are_in_the_wheel(installed: Path, tmp_path: Path) -> None:
+    done = run(installed, tmp_path, "-m", "opt3dgs_optim", "lines", "3dgs-mcmc")
+    assert done.returncode == 0, done.stderr
+    for said in ("phases = PhaseScheduler(opt.iterations - 1)", "Noise: ", "Resume: "):
+        assert said in done.stdout
 
 
 def test_doctor_finds_the_wheel_in_order(installed: Path, wheel: Path, tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from opt3dgs_optim.version import __version__
 
 MODULES = {
     "lines": "hosts.lines",
-    "hosts": "hosts.diff",
     "doctor": "doctor",
     "report": "runs.report",
 }
@@ -17,8 +16,7 @@ USAGE = f"""opt3dgs_optim {__version__}
 
 opt3dgs COMMAND ...
 
-  lines   the three lines for your trainer, and where each goes
-  hosts   the same lines put into your trainer's file, as a diff or applied
+  lines   the three lines for your trainer, printed or put into its script
   doctor  versions, what runs on this machine and why, and a self-test
   report  compare runs from their logs: error against run time
 

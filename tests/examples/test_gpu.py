@@ -17,7 +17,7 @@ from benchmarks import steps
 @pytest.fixture
 def said(monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple[int, str]]:
     """What the processes say that it starts; the doctor and the tests do not run."""
-    answers = {"doctor": (0, "all is well"), "pytest": (0, "3 passed"), "diff": (0, "written")}
+    answers = {"doctor": (0, "all is well"), "pytest": (0, "3 passed"), "lines": (0, "written")}
     answers |= {"stock": (0, ""), "with the lines": (1, "a\nImportError: no tyro\n")}
 
     def run(words: Any, folder: Path = gpu.ROOT) -> tuple[int, str, float]:

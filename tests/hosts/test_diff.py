@@ -1,4 +1,4 @@
-"""`opt3dgs hosts diff`: the lines in the right places, or none.
+"""`opt3dgs lines FILE`: the lines in the right places, or none.
 
 The files here are made of the lines that `trainers` asks for, and of nothing of the real ones;
 `test_trainers.py` has those.
@@ -12,11 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from opt3dgs_optim.hosts import diff
-from opt3dgs_optim.hosts.places import Trainer
-from opt3dgs_optim.hosts.trainers import ANY, TRAINERS
+from opt3dgs_optim.hosts import diff, lines
+from opt3dgs_optim.hosts.diff import ANY
+from opt3dgs_optim.hosts.pages import Trainer
+from opt3dgs_optim.hosts.trainers import TRAINERS
 
-EDITED = [name for name, trainer in TRAINERS.items() if trainer.inserted]
+EDITED = [name for name, trainer in TRAINERS.items() if trainer.signs]
 
 
 def statement(text: str) -> list[str]:
@@ -67,19 +68,19 @@ def test_the_lines_go_to_their_places(name: str) -> None:
     found, new = diff.edited(text)
     assert found is trainer
     ast.parse(new)
-    old, lines = text.split("\n"), new.split("\n")
-    rest = iter(lines)
+    old, made = text.split("\n"), new.split("\n")
+    rest = iter(made)
     assert all(line in rest for line in old)  # in their order
-    assert len(lines) - len(old) == sum(len(p.lines) * p.times for p in trainer.places)
+    assert len(made) - len(old) == sum(len(p.lines) * p.times for p in trainer.places)
     for place in trainer.places:
         indent = place.anchor[: len(place.anchor) - len(place.anchor.lstrip())]
-        expected = [f"{indent}{line}" for line in trainer.lines_at(place)]
-        places = [at for at, line in enumerate(lines) if line == place.anchor]
+        expected = [f"{indent}{line}" for line in place.lines]
+        places = [at for at, line in enumerate(made) if line == place.anchor]
         assert len(places) == place.times
         for at in places:
             size = len(expected)
             start = at - size if place.above else at + 1
-            assert lines[start : start + size] == expected
+            assert made[start : start + size] == expected
 
 
 @pytest.mark.parametrize("name", EDITED)
@@ -137,16 +138,16 @@ def test_written_and_kept(
     old = start + b"#\n" + example(TRAINERS["3dgs-mcmc"]).rstrip("\n").replace("\n", end).encode()
     old = old.replace(b"#\n", f"#{end}".encode())
     path.write_bytes(old)
-    assert diff.main(["diff", str(path)]) == 0
+    assert lines.main([str(path)]) == 0
     assert path.read_bytes() == old
     assert "+    phases = PhaseScheduler(opt.iterations - 1)" in capsys.readouterr().out
-    assert diff.main(["diff", str(path), "--write"]) == 0
+    assert lines.main([str(path), "--write"]) == 0
     assert path.with_name("train.py.orig").read_bytes() == old
     new = path.read_bytes()
     assert new.count(b"\n") == old.count(b"\n") + 3
     assert new.count(b"\r\n") == (new.count(b"\n") if end == "\r\n" else 0)
     capsys.readouterr()
-    assert diff.main(["diff", str(path), "--write"]) == 1
+    assert lines.main([str(path), "--write"]) == 1
     assert "already, so that nothing is inserted" in capsys.readouterr().err
     assert path.read_bytes() == new
 
@@ -157,7 +158,7 @@ def test_an_old_copy_is_never_written_over(
     path, kept = tmp_path / "train.py", tmp_path / "train.py.orig"
     path.write_text(example(TRAINERS["gsplat"]))
     kept.write_text("mine")
-    assert diff.main(["diff", str(path), "--write"]) == 1
+    assert lines.main([str(path), "--write"]) == 1
     assert "move it away" in capsys.readouterr().err
     assert (kept.read_text(), path.read_text()) == ("mine", example(TRAINERS["gsplat"]))
 
@@ -171,17 +172,16 @@ def test_what_cannot_be_read(
         path.write_bytes(content)
     elif content:
         path.mkdir()
-    assert diff.main(["diff", str(path), "--write"]) == 1
+    assert lines.main([str(path), "--write"]) == 1
     said = capsys.readouterr().err
     assert str(path) in said
     assert ("there is no such file" in said) == (not path.is_file())
 
 
-def test_the_command_says_what_it_can_do(capsys: pytest.CaptureFixture[str]) -> None:
-    for words in ([], ["--help"], ["diff"]):
-        assert diff.main(words) == 0
-        printed = capsys.readouterr().out
-        known = [f"  {TRAINERS[name].title}: {TRAINERS[name].file}" for name in EDITED]
-        assert printed.splitlines()[-len(EDITED) :] == known
-    for words in (["apply", "x"], ["diff", "a", "b"], ["diff", "--no-such-option"]):
-        assert diff.main(words) == 2
+@pytest.mark.parametrize(
+    "words", [["--write"], ["gsplat", "--write"], ["gsplt", "--write"], ["a", "b"], ["--no-such"]]
+)
+def test_a_wrong_command(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        lines.main(words)
+    assert "usage: opt3dgs lines" in capsys.readouterr().err

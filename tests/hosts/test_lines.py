@@ -1,4 +1,4 @@
-"""`opt3dgs lines`: every trainer has its lines, and the pages of docs/hosts/ say the same."""
+"""`opt3dgs lines`: every trainer's lines and notes are read from its page as they stand there."""
 
 from __future__ import annotations
 
@@ -9,63 +9,70 @@ from pathlib import Path
 import pytest
 
 from opt3dgs_optim.hosts import lines
-from opt3dgs_optim.hosts.trainers import ANY, TRAINERS
+from opt3dgs_optim.hosts.diff import ANY
+from opt3dgs_optim.hosts.pages import section
+from opt3dgs_optim.hosts.trainers import TRAINERS
 
 ROOT = Path(__file__).resolve().parents[2]
-DOCS = ROOT / "docs" / "hosts"
 PATCHES = ROOT / "examples" / "hosts"
-NAMES = list(lines.known())
-PYTHON = [name for name in NAMES if name not in ("lightning", "nerfstudio")]
-
-
-def words(text: str) -> str:
-    """Without line breaks, which pages and terminals set differently."""
-    return " ".join(text.split())
+PYTHON = [name for name, trainer in TRAINERS.items() if trainer.places]
+PARTS = {
+    **dict.fromkeys(["gsplat-mcmc", "3dgs-mcmc"], r"None"),
+    **dict.fromkeys(["gsplat", "faster-gs", "3dgrut", "fvdb"], r"None if .+ else DEFAULTS_ADC"),
+    "citygaussian": r"None if .+ else DEFAULTS_ADC",
+}
 
 
 def test_the_list_has_every_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert lines.main([]) == 0
     printed = capsys.readouterr().out
-    assert [line.split()[0] for line in printed.splitlines()[: len(NAMES)]] == NAMES
+    listed = [re.split(r"  +", line) for line in printed.splitlines()[: len(TRAINERS)]]
+    assert listed == [[name, trainer.title] for name, trainer in TRAINERS.items()]
     assert ANY in printed
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_trainers_page_has_what_is_printed(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Its lines stand in one block of a page, and each of its notes in that page's text."""
+@pytest.mark.parametrize("name", TRAINERS)
+def test_what_is_printed_stands_on_the_page(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every group of lines and every note of its own section; a link is for a page."""
+    trainer = TRAINERS[name]
     assert lines.main([name]) == 0
     printed = capsys.readouterr().out
-    trainer, relocates = lines.known()[name]
-    block = lines.block(trainer, relocates)
-    assert block in printed
-    assert "](" not in printed  # a link is for a page
-    for said in (said for topic, said in trainer.notes.items() if topic != "Density control"):
-        assert set(re.findall("`.+?`", said)) <= set(re.findall("`.+?`", words(printed))), said
-    pages = [page.read_text(encoding="utf-8") for page in sorted(DOCS.glob("*.md"))]
-    found = [page for page in pages if f"\n{block}\n```" in page]
-    assert len(found) == 1
-    for topic, said in trainer.notes.items():
-        assert words(f"**{topic}.** {said}") in words(found[0]), topic
-    for commit in trainer.read:
-        assert commit in words(found[0])
+    own = section(trainer.sections[-1])
+    (fenced,) = re.findall(r"^```(?:py|yaml|sh)\n(# .+?)```$", own, re.M | re.S)
+    assert fenced in printed
+    assert "](" not in printed
+    pages = "".join(section(place) for place in trainer.sections)
+    for topic in set(re.findall(r"^\*\*(.+?)\.\*\* ", pages, re.M)) | {"Density control"}:
+        assert len(re.findall(rf"^{topic}: ", printed, re.M)) == 1
+    for said in re.findall(r"^\*\*.+?\.\*\*(?: .+\n)+", own, re.M):
+        wanted = set(re.findall("`.+?`", " ".join(said.split())))
+        assert wanted <= set(re.findall("`.+?`", " ".join(printed.split())))
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_a_place_is_one_of_a_file(name: str) -> None:
+    """Every comment above lines says a place, or none does: a plugin, a command."""
+    trainer = TRAINERS[name]
+    groups = trainer.block.split("\n\n")
+    assert len(trainer.places) in (0, len(groups))
+    assert all(group.startswith("# ") for group in groups)
+    assert re.fullmatch(r"File: .+ of .+ \(github\.com/\S+/\S+\)\. Read at .+\.", trainer.head)
+    if trainer.signs:
+        assert trainer.places
 
 
 @pytest.mark.parametrize("name", PYTHON)
 def test_the_lines_are_three_statements(name: str) -> None:
     """An import, a scheduler with the preset of the density control, an upgrade; nothing else."""
-    trainer, relocates = lines.known()[name]
-    tree = ast.parse(lines.block(trainer, relocates))
+    trainer = TRAINERS[name]
+    tree = ast.parse(trainer.block)
     scheduler = next(
         node
         for node in ast.walk(tree)
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "PhaseScheduler"
     )
     parts = {k.arg: ast.unparse(k.value) for k in scheduler.keywords}.get("parts", "None")
-    expected = {True: "None", False: "DEFAULTS_ADC"}
-    if isinstance(relocates, bool):
-        assert parts == expected[relocates]
-    else:
-        assert re.fullmatch(r"None if .+ else DEFAULTS_ADC", parts)
+    assert re.fullmatch(PARTS.get(name, "DEFAULTS_ADC"), parts)
     imported = {"PhaseScheduler"} | ({"DEFAULTS_ADC"} if parts != "None" else set())
     first = tree.body[0]
     assert isinstance(first, ast.ImportFrom)
@@ -92,13 +99,14 @@ def test_a_patch_adds_the_lines(patch: Path) -> None:
     text = patch.read_text(encoding="utf-8")
     changed = [line for line in text.splitlines() if re.match(r"[+-](?!\+\+|--)", line)]
     added = [line[1:].strip() for line in changed if line.startswith("+")]
-    expected = [line for place in trainer.places for line in trainer.lines_at(place) * place.times]
+    expected = [line for place in trainer.places for line in place.lines * place.times]
     assert added == expected
     assert len(added) == len(changed)  # nothing is taken away
-    assert trainer.read[0].split(" (")[0].split()[-1] in text  # the commit
+    commit = re.findall(r"Read at (?:main )?(.+?)[,. ]", trainer.head)[0]
+    assert commit in text
 
 
 def test_every_edited_trainer_has_a_patch() -> None:
     assert {path.stem for path in PATCHES.glob("*.patch")} == {
-        name for name, trainer in TRAINERS.items() if trainer.inserted
+        name for name, trainer in TRAINERS.items() if trainer.signs
     }

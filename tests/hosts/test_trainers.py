@@ -31,7 +31,7 @@ PLACES = {  # the folder of each trainer's sources; the others' is their name
 }  # fmt: skip
 OLDER = [("gsplat", "gsplat-1.5.3"), ("gsplat", "gsplat-1.4.0"), ("gsplat-2dgs", "gsplat-1.5.3"),
          ("gsplat-2dgs", "gsplat-1.4.0"), ("inria", "gaussian-splatting-2024-04")]  # fmt: skip
-EACH = [(name, PLACES.get(name, name)) for name, each in TABLE.items() if each.inserted]
+EACH = [(name, PLACES.get(name, name)) for name, each in TABLE.items() if each.signs]
 
 PATCHES = Path(__file__).resolve().parents[2] / "examples" / "hosts"
 

@@ -1,4 +1,4 @@
-"""The lines put into a trainer's file: `opt3dgs hosts diff FILE [--write]`.
+"""The lines put into a trainer's file.
 
 The file is known by whole lines that it must have exactly so often as `trainers` says. Lines are
 inserted and nothing else changes, which the syntax tree of the new file confirms. Any other file is
@@ -8,22 +8,18 @@ refused, with the lines to write by hand.
 from __future__ import annotations
 
 import ast
-import difflib
 import re
-import shutil
-import sys
-from collections.abc import Sequence
-from pathlib import Path
 
-from opt3dgs_optim.hosts.lines import block
-from opt3dgs_optim.hosts.places import Trainer
-from opt3dgs_optim.hosts.trainers import ANY, TRAINERS
+from opt3dgs_optim.hosts.pages import Trainer
+from opt3dgs_optim.hosts.trainers import TRAINERS
 
-USAGE = """opt3dgs hosts diff FILE           the lines that FILE would get, as a diff
-opt3dgs hosts diff FILE --write   writes them, and keeps the old file as FILE.orig
+ANY = """\
+from opt3dgs_optim import PhaseScheduler
 
-The files that it knows; for every other one `opt3dgs lines` prints the lines to write by hand:
-{known}"""
+# above the training loop, when the optimizers are made and a checkpoint is loaded
+phases = PhaseScheduler(N)  # N: how many steps the training makes
+phases.upgrade(OPTIMIZERS)  # a torch.optim.Adam with named groups, a dict of them, or a list
+# with clone, split and prune: PhaseScheduler(N, parts=DEFAULTS_ADC), imported beside it"""
 
 
 def misses(trainer: Trainer, text: str) -> list[str]:
@@ -54,7 +50,7 @@ def edited(text: str) -> tuple[Trainer, str]:
     if word := re.search(r"\b(opt3dgs_optim|PhaseScheduler|DEFAULTS_ADC|phases)\b", plain):
         line = plain.count("\n", 0, word.start()) + 1
         raise ValueError(f"line {line} has `{word[0]}` already, so that nothing is inserted")
-    fit = [each for each in TRAINERS.values() if each.inserted and not misses(each, plain)]
+    fit = [each for each in TRAINERS.values() if each.signs and not misses(each, plain)]
     if len(fit) != 1:
         raise ValueError(_by_hand(plain))
     trainer, lines = fit[0], text.split("\n")
@@ -62,7 +58,7 @@ def edited(text: str) -> tuple[Trainer, str]:
     for place in trainer.places:
         for at in _starts(place.anchor, plain):
             end = "\r" if lines[at].endswith("\r") else ""
-            new = [f"{place.indent}{line}{end}" for line in trainer.lines_at(place)]
+            new = [f"{place.indent}{line}{end}" for line in place.lines]
             inserted.setdefault(at if place.above else at + 1, []).extend(new)
     whole: list[str] = []
     ours: set[int] = set()  # numbers of our lines, from 1
@@ -109,42 +105,8 @@ def _by_hand(text: str) -> str:
         return f"it is no trainer that is known; the lines to write by hand:\n\n{ANY}"
     found = ((place.anchor, at) for place in best.places for at in _starts(place.anchor, text))
     numbers = [f"line {at + 1}: `{anchor.strip()}`" for anchor, at in found]
-    differs = misses(best, text) if best.inserted else ["a line of it must be replaced"]
+    differs = misses(best, text) if best.signs else ["a line of it must be replaced"]
     return (
         f"it is like {best.title}, but {'; '.join(differs[:3])}. Read the file, then write by hand "
-        f"what holds of these lines ({', '.join(numbers)}):\n\n{block(best)}"
+        f"what holds of these lines ({', '.join(numbers)}):\n\n{best.block}"
     )
-
-
-def main(arguments: Sequence[str]) -> int:
-    """Print the diff or write it: 0; 1 where the file is refused, 2 for a wrong command."""
-    words = [word for word in arguments if word != "--write"]
-    if not words or words[0] in ("-h", "--help") or words == ["diff"]:
-        files = (f"  {each.title}: {each.file}" for each in TRAINERS.values() if each.inserted)
-        print(USAGE.format(known="\n".join(files)))
-        return 0
-    if words[0] != "diff" or len(words) > 2 or words[1].startswith("-"):
-        print(
-            f"opt3dgs hosts: no command {' '.join(words)!r}; diff FILE [--write]", file=sys.stderr
-        )
-        return 2
-    path = Path(words[1])
-    kept = path.with_name(f"{path.name}.orig")
-    try:
-        if not path.is_file():
-            raise ValueError("there is no such file; give the path of the trainer's script")
-        old = path.read_bytes().decode()
-        trainer, new = edited(old)
-        if "--write" in arguments:
-            if kept.exists():
-                raise ValueError(f"{kept} is there already; move it away")
-            shutil.copy2(path, kept)
-            path.write_bytes(new.encode())
-    except (OSError, ValueError) as error:
-        print(f"opt3dgs hosts diff {path}: {error}", file=sys.stderr)
-        return 1
-    pair = (old.replace("\r", "").split("\n"), new.replace("\r", "").split("\n"))
-    print("\n".join(difflib.unified_diff(*pair, str(path), str(path), lineterm="")))
-    done = f"written, the old file is {kept}" if "--write" in arguments else "not written"
-    print(f"\n{trainer.title}: {done}", file=sys.stderr)
-    return 0

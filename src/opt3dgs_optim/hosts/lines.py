@@ -1,85 +1,123 @@
-"""The lines for a trainer, by its name: `opt3dgs lines`, `opt3dgs lines gsplat-mcmc`."""
+"""The lines for a trainer, by its name or put into its file: `opt3dgs lines`."""
 
 from __future__ import annotations
 
+import argparse
 import difflib
 import re
+import shutil
 import sys
 import textwrap
 from collections.abc import Sequence
+from pathlib import Path
 
-from opt3dgs_optim.hosts.places import Place, Trainer
-from opt3dgs_optim.hosts.trainers import ANY, TRAINERS
+from opt3dgs_optim.hosts.diff import ANY, edited
+from opt3dgs_optim.hosts.pages import PAGES
+from opt3dgs_optim.hosts.schedules import schedule, shortened
+from opt3dgs_optim.hosts.trainers import TRAINERS
 
-USAGE = """opt3dgs lines             the trainers that are known
-opt3dgs lines TRAINER     its lines, where they go, and what to know
-
-"""
 WIDTH = 100
 
 
-def known() -> dict[str, tuple[Trainer, bool | str]]:
-    """Every name, with its trainer and what the lines assume of density control."""
-    found = {}
-    for name, trainer in TRAINERS.items():
-        found[name] = trainer, trainer.relocates
-        found.update((each, (trainer, kind)) for each, kind in trainer.variants.items())
-    return found
+def text(name: str, iterations: int | None = None) -> str:
+    """All that is known of a trainer, and its schedule shortened to so many iterations.
 
-
-def block(trainer: Trainer, relocates: bool | str | None = None) -> str:
-    """The lines, each group below a comment that says where it goes."""
-    groups = []
-    for place in trainer.places:
-        lines = trainer.lines_at(place, relocates)
-        groups.append("\n".join([f"# {where(place)}", *lines]))
-    return "\n\n".join(groups)
-
-
-def where(place: Place) -> str:
-    """The place in words."""
-    if not place.anchor.startswith((" ", "import")):
-        return place.anchor
-    side = "above" if place.above else "below"
-    each = "" if place.times == 1 else f", at each of its {place.times} places"
-    inside = f", indented by {len(place.indent)} as it is" if place.indent else ""
-    return f"{side} `{place.anchor.strip()}`{inside}{each}"
-
-
-def text(name: str) -> str:
-    """All that is known of a trainer. KeyError for an unknown name."""
-    trainer, relocates = known()[name]
-    read = ", ".join(trainer.read)
-    head = f"{trainer.title}: {trainer.file}\ngithub.com/{trainer.repository}, read at {read}"
-    notes = (
+    Raises:
+        KeyError: no trainer of this name is known.
+        ValueError: no schedule of it is known, or not for so many iterations.
+    """
+    trainer = TRAINERS[name]
+    notes = "\n".join(
         textwrap.fill(
             f"{topic}: {_plain(said)}", WIDTH, subsequent_indent="  ", break_on_hyphens=False
         )
         for topic, said in trainer.notes.items()
-        if not (topic == "Density control" and isinstance(relocates, bool) and trainer.variants)
     )
-    return "\n\n".join([head, block(trainer, relocates), "\n".join(notes)])
+    head = textwrap.fill(trainer.head, WIDTH, break_on_hyphens=False)
+    if iterations is None:
+        return "\n\n".join([head, trainer.block, notes])
+    if (stock := schedule(trainer)) is None:
+        known = ", ".join(each for each, one in TRAINERS.items() if schedule(one))
+        raise ValueError(f"--iterations is for {known}; the schedule of {name} was not read")
+    return "\n\n".join([head, trainer.block, shortened(stock, iterations), notes])
 
 
 def _plain(said: str) -> str:
     """A page's link, `[title](page)`, as words for a terminal."""
-    return re.sub(r"\[([^][]+)\]\(([^)]+)\)", r'"\1" (docs/hosts/\2)', said)
+    return re.sub(r"\[([^][]+)\]\(([^)]+)\)", rf'"\1" ({PAGES.as_posix()}/\2)', said)
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Print the trainers, or one trainer's lines; 2 for a name that is not known."""
-    names = known()
-    if not arguments or arguments[0] in ("-h", "--help"):
-        for name, (trainer, _) in names.items():
-            print(f"{name:18} {trainer.title}: {trainer.file}")
-        print(f"\n{USAGE}{ANY}")
-        return 0
-    if len(arguments) > 1 or arguments[0] not in names:
-        near = difflib.get_close_matches(arguments[0], names, cutoff=0.4)
+def put(path: Path, *, write: bool) -> tuple[str, str]:
+    """The lines in a file, as a diff, and what was done; written where that is asked for.
+
+    Raises:
+        ValueError: the file is refused; the message has what to do by hand.
+    """
+    if not path.is_file():
+        raise ValueError("there is no such file; give the path of the trainer's script")
+    old = path.read_bytes().decode()
+    trainer, new = edited(old)
+    done = "not written"
+    if write:
+        kept = path.with_name(f"{path.name}.orig")
+        if kept.exists():
+            raise ValueError(f"{kept} is there already; move it away")
+        shutil.copy2(path, kept)
+        path.write_bytes(new.encode())
+        done = f"written, the old file is {kept}"
+    before, after = (each.replace("\r", "").split("\n") for each in (old, new))
+    changes = "\n".join(difflib.unified_diff(before, after, str(path), str(path), lineterm=""))
+    return changes, f"{trainer.title}: {done}"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print or write what was asked for: 0; 1 for a file that is refused, 2 for a wrong word."""
+    parser = argparse.ArgumentParser(
+        prog="opt3dgs lines",
+        description="The three lines for your trainer, and where they go.",
+        epilog="Without an argument: the names of the trainers that are known.",
+    )
+    parser.add_argument(
+        "trainer",
+        nargs="?",
+        metavar="NAME|FILE",
+        help="a trainer's name: its lines, and what to know; its script: the same lines as a diff",
+    )
+    parser.add_argument(
+        "--write", action="store_true", help="write them; the old file stays as FILE.orig"
+    )
+    parser.add_argument(
+        "--iterations",
+        type=int,
+        metavar="N",
+        help="with NAME: also what shortens the whole schedule of its trainer to N iterations",
+    )
+    options = parser.parse_args(arguments)
+    word = options.trainer
+    is_file = word is not None and (Path(word).exists() or word.endswith(".py"))
+    if options.write and (word in TRAINERS or not is_file):
+        parser.error("--write needs the path of a trainer's script")
+    if options.iterations is not None and word not in TRAINERS:
+        parser.error("--iterations needs the name of a trainer")
+    if word is None:
+        print("\n".join(f"{name:18} {trainer.title}" for name, trainer in TRAINERS.items()))
+        print(f"\nAny other trainer:\n\n{ANY}")
+    elif word in TRAINERS:
+        try:
+            print(text(word, options.iterations))
+        except ValueError as error:
+            parser.error(str(error))
+    elif is_file:
+        try:
+            changes, done = put(Path(word), write=options.write)
+        except (OSError, ValueError) as error:
+            print(f"opt3dgs lines {word}: {error}", file=sys.stderr)
+            return 1
+        print(changes)
+        print(f"\n{done}", file=sys.stderr)
+    else:
+        near = difflib.get_close_matches(word, TRAINERS, cutoff=0.4)
         meant = f"did you mean {' or '.join(near)}?" if near else "any trainer has these lines:"
-        print(
-            f"opt3dgs lines: no trainer {' '.join(arguments)!r}; {meant}\n\n{ANY}", file=sys.stderr
-        )
+        print(f"opt3dgs lines: no trainer and no file {word!r}; {meant}\n\n{ANY}", file=sys.stderr)
         return 2
-    print(text(arguments[0]))
     return 0
