@@ -346,7 +346,9 @@ RUNS = {
     "inria": Trial("gaussian-splatting", "--disable_viewer"),
     "3dgs-mcmc": Trial("3dgs-mcmc", "--init_type sfm"),
     "2dgs": Trial("2d-gaussian-splatting"),
-    "gsplat-mcmc": Trial("gsplat-main", script="examples/simple_trainer.py"),
+    "gsplat-mcmc": Trial(
+        "gsplat-main", "--strategy.cap_max 2500", script="examples/simple_trainer.py"
+    ),
     "gsplat-default": Trial("gsplat-main", script="examples/simple_trainer.py"),
 }
 
@@ -372,7 +374,14 @@ def test_what_is_printed_is_pasted_and_runs_to_its_end(
     given = {"SCENE": str(scene), "GAUSSIANS": "2500"}
     own = ["-m", str(out), "--images", "images_jpg", "--eval"]
     if trial.gsplat:
-        own = ["--result_dir", str(out), "--data_factor", "4", "--disable_viewer"]
+        own = [
+            "--result_dir",
+            str(out),
+            "--data_factor",
+            "4",
+            "--disable_viewer",
+            "--disable_video",
+        ]
     done = run(path, [given.get(w, w) for w in words[2:]] + own + trial.options.split(), out)
     assert done.code == 0, done.output[-3000:]
     steps = SHORTEST if trial.gsplat else SHORTEST - 1
