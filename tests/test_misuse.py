@@ -272,7 +272,7 @@ def test_a_run_that_is_longer_than_it_was_said(recwarn: pytest.WarningsRecorder)
     found = [str(each.message) for each in recwarn]
     assert len(found) == 1
     assert "iteration 11 of total_steps=10" in found[0]
-    assert "pass the training's number of iterations" in found[0]
+    assert "pass its number of iterations as total_steps" in found[0]
 
 
 def test_moments_of_other_rows_are_named() -> None:

@@ -19,14 +19,15 @@ from torch.optim.optimizer import _global_optimizer_post_hooks, _global_optimize
 from opt3dgs_optim.checkpoint import (
     STATE_KEY,
     check_loaded,
+    complete_groups,
     drop_other_means,
+    forget_own_frames,
     iteration_by_counts,
     note_in_groups,
     numbers_of,
     recode_all,
     restore_notes,
     restore_parts,
-    say_other_names,
     steps_of_a_stock_adam,
     take_from_groups,
 )
@@ -36,7 +37,7 @@ from opt3dgs_optim.mean import put_mean
 from opt3dgs_optim.moments import MOMENTS, as_numbers
 from opt3dgs_optim.names import split_name
 from opt3dgs_optim.sparse_adam import check_arguments, refuse_mask, step_around
-from opt3dgs_optim.stepper import KEPT, ParamStepper
+from opt3dgs_optim.stepper import ParamStepper, kept_in
 from opt3dgs_optim.training import Member, Training
 
 
@@ -44,29 +45,28 @@ class StepAdam(Adam):
     """`torch.optim.Adam` whose steps have the parts of a `Training`.
 
     Made by `PhaseScheduler.upgrade`, `AWSGLD` and `LQNAdam`. An upgraded optimizer is an instance
-    of this class *and* of the class that it had. Without parts its step is that class's own.
-
-    What it keeps lies beside Adam's moments in `state[param]`, rows first, and as a line of JSON in
-    `param_groups[i]["opt3dgs"]`, so that `state_dict()` and `torch.save` carry it.
+    of this class *and* of the class that it had. Without parts its step is that class's own. What
+    it keeps lies beside Adam's moments in `state[param]`, rows first.
     """
 
     training: Training
     ticket: Ticket
     coded = False  # whether its moments are codes of 16 bits, see `moments`
-    _implementations: list[Any] = []  # noqa: RUF012  (`fused` and `foreach` of the trainer's groups)
     _base: type[Adam] = Adam  # the class whose optimizer it was
     _steppers: list[ParamStepper] = []  # noqa: RUF012  (made anew, never changed)
     _in_order: list[ParamStepper] = []  # noqa: RUF012  (the same, as they step)
     _slots: Slots
-    # Where it has not stepped since a load: of every parameter, the iteration of its last step, and
-    # the sets whose positions' moments are those of the own frame.
-    _last: tuple[int, ...] = ()
+    _last: tuple[int, ...] = ()  # what `last_steps` and `own_frame` say until the first step
     _own_frame: frozenset[str] = frozenset()
 
     def follow(self, training: Training, slots: Slots) -> None:
         """Have the parts of `training` from now on; slots are, by group, set and name."""
         self._last, self._own_frame = self.last_steps(), self.own_frame()
-        self.training, self._slots, self._steppers = training, slots, []
+        if len(self._last) != sum(len(group["params"]) for group in self.param_groups):
+            self._last = ()  # groups are others now
+        self.training, self._slots, self._steppers, self._in_order = training, slots, [], []
+        if not self.state:
+            self.coded = training.moments == 16
         if "ticket" not in vars(self):
             self.ticket = Ticket()
         self._masked = own_step(self._base) is not None
@@ -77,12 +77,15 @@ class StepAdam(Adam):
 
     def _name_groups(self) -> None:
         """Say in each group which Gaussian parameter it holds, by gsplat's name, or None."""
+        members = self.training.members
+        for slot in [slot for slot, member in members.items() if member.optimizer is self]:
+            del members[slot]
         for at, (which, name) in enumerate(self._slots):
             self.param_groups[at]["gaussian"] = name
             # Always there, since flattened states are loaded by the keys that a group has.
             self.param_groups[at].setdefault(STATE_KEY, "")
             if name is not None:
-                self.training.members[which, name] = Member(self, at, self.ticket)
+                members[which, name] = Member(self, at, self.ticket)
             if name == "means":
                 self.ticket.has_means = self.training.counts_means = True
 
@@ -90,8 +93,6 @@ class StepAdam(Adam):
         """Keep Adam's count of steps on the host, which reads it in every step of ours."""
         if not self.training.changes_steps:
             return
-        own = [(group.get("fused"), group.get("foreach")) for group in self.param_groups]
-        self._implementations = [*self._implementations, *own[len(self._implementations) :]]
         for group in self.param_groups:
             group["fused"], group["foreach"] = False, False
         for state in self.state.values():
@@ -161,7 +162,8 @@ class StepAdam(Adam):
             self.own_class_step(*given, **masks)
         elif self._masked:
             itself = functools.partial(self.own_class_step, *given, **masks)
-            step_around(self.steppers(), self.state, iteration, itself)
+            self.steppers()
+            step_around(self._in_order, self.state, iteration, itself)
         else:
             with_grad = torch.is_grad_enabled()
             torch._C._set_grad_enabled(False)  # in a tenth of the time of `with torch.no_grad()`
@@ -185,6 +187,11 @@ class StepAdam(Adam):
                     return self._new_steppers()
                 i += 1
         return steppers if i == len(steppers) else self._new_steppers()
+
+    def notice_edits(self) -> None:
+        """Drop what is kept for rows that are others since the last step; a copy knows no more."""
+        if self._steppers:
+            self.steppers()
 
     def _new_steppers(self) -> list[ParamStepper]:
         if len(self._slots) != len(self.param_groups):
@@ -229,17 +236,17 @@ class StepAdam(Adam):
             rows: their indices, or an [N] bool mask.
         """
         check_held(f"{type(self).__name__}.reset_rows", self, param)
+        self.notice_edits()
         state = self.state.get(param, {})
-        for key in (*MOMENTS, *KEPT):
+        for key in (*MOMENTS, *kept_in(state)):
             if key in state:
                 state[key][rows] = 0
 
     @torch.no_grad()
     def put_means(self) -> int:
-        """Put the running means in the parameters' place now; of how many parameters.
+        """Put the running means in the parameters' place, also after noise; of how many parameters.
 
-        Of those that have not gone on since the end of the training. Inside it once more where a
-        step has put it: 3DGS-MCMC's trainers add noise to positions after the step.
+        Those stay as they are that have gone on since the end of the training.
         """
         found, end = 0, self.training.total_steps
         for stepper in self.steppers():
@@ -254,16 +261,17 @@ class StepAdam(Adam):
     def state_dict(self) -> dict[str, Any]:
         """As torch's, with what is ours in each group, `"opt3dgs"`: a line of JSON.
 
-        Any Adam may load it, and has the trainer's `fused` and `foreach` again. Moments of 16 bits
-        are float32 in it, on the host; their codes are the same again.
+        Any Adam may load it, with the trainer's `fused` and `foreach`. Moments of 16 bits are
+        float32 in it, on the host.
         """
         if not self.training.changes_steps:
             return super().state_dict()
         own = [dict(group) for group in self.param_groups]
-        self.note_in_groups()
-        for group, own_kind in zip(self.param_groups, self._implementations, strict=True):
-            group["fused"], group["foreach"] = own_kind
         try:
+            self.note_in_groups()
+            for group in self.param_groups:
+                for option in ("fused", "foreach"):
+                    group[option] = self.defaults.get(option)
             found = super().state_dict()
         finally:  # it is of this moment
             for group, was in zip(self.param_groups, own, strict=True):
@@ -275,16 +283,16 @@ class StepAdam(Adam):
 
     def note_in_groups(self) -> None:
         """Put into each group what a checkpoint has beside tensors."""
+        self.notice_edits()
         counts = (int(state["step"]) for state in self.state.values() if "step" in state)
         common = numbers_of(self.training, self.ticket, max(counts, default=0))
         last, now = self.last_steps(), self.ticket.next_iteration - 1
         note_in_groups(self.param_groups, self._slots, common, last, now, self.own_frame())
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """As torch's; the training goes on where the checkpoint was.
+        """As torch's; the training goes on where the checkpoint was, by Adam's own count if stock.
 
-        Of a checkpoint of a stock Adam, the place is the number of Adam's own steps. Load hooks run
-        first: they may order or drop groups.
+        Load hooks run first: they may order or drop groups.
 
         Raises:
             ValueError: it is damaged, or of another version; nothing has been changed.
@@ -296,14 +304,11 @@ class StepAdam(Adam):
         def check(_: Any, given: dict[str, Any]) -> None:
             saved = check_loaded(call, given, own)
             if saved is not None:
-                restore_parts(self.training, saved)
+                restore_parts(self.training, [saved])
 
         def go_on(_: Any) -> None:
             self.coded = False  # unless the training's numbers say so
-            for group, was in zip(self.param_groups, own, strict=True):
-                for key, value in was.items():
-                    group.setdefault(key, value)  # an option that torch did not always have
-            say_other_names(self.training, self.param_groups, own)
+            complete_groups(self.training, self.param_groups, own)
             self._count_on_host()
             self.resume()
 
@@ -321,7 +326,6 @@ class StepAdam(Adam):
         """Go on where the state says that the training is: after a load."""
         training = self.training
         if not self.state and not any(map(operator.itemgetter(STATE_KEY), self.param_groups)):
-            self._steppers, self.coded = [], training.moments == 16
             self.ticket.next_iteration = training.iteration + 1  # made anew, perhaps under way
             return
         saved, last, own_frame = take_from_groups(self.param_groups, self._slots)
@@ -334,7 +338,7 @@ class StepAdam(Adam):
             iteration = saved["iteration"] + max(missed, 0)
         else:
             iteration = iteration_by_counts(type(self).__name__, counts, training)
-        self._steppers, self.ticket.next_iteration = [], iteration
+        self._steppers, self._in_order, self.ticket.next_iteration = [], [], iteration
         clocks = training.clocks()
         if saved is not None or (counts and (self.ticket.has_means or not any(clocks))):
             training.resume(max([iteration, *clocks]))  # one that steps now and then lags
@@ -342,16 +346,11 @@ class StepAdam(Adam):
             restore_notes(training, saved)
         recode_all(self.state, self.coded, saved, training)
         self.coded = training.moments == 16
-        if self._own_frame and not training.changes_steps:
-            for group, (which, name) in zip(self.param_groups, self._slots, strict=True):
-                if name == "means" and which in self._own_frame:
-                    for key in MOMENTS:
-                        self.state[group["params"][0]][key].zero_()
+        if not training.changes_steps:
+            forget_own_frames(self.param_groups, self._slots, self._own_frame, self.state)
 
     def last_steps(self) -> tuple[int, ...]:
         """Of every parameter, the iteration of its last step."""
-        if self._steppers:
-            self.steppers()  # what is kept for rows that are others now goes: a copy knows no more
         return tuple(stepper.stepped_in for stepper in self._steppers) or self._last
 
     def own_frame(self) -> frozenset[str]:
@@ -363,7 +362,8 @@ class StepAdam(Adam):
     # -- copies ------------------------------------------------------------------------------------
 
     def __getstate__(self) -> dict[str, Any]:
-        kept = ("training", "ticket", "_slots", "_masked", "coded", "_on_gpu", "_implementations")
+        self.notice_edits()
+        kept = ("training", "ticket", "_slots", "_masked", "coded", "_on_gpu")
         own = {key: getattr(self, key) for key in kept}
         own |= {"_steppers": [], "_last": self.last_steps(), "_own_frame": self.own_frame()}
         return {**super().__getstate__(), **own}

@@ -75,11 +75,11 @@ def note_in_groups(
 
 
 def take_from_groups(groups: list[dict[str, Any]], slots: Slots) -> Any:
-    """What `note_in_groups` has put there, which is no more there then.
+    """Read and remove what `note_in_groups` has put there.
 
     Returns:
-        of the first group that has it all that it has, or None; of every parameter, the iteration
-        of its last step; the sets whose positions' moments are the own frame's.
+        the numbers of the first group that has any, or None; of every parameter, the iteration of
+        its last step; the sets whose positions' moments are the own frame's.
     """
     found = [saved_numbers(group.get(STATE_KEY)) for group in groups]
     for group in groups:
@@ -87,16 +87,20 @@ def take_from_groups(groups: list[dict[str, Any]], slots: Slots) -> Any:
     first = next((each for each in found if each is not None), None)
     if first is None:
         return None, (), frozenset()
-    known = [first if each is None else each for each in found]
-    last = tuple(number for each in known for number in each["last"])
-    pairs = zip(found, slots, strict=True)
-    return first, last, frozenset(which for each, (which, _) in pairs if each and each["own_frame"])
+    now = first["iteration"] - 1
+    last: list[int] = []
+    framed: set[str] = set()
+    for saved, group, (which, _) in zip(found, groups, slots, strict=True):
+        last += [now] * len(group["params"]) if saved is None else saved["last"]
+        if saved is not None and saved["own_frame"]:
+            framed.add(which)
+    return first, tuple(last), frozenset(framed)
 
 
-def say_other_names(
+def complete_groups(
     training: Training, groups: list[dict[str, Any]], own: list[dict[str, Any]]
 ) -> None:
-    """Say that groups have been loaded into others, by their names."""
+    """Give loaded groups the options that torch did not always have; tell of other names."""
     for group, was in zip(groups, own, strict=True):
         if group.get("name") != was.get("name"):
             training.messages.say_once(
@@ -104,6 +108,19 @@ def say_other_names(
                 f"group {was.get('name')!r}, which has its place; a load hook "
                 "(register_load_state_dict_pre_hook) may put groups into another order"
             )
+        for key, value in was.items():
+            group.setdefault(key, value)
+
+
+def forget_own_frames(
+    groups: list[dict[str, Any]], slots: Slots, framed: Container[str], states: Mapping[Any, Any]
+) -> None:
+    """Zero the moments of positions that are in the own frame's units, for a stock step."""
+    for group, (which, name) in zip(groups, slots, strict=True):
+        if name == "means" and which in framed:
+            state = states.get(group["params"][0], {})
+            for key in set(state) & set(MOMENTS):
+                state[key].zero_()
 
 
 def saved_numbers(line: Any) -> dict[str, Any] | None:
@@ -114,11 +131,18 @@ def saved_numbers(line: Any) -> dict[str, Any] | None:
         return {}  # of no version
 
 
-def restore_parts(training: Training, saved: Mapping[str, Any]) -> None:
-    """Give parts that learn what they had learnt; they refuse what is damaged."""
-    for part in training.parts:
-        if part.learns and type(part).__name__ in saved["parts"]:
-            part.load_state_dict(saved["parts"][type(part).__name__])
+def restore_parts(training: Training, saved: Iterable[Mapping[str, Any]]) -> None:
+    """Give parts that learn what they had learnt; where one refuses it none is changed."""
+    learn = {type(part).__name__: part for part in training.parts if part.learns}
+    before = {name: part.state_dict() for name, part in learn.items()}
+    try:
+        for each in saved:
+            for name in set(learn) & set(each["parts"]):
+                learn[name].load_state_dict(each["parts"][name])
+    except ValueError:
+        for name, part in learn.items():
+            part.load_state_dict(before[name])
+        raise
 
 
 def restore_notes(training: Training, saved: Mapping[str, Any]) -> None:
@@ -177,7 +201,7 @@ def steps_of_a_stock_adam(
     counts: list[int], saved: Mapping[str, Any] | None, training: Training
 ) -> int:
     """How many steps a stock Adam has made with a checkpoint of ours; tell of them."""
-    missed = 0 if saved is None else max(counts, default=0) - saved["steps"]
+    missed = 0 if saved is None else max(max(counts, default=0) - saved["steps"], 0)
     if missed:
         training.messages.say_once(
             f"opt3dgs_optim: a stock Adam has gone on for {missed} steps with this checkpoint; "
@@ -295,7 +319,8 @@ def check_group(call: str, group: Any, count: int) -> None:
         raise ValueError(f"{call} has betas={betas!r}, but two numbers are needed")
     numbers = {name: group.get(name) for name in ("lr", "eps", "weight_decay")}
     for name, value in {**numbers, "betas[0]": betas[0], "betas[1]": betas[1]}.items():
-        check_number(call, name, value, 0.0, 1.0 if "betas" in name else math.inf)
+        is_beta = "betas" in name
+        check_number(call, name, value, 0.0, 1.0 if is_beta else math.inf, open_high=is_beta)
 
 
 def check_moments(call: str, state: Any) -> None:

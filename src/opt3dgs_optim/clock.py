@@ -59,8 +59,9 @@ class Clock:
     def begin(self, ticket: Ticket) -> int:
         """The iteration of a step that an optimizer is about to make.
 
-        Another optimizer than that of the positions may step first in an iteration, never or
-        several times: it begins one only if the positions have been stepped in the one before.
+        Other optimizers may step before the positions, not at all, or several times. Such a step
+        begins an iteration only if the positions have stepped in the present one, and did not step
+        first there.
         """
         present = self.iteration + self._resumed
         iteration = max(ticket.next_iteration, present, 0)

@@ -24,7 +24,7 @@ REFUSED = ("amsgrad", "maximize", "differentiable", "capturable")
 def own_step(kind: type) -> type | None:
     """The class of a step that is not torch's: gsplat's SelectiveAdam, INRIA's; else None."""
     for owner in kind.__mro__:
-        if "step" in vars(owner) and issubclass(owner, Adam):
+        if "step" in vars(owner):
             # torch wraps, for hooks, the step of the class of the first optimizer in a process.
             if bare(vars(owner)["step"]) in (bare(Adam.step), bare(AdamW.step)):
                 return None
@@ -169,8 +169,8 @@ def check_parts(call: str, parts: Any) -> Sequence[Part]:
     kinds = [type(part) for part in parts]
     if OwnFrame in kinds and Curvature in kinds:
         raise ValueError(
-            f"{call}: OwnFrame steps the positions in other units, in which Curvature's pairs are "
-            "none; leave one of the two out"
+            f"{call}: OwnFrame and Curvature cannot be combined, since Curvature's pairs are in "
+            "world units and OwnFrame's steps are not; leave one of the two out"
         )
     for kind in kinds:
         if kinds.count(kind) > 1:

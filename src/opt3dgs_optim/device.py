@@ -43,12 +43,13 @@ class BadNumbers:
     """How many numbers of gradients were not finite; devices count theirs themselves."""
 
     def __init__(self) -> None:
-        self._found = 0
+        self._on_host = 0
+        self._on_devices: dict[torch.device, int] = {}
         self._readings: dict[torch.device, Reading] = {}
 
     def add(self, numbers: int) -> None:
         """Take a number that the host knows."""
-        self._found += numbers
+        self._on_host += numbers
 
     def counter_on(self, device: torch.device) -> Tensor | None:
         """[1] int32 to which a device adds how many there were; None for a CPU."""
@@ -60,13 +61,14 @@ class BadNumbers:
 
     def look(self) -> int:
         """How many there have been, as far as is known without a wait."""
-        for reading in self._readings.values():
-            self._found = max(self._found, *map(abs, reading.take() or [0]))  # int32 may wrap
+        for device, reading in self._readings.items():
+            (found,) = reading.take() or [0]
+            self._on_devices[device] = max(self._on_devices.get(device, 0), abs(found))  # may wrap
             reading.ask()
-        return self._found
+        return self._on_host + sum(self._on_devices.values())
 
     def __getstate__(self) -> dict[str, Any]:  # what is on its way does not reach a copy
-        return {"_found": self._found, "_readings": {}}
+        return {**vars(self), "_readings": {}}
 
 
 class Rows:
@@ -86,6 +88,8 @@ class Rows:
 
         That is known without a wait, an edit later.
         """
+        if len(means) < self.LOOKED_AT:
+            return False
         found = self._moved.take() if self._moved is not None else None
         if self._places is not None and self._was is not None and len(means) > self._last:
             now = means[self._places]

@@ -1,8 +1,8 @@
 """The running mean of the last iterates: where it lies, how an iterate goes into it, how it is put.
 
-Beside moments of 32 bits it is a tensor like the parameter. Beside moments of 16 bits it has as
-many, the lower bits of its place on a grid, except that of positions, for which no grid can be
-named: they are in the units of the scene. Far from the origin a position has few digits for its
+Beside moments of 32 bits it is a tensor like the parameter. Beside moments of 16 bits it is int16,
+the lower bits of its place on a fixed grid. The mean of positions is float32 in both: their unit is
+the scene's, and no grid fits all scenes. Far from the origin a position has few digits for its
 fractions, so that a second tensor has what rounding leaves of its mean (Kahan 1965).
 """
 
@@ -53,7 +53,11 @@ def mean_of(param: Tensor, state: dict[str, Any], name: str | None, put: bool, c
     key = MEAN if grid is None else RESIDUE
     found = state.get(key), state.get(BEGAN), state.get(REST)
     mean, began, rest = found
-    if mean is None or began is None or (rest is None and name == "means"):
+    rows = param.numel() if mean is None else mean.numel()
+    if (
+        mean is None or began is None or rows != param.numel()
+        or (name == "means" and (rest is None or rest.numel() != rows))
+    ):  # fmt: skip
         for each in OF_MEAN:
             state.pop(each, None)
         mean = torch.zeros_like(param, dtype=None if grid is None else CODES)

@@ -49,7 +49,7 @@ class Messages:
 
 
 class End:
-    """How a training ended, which is told where its scheduler is no more.
+    """Whether a training ended early, which is told when its scheduler goes, or at exit.
 
     Attributes:
         mean_at: the first iteration after which the mean is in the parameters' place;
@@ -63,7 +63,7 @@ class End:
         self.finished = False
 
     def line(self) -> str | None:
-        """What is said where it ends before its end; None: it does not."""
+        """The warning; None: nothing is wrong."""
         if self.finished:
             return None
         if self.upgraded and not self.done:

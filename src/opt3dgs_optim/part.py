@@ -19,7 +19,8 @@ class Part:
 
     A part says *what* the step of a parameter has, in `plan`, by plain values; one function makes
     the step of them (`opt3dgs_optim.step`), on a GPU in one launch. A part that needs its own
-    arithmetic has `before` and `after`, in torch operations, at a launch for each of them.
+    arithmetic has `before`, which replaces the gradient after all plans, and `after`, in torch
+    operations, at a launch for each of them.
 
     What a part learns of a training goes into `training.notes_of(self)`, a dict of plain numbers by
     name, which is saved with the optimizers; a part object whose state lives in itself sets

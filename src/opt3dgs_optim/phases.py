@@ -181,9 +181,7 @@ class PhaseScheduler(Training):
                 f"{CALL}.upgrade: {doubled[0][1]!r} is held twice; for two sets of Gaussians name "
                 "the groups 'first#means', 'second#means', or make a scheduler for each"
             )
-        for each in saved:
-            if each is not None:
-                restore_parts(self, each)
+        restore_parts(self, [each for each in saved if each is not None])
         self._end.upgraded = True
         for (_, optimizer), its in zip(given, slots, strict=True):
             self._upgrade(optimizer, its)
@@ -297,8 +295,8 @@ class PhaseScheduler(Training):
     def finish(self) -> None:
         """End the run here: the mean of the last iterates takes the parameters' place.
 
-        Before the last thirtieth there is no mean, and the parameters stay as they are. So they do
-        where the training has gone on since: past its last iteration, or past another `finish()`.
+        Before the last thirtieth there is no mean, and the parameters stay as they are. They stay,
+        too, if the training went on past `total_steps` or past an earlier `finish()`.
         """
         if not self.finished:
             holders: Any = {id(m.optimizer): m.optimizer for m in self.members.values()}.values()
@@ -344,7 +342,8 @@ class PhaseScheduler(Training):
             self.messages.warn_once(
                 "overrun",
                 f"{CALL}: iteration {self.iteration} of total_steps={self.total_steps}: the "
-                "schedule came too early for this run; pass the training's number of iterations",
+                "training is longer than that, so that all schedules ended early; pass its number "
+                "of iterations as total_steps",
             )
         if self.finished:
             self.messages.warn_once(
@@ -362,8 +361,8 @@ class PhaseScheduler(Training):
     def rows_edited(self, means: Tensor, rows_before: int) -> None:
         """See whether Gaussians disappear, under parts that are made for relocation.
 
-        Relocation keeps the rows of those that stay; after pruning other Gaussians are in them. So
-        it shows although clones outnumber what is pruned.
+        Pruning moves other Gaussians into a row, and relocation does not. So pruning is seen even
+        if the number of Gaussians grows.
         """
         if self._chosen:
             return

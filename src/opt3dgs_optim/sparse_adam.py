@@ -8,6 +8,7 @@ out of view are held by the mask already, and moments are theirs.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 from collections.abc import Callable, MutableMapping
@@ -58,62 +59,51 @@ def step_around(
 ) -> None:
     """Have the optimizer's own class make a step as the parts say; put back what it was given."""
     steps: list[tuple[ParamStepper, Step, float]] = []
-    undo: list[Callable[[], None]] = []
-    try:
+    with contextlib.ExitStack() as undo:  # all of it, also where some of it fails
         for stepper in steppers:
             param = stepper.param()
             if param is not None and param.grad is not None:
                 step = stepper.plan(param, states[param], iteration)
                 steps.append((stepper, step, float(step.state["step"])))
-                undo.append(_give(step, stepper.training))
+                _give(step, stepper.training, undo)
         step_itself()
-    finally:
-        for put_back in undo:
-            put_back()
     for stepper, step, count in steps:
         if step.state["step"] == count:  # gsplat's and INRIA's kernels need no count, and keep none
             step.state["step"] += 1
         stepper.after(step, int(step.state["step"]))  # steps, not iterations
 
 
-def _give(step: Step, training: Training) -> Callable[[], None]:
+def _give(step: Step, training: Training, undo: contextlib.ExitStack) -> None:
     """Have the step find the gradient, the rate and the moments that the parts say.
 
-    In the own frame, and where the factor is a device's number, it steps from zeros.
-
-    Returns:
-        what puts back what was there, and has what the step says in it.
+    In the own frame, and where the factor is a device's number, it steps from zeros. What `undo`
+    gets restores all that, and moves the parameter by what the step has made of the zeros.
     """
     param, group, state, factor = step.param, step.group, step.state, step.factor
-    was = param.grad, group["lr"], group["eps"], param.data
+    was, position = (param.grad, group["lr"], group["eps"]), param.data
     axes = None if step.frame is None else axes_of(step.frame)
     grad, bad = finite(step.grad, training.bad_numbers.counter_on(param.device))
     training.bad_numbers.add(bad)
+    if axes is not None:
+        grad = into_frame(axes, grad)
+    on_device = isinstance(factor, Tensor)
+    start = torch.zeros_like(position) if on_device or axes is not None else position
     if step.fade is not None:
         chosen = like_rows(chosen_rows(step.fade, len(param), param.device), param)
         for key, share in zip(MOMENTS, step.fade[2:], strict=True):
             state[key].copy_(torch.where(chosen, state[key] * share, state[key]))
 
     def put_back() -> None:
-        param.grad, group["lr"], group["eps"], position = was
-        if param.data_ptr() == position.data_ptr():
-            return
-        moved, param.data = param.data, position
-        moved = moved if axes is None else out_of_frame(axes, moved)
-        param.add_(moved * factor if isinstance(factor, Tensor) else moved)
+        param.grad, group["lr"], group["eps"] = was
+        if start is not position:
+            moved, param.data = param.data, position
+            moved = moved if axes is None else out_of_frame(axes, moved)
+            param.add_(moved * factor if on_device else moved)
 
-    try:
-        if axes is not None:
-            grad = into_frame(axes, grad)
-    except BaseException:
-        put_back()
-        raise
-    known = 1.0 if isinstance(factor, Tensor) else factor
+    undo.callback(put_back)
+    known = 1.0 if on_device else factor
     if step.frame is not None:
         group["lr"], group["eps"] = step.frame.rate * known, FRAME_EPS
     elif known != 1.0:
         group["lr"] = group["lr"] * known
-    if axes is not None or isinstance(factor, Tensor):
-        param.data = torch.zeros_like(param.data)
-    param.grad = grad
-    return put_back
+    param.data, param.grad = start, grad

@@ -33,7 +33,7 @@ class ParamStepper:
         rows: how many it has.
         name, set: which Gaussian parameter it is, and of which set of Gaussians.
         acting: by `Training.exploiting`: the parts with a `plan`, with a `before`, with an `after`.
-        later: what parts may put into its steps that the first has not, see `Part.later`.
+        later: what later steps may have and the first has not, see `Part.later`.
         counter: where its device counts numbers that are not finite; None on a CPU.
         stepped_in: the iteration of its last step; -1: none.
         framed: whether its moments are those of the own frame; None: it has none yet.
@@ -90,8 +90,6 @@ class ParamStepper:
         beta1, beta2, lr, eps = float(beta1), float(beta2), float(group["lr"]), float(group["eps"])
         decay = group["weight_decay"]
         coded = training.moments == 16
-        if coded:
-            as_codes(state)
         hyper = Hyper(
             lr, beta1, beta2, eps if step.frame is None else FRAME_EPS,
             1.0 - beta1**t, (1.0 - beta2**t) ** 0.5, state["exp_avg"], state["exp_avg_sq"],
@@ -132,6 +130,8 @@ class ParamStepper:
             self._begin(param, state)
         elif state["exp_avg"].numel() != numbers or state["exp_avg_sq"].numel() != numbers:
             self.check_rows(param, state)
+        if training.moments == 16:
+            as_codes(state)
         step = Step(
             param, grad, self.name, self.set, self.group, state, iteration, self.stepped_in,
             self.keep,
@@ -168,7 +168,10 @@ class ParamStepper:
     # -- what is kept for its rows ---------------------------------------------------------------
 
     def keep(self, state: dict[str, Any], key: str, shape: tuple[int, ...]) -> Tensor:
-        """What a part keeps for the rows under a name; a row of zeros: nothing is kept for it."""
+        """What a part keeps for the rows; a row of zeros: nothing is kept for it.
+
+        `key` is "part.what": by its dot it is known from Adam's own.
+        """
         self.begin_edited_rows_anew(state)
         tensor = state.get(key)
         if tensor is None or tensor.shape != shape:
@@ -229,10 +232,15 @@ def begin_moments_anew(state: dict[str, Any]) -> None:
         state.pop(key, None)
 
 
+def kept_in(state: dict[str, Any]) -> list[str]:
+    """What is kept for rows beside Adam's moments, by name."""
+    return [key for key in state if "." in key]
+
+
 def drop_kept(state: dict[str, Any]) -> None:
     """Have nothing kept for rows beside Adam's moments."""
-    for key in KEPT:
-        state.pop(key, None)
+    for key in kept_in(state):
+        del state[key]
 
 
 def checked_gradient(part: Any, found: Any, grad: Tensor) -> Tensor:

@@ -134,6 +134,7 @@ class Training(Clock):
         """Go on at an iteration; what was kept from step to step is of another one."""
         super().resume(iteration)
         self.unsaved.clear()
+        self._look_at = min(self._look_at, iteration + LOOK_INTERVAL)
 
     def look_at_numbers(self) -> None:
         """Say once that gradients have not been finite."""

@@ -22,7 +22,7 @@ class Annealing(Part):
         factor(t) = peak^(1 - t) * final^t,    t = iteration / total_steps in 0..1
 
     3DGS keeps all learning rates but the positions' constant: too small to get far in the first
-    iterations, too large to read_back in the last. The factor comes on top of the trainer's own
+    iterations, too large to settle in the last. The factor comes on top of the trainer's own
     schedule; the learning rates in `param_groups` stay as they are. It costs no memory.
 
     The positions are left alone, and the opacities have a peak of their own, since either would

@@ -46,6 +46,7 @@ class OutOfView(Part):
     """
 
     names = ("means", "scales", "opacities")
+    later = ("hold",)
 
     def plan(self, step: Step, training: Training) -> None:
         """See at the positions [N, 3] who is out of view; hold the others' second moments."""
@@ -84,6 +85,8 @@ class _Seen:
 
     def __init__(self, note: str, notes: dict[str, Any]) -> None:
         self.note, self.notes, self.due = note, notes, f"due of {note}"
+        if f"view's {note}" not in notes:
+            notes.pop(self.due, None)  # it was on its way before a load
         self.iteration: int | None = None
         self.rows: Tensor | None = None
         self.counter: Tensor | None = None

@@ -38,7 +38,7 @@ class _Pending(NamedTuple):
 
 
 class RunLog(AbstractContextManager["RunLog"]):
-    """The training of one training run, appended line by line to the JSON-lines file `path`.
+    """The log of one training run, appended line by line to the JSON-lines file `path`.
 
     Every line has the iteration and the run seconds at which it was logged. The clock runs from
     here on, and stands still within `paused`, so that evaluations cost no run time. `read_run`

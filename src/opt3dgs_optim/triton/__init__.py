@@ -86,7 +86,7 @@ def takes(step: Step, hyper: Hyper) -> bool:
     return step.param.is_cuda and _runs(step.param.device) and fits(step, hyper)
 
 
-def fits(step: Step, hyper: Hyper) -> bool:
+def fits(step: Step, hyper: Hyper) -> bool:  # noqa: PLR0911
     """`takes`, wherever the tensors lie."""
     frame, hold, mean = step.frame, step.hold, hyper.mean
     for tensor in (step.param, step.grad, hyper.exp_avg, hyper.exp_avg_sq):
@@ -94,6 +94,9 @@ def fits(step: Step, hyper: Hyper) -> bool:
             return False
     kept = () if mean is None else (mean.tensor, mean.began, mean.rest)
     kept = kept if hold is None else (*kept, hold.rows)
+    factor, device = step.factor, step.param.device
+    if isinstance(factor, Tensor) and not (_plain(factor) and factor.device == device):
+        return False
     if not all(tensor is None or tensor.is_contiguous() for tensor in kept):
         return False
     if frame is None:
@@ -114,11 +117,12 @@ def take_step(step: Step, hyper: Hyper, later: tuple[str, ...] = ()) -> None:
     """Make the step in one launch: what `opt3dgs_optim.step.take_step` means.
 
     Numbers that are not finite are added to `hyper.nonfinite` [1] int32. Nothing waits for the
-    device, and nothing is allocated there. With the first of the parameter's steps the kernels of
-    those are compiled that have what is in `later`, see `Part.later`.
+    device, and nothing is allocated there. At a parameter's first step the kernels that its later
+    steps will need (`Part.later`) are compiled, too.
     """
-    if later and (step.name, hyper.exp_avg.dtype, later, step.frame is None) not in _PREPARED:
-        _PREPARED.add((step.name, hyper.exp_avg.dtype, later, step.frame is None))
+    key = step.name, step.param.device, hyper.exp_avg.dtype, later, step.frame is None
+    if later and key not in _PREPARED:
+        _PREPARED.add(key)
         for forms in _subsets(later):
             launch(*_stand_in(step, hyper, forms))
     launch(step, hyper)
@@ -167,6 +171,14 @@ def look(
             that has or had one; or None.
     """
     mask = None if out_of_view is None else out_of_view.view(torch.uint8)
+    dtype = torch.float32 if exp_avg_sq is None else exp_avg_sq.dtype
+    if counter is not None and ("look", grad.device, dtype) not in _PREPARED:
+        # What later looks need is compiled with the first ones.
+        _PREPARED.add(("look", grad.device, dtype))
+        one, seen = torch.zeros_like(grad[:1]), torch.zeros_like(grad[:1, 0], dtype=torch.bool)
+        second, count = torch.zeros_like(one, dtype=dtype), torch.zeros_like(counter)
+        for given in ((second, seen, count), (None, seen, None), (second, None, count)):
+            look(one, *given)
     _run(
         "look_at_positions", -(-len(grad) // LOOK_BLOCK), (grad, exp_avg_sq, mask, counter),
         (len(grad),), (exp_avg_sq is not None and exp_avg_sq.dtype is CODES, False),
@@ -227,9 +239,8 @@ def _run(
     """Launch a kernel; what Triton has compiled is launched again without its launcher.
 
     `coded` says whether moments, and whether the mean, are codes: each has a kernel of its own.
-    Triton's launcher looks at every argument, which takes 30 us. What it finds is the same again
-    where the same tensors are there, begin at multiples of 16 bytes or do not, and are on one
-    device.
+    Triton's launcher looks at every argument, which takes 30 us. What it finds depends only on
+    which tensors are None, on whether each begins at a multiple of 16 bytes, and on the device.
     """
     pointers = [None if tensor is None else tensor.data_ptr() for tensor in tensors]
     first = tensors[0]

@@ -1,7 +1,7 @@
 """The step of one parameter in one launch: what `opt3dgs_optim.step.take_step` means, line by line.
 
-Every number is read once and written once; nothing lies between. One thread has four numbers of
-`step_rows`, or one Gaussian of `step_in_own_frame`. What changes from step to step is an argument
+Every number is read once and written once; nothing lies between. A thread has four numbers of
+`step_rows`, or two Gaussians of `step_in_own_frame`. What changes from step to step is an argument
 that compiles nothing anew; what is not there is None, and compiles to nothing.
 What a load gives outside of its mask is never stored.
 
