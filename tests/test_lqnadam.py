@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import copy
 import io
-import pickle
 import warnings
 from typing import Any
 
 import pytest
 import torch
 from problems import gradient, hessians, quadratic
-from torch import Tensor
 from torch.nn import Parameter
 
 from opt3dgs_optim import Curvature, LQNAdam
@@ -61,22 +58,7 @@ def test_it_arrives_where_the_rate_decays(condition: float, left: float) -> None
     assert float(x.detach().norm(dim=1).median()) < left
 
 
-def test_a_closure() -> None:
-    x = points()
-    optimizer = LQNAdam([x], lr=0.1)
-
-    def closure() -> Tensor:
-        optimizer.zero_grad()
-        loss = (x**2).sum()
-        loss.backward()
-        return loss
-
-    losses = [optimizer.step(closure).item() for _ in range(6)]
-    assert losses == sorted(losses, reverse=True)
-
-
-@pytest.mark.parametrize("road", ["torch.save", "deepcopy", "pickle"])
-def test_it_resumes_bit_for_bit(road: str) -> None:
+def test_it_resumes_bit_for_bit() -> None:
     x, stiff = points(), torch.tensor([1.0, 5.0, 25.0])
     optimizer = LQNAdam([{"params": [x], "name": "means"}], lr=0.01)
 
@@ -86,17 +68,11 @@ def test_it_resumes_bit_for_bit(road: str) -> None:
             optimizer.step()
 
     go(x, optimizer)
-    if road == "torch.save":
-        y, buffer = Parameter(x.detach().clone()), io.BytesIO()
-        twin = LQNAdam([{"params": [y], "name": "means"}], lr=0.3)
-        torch.save(optimizer.state_dict(), buffer)
-        buffer.seek(0)
-        twin.load_state_dict(torch.load(buffer, weights_only=True))
-    else:
-        twin = copy.deepcopy(optimizer) if road == "deepcopy" else pickle.loads(
-            pickle.dumps(optimizer)
-        )  # fmt: skip
-        (y,) = twin.param_groups[0]["params"]
+    y, buffer = Parameter(x.detach().clone()), io.BytesIO()
+    twin = LQNAdam([{"params": [y], "name": "means"}], lr=0.3)
+    torch.save(optimizer.state_dict(), buffer)
+    buffer.seek(0)
+    twin.load_state_dict(torch.load(buffer, weights_only=True))
     go(x, optimizer)
     go(y, twin)
     assert torch.equal(x, y)
@@ -134,6 +110,4 @@ def test_what_is_outside_is_refused() -> None:
     assert len(optimizer.param_groups) == 1
     with pytest.raises(ValueError, match="Curvature: history_size=17"):
         LQNAdam([points()], history_size=17)
-    with pytest.raises(ValueError, match="LQNAdam: moments=8, but 32 or 16"):
-        LQNAdam([points()], moments=8)  # pyright: ignore[reportArgumentType]
     assert LQNAdam([points()], moments=16).training.moments == 16
