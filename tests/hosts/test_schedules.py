@@ -21,7 +21,6 @@ from typing import Any, Literal
 
 import pytest
 from trials import TRAINERS as SOURCES
-from trials import Trial, copy_edited, missing, run
 
 from opt3dgs_optim.hosts import lines
 from opt3dgs_optim.hosts.schedules import schedule, shortened
@@ -337,47 +336,3 @@ def test_3dgruts_configuration() -> None:
             for config, words in ((base, stock), (changed, short)):
                 for option, number in options(words).items():
                     assert omegaconf.OmegaConf.select(config, option) == number, option
-
-
-# -- and run ---------------------------------------------------------------------------------------
-
-SHORTEST = 300
-RUNS = {
-    "inria": Trial("gaussian-splatting", "--disable_viewer"),
-    "3dgs-mcmc": Trial("3dgs-mcmc", "--init_type sfm"),
-    "2dgs": Trial("2d-gaussian-splatting"),
-    "gsplat-mcmc": Trial("gsplat-main", script="examples/simple_trainer.py"),
-    "gsplat-default": Trial("gsplat-main", script="examples/simple_trainer.py"),
-}
-
-
-@hosts
-@pytest.mark.parametrize("name", RUNS)
-def test_what_is_printed_is_pasted_and_runs_to_its_end(
-    name: str, scene: Path, tmp_path: Path
-) -> None:
-    """The real script with the three lines and the replaced ones, and the printed command."""
-    trial = RUNS[name]
-    if (why := missing(trial)) is not None:
-        pytest.skip(why)
-    folder, out = tmp_path / "edited" / trial.trainer, tmp_path / "out"
-    copy_edited(trial, folder, None)
-    path = folder / trial.script
-    text = path.read_text(encoding="utf-8")
-    for old, new in edits(name, SHORTEST):
-        assert len(re.findall(rf"^{re.escape(old)} *$", text, re.M)) == 1
-        text = re.sub(rf"^{re.escape(old)} *$", lambda _, new=new: new, text, flags=re.M)
-    path.write_text(text, encoding="utf-8")
-    (words,) = commands(name, SHORTEST)
-    given = {"SCENE": str(scene), "GAUSSIANS": "2500"}
-    own = ["-m", str(out), "--images", "images_jpg", "--eval"]
-    if trial.gsplat:
-        own = ["--result_dir", str(out), "--data_factor", "4", "--disable_viewer"]
-    done = run(path, [given.get(w, w) for w in words[2:]] + own + trial.options.split(), out)
-    assert done.code == 0, done.output[-3000:]
-    steps = SHORTEST if trial.gsplat else SHORTEST - 1
-    assert f"opt3dgs_optim: {steps} iterations" in done.output
-    assert "no mean" not in done.output
-    assert done.psnr is not None
-    saved = [f"*/ckpt_{SHORTEST - 1}_rank0.pt", f"*/iteration_{SHORTEST}/point_cloud.ply"]
-    assert [*out.glob(saved[not trial.gsplat])]
