@@ -1,17 +1,31 @@
-"""What changes at the paper's switch: the loss (test_reference_step.py has the moments)."""
+"""What changes at the paper's switch: the loss, and the moments."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import pytest
+import row_edits
 import torch
+from gaussians import steps
 from torch import Tensor
 from torch.nn import Parameter
 
 from opt3dgs_optim import FreshMoments, Part, PhaseScheduler, SquaredLoss
 
 TOTAL, SWITCH = 12, 8
+
+
+def test_moments_begin_anew_once_in_a_parameters_first_step_after_the_switch() -> None:
+    """Which may come later, and an edit of the rows is no other parameter."""
+    params: Any = {"means": Parameter(torch.ones(4, 3))}
+    phases = PhaseScheduler(TOTAL, SWITCH, parts=[FreshMoments()])
+    adam = phases.upgrade(torch.optim.Adam([{"params": [params["means"]], "name": "means"}]))
+    for iteration, count in ((SWITCH - 2, 1), (SWITCH - 1, 2), (SWITCH + 2, 1), (SWITCH + 3, 2)):
+        phases.observe(iteration=iteration)
+        steps({"all": adam}, params, 1)
+        assert adam.state[params["means"]]["step"] == count
+        row_edits.apply(row_edits.removed(torch.tensor([0])), params, [adam], ["means"], False)
 
 
 class Fourth(Part):
