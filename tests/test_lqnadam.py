@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from problems import gradient, hessians, quadratic
 from torch.nn import Parameter
 
 from opt3dgs_optim import Curvature, LQNAdam
@@ -42,20 +41,6 @@ def test_without_pairs_it_is_torch_adam_bit_for_bit(rows: int, options: dict[str
     assert torch.equal(ours, theirs)
     assert torch.equal(a.state[ours]["exp_avg_sq"], b.state[theirs]["exp_avg_sq"])
     assert float(a.accepted_share) == 0.0  # pyright: ignore[reportArgumentType]
-
-
-@pytest.mark.parametrize(("condition", "left"), [(1.0, 1e-6), (10.0, 1e-3)])
-def test_it_arrives_where_the_rate_decays(condition: float, left: float) -> None:
-    """With a schedule of torch's, before which nothing warns; three axes at random per row."""
-    hessian = hessians(50, condition)
-    x = Parameter(torch.ones(50, 3, dtype=torch.float64))
-    optimizer = LQNAdam([x], lr=0.1, betas=(0.9, 0.95))
-    decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, 1e-5 ** (1 / 400))
-    for _ in range(400):
-        x.grad = gradient(quadratic(hessian), x)
-        optimizer.step()
-        decay.step()
-    assert float(x.detach().norm(dim=1).median()) < left
 
 
 def test_it_resumes_bit_for_bit() -> None:

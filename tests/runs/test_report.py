@@ -149,8 +149,11 @@ def test_lines_between_evaluations_are_walked_to_the_first_crossing(tmp_path):
     runs = [
         write_run(tmp_path / "m.jsonl", "mcmc", 0, [(0, 0.0, 20.0), (1, 5.0, 24.0)]),
         write_run(tmp_path / "x.jsonl", "x", 0, ours),
+        write_run(tmp_path / "y.jsonl", "y", 0, [(0, 0.5, 25.0), (1, 1.0, 23.0)]),
     ]
-    numbers = arms_of(runs)[1]["x"].numbers
+    arms = arms_of(runs)[1]
+    assert arms["y"].numbers["seconds to baseline psnr"].mean == 0.5  # from the first on
+    numbers = arms["x"].numbers
     assert numbers["seconds to baseline psnr"].mean == pytest.approx(2.0)
     gain = 26.0 - 4.0 * 2 / 3 - 24.0  # where the baseline ends, in the second stretch
     assert numbers["psnr gain at equal seconds"].mean == pytest.approx(gain)

@@ -25,7 +25,6 @@ def _change(table: dict, key: str, value) -> dict:
     ("key", "value", "message"),
     [
         ("frames", None, "expected a list under 'frames', got NoneType"),
-        ("fl_x", None, r"frame 0: KeyError\('fl_x'\)"),
         ("fl_x", math.nan, "impossible camera"),
         ("w", math.inf, "impossible camera"),
         ("k1", 0.1, "lens distortion {'k1': 0.1}.*colmap image_undistorter"),
