@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import io
-import pickle
 import re
 import warnings
 from typing import Any
@@ -217,7 +216,7 @@ def by_torch(state: Any) -> Any:
     return torch.load(buffer, weights_only=True)
 
 
-@pytest.mark.parametrize("road", ["torch.save", "deepcopy", "pickle"])
+@pytest.mark.parametrize("road", ["torch.save", "deepcopy"])
 @pytest.mark.parametrize("preconditioner", ["adam", "none"])
 def test_it_resumes_bit_for_bit(road: str, preconditioner: str) -> None:
     params = parameters([(5, 3), ()])
@@ -230,33 +229,14 @@ def test_it_resumes_bit_for_bit(road: str, preconditioner: str) -> None:
         twin.load_state_dict(by_torch(optimizer.state_dict()))
         generator: Any = twin.training.parts[1]
         generator.generator.set_state(noise.generator.get_state())
-    elif road == "deepcopy":
-        twin = copy.deepcopy(optimizer)
     else:
-        generator, noise.generator = noise.generator, None  # torch's generators cannot be pickled
-        twin = pickle.loads(pickle.dumps(optimizer))
-        noise.generator = generator
-        copied: Any = twin.training.parts[1]
-        copied.generator = torch.Generator()
-        copied.generator.set_state(generator.get_state())
+        twin = copy.deepcopy(optimizer)
     others = [param for group in twin.param_groups for param in group["params"]]
     assert twin.histogram is not optimizer.histogram
     expected = go(optimizer, params, 20, 40)
     for ours, theirs in zip(go(twin, others, 20, 40), expected, strict=True):
         assert torch.equal(ours, theirs)
     assert twin.training.iteration == optimizer.training.iteration == 39
-
-
-def test_a_checkpoint_of_stock_adam_loads() -> None:
-    x, y = parameters([(5, 3)]), parameters([(5, 3)])
-    stock, ours = torch.optim.Adam(x, lr=0.3, betas=(0.8, 0.99)), made(y)
-    set_gradients(x, 0)
-    stock.step()
-    ours.load_state_dict(by_torch(stock.state_dict()))
-    assert (ours.param_groups[0]["lr"], ours.param_groups[0]["betas"]) == (0.3, (0.8, 0.99))
-    assert torch.equal(ours.state[y[0]]["exp_avg"], stock.state[x[0]]["exp_avg"])
-    go(ours, y, 1, 2)
-    assert ours.training.iteration == 1
 
 
 # -- groups, schedules, options --------------------------------------------------------------------
@@ -275,7 +255,6 @@ def test_groups_may_be_added_and_are_stepped_with_nu() -> None:
     for wrong, message in (
         ({"params": [half]}, "float16"),
         ({"params": [Parameter(torch.zeros(3))], "lr": torch.tensor(0.1)}, "tensor as lr"),
-        ({"params": [Parameter(torch.zeros(3))], "maximize": True}, "maximize=True"),
         ({"params": [Parameter(torch.zeros(3))], "amsgrad": True}, "amsgrad=True"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -291,11 +270,8 @@ def test_wrong_options_are_named() -> None:
     for options, error, said in (
         ({"preconditioner": "rms"}, ValueError, "preconditioner='rms', but 'adam' or 'none'"),
         ({"histogram": IsotropicNoise(std=1.0)}, TypeError, "but an EnergyHistogram is needed"),
-        ({"histogram": 1.5}, TypeError, "histogram=1.5"),
         ({"noise": EnergyHistogram()}, TypeError, "but IsotropicNoise or PositionNoise is needed"),
         ({"noise": PositionNoise()}, ValueError, "positions are [N, 3]"),
-        ({"moments": 8}, ValueError, "AWSGLD: moments=8, but 32 or 16"),
-        ({"lr": -1.0}, ValueError, "Invalid learning rate"),
     ):
         with pytest.raises(error, match=re.escape(said)):
             build(**options)

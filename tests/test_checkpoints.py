@@ -191,6 +191,15 @@ def test_the_usual_damage_is_refused(path: tuple[Any, ...], wrong: Any) -> None:
     assert equal(before, snapshot(phases, optimizer, params))
 
 
+def test_a_state_of_an_unknown_parameter_is_refused() -> None:
+    phases, optimizer, params = trained(3)
+    before, state = snapshot(phases, optimizer, params), damaged(("state",), SAVED["state"])
+    state["state"][len(NAMES)] = state["state"][0]
+    with pytest.raises(ValueError, match=r"Adam.load_state_dict: the state is not of .* \[0, 1\]"):
+        optimizer.load_state_dict(state)
+    assert equal(before, snapshot(phases, optimizer, params))
+
+
 @pytest.mark.parametrize("option", ["amsgrad", "maximize", "differentiable", "capturable"])
 def test_options_that_are_refused_do_not_come_with_a_checkpoint(option: str) -> None:
     _, optimizer, params = trained(3)

@@ -9,7 +9,7 @@ import torch
 from gaussians import adam_of, adams_of, parameters, same_tensors, steps
 from torch.nn import Parameter
 
-from opt3dgs_optim import DEFAULTS, DEFAULTS_ADC, Averaging, Part, Phase, PhaseScheduler
+from opt3dgs_optim import DEFAULTS, Averaging, Part, Phase, PhaseScheduler
 from opt3dgs_optim.step import Step
 from opt3dgs_optim.training import Training
 
@@ -33,35 +33,6 @@ def clocked(total: int = TOTAL) -> tuple[PhaseScheduler, Clocked]:
     return PhaseScheduler(total, parts=[part]), part
 
 
-@pytest.mark.parametrize("parts", [DEFAULTS, DEFAULTS_ADC], ids=["relocation", "adc"])
-def test_three_lines_are_enough(parts: Any) -> None:
-    """Without `observe` the defaults end where they end with it, bit for bit."""
-    ends = []
-    for observe in (False, True):
-        params = parameters(20)
-        phases = PhaseScheduler(TOTAL, parts=parts)
-        optimizers = phases.upgrade(adams_of(params))
-        for iteration in range(TOTAL):
-            if observe:
-                phases.observe(torch.tensor(0.1 * iteration), iteration=iteration)
-            steps(optimizers, params, 1, seed=iteration)
-        ends.append({name: param.detach() for name, param in params.items()})
-    assert same_tensors(*ends)
-
-
-def test_gradients_are_accumulated() -> None:
-    """A step in every fourth iteration; the trainer's count is said."""
-    phases, part = clocked()
-    params = parameters(5, "means")
-    optimizers = phases.upgrade(adams_of(params))
-    for iteration in range(40):
-        phases.observe(iteration=iteration)
-        if iteration % 4 == 3:
-            steps(optimizers, params, 1)
-    assert part.seen["means"] == list(range(3, 40, 4))
-    assert phases.iteration == 39
-
-
 def test_an_optimizer_that_steps_now_and_then() -> None:
     """taming-3dgs has f_rest in an optimizer of its own, which steps in every sixteenth."""
     phases, part = clocked()
@@ -82,32 +53,6 @@ def test_an_optimizer_that_steps_now_and_then() -> None:
     steps({"shN": resumed[1]}, params, 1)
     steps({"means": resumed[0]}, params, 1)
     assert part.seen == {"shN": [50], "means": [50]}
-
-
-def test_iterations_without_a_gradient_and_a_last_one_without_a_step() -> None:
-    """INRIA's densification makes new Parameters before the step, which then does nothing."""
-    phases, part = clocked()
-    params: dict[str, Any] = parameters(5, "means")
-    optimizer = phases.upgrade(adam_of(params))
-    for iteration in range(1, TOTAL + 1):
-        params["means"].grad = torch.ones(5, 3)
-        if iteration % 10 == 0:
-            new = Parameter(params["means"].detach().clone())
-            optimizer.state[new] = optimizer.state.pop(params["means"])
-            optimizer.param_groups[0]["params"] = [new]
-            params["means"] = new
-        if iteration < TOTAL:
-            optimizer.step()
-    assert phases.iteration == TOTAL - 2
-    assert part.seen["means"] == [i for i in range(TOTAL - 1) if i % 10 != 9]
-
-
-def test_the_mean_is_in_place_before_the_last_step() -> None:
-    """Trainers save before it, and INRIA's leaves it out."""
-    params = parameters(5, "sh0")
-    optimizers = PhaseScheduler(300, parts=[Averaging()]).upgrade(adams_of(params))
-    steps(optimizers, params, 299)
-    assert torch.equal(params["sh0"], optimizers["sh0"].state[params["sh0"]]["averaging.mean"])
 
 
 def test_a_second_upgrade_changes_nothing() -> None:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 import io
-import pickle
 import warnings
 from typing import Any
 
 import pytest
 import torch
-from problems import gradient, hessians, quadratic
-from torch import Tensor
 from torch.nn import Parameter
 
 from opt3dgs_optim import Curvature, LQNAdam
@@ -47,36 +43,7 @@ def test_without_pairs_it_is_torch_adam_bit_for_bit(rows: int, options: dict[str
     assert float(a.accepted_share) == 0.0  # pyright: ignore[reportArgumentType]
 
 
-@pytest.mark.parametrize(("condition", "left"), [(1.0, 1e-6), (10.0, 1e-3)])
-def test_it_arrives_where_the_rate_decays(condition: float, left: float) -> None:
-    """With a schedule of torch's, before which nothing warns; three axes at random per row."""
-    hessian = hessians(50, condition)
-    x = Parameter(torch.ones(50, 3, dtype=torch.float64))
-    optimizer = LQNAdam([x], lr=0.1, betas=(0.9, 0.95))
-    decay = torch.optim.lr_scheduler.ExponentialLR(optimizer, 1e-5 ** (1 / 400))
-    for _ in range(400):
-        x.grad = gradient(quadratic(hessian), x)
-        optimizer.step()
-        decay.step()
-    assert float(x.detach().norm(dim=1).median()) < left
-
-
-def test_a_closure() -> None:
-    x = points()
-    optimizer = LQNAdam([x], lr=0.1)
-
-    def closure() -> Tensor:
-        optimizer.zero_grad()
-        loss = (x**2).sum()
-        loss.backward()
-        return loss
-
-    losses = [optimizer.step(closure).item() for _ in range(6)]
-    assert losses == sorted(losses, reverse=True)
-
-
-@pytest.mark.parametrize("road", ["torch.save", "deepcopy", "pickle"])
-def test_it_resumes_bit_for_bit(road: str) -> None:
+def test_it_resumes_bit_for_bit() -> None:
     x, stiff = points(), torch.tensor([1.0, 5.0, 25.0])
     optimizer = LQNAdam([{"params": [x], "name": "means"}], lr=0.01)
 
@@ -86,17 +53,11 @@ def test_it_resumes_bit_for_bit(road: str) -> None:
             optimizer.step()
 
     go(x, optimizer)
-    if road == "torch.save":
-        y, buffer = Parameter(x.detach().clone()), io.BytesIO()
-        twin = LQNAdam([{"params": [y], "name": "means"}], lr=0.3)
-        torch.save(optimizer.state_dict(), buffer)
-        buffer.seek(0)
-        twin.load_state_dict(torch.load(buffer, weights_only=True))
-    else:
-        twin = copy.deepcopy(optimizer) if road == "deepcopy" else pickle.loads(
-            pickle.dumps(optimizer)
-        )  # fmt: skip
-        (y,) = twin.param_groups[0]["params"]
+    y, buffer = Parameter(x.detach().clone()), io.BytesIO()
+    twin = LQNAdam([{"params": [y], "name": "means"}], lr=0.3)
+    torch.save(optimizer.state_dict(), buffer)
+    buffer.seek(0)
+    twin.load_state_dict(torch.load(buffer, weights_only=True))
     go(x, optimizer)
     go(y, twin)
     assert torch.equal(x, y)
@@ -134,6 +95,4 @@ def test_what_is_outside_is_refused() -> None:
     assert len(optimizer.param_groups) == 1
     with pytest.raises(ValueError, match="Curvature: history_size=17"):
         LQNAdam([points()], history_size=17)
-    with pytest.raises(ValueError, match="LQNAdam: moments=8, but 32 or 16"):
-        LQNAdam([points()], moments=8)  # pyright: ignore[reportArgumentType]
     assert LQNAdam([points()], moments=16).training.moments == 16

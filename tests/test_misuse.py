@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import logging
 import subprocess
 import sys
 from collections.abc import Callable
 from typing import Any
 
 import pytest
+import row_edits
 import torch
-from gaussians import adam_of, adams_of, parameters, steps
+from gaussians import adams_of, parameters, steps
 from torch.nn import Parameter
 from torch.optim import Adam
 
@@ -65,16 +65,6 @@ OPTIMIZERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     ),
     "a foreign step": (lambda: Foreign(one().param_groups), TypeError, "Foreign has a step of its"),
     "no optimizer": (lambda: torch.ones(3), TypeError, "Tensor is no optimizer; pass the trainer"),
-    "sparse gradients": (
-        lambda: torch.optim.SparseAdam([Parameter(torch.ones(ROWS, 3))]),
-        TypeError,
-        "SparseAdam has a step of its own",
-    ),
-    "complex": (
-        lambda: one(torch.ones(ROWS, 3, dtype=torch.complex64)),
-        ValueError,
-        "means is torch.complex64.*dense float32 is needed",
-    ),
     "half precision": (
         lambda: one(torch.ones(ROWS, 3, dtype=torch.bfloat16)),
         ValueError,
@@ -141,7 +131,6 @@ def test_a_group_that_comes_later_is_refused_too() -> None:
 
 SCHEDULERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "no length": (lambda: PhaseScheduler(0), ValueError, "total_steps=0, but an integer at least"),
-    "a float": (lambda: PhaseScheduler(3e4), ValueError, "total_steps=30000.0, but an integer"),  # pyright: ignore
     "a switch beyond": (lambda: PhaseScheduler(100, 101), ValueError, "switch=101.*0..100"),
     "a share beyond": (lambda: PhaseScheduler(100, 1.5), ValueError, "switch=1.5.*is needed"),
     "parts second": (
@@ -251,14 +240,10 @@ def test_rows_removed_under_the_default_parts(
     """Once; a user who has chosen parts knows what density control there is."""
     params: dict[str, Any] = parameters(9)
     optimizers = PhaseScheduler(100, parts=chosen).upgrade(adams_of(params))
-    for rows in (9, 8, 7):
-        for name, optimizer in optimizers.items():
-            old = params[name]
-            params[name] = new = Parameter(old.detach()[:rows])
-            optimizer.param_groups[0]["params"] = [new]
-            state = optimizer.state.pop(old, None)
-            if state is not None:
-                optimizer.state[new] = {k: v if k == "step" else v[:rows] for k, v in state.items()}
+    steps(optimizers, params, 1)
+    for _ in range(2):
+        gone = row_edits.removed(torch.tensor([0]))
+        row_edits.apply(gone, params, optimizers.values(), list(params), False)
         steps(optimizers, params, 1)
     found = [str(each.message) for each in recwarn]
     assert len(found) == (chosen is None)
@@ -273,18 +258,6 @@ def test_a_run_that_is_longer_than_it_was_said(recwarn: pytest.WarningsRecorder)
     assert len(found) == 1
     assert "iteration 11 of total_steps=10" in found[0]
     assert "pass its number of iterations as total_steps" in found[0]
-
-
-def test_moments_of_other_rows_are_named() -> None:
-    """Those of 20 Gaussians, loaded for 30."""
-    few, many = parameters(20, "means"), parameters(30, "means")
-    first = PhaseScheduler(60).upgrade(adams_of(few, weight_decay=0.0))
-    with pytest.warns(UserWarning, match="OwnFrame: positions .20, 3. need scales"):
-        steps(first, few, 3)
-    second = PhaseScheduler(60).upgrade(adams_of(many))
-    second["means"].load_state_dict(first["means"].state_dict())
-    with pytest.raises(ValueError, match=r"means is .30, 3., but its exp_avg.* 20 rows for 30"):
-        steps(second, many, 1)
 
 
 def test_numbers_that_are_not_finite_are_told_once(recwarn: pytest.WarningsRecorder) -> None:
@@ -319,17 +292,18 @@ def test_positions_of_a_name_that_is_not_known() -> None:
 
 
 @pytest.mark.parametrize(
-    ("done", "finished", "said"),
+    ("total", "done", "finished", "said"),
     [
-        (5, False, True),
-        (585, False, True),
-        (599, False, False),
-        (585, True, False),
+        (600, 5, False, True),
+        (600, 585, False, True),
+        (600, 599, False, False),
+        (600, 585, True, False),
+        (20, 20, False, False),  # too short for a mean
     ],
 )
-def test_a_training_that_ends_early(done: int, finished: bool, said: bool) -> None:
+def test_a_training_that_ends_early(total: int, done: int, finished: bool, said: bool) -> None:
     params = parameters(ROWS, "means")
-    phases = PhaseScheduler(600, parts=[Averaging()])
+    phases = PhaseScheduler(total, parts=[Averaging()])
     steps(phases.upgrade(adams_of(params)), params, done)
     if finished:
         phases.finish()
@@ -348,15 +322,6 @@ def test_optimizers_that_make_no_step() -> None:
     assert "have made no step; upgrade those that the training steps" in str(phases.end_line())
 
 
-def test_a_checkpoint_that_is_loaded_to_be_looked_at() -> None:
-    params = parameters(ROWS, "means")
-    trained = PhaseScheduler(600, parts=[Averaging()]).upgrade(adams_of(params))
-    steps(trained, params, 5)
-    phases = PhaseScheduler(600, parts=[Averaging()])
-    phases.upgrade(adams_of(params))["means"].load_state_dict(trained["means"].state_dict())
-    assert phases.end_line() is None
-
-
 def test_a_schedule_that_another_takes_over_says_no_more() -> None:
     params = parameters(ROWS, "means")
     first = PhaseScheduler(600, parts=[Averaging()])
@@ -366,36 +331,19 @@ def test_a_schedule_that_another_takes_over_says_no_more() -> None:
     assert first.end_line() is None
 
 
-def test_a_training_too_short_for_a_mean_ends_without_a_line(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    params = parameters(ROWS, "means")
-    phases = PhaseScheduler(20, parts=[Averaging()])
-    steps(phases.upgrade(adams_of(params)), params, 20)
-    assert phases.end_line() is None
-    phases.finish()
-    assert "finish()" not in caplog.text
-
-
-def test_finish_before_there_is_a_mean(caplog: pytest.LogCaptureFixture) -> None:
-    params = parameters(ROWS, "means")
-    phases = PhaseScheduler(600)
-    phases.upgrade(adam_of(params))
-    with caplog.at_level(logging.WARNING, "opt3dgs_optim"):
-        phases.finish()
-    assert "averaging begins at 580, and the parameters stay the last iterate" in caplog.text
-
-
 def test_finish_of_a_resumed_training_before_there_is_a_mean(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
+    """And a checkpoint that is loaded to be looked at has no line at the end."""
     params = parameters(ROWS, "means")
     trained = PhaseScheduler(600, parts=[Averaging()]).upgrade(adams_of(params))
     steps(trained, params, 5)
     phases = PhaseScheduler(600, parts=[Averaging()])
     phases.upgrade(adams_of(params))["means"].load_state_dict(trained["means"].state_dict())
+    assert phases.end_line() is None
     phases.finish()
-    assert "finish() at iteration 5 of 600: averaging begins at 580" in caplog.text
+    said = "finish() at iteration 5 of 600: averaging begins at 580, and the parameters stay the"
+    assert f"{said} last iterate" in caplog.text
 
 
 @pytest.mark.processes

@@ -117,26 +117,6 @@ def test_codes_are_right_in_the_mean() -> None:
         assert abs(away.mean().item()) < 2 * most * 0.5 / (500 * 2_000) ** 0.5 * 5
 
 
-@pytest.mark.parametrize("shape", [(0, 3), (1, 3), (9_000, 15, 3)])
-def test_a_step_in_pieces_is_a_step(
-    shape: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A CPU steps some rows at a time: the codes are those of the whole."""
-    from opt3dgs_optim import step
-
-    made = []
-    for chunk in (step.CHUNK, 10**9):
-        monkeypatch.setattr(step, "CHUNK", chunk)
-        adam = AWSGLD([Parameter(torch.zeros(shape))], moments=16)
-        for seed in range(3):
-            draw = torch.Generator().manual_seed(seed)
-            param_of(adam).grad = torch.randn(shape, generator=draw)
-            adam.step()
-        state = adam.state[param_of(adam)]
-        made.append([param_of(adam).detach(), *(state[key] for key in MOMENTS)])
-    assert same(*made)
-
-
 # -- trainings -------------------------------------------------------------------------------------
 
 
@@ -209,18 +189,6 @@ def test_noise_of_the_trainer_stays_out_of_the_mean_of_positions(moments: Any) -
         iterate(adams, i, i + 1)
     assert means.detach().std() == pytest.approx(10.0 / 10**0.5, rel=0.05)
     assert kept(adams, "averaging.residue") == (0 if moments == 32 else 1_000 * 112)
-
-
-def test_a_training_goes_as_with_32_bits() -> None:
-    ends = []
-    for moments in (32, 16):
-        adams, _ = trained(moments=moments)
-        iterate(adams, 0, 60)
-        ends.append(values(adams))
-    start = values(trained()[0])
-    for one, other, first in zip(*ends, start, strict=True):
-        # Of the way that the training goes.
-        assert (one - other).square().mean().sqrt() < 0.02 * (one - first).square().mean().sqrt()
 
 
 @pytest.mark.parametrize(("at", "total"), [(33, 60), (293, 300), (298, 300)])
@@ -305,22 +273,6 @@ def test_rows_are_edited_by_trainers_that_know_nothing_of_it(rows: Any) -> None:
         assert (now / kept - 0.999).abs().max() <= 2 * SECOND  # a code up or down
 
 
-def test_rows_that_are_zeroed_begin_anew() -> None:
-    """As 3DGS-MCMC's relocation and `reset_rows` do."""
-    adams, _ = trained()
-    iterate(adams, 0, 10)
-    means = adams["means"]
-    state = means.state[param_of(means)]
-    for key in MOMENTS:
-        state[key][:7] = 0
-    param_of(means).grad = torch.ones_like(param_of(means))
-    means.step()
-    first, second = decoded(*(state[key] for key in MOMENTS))
-    ratio = first[:7].abs() / second[:7].sqrt()
-    # Adam's first step of a row: (1 - beta1) / sqrt(1 - beta2).
-    assert (ratio - 0.1 / 0.001**0.5).abs().max() < 0.05
-
-
 # -- averages that change slowly -------------------------------------------------------------------
 
 
@@ -354,7 +306,7 @@ def test_other_numbers_of_bits_are_refused(bits: Any) -> None:
         lambda: AWSGLD([Parameter(torch.ones(2))], moments=bits),
         lambda: LQNAdam([Parameter(torch.ones(1, 2))], moments=bits),
     ):
-        with pytest.raises(ValueError, match=r"moments=.*, but 32 or 16 is needed"):
+        with pytest.raises(ValueError, match=r"^\w+: moments=.*, but 32 or 16 is needed"):
             make()
 
 
@@ -372,21 +324,6 @@ def test_steps_of_other_classes_and_float64_are_refused() -> None:
         PhaseScheduler(10, moments=16).upgrade(double)
     with pytest.raises(ValueError, match="use float32"):
         AWSGLD([Parameter(torch.ones(2).double())], moments=16)
-
-
-def test_a_checkpoint_of_16_bits_serves_a_stock_adam() -> None:
-    """What is saved is numbers, not codes, and the codes of them are the same again."""
-    adams = {k: Adam([Parameter(torch.ones(50, *s))], lr=1e-2) for k, s in SHAPES.items()}
-    PhaseScheduler(60, parts=[], moments=16).upgrade(adams)
-    iterate(adams, 0, 10)
-    for adam in adams.values():
-        state = adam.state_dict()["state"][0]
-        assert state["exp_avg"].dtype == state["exp_avg_sq"].dtype == torch.float32
-        own = adam.state[param_of(adam)]
-        assert torch.equal(decoded(own["exp_avg"], own["exp_avg_sq"])[1], state["exp_avg_sq"])
-        again = Adam([Parameter(param_of(adam).detach().clone())], lr=1e-2)
-        again.load_state_dict(adam.state_dict())
-        assert torch.equal(again.state[param_of(again)]["exp_avg_sq"], state["exp_avg_sq"])
 
 
 def test_groups_that_are_no_gaussians_are_refused() -> None:

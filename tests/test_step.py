@@ -53,25 +53,6 @@ def stepped(device: bool = False, rows: int = 50, seed: int = 0, **options: Any)
     return [on_host(each) for each in (*tensors(step, hyper), hyper.nonfinite + bad)]
 
 
-@pytest.mark.parametrize(
-    ("rows", "width", "pieces"), [(8, 3, [8]), (9, 3, [4, 4, 1]), (3, 13, [1, 1, 1]), (0, 3, [0])]
-)
-def test_a_cpu_takes_as_many_whole_rows_at_a_time_as_a_chunk_holds(
-    rows: int, width: int, pieces: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two chunks are not worth it."""
-    taken: list[int] = []
-
-    def noted(grad: Tensor, counter: Tensor | None) -> tuple[Tensor, int]:
-        taken.append(len(grad))
-        return finite(grad, counter)
-
-    monkeypatch.setattr(module, "CHUNK", 12)
-    monkeypatch.setattr(module, "finite", noted)
-    take_step(*case((rows, width), torch.Generator()))
-    assert taken == pieces
-
-
 @pytest.mark.parametrize("kind", [*KINDS.values(), {"coded": True}], ids=[*KINDS, "16 bits"])
 def test_pieces_make_the_whole(kind: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     options = {**kind, "mean": True, "put": True, "bad": 100}

@@ -17,8 +17,6 @@ from kernel_host import compiler, host_kernels
 from line_search import minimise
 from oracles import dense_bfgs
 from problems import (
-    MUELLER_BROWN_OTHERS,
-    MULTIMODAL,
     SMOOTH,
     Problem,
     gradient,
@@ -145,70 +143,6 @@ def test_rows_that_are_not_finite_hurt_no_other(make: Make, bad: float) -> None:
     assert torch.equal(x[sound], clean[sound])
     assert bool(torch.isfinite(x).all())
     assert float((x - 1).abs().max()) < 0.4
-
-
-@MAKES
-@pytest.mark.parametrize(
-    ("signs", "end", "within"),
-    [((1.0, -1.0), 1.0, 0.1), ((1.0, 1.0), 0.59, 1e-5)],
-    ids=["alternating", "identical"],
-)
-def test_gradients_without_curvature(make: Make, signs: Any, end: float, within: float) -> None:
-    """Across a valley floor steps do not grow; where y = 0 there is no pair, and they are full."""
-    x = steps(
-        Parameter(torch.ones(ROWS, 3)), make, lambda x, k: torch.full_like(x, signs[k % 2]), 41
-    )
-    torch.testing.assert_close(x, torch.full_like(x, end), rtol=0, atol=within)
-
-
-@MAKES
-def test_steps_below_the_last_place_do_not_move(make: Make) -> None:
-    """|x| = 1e6 with a rate of 1e-6: s = 0 is no pair, and no division by it."""
-    x = Parameter(torch.full((ROWS, 3), 1e6))
-    optimizer = make(x)
-    optimizer.param_groups[0]["lr"] = 1e-6
-    histogram = getattr(optimizer, "histogram", None)
-    for _ in range(10):
-        x.grad = x.detach() * torch.tensor([1.0, 10.0, 100.0])
-        if histogram is not None:
-            histogram.observe(0.1)
-        optimizer.step()
-    assert bool((x.detach() == 1e6).all())
-
-
-@pytest.mark.parametrize("size", [1e-45, 1e-42, 1e-39])
-def test_denormal_gradients_step_as_far_as_torch_does(size: float) -> None:
-    """No digits are left in y: the step is then plain Adam's or smaller, never a wild one."""
-    ends = []
-    for make in (LQNAdam, torch.optim.Adam):
-        x = Parameter(torch.ones(ROWS, 3))
-
-        def slope(x: Tensor, k: int) -> Tensor:
-            return torch.full_like(x, size) * (1 + k % 3)
-
-        ends.append(steps(x, lambda p, m=make: m([p], lr=0.01), slope, 12))
-    assert torch.equal(*ends)  # 1e-39 / (1e-39 + eps) is nothing
-
-
-@MAKES
-@pytest.mark.parametrize("rows", [0, 1])
-def test_no_row_and_one(make: Make, rows: int) -> None:
-    x = steps(Parameter(torch.ones(rows, 3)), make, lambda x, k: x * 2, 10)
-    assert x.shape == (rows, 3)
-    assert bool((x < 1).all())
-
-
-@pytest.mark.parametrize("large", [1e16, 1e27, 3e38])
-def test_the_plain_drift_forgets_a_large_gradient(large: float) -> None:
-    x = Parameter(torch.zeros(2))
-    walk = AWSGLD([x], lr=1e-40, preconditioner="none")
-    x.grad = torch.tensor([large, 1.0])
-    walk.step()
-    walk.param_groups[0]["lr"] = 1e-3
-    before = x.detach().clone()
-    x.grad = torch.ones(2)
-    walk.step()
-    torch.testing.assert_close(before - x.detach(), torch.full((2,), 1e-3), rtol=1e-3, atol=0)
 
 
 # -- the two-loop recursion ------------------------------------------------------------------------
@@ -358,27 +292,3 @@ def test_two_loop_with_a_line_search_reaches_the_minimum(problem: Problem, rows:
         error = (end - minimum).norm(dim=1) / minimum.norm(dim=1)
         # f is flat to its rounding: half of the digits, less those of the condition (2,500)
         assert float(error.max()) < 1e-7
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("problem", MULTIMODAL, ids=lambda p: p.name)
-def test_of_several_valleys_it_finds_the_bottom_of_one(problem: Problem) -> None:
-    """From around the customary start, in units of 1e-8 to 1e8: which one is the start's affair."""
-    rows = 30
-    scale, turn = log_uniform(rows, 1e-8, 1e8), rotations(rows, problem.dim)
-    value = placed(problem, scale, turn)
-    generator = torch.Generator().manual_seed(0)
-    start = problem.starts(rows)
-    start += 0.3 * torch.randn(start.shape, generator=generator, dtype=torch.float64)
-    end = minimise(value, to_world(start, scale, turn), 40)[-1]
-    there = torch.einsum("nij,ni->nj", turn, end / scale[:, None])
-    found = problem.value(there)
-    assert bool((found < problem.value(start)).all())
-    assert bool((found >= problem.minimum_value - 1e-8).all())
-    # the square root of float64's rounding of f, times curvatures of up to 1e3
-    assert float(problem.gradient(there).abs().max()) < 1e-5
-    if problem.name == "Mueller-Brown":
-        minima = torch.tensor([problem.minimum_value, *(m[2] for m in MUELLER_BROWN_OTHERS[:2])])
-        distance = (found[:, None] - minima.double()).abs()
-        assert float(distance.amin(1).max()) < 1e-4
-        assert float(distance.amin(0).max()) < 1e-4  # each of the three, from somewhere

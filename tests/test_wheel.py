@@ -121,8 +121,7 @@ def test_wheel_is_small_and_holds_the_package_alone(wheel: Path) -> None:
 
 
 def test_wheel_needs_torch_and_numpy_alone(wheel: Path) -> None:
-    (metadata,) = (text for name, text in contents(wheel).items() if name.endswith("/METADATA"))
-    lines = metadata.decode().splitlines()
+    lines = metadata_of(wheel).splitlines()
     needed = [
         line for line in lines if line.startswith("Requires-Dist:") and "extra ==" not in line
     ]

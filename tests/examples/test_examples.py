@@ -53,7 +53,6 @@ def test_the_arms_of_the_comparison_do_not_disturb_each_other(
     ("words", "message"),
     [
         (["--arms", "mcmc,sgd"], "'sgd' is unknown"),
-        (["--arms", ""], "'' is unknown"),
         (["--arms", "adc"], "error_vs_time: arm 'adc'"),
         (["--scene", "/nowhere/at/all"], "/nowhere/at/all"),
         (["--seeds", "0"], "--seeds 0"),

@@ -1,4 +1,4 @@
-"""What INRIA's trainer, 3dgs-mcmc, taming-3dgs and mini-splatting do to an upgraded optimizer."""
+"""What INRIA's trainer, 3dgs-mcmc and mini-splatting do to an upgraded optimizer."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import pytest
 import torch
 from gsplat_host import POINTS, splats
 from inria_host import ATTRIBUTES, OPTIONS, SimulatedModel, made_model
-from torch.optim import Adam
 
 from opt3dgs_optim import DEFAULTS_ADC, PhaseScheduler
 
@@ -120,47 +119,3 @@ def test_an_optimizer_made_anew_under_way() -> None:
             model.training_setup(OPTIONS)
             phases.upgrade(model.optimizer)
     assert phases.end_line() is None
-
-
-def test_a_second_optimizer_stepped_less_often() -> None:
-    """taming-3dgs: the higher harmonics apart, in every 16th iteration; two states saved."""
-
-    def begun(saved: Any = None) -> tuple[dict[str, torch.nn.Parameter], list[Adam], Any]:
-        values = dict(splats().items())
-        if saved is not None:
-            values = {name: torch.nn.Parameter(value.clone()) for name, value in saved[0].items()}
-        groups = ({"means": "xyz", "opacities": "opacity"}, {"shN": "f_rest"})
-        made = [
-            Adam([{"params": [values[k]], "lr": 1e-3, "name": n} for k, n in each.items()])
-            for each in groups
-        ]
-        for optimizer, state in zip(made, () if saved is None else saved[1], strict=False):
-            optimizer.load_state_dict(state)
-        phases = PhaseScheduler(TOTAL, parts=DEFAULTS_ADC)
-        optimizers: Any = made
-        phases.upgrade(optimizers)
-        return values, made, phases
-
-    def go_on(values: Any, made: list[Adam], first: int, last: int) -> None:
-        for iteration in range(first, last):
-            torch.manual_seed(iteration)
-            for value in values.values():
-                noise = torch.randn_like(value)
-                value.grad = noise if value.grad is None else value.grad + noise
-            made[0].step()
-            made[0].zero_grad()
-            if iteration % 16 == 0:
-                made[1].step()
-                made[1].zero_grad()
-
-    values, made, phases = begun()
-    go_on(values, made, 0, TOTAL)
-    assert phases.iteration == TOTAL - 1
-    half = begun()
-    go_on(*half[:2], 0, 33)  # the second has just stepped, and has no gradient
-    state = {name: value.detach().clone() for name, value in half[0].items()}
-    resumed = begun((state, [optimizer.state_dict() for optimizer in half[1]]))
-    assert resumed[2].iteration == 32
-    go_on(*resumed[:2], 33, TOTAL)
-    for name in ("means", "opacities", "shN"):
-        assert torch.equal(values[name], resumed[0][name]), name

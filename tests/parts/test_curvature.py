@@ -43,15 +43,6 @@ def test_it_acts_on_its_parameters_from_the_switch_on(names: Any) -> None:
         assert holders == (acts if i >= 4 else set())
 
 
-def test_while_exploiting_the_positions_go_where_lqnadam_takes_them() -> None:
-    (x, adam), (y, twin) = positions(torch.optim.Adam), positions()
-    ours = PhaseScheduler(20, 0, parts=[Curvature()]).upgrade({"means": adam})["means"]
-    for _ in range(12):
-        quadratic_step(x, ours)
-        quadratic_step(y, twin)
-    assert torch.equal(x, y)
-
-
 def test_the_share_is_over_all_parameters_of_a_step() -> None:
     """One whose pairs are refused, one whose are taken."""
     curvature = Curvature(names=("means", "scales"))

@@ -69,16 +69,6 @@ def test_rows_of_nonsense_do_not_move_and_move_no_other() -> None:
 # -- what is added ---------------------------------------------------------------------------------
 
 
-def test_added_noise_is_scale_times_learning_rate_times_the_draw() -> None:
-    g = gaussians(7)
-    start = torch.randn(7, 3, generator=draw(1), dtype=torch.float64)
-    means = start.clone()
-    PositionNoise(g, scale=0.25, generator=draw()).add_to(means, 0.05)
-    eta = torch.randn(7, 3, generator=draw(), dtype=torch.float64)
-    expected = start + 0.25 * 0.05 * covariance_noise(**g, eta=eta)
-    torch.testing.assert_close(means, expected, rtol=1e-12, atol=1e-15)
-
-
 @pytest.mark.parametrize("rows", [1, 3, 5])
 def test_gaussians_of_another_scene(rows: int) -> None:
     """Where the number of points is one, or that of the coordinates, too."""
@@ -166,13 +156,6 @@ def test_its_size_goes_by_the_trainers_rate_without_any_factor() -> None:
     others = {name: splats[name].detach() for name in ("scales", "quats", "opacities")}
     expected = 2.0 * 0.03 * covariance_noise(**others, eta=eta)
     torch.testing.assert_close(moved(splats, adams), expected, rtol=1e-4, atol=1e-6)
-
-
-def test_without_the_other_tensors_it_says_which() -> None:
-    splats = {"means": dim()["means"]}
-    _, adams = upgraded(splats, PositionNoise())
-    with pytest.raises(ValueError, match="PositionNoise: scales is missing"):
-        moved(splats, adams)
 
 
 # -- options ---------------------------------------------------------------------------------------

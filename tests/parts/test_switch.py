@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+import row_edits
 import torch
+from gaussians import steps
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -14,36 +16,16 @@ from opt3dgs_optim import FreshMoments, Part, PhaseScheduler, SquaredLoss
 TOTAL, SWITCH = 12, 8
 
 
-def made(switch: int = SWITCH, *parts: Any) -> tuple[Parameter, Any, PhaseScheduler]:
-    x = Parameter(torch.arange(12.0).reshape(4, 3))
-    phases = PhaseScheduler(TOTAL, switch, parts=list(parts or (FreshMoments(),)))
-    return x, phases.upgrade({"means": torch.optim.Adam([x], lr=0.1)})["means"], phases
-
-
-def step(x: Parameter, optimizer: Any, iteration: int) -> None:
-    x.grad = x.detach().cos() * (1e3 if iteration < SWITCH else 1.0)
-    optimizer.step()
-
-
-def test_a_parameter_without_a_gradient_there_begins_anew_later() -> None:
-    x, optimizer, phases = made()
-    for i in range(SWITCH - 1):
-        step(x, optimizer, i)
-    phases.observe(iteration=SWITCH + 2)
-    step(x, optimizer, SWITCH + 2)
-    assert float(optimizer.state[x]["step"]) == 1.0
-
-
-def test_an_edit_of_the_rows_after_the_switch_does_not_begin_anew() -> None:
-    x, optimizer, _ = made()
-    for i in range(SWITCH + 2):
-        step(x, optimizer, i)
-    state, fewer = optimizer.state.pop(x), Parameter(x.detach()[:2])
-    for key in ("exp_avg", "exp_avg_sq"):
-        state[key] = state[key][:2]
-    optimizer.state[fewer], optimizer.param_groups[0]["params"] = state, [fewer]
-    step(fewer, optimizer, SWITCH + 2)
-    assert float(optimizer.state[fewer]["step"]) == 3.0
+def test_moments_begin_anew_once_in_a_parameters_first_step_after_the_switch() -> None:
+    """Which may come later, and an edit of the rows is no other parameter."""
+    params: Any = {"means": Parameter(torch.ones(4, 3))}
+    phases = PhaseScheduler(TOTAL, SWITCH, parts=[FreshMoments()])
+    adam = phases.upgrade(torch.optim.Adam([{"params": [params["means"]], "name": "means"}]))
+    for iteration, count in ((SWITCH - 2, 1), (SWITCH - 1, 2), (SWITCH + 2, 1), (SWITCH + 3, 2)):
+        phases.observe(iteration=iteration)
+        steps({"all": adam}, params, 1)
+        assert adam.state[params["means"]]["step"] == count
+        row_edits.apply(row_edits.removed(torch.tensor([0])), params, [adam], ["means"], False)
 
 
 class Fourth(Part):
@@ -57,7 +39,9 @@ class Fourth(Part):
 @pytest.mark.parametrize(("part", "late"), [(SquaredLoss(), 0.08), (Fourth(), 0.0256), (None, 0.2)])
 def test_a_compiled_loss_changes_its_kind_at_the_switch(part: Any, late: float) -> None:
     """It is compiled once for each kind, and not for each iteration."""
-    x, optimizer, phases = made(SWITCH, part or FreshMoments())
+    x = Parameter(torch.ones(4, 3))
+    phases = PhaseScheduler(TOTAL, SWITCH, parts=[part or FreshMoments()])
+    optimizer = phases.upgrade(torch.optim.Adam([{"params": [x], "name": "means"}]))
     compiled: list[Any] = []
 
     def backend(graph: Any, _: Any) -> Any:
@@ -68,5 +52,5 @@ def test_a_compiled_loss_changes_its_kind_at_the_switch(part: Any, late: float) 
     for i in range(TOTAL):
         expected = 0.2 if i < SWITCH and not isinstance(part, Fourth) else late
         assert float(loss_of(torch.tensor([0.4, 0.0]))) == pytest.approx(expected)
-        step(x, optimizer, i)
+        optimizer.step()
     assert len(compiled) <= 2

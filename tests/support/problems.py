@@ -88,23 +88,6 @@ def wood(x: Tensor) -> Tensor:
     return valleys + 10 * (b + d - 2) ** 2 + 0.1 * (b - d) ** 2
 
 
-MUELLER_BROWN = (  # A, a, b, c, x0, y0 of every term
-    (-200.0, -1.0, 0.0, -10.0, 1.0, 0.0),
-    (-100.0, -1.0, 0.0, -10.0, 0.0, 0.5),
-    (-170.0, -6.5, 11.0, -6.5, -0.5, 1.5),
-    (15.0, 0.7, 0.6, 0.7, -1.0, 1.0),
-)
-
-
-def mueller_brown(x: Tensor) -> Tensor:
-    """Müller and Brown (1979): three minima, two saddles."""
-    total = torch.zeros_like(x[:, 0])
-    for height, a, b, c, x0, y0 in MUELLER_BROWN:
-        dx, dy = x[:, 0] - x0, x[:, 1] - y0
-        total = total + height * (a * dx**2 + b * dx * dy + c * dy**2).exp()
-    return total
-
-
 def double_well(x: Tensor, barrier: float = 1.0) -> Tensor:
     return barrier * (x[:, 0] ** 2 - 1) ** 2
 
@@ -119,16 +102,6 @@ def nine_modes(x: Tensor) -> Tensor:
     square = (x**2).sum(1)
     waves = (1.2 * math.pi * x).cos().sum(1)
     return (square / 10 - waves) / 0.3 + (square - 7).clamp(min=0)
-
-
-def rastrigin(x: Tensor) -> Tensor:
-    return (x**2 - 10 * (2 * math.pi * x).cos() + 10).sum(1)
-
-
-def ackley(x: Tensor) -> Tensor:
-    distance = (x**2).mean(1).sqrt()
-    waves = (2 * math.pi * x).cos().mean(1)
-    return -20 * (-0.2 * distance).exp() - waves.exp() + 20 + math.e
 
 
 SMOOTH = (  # one valley each: a quasi-Newton method with a line search gets to the minimum
@@ -147,24 +120,8 @@ SMOOTH = (  # one valley each: a quasi-Newton method with a line search gets to 
     Problem("Wood", wood, (-3.0, -1.0, -3.0, -1.0), 19192.0, (1.0,) * 4),
 )
 MULTIMODAL = (
-    Problem(
-        "Mueller-Brown",
-        mueller_brown,
-        (-0.05, 0.467),
-        -80.7678,
-        (-0.558223635, 1.441725842),
-        -146.69951721,
-    ),
     Problem("Double well", double_well, (-1.0,), 0.0, (-1.0,)),
     Problem("Nine modes", nine_modes, (2.0, 2.0), 1.606553371, (0.0, 0.0), -20 / 3),
-    Problem("Rastrigin", rastrigin, (2.56,) * 3, 77.554094577, (0.0,) * 3),
-    Problem("Ackley", ackley, (2.0,) * 3, 6.593599, (0.0,) * 3),
-)
-MUELLER_BROWN_OTHERS = (  # x, y, value; two minima, then two saddles
-    (0.623499, 0.028038, -108.16672),
-    (-0.050011, 0.466694, -80.76782),
-    (-0.822002, 0.624313, -40.66484),
-    (0.212487, 0.292988, -72.24894),
 )
 
 

@@ -13,8 +13,6 @@ from splatting.embedded import embedded_scene
 from splatting.fit import Fit, FitOptions
 from splatting.scenes import Scene
 
-from opt3dgs_optim import PhaseScheduler
-
 OPTIONS = FitOptions(iterations=90, points=150)
 RESUMED = ("mcmc", "own", "x2", "learn2splat", "paper")  # what the others have, too
 
@@ -48,16 +46,6 @@ def test_an_arm_trains_and_resumes_bit_for_bit(scene: Scene, name: str, tmp_path
         fit.load(tmp_path / f"{i}.pt")
     assert fit.iteration == 90
     assert all(torch.equal(a, b) for a, b in zip(values(whole), values(fit), strict=True))
-
-
-def test_an_upgraded_adam_without_parts_is_the_trainers_own(scene: Scene) -> None:
-    stock = Fit(scene, ARMS["mcmc"], OPTIONS)
-    ours = Fit(scene, ARMS["mcmc"], OPTIONS)
-    ours.phases = PhaseScheduler(OPTIONS.iterations, parts=[])
-    ours.phases.upgrade(ours.optimizers)
-    trained(stock, 60)
-    trained(ours, 60)
-    assert all(torch.equal(a, b) for a, b in zip(values(stock), values(ours), strict=True))
 
 
 def test_arms_are_what_they_say(scene: Scene) -> None:
