@@ -2,8 +2,9 @@
 
     python examples/benchmarks/evidence.py RECORD.json...     (those that train.py has left)
 
-A line has what was trained (scene, size of the photos, arm, iterations, points, sh_degree, seed),
-what came of it on views that were held out (psnr, ssim, lpips), CPU or GPU seconds, device, date
+A line has what was trained (scene, size of the photos, density control, arm, iterations, points,
+sh_degree, seed), what came of it on views that were held out (psnr, ssim, lpips) and of some that
+were not (train_psnr), how many Gaussians there were at the end, CPU or GPU seconds, device, date
 and command. What is not in a line is as usual, see `USUAL`. Where `seed` is a list, the line has
 the means of these seeds: results of questions that are closed.
 """
@@ -17,11 +18,12 @@ from pathlib import Path
 from typing import Any
 
 FILE = Path(__file__).resolve().parents[2] / "docs" / "results" / "evidence.jsonl"
-TRAINED = ("scene", "size", "arm", "iterations", "points", "sh_degree", "seed")
+TRAINED = ("scene", "size", "density", "arm", "iterations", "points", "sh_degree", "seed")
 # `rotated`: the seed says which views are held out. `views`: trained on, 0 is all of them.
-# `rates`: factor on all learning rates. `pieces`: every photo was cut into so many.
-USUAL = {"rotated": True, "views": 0, "init": "sfm", "rates": 1.0, "pieces": 0}
-MEASURED = ("psnr", "ssim", "lpips", "seconds")
+# `rates`: factor on all learning rates. `threshold`: factor on that of clone and split. `pieces`:
+# every photo was cut into so many.
+USUAL = {"rotated": True, "views": 0, "init": "sfm", "rates": 1.0, "threshold": 1.0, "pieces": 0}
+MEASURED = ("psnr", "ssim", "lpips", "train_psnr", "seconds")
 CURVE = ("iteration", "psnr", "ssim", "lpips")
 SHOWN = ("bonsai", "lego", "plush")  # whose curves of half size are kept
 ORDER = (*TRAINED, *USUAL, *MEASURED, "gaussians", "device", "date", "command", "note", "curve")
@@ -44,8 +46,8 @@ def line_of(record: Line) -> Line:
 
 def command_of(line: Line) -> str:
     """The command that trains a line, in a folder that holds the scenes."""
-    options = {"scene": "", "arm": "", "size": "", "iterations": 0, "points": 0}
-    options |= {"sh_degree": 0, "views": 0, "rates": 1.0, "seed": -1}
+    options = {"scene": "", "density": "relocation", "arm": "", "size": "", "iterations": 0}
+    options |= {"points": 0, "sh_degree": 0, "views": 0, "rates": 1.0, "threshold": 1.0, "seed": -1}
     said = [(name, line.get(name, usual)) for name, usual in options.items()]
     words = [f"--{n.replace('_', '-')} {v}" for n, v in said if v != options[n]]
     words += ["--background white"] * (line["scene"] == "lego")
@@ -57,7 +59,7 @@ def key_of(line: Line) -> tuple[Any, ...]:
     usual = [json.dumps(line.get(key, value)) for key, value in USUAL.items()]
     kind = "GPU" if "NVIDIA" in line["device"] else "CPU"
     first = [line["scene"], line["size"], line["sh_degree"], line["points"], line["iterations"]]
-    last = (kind, line["arm"], json.dumps(line["seed"]), line.get("note", ""))
+    last = (kind, line["density"], line["arm"], json.dumps(line["seed"]), line.get("note", ""))
     return (*first, *usual, *last)
 
 

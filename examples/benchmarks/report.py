@@ -50,7 +50,8 @@ class Evidence:
 
     def of(self, arm: str, scene: str, *, gpu: bool = False, **those: Any) -> list[Line]:
         """The lines of an arm; what is not said is as usual. One a seed, in order."""
-        wanted = evidence.USUAL | those | {"arm": arm, "scene": scene}
+        density = "clone-and-split" if arm.startswith("adc") else "relocation"
+        wanted = evidence.USUAL | {"density": density} | those | {"arm": arm, "scene": scene}
         found = [x for x in self.lines if all(x.get(k) == v for k, v in wanted.items())]
         found = [x for x in found if ("NVIDIA" in x["device"]) is gpu]
         return sorted(found, key=lambda x: str(x["seed"]))

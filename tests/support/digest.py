@@ -2,10 +2,9 @@
 
     python tests/support/digest.py            (the digest, and with --cases one line a training)
 
-A change that moves code from room to room leaves it as it is. It depends on torch and on the
-processor, so that it is no test: run it before and after, on one machine. A training has random
-parts, an optimizer of six groups or six optimizers, edits of rows between its steps, in gsplat's
-way or INRIA's, learning rates that fall, and perhaps a checkpoint that another one resumes.
+A change that moves code leaves it as it is. It depends on torch and on the processor, so that it is
+no test: run it before and after, on one machine. A training has random parts, one optimizer or six,
+edits of rows in gsplat's way or INRIA's, and perhaps a checkpoint that another one resumes.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ TRAININGS, ROWS = 200, 40
 
 
 def parts_of(draw: random.Random) -> list[Any] | None:
-    """None for the defaults, or some of all parts, with options."""
+    """None for the defaults, or some parts."""
     kind = draw.randrange(4)
     if kind == 0:
         return None
@@ -132,13 +131,11 @@ def train(number: int) -> str:
 
 
 def take(digest: Any, value: Tensor) -> None:
-    """Take the bits of a tensor."""
     digest.update(str((value.dtype, tuple(value.shape))).encode())
     digest.update(value.detach().contiguous().numpy().tobytes())
 
 
 def main() -> int:
-    """The command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--cases", action="store_true", help="one line a training, too")
     shown = parser.parse_args().cases

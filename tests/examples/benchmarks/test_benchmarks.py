@@ -19,6 +19,7 @@ TINY = ["--scene", "embedded", "--arm", "own", "--iterations", "20", "--points",
 
 def line(**changes: Any) -> dict[str, Any]:
     made = {"scene": "lego", "size": "images_2", "arm": "mcmc", "iterations": 30_000}
+    made |= {"density": "relocation"}
     made |= {"points": 50_000, "sh_degree": 0, "seed": 0, "psnr": 30.0, "ssim": 0.9, "lpips": 0.1}
     made |= {"seconds": 1.0, "device": "a CPU", "date": "2026-11-27", "command": "train"}
     return made | changes
