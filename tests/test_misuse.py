@@ -85,7 +85,7 @@ OPTIMIZERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "positions of another shape": (
         lambda: one(torch.ones(ROWS, 4, 3)),
         ValueError,
-        r"means is \(4, 4, 3\); positions are \[N, 3\]",
+        r"means is \(4, 4, 3\); Gaussian parameters have a row .*, and positions are \[N, 3\]",
     ),
     "no Gaussians": (
         lambda: one(name="mlp"),

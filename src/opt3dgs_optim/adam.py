@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import operator
+import weakref
 from collections.abc import Mapping
 from typing import Any, cast
 
@@ -36,7 +37,7 @@ from opt3dgs_optim.contract import Slots, bare, check_held, check_supported, own
 from opt3dgs_optim.mean import put_mean
 from opt3dgs_optim.moments import MOMENTS, as_numbers
 from opt3dgs_optim.names import split_name
-from opt3dgs_optim.sparse_adam import check_arguments, refuse_mask, step_around
+from opt3dgs_optim.sparse_adam import check_arguments, refuse_capture, refuse_mask, step_around
 from opt3dgs_optim.stepper import ParamStepper, kept_in
 from opt3dgs_optim.training import Member, Training
 
@@ -74,18 +75,19 @@ class StepAdam(Adam):
         self._on_gpu = any(p.is_cuda for group in self.param_groups for p in group["params"])
         self._name_groups()
         self._count_on_host()
+        self._remember_rows()
 
     def _name_groups(self) -> None:
         """Say in each group which Gaussian parameter it holds, by gsplat's name, or None."""
         members = self.training.members
-        for slot in [slot for slot, member in members.items() if member.optimizer is self]:
+        for slot in [slot for slot, each in members.items() if each.optimizer() is self]:
             del members[slot]
         for at, (which, name) in enumerate(self._slots):
             self.param_groups[at]["gaussian"] = name
             # Always there, since flattened states are loaded by the keys that a group has.
             self.param_groups[at].setdefault(STATE_KEY, "")
             if name is not None:
-                members[which, name] = Member(self, at, self.ticket)
+                members[which, name] = Member(weakref.ref(self), at, self.ticket)
             if name == "means":
                 self.ticket.has_means = self.training.counts_means = True
 
@@ -114,14 +116,10 @@ class StepAdam(Adam):
         self._name_groups()
         self._count_on_host()
 
-    # -- a step ----------------------------------------------------------------------------------
-
     def step(self, *args: Any, **options: Any) -> Any:
-        """One step of every parameter that has a gradient; return the closure's value.
+        """One step of every parameter that has a gradient; return the value of `closure`, if given.
 
-        Args:
-            closure: evaluates the model and returns the loss, or None. gsplat's SelectiveAdam and
-                INRIA's SparseGaussianAdam get their mask, and what goes with it, unchanged.
+        gsplat's SelectiveAdam and INRIA's SparseGaussianAdam get their own arguments, unchanged.
         """
         self._opt_called = True  # what learning-rate schedulers would note by wrapping this method
         if torch.compiler.is_compiling():
@@ -153,10 +151,7 @@ class StepAdam(Adam):
             if loss is not None and training.observers:
                 training.observe(loss)
         if self._on_gpu and torch.cuda.is_current_stream_capturing():
-            raise RuntimeError(
-                f"{type(self).__name__}.step: a CUDA graph is being captured, which would repeat "
-                "this one iteration's numbers for ever; capture the rendering alone"
-            )
+            refuse_capture(type(self).__name__)
         iteration = training.begin(self.ticket)
         if not training.changes_steps:
             self.own_class_step(*given, **masks)
@@ -193,7 +188,12 @@ class StepAdam(Adam):
         if self._steppers:
             self.steppers()
 
-    def _new_steppers(self) -> list[ParamStepper]:
+    def _remember_rows(self) -> None:
+        """Know whose rows the state is of, so that an edit before the first step shows."""
+        if self.state and len(self._slots) == len(self.param_groups):
+            self._new_steppers(check=False)
+
+    def _new_steppers(self, check: bool = True) -> list[ParamStepper]:
         if len(self._slots) != len(self.param_groups):
             raise ValueError(
                 f"{type(self).__name__}.step: {len(self.param_groups)} parameter groups, but "
@@ -208,13 +208,12 @@ class StepAdam(Adam):
                 if i < len(old):
                     stepper.follow(old[i], param, state)
                 else:
-                    # One that has not stepped yet counts as having stepped in the iteration before
-                    # the present one: events of earlier ones are not made up for.
-                    now = self.ticket.next_iteration - 1
-                    stepper.stepped_in = self._last[i] if i < len(self._last) else now - 1
+                    stepper.stepped_in = self._last[i] if i < len(self._last) else None
                     if state:
                         stepper.framed = stepper.name == "means" and stepper.set in self._own_frame
-                stepper.check_rows(param, state)
+                        stepper.remember(state)
+                if check:
+                    stepper.check_rows(param, state)
                 made.append(stepper)
         self._steppers = made
         # Positions first: they step in frames of the shapes that the gradient is of.
@@ -224,8 +223,6 @@ class StepAdam(Adam):
     def own_class_step(self, *args: Any, **options: Any) -> Any:
         """The step of the class that it had, without torch's hooks, which `step` runs already."""
         return bare(self._base.step)(self, *args, **options)
-
-    # -- rows and checkpoints ----------------------------------------------------------------------
 
     @torch.no_grad()
     def reset_rows(self, param: Tensor, rows: Tensor) -> None:
@@ -250,7 +247,7 @@ class StepAdam(Adam):
         """
         found, end = 0, self.training.total_steps
         for stepper in self.steppers():
-            if end is not None and stepper.stepped_in > end:  # trainers that count from 1 end there
+            if end is not None and (stepper.stepped_in or 0) > end:  # one may count from 1
                 continue
             param = stepper.param()
             if param is not None and (state := self.state.get(param)):
@@ -285,7 +282,8 @@ class StepAdam(Adam):
         """Put into each group what a checkpoint has beside tensors."""
         self.notice_edits()
         counts = (int(state["step"]) for state in self.state.values() if "step" in state)
-        common = numbers_of(self.training, self.ticket, max(counts, default=0))
+        kept = sum(bool(kept_in(state)) for state in self.state.values())
+        common = numbers_of(self.training, self.ticket, max(counts, default=0), kept)
         last, now = self.last_steps(), self.ticket.next_iteration - 1
         note_in_groups(self.param_groups, self._slots, common, last, now, self.own_frame())
 
@@ -348,18 +346,19 @@ class StepAdam(Adam):
         self.coded = training.moments == 16
         if not training.changes_steps:
             forget_own_frames(self.param_groups, self._slots, self._own_frame, self.state)
+        self._remember_rows()
 
     def last_steps(self) -> tuple[int, ...]:
         """Of every parameter, the iteration of its last step."""
-        return tuple(stepper.stepped_in for stepper in self._steppers) or self._last
+        now = self.ticket.next_iteration - 1 if self._steppers else 0
+        made = [now if each.stepped_in is None else each.stepped_in for each in self._steppers]
+        return tuple(made) or self._last
 
     def own_frame(self) -> frozenset[str]:
         """The sets whose positions' moments are those of the own frame."""
         if not self._steppers:
             return self._own_frame
         return frozenset(each.set for each in self._steppers if each.framed)
-
-    # -- copies ------------------------------------------------------------------------------------
 
     def __getstate__(self) -> dict[str, Any]:
         self.notice_edits()
@@ -378,10 +377,11 @@ class StepAdam(Adam):
         self._step_supports_amp_scaling = False
         if "training" in vars(self):  # a copy, whose training does not know it, or a load
             self._name_groups()
+            self._remember_rows()
 
 
 _hooked_step: Any = Optimizer.profile_hook_step(StepAdam._step)
-_uncompiled_step: Any = torch._disable_dynamo(StepAdam._step)  # pyright: ignore  (it reads numbers)
+_uncompiled_step: Any = torch._disable_dynamo(StepAdam.step)  # pyright: ignore  (it reads numbers)
 
 
 def _made_again(kind: type[StepAdam] | None, base: type[Adam]) -> StepAdam:

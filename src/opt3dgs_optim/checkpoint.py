@@ -14,18 +14,18 @@ from opt3dgs_optim.clock import Ticket
 from opt3dgs_optim.contract import REFUSED, Slots
 from opt3dgs_optim.mean import BEGAN, MEAN, OF_MEAN, RESIDUE, REST
 from opt3dgs_optim.moments import CODES, MOMENTS, recode
-from opt3dgs_optim.stepper import KEPT
+from opt3dgs_optim.stepper import KEPT, kept_in
 from opt3dgs_optim.training import Training
 
 # In each group of a checkpoint, as a line of JSON, so that a group may be moved or dropped, and
 # that who takes nested states apart (torch.distributed.checkpoint) finds one leaf.
 STATE_KEY = "opt3dgs"
 FORMAT = 4
-COMMON = {"format", "iteration", "total_steps", "steps", "moments", "notes", "parts"}
+COMMON = {"format", "iteration", "total_steps", "steps", "moments", "notes", "parts", "kept"}
 OF_GROUP = {"last", "own_frame"}
 
 
-def numbers_of(training: Training, ticket: Ticket, steps: int) -> dict[str, Any]:
+def numbers_of(training: Training, ticket: Ticket, steps: int, kept: int) -> dict[str, Any]:
     """What all groups of a checkpoint have beside tensors: plain numbers and lists.
 
     A group has besides `last`, of every parameter the iteration of its last step, and `own_frame`,
@@ -34,6 +34,7 @@ def numbers_of(training: Training, ticket: Ticket, steps: int) -> dict[str, Any]
     Args:
         ticket: the optimizer's.
         steps: that Adam has made, of its parameters the most.
+        kept: of how many parameters something is kept for rows beside the moments.
     """
     training.read_back()
     training.look_at_numbers()
@@ -45,6 +46,7 @@ def numbers_of(training: Training, ticket: Ticket, steps: int) -> dict[str, Any]
         "total_steps": training.total_steps,
         "steps": steps,
         "moments": training.moments,
+        "kept": kept,
         "notes": notes,
         "parts": {type(p).__name__: p.state_dict() for p in training.parts if p.learns},
     }
@@ -164,6 +166,12 @@ def drop_other_means(
         saved: what the checkpoint says; None: nothing that holds.
     """
     states = list(states)
+    if saved is not None and saved["kept"] > sum(bool(kept_in(state)) for state in states):
+        training.messages.say_once(
+            "opt3dgs_optim: the checkpoint was loaded without the mean of the last iterates, or "
+            "curvature pairs, that it has (torch.distributed.checkpoint loads only what the new "
+            "optimizer has); they begin anew"
+        )
     dropped = KEPT if saved is None or saved["total_steps"] != training.total_steps else ()
     if saved is not None and saved["moments"] != training.moments:
         dropped = dropped or OF_MEAN
@@ -260,6 +268,7 @@ def check_numbers(call: str, saved: Any, count: int) -> None:
     if saved["total_steps"] is not None:
         check_count(call, "total_steps", saved["total_steps"], 1)
     check_count(call, "steps", saved["steps"], 0)
+    check_count(call, "kept", saved["kept"], 0)
     check_choice(call, "moments", saved["moments"], (32, 16))
     last = saved["last"]
     if not isinstance(last, list) or [type(each) for each in last] != [int] * count:

@@ -92,8 +92,11 @@ def check_supported(optimizer: Any, slots: Slots, moments: int = 32) -> None:
                     f"upgrade: {shown} is {param.dtype}, {param.layout}; dense float32 is needed "
                     "(or float64, which is stepped in plain torch)"
                 )
-            if name == "means" and param.shape[1:] != (3,):
-                raise ValueError(f"upgrade: {shown} is {tuple(param.shape)}; positions are [N, 3]")
+            if (name and not param.dim()) or (name == "means" and param.shape[1:] != (3,)):
+                raise ValueError(
+                    f"upgrade: {shown} is {tuple(param.shape)}; Gaussian parameters have a row for "
+                    "each Gaussian, and positions are [N, 3]"
+                )
     devices = {str(p.device) for g in optimizer.param_groups for p in g["params"]}
     if len(devices) > 1:
         raise ValueError(f"upgrade: its parameters lie on {sorted(devices)}; one device is needed")

@@ -299,8 +299,7 @@ class PhaseScheduler(Training):
         too, if the training went on past `total_steps` or past an earlier `finish()`.
         """
         if not self.finished:
-            holders: Any = {id(m.optimizer): m.optimizer for m in self.members.values()}.values()
-            found = sum(each.put_means() for each in holders)
+            found = sum(each.put_means() for each in self.optimizers())
             assert self.total_steps is not None
             if not found and self.iteration < self._end.mean_at < self.total_steps:
                 LOGGER.warning(
@@ -315,7 +314,7 @@ class PhaseScheduler(Training):
     def resume(self, iteration: int) -> None:
         """Go on from a checkpoint, which may have been loaded to be looked at alone."""
         super().resume(iteration)
-        self._end.upgraded = False
+        self._end.upgraded, self._end.done = False, 0
 
     def advanced(self) -> None:
         """Say what is wrong with the training as it goes; write a line of the log."""

@@ -50,6 +50,14 @@ def refuse_mask(call: str) -> None:
     )
 
 
+def refuse_capture(call: str) -> None:
+    """RuntimeError where a CUDA graph is being captured."""
+    raise RuntimeError(
+        f"{call}.step: a CUDA graph is being captured, which would repeat this one iteration's "
+        "numbers for ever; capture the rendering alone"
+    )
+
+
 @torch.no_grad()
 def step_around(
     steppers: list[ParamStepper],

@@ -35,7 +35,8 @@ class ParamStepper:
         acting: by `Training.exploiting`: the parts with a `plan`, with a `before`, with an `after`.
         later: what later steps may have and the first has not, see `Part.later`.
         counter: where its device counts numbers that are not finite; None on a CPU.
-        stepped_in: the iteration of its last step; -1: none.
+        stepped_in: the iteration of its last step; -1: none; None: it is not known, and counts as
+            the one before its next step, so that events of earlier ones are not made up for.
         framed: whether its moments are those of the own frame; None: it has none yet.
     """
 
@@ -57,7 +58,7 @@ class ParamStepper:
         self.parts = mine
         self._arrange(-1)
         self.later = tuple(sorted({each for p in mine for each in p.later}))
-        self.stepped_in = -1
+        self.stepped_in: int | None = -1
         self.framed: bool | None = None
         self._exp_avg: Any = None  # a weak reference to that beside which something is kept
 
@@ -132,10 +133,10 @@ class ParamStepper:
             self.check_rows(param, state)
         if training.moments == 16:
             as_codes(state)
+        before = iteration - 1 if self.stepped_in is None else self.stepped_in
         step = Step(
-            param, grad, self.name, self.set, self.group, state, iteration, self.stepped_in,
-            self.keep,
-        )  # fmt: skip
+            param, grad, self.name, self.set, self.group, state, iteration, before, self.keep
+        )
         if iteration >= self._arranged_until:
             self._arrange(iteration)
         plans, befores, _ = self.acting[training.exploiting]
@@ -200,6 +201,11 @@ class ParamStepper:
         if self._exp_avg is not None:
             drop_kept(state)
         self._exp_avg = weakref.ref(exp_avg)
+
+    def remember(self, state: dict[str, Any]) -> None:
+        """Know the `exp_avg` beside which something is kept, of a state that was loaded."""
+        if "exp_avg" in state:
+            self._exp_avg = weakref.ref(state["exp_avg"])
 
     def follow(self, before: ParamStepper, param: Tensor, state: dict[str, Any]) -> None:
         """Go on where the one before was, whose Parameter may be another."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Iterable
 from typing import Any, NamedTuple, TypeVar
 
@@ -19,9 +20,12 @@ AnyPart = TypeVar("AnyPart")
 
 
 class Member(NamedTuple):
-    """Who holds a Gaussian parameter: an optimizer, in which of its groups, and its ticket."""
+    """Who holds a Gaussian parameter: an optimizer, in which of its groups, and its ticket.
 
-    optimizer: Optimizer
+    A weak reference: one that the trainer has replaced is freed at once, with its moments.
+    """
+
+    optimizer: weakref.ref[Optimizer]
     at: int
     ticket: Ticket
 
@@ -82,16 +86,25 @@ class Training(Clock):
     def param_of(self, set_name: str, name: str) -> Tensor | None:
         """The present tensor of a Gaussian parameter, by gsplat's name; None if nobody holds it."""
         member = self.members.get((set_name, name))
-        return None if member is None else member[0].param_groups[member[1]]["params"][0]
+        optimizer = None if member is None else member[0]()
+        if member is None or optimizer is None:
+            return None
+        return optimizer.param_groups[member[1]]["params"][0]
 
     def state_of_param(self, set_name: str, name: str) -> dict[str, Any] | None:
         """The optimizer's state of a Gaussian parameter; None before its first step."""
-        member, param = self.members.get((set_name, name)), self.param_of(set_name, name)
-        return None if member is None or param is None else member[0].state.get(param) or None
+        param, member = self.param_of(set_name, name), self.members.get((set_name, name))
+        optimizer = None if member is None else member[0]()
+        return None if optimizer is None or param is None else optimizer.state.get(param) or None
+
+    def optimizers(self) -> list[Any]:
+        """Those that hold Gaussian parameters."""
+        found = {id(o): o for m in self.members.values() if (o := m.optimizer()) is not None}
+        return list(found.values())
 
     def clocks(self) -> list[int]:
         """Of each optimizer whose steps are counted, the iteration that it steps next."""
-        tickets = [member.ticket for member in self.members.values()]
+        tickets = [each.ticket for each in self.optimizers()]
         return [each.next_iteration for each in tickets if each.has_means or not self.counts_means]
 
     def numbers(self) -> dict[str, float | Tensor]:
@@ -112,7 +125,7 @@ class Training(Clock):
     def end_averaging(self) -> None:
         """Go on without the mean of the last iterates, for which a device has no room."""
         self.averages = False
-        for optimizer in {id(m.optimizer): m.optimizer for m in self.members.values()}.values():
+        for optimizer in self.optimizers():
             for state in optimizer.state.values():
                 for key in OF_MEAN:
                     state.pop(key, None)

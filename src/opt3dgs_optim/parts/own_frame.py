@@ -99,9 +99,10 @@ class OwnFrame(Part):
         if (
             quats is None or scales is None
             or quats.shape != (rows, 4) or scales.shape != (rows, 3)
+            or not quats.dtype == scales.dtype == step.param.dtype
         ):  # fmt: skip
             found = {
-                n: None if t is None else tuple(t.shape)
+                n: None if t is None else (*t.shape, t.dtype)
                 for n, t in (("scales", scales), ("quats", quats))
             }
             training.messages.warn_once(
