@@ -210,10 +210,9 @@ def test_a_triton_that_cannot_compile_is_said_with_the_cure(
         raise RuntimeError("Failed to find C compiler.")
 
     zeros = torch.zeros
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(triton, "launch", fails)
     monkeypatch.setattr(torch, "zeros", lambda *size, **_: zeros(*size))
-    said = inspect.unwrap(triton.missing)()
+    said = inspect.unwrap(triton.missing_on)(torch.device("cuda"))
     assert said is not None
     assert "Failed to find C compiler" in said
     assert "apt install gcc" in said

@@ -39,7 +39,7 @@ def missing() -> str | None:
     """Why no kernel runs on this machine's GPU, in a sentence; None: they run."""
     if not torch.cuda.is_available():
         return _import_error() or "torch sees no GPU, so that a step is plain torch."
-    return missing_on(torch.device("cuda", torch.cuda.current_device()))
+    return missing_on(torch.device("cuda"))
 
 
 @functools.cache
