@@ -35,22 +35,18 @@ each_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
 def stepped(device: bool = False, rows: int = 50, seed: int = 0, **options: Any) -> list[Tensor]:
     """What a step leaves, on the CPU, and how many numbers were not finite."""
-    step, hyper = case((rows, 3), torch.Generator().manual_seed(seed), **options)
+    step = case((rows, 3), torch.Generator().manual_seed(seed), **options)
+    assert step.nonfinite is not None
     if device:
-        for owner, names in (
-            (step, ("param", "grad")),
-            (hyper, ("exp_avg", "exp_avg_sq", "nonfinite")),
-        ):
-            for name in names:
-                given = getattr(owner, name)
-                setattr(owner, name, given if given is None else on_device(given))
-        if (mean := hyper.mean) is not None:
+        step.param, step.grad = on_device(step.param), on_device(step.grad)
+        step.nonfinite = on_device(step.nonfinite)
+        step.state = {key: on_device(moment) for key, moment in step.state.items()}
+        if (mean := step.mean) is not None:
             mean.tensor, mean.began = on_device(mean.tensor), on_device(mean.began)
             mean.rest = None if mean.rest is None else on_device(mean.rest)
-    bad = take_step(step, hyper)
-    assert hyper.nonfinite is not None
+    bad = take_step(step)
     assert bad == 0 or not device  # nobody waits
-    return [on_host(each) for each in (*tensors(step, hyper), hyper.nonfinite + bad)]
+    return [on_host(each) for each in (*tensors(step), step.nonfinite + bad)]
 
 
 @pytest.mark.parametrize("kind", [*KINDS.values(), {"coded": True}], ids=[*KINDS, "16 bits"])
@@ -158,17 +154,15 @@ def test_an_iterate_without_a_place_leaves_its_mean_alone(value: float) -> None:
 def test_a_mean_at_16_bits_is_the_same_mean(put: bool) -> None:
     """Also where the trainer decays the parameter."""
     options: dict[str, Any] = {"coded": True, "mean": True, "put": put, "shrink": 0.9, "decay": 0.1}
-    (step, hyper), (step2, hyper2) = (
-        case((50, 3), torch.Generator().manual_seed(2), **options) for _ in range(2)
-    )
-    assert hyper.mean is not None
-    assert hyper2.mean is not None
-    hyper.mean.grid = GRID
-    hyper2.mean.tensor = mean_of(step2.param, hyper2.mean.tensor)
-    take_step(step, hyper)
-    take_step(step2, hyper2)
+    step, step2 = (case((50, 3), torch.Generator().manual_seed(2), **options) for _ in range(2))
+    assert step.mean is not None
+    assert step2.mean is not None
+    step.mean.grid = GRID
+    step2.mean.tensor = mean_of(step2.param, step2.mean.tensor)
+    take_step(step)
+    take_step(step2)
     torch.testing.assert_close(step.param, step2.param, rtol=1e-6, atol=1e-6)
-    near = mean_of(step2.param, hyper.mean.tensor) - hyper2.mean.tensor
+    near = mean_of(step2.param, step.mean.tensor) - step2.mean.tensor
     assert near.abs().max() <= GRID
 
 

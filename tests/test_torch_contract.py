@@ -248,7 +248,7 @@ def test_a_copy_of_one_of_six_optimizers_does_not_carry_the_others() -> None:
     assert len(pickle.dumps(optimizers["opacities"])) < 8_000
     copied = pickle.loads(pickle.dumps(optimizers))
     (training,) = {id(each.training): each.training for each in copied.values()}.values()
-    assert training.members["", "shN"].optimizer() is copied["shN"]
+    assert training.members["", "shN"][0]() is copied["shN"]
 
 
 @pytest.mark.parametrize("kind", [LQNAdam, "Curvature(names=None)"])
@@ -306,9 +306,7 @@ def test_what_is_kept_begins_anew_after_an_edit(edit: str) -> None:
     fed: list[Any] = []
     before = stepper.take_step  # pyright: ignore
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            stepper, "take_step", lambda s, h: [fed.append(s.grad.clone()), before(s, h)][1]
-        )
+        patch.setattr(stepper, "take_step", lambda s: [fed.append(s.grad.clone()), before(s)][1])
         steps(optimizers, {"means": params["means"]}, 1)
     assert torch.equal(fed[0], params["means"].grad)  # no pair is known: Adam is fed the gradient
 

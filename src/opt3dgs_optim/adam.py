@@ -32,14 +32,13 @@ from opt3dgs_optim.checkpoint import (
     steps_of_a_stock_adam,
     take_from_groups,
 )
-from opt3dgs_optim.clock import Ticket
 from opt3dgs_optim.contract import Slots, bare, check_held, check_supported, own_step
 from opt3dgs_optim.mean import put_mean
 from opt3dgs_optim.moments import MOMENTS, as_numbers
 from opt3dgs_optim.names import split_name
 from opt3dgs_optim.sparse_adam import check_arguments, refuse_capture, refuse_mask, step_around
 from opt3dgs_optim.stepper import ParamStepper, kept_in
-from opt3dgs_optim.training import Member, Training
+from opt3dgs_optim.training import Training
 
 
 class StepAdam(Adam):
@@ -51,7 +50,8 @@ class StepAdam(Adam):
     """
 
     training: Training
-    ticket: Ticket
+    next_iteration = 0  # the one that it steps next
+    has_means = False  # whether it holds positions, whose steps count
     coded = False  # whether its moments are codes of 16 bits, see `moments`
     _base: type[Adam] = Adam  # the class whose optimizer it was
     _steppers: list[ParamStepper] = []  # noqa: RUF012  (made anew, never changed)
@@ -68,8 +68,6 @@ class StepAdam(Adam):
         self.training, self._slots, self._steppers, self._in_order = training, slots, [], []
         if not self.state:
             self.coded = training.moments == 16
-        if "ticket" not in vars(self):
-            self.ticket = Ticket()
         self._masked = own_step(self._base) is not None
         self._step_supports_amp_scaling = False  # a GradScaler unscales, and leaves steps out
         self._on_gpu = any(p.is_cuda for group in self.param_groups for p in group["params"])
@@ -80,16 +78,16 @@ class StepAdam(Adam):
     def _name_groups(self) -> None:
         """Say in each group which Gaussian parameter it holds, by gsplat's name, or None."""
         members = self.training.members
-        for slot in [slot for slot, each in members.items() if each.optimizer() is self]:
+        for slot in [slot for slot, each in members.items() if each[0]() is self]:
             del members[slot]
         for at, (which, name) in enumerate(self._slots):
             self.param_groups[at]["gaussian"] = name
             # Always there, since flattened states are loaded by the keys that a group has.
             self.param_groups[at].setdefault(STATE_KEY, "")
             if name is not None:
-                members[which, name] = Member(weakref.ref(self), at, self.ticket)
+                members[which, name] = weakref.ref(self), at
             if name == "means":
-                self.ticket.has_means = self.training.counts_means = True
+                self.has_means = self.training.counts_means = True
 
     def _count_on_host(self) -> None:
         """Keep Adam's count of steps on the host, which reads it in every step of ours."""
@@ -152,7 +150,7 @@ class StepAdam(Adam):
                 training.observe(loss)
         if self._on_gpu and torch.cuda.is_current_stream_capturing():
             refuse_capture(type(self).__name__)
-        iteration = training.begin(self.ticket)
+        iteration = training.begin(self)
         if not training.changes_steps:
             self.own_class_step(*given, **masks)
         elif self._masked:
@@ -283,8 +281,8 @@ class StepAdam(Adam):
         self.notice_edits()
         counts = (int(state["step"]) for state in self.state.values() if "step" in state)
         kept = sum(bool(kept_in(state)) for state in self.state.values())
-        common = numbers_of(self.training, self.ticket, max(counts, default=0), kept)
-        last, now = self.last_steps(), self.ticket.next_iteration - 1
+        common = numbers_of(self.training, self.next_iteration, max(counts, default=0), kept)
+        last, now = self.last_steps(), self.next_iteration - 1
         note_in_groups(self.param_groups, self._slots, common, last, now, self.own_frame())
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -324,7 +322,7 @@ class StepAdam(Adam):
         """Go on where the state says that the training is: after a load."""
         training = self.training
         if not self.state and not any(map(operator.itemgetter(STATE_KEY), self.param_groups)):
-            self.ticket.next_iteration = training.iteration + 1  # made anew, perhaps under way
+            self.next_iteration = training.iteration + 1  # made anew, perhaps under way
             return
         saved, last, own_frame = take_from_groups(self.param_groups, self._slots)
         counts = [int(state["step"]) for state in self.state.values() if "step" in state]
@@ -336,9 +334,9 @@ class StepAdam(Adam):
             iteration = saved["iteration"] + max(missed, 0)
         else:
             iteration = iteration_by_counts(type(self).__name__, counts, training)
-        self._steppers, self._in_order, self.ticket.next_iteration = [], [], iteration
+        self._steppers, self._in_order, self.next_iteration = [], [], iteration
         clocks = training.clocks()
-        if saved is not None or (counts and (self.ticket.has_means or not any(clocks))):
+        if saved is not None or (counts and (self.has_means or not any(clocks))):
             training.resume(max([iteration, *clocks]))  # one that steps now and then lags
         if saved is not None:
             restore_notes(training, saved)
@@ -350,7 +348,7 @@ class StepAdam(Adam):
 
     def last_steps(self) -> tuple[int, ...]:
         """Of every parameter, the iteration of its last step."""
-        now = self.ticket.next_iteration - 1 if self._steppers else 0
+        now = self.next_iteration - 1 if self._steppers else 0
         made = [now if each.stepped_in is None else each.stepped_in for each in self._steppers]
         return tuple(made) or self._last
 
@@ -362,7 +360,7 @@ class StepAdam(Adam):
 
     def __getstate__(self) -> dict[str, Any]:
         self.notice_edits()
-        kept = ("training", "ticket", "_slots", "_masked", "coded", "_on_gpu")
+        kept = ("training", "next_iteration", "has_means", "_slots", "_masked", "coded", "_on_gpu")
         own = {key: getattr(self, key) for key in kept}
         own |= {"_steppers": [], "_last": self.last_steps(), "_own_frame": self.own_frame()}
         return {**super().__getstate__(), **own}

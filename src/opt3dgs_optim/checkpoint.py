@@ -10,7 +10,6 @@ from typing import Any
 from torch import Tensor
 
 from opt3dgs_optim.checks import as_float, check_choice, check_count, check_number
-from opt3dgs_optim.clock import Ticket
 from opt3dgs_optim.contract import REFUSED, Slots
 from opt3dgs_optim.mean import BEGAN, MEAN, OF_MEAN, RESIDUE, REST
 from opt3dgs_optim.moments import CODES, MOMENTS, recode
@@ -25,14 +24,14 @@ COMMON = {"format", "iteration", "total_steps", "steps", "moments", "notes", "pa
 OF_GROUP = {"last", "own_frame"}
 
 
-def numbers_of(training: Training, ticket: Ticket, steps: int, kept: int) -> dict[str, Any]:
+def numbers_of(training: Training, next_iteration: int, steps: int, kept: int) -> dict[str, Any]:
     """What all groups of a checkpoint have beside tensors: plain numbers and lists.
 
     A group has besides `last`, of every parameter the iteration of its last step, and `own_frame`,
     whether the moments of its positions are the own frame's.
 
     Args:
-        ticket: the optimizer's.
+        next_iteration: of the optimizer.
         steps: that Adam has made, of its parameters the most.
         kept: of how many parameters something is kept for rows beside the moments.
     """
@@ -42,7 +41,7 @@ def numbers_of(training: Training, ticket: Ticket, steps: int, kept: int) -> dic
     check_notes("state_dict", notes)
     return {
         "format": FORMAT,
-        "iteration": max(ticket.next_iteration, training.iteration),  # it may have been put on
+        "iteration": max(next_iteration, training.iteration),  # it may have been put on
         "total_steps": training.total_steps,
         "steps": steps,
         "moments": training.moments,

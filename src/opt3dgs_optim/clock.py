@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 import math
-from dataclasses import dataclass
+from typing import Any
 
 
 class Phase(enum.Enum):
@@ -12,19 +12,6 @@ class Phase(enum.Enum):
 
     EXPLORATION = "exploration"
     EXPLOITATION = "exploitation"
-
-
-@dataclass(slots=True)
-class Ticket:
-    """What the clock knows of an optimizer.
-
-    Attributes:
-        next_iteration: the one that it steps next.
-        has_means: whether it holds positions: the clock counts its steps.
-    """
-
-    next_iteration: int = 0
-    has_means: bool = False
 
 
 class Clock:
@@ -56,16 +43,20 @@ class Clock:
         """Of the present iteration."""
         return Phase.EXPLOITATION if self.exploiting else Phase.EXPLORATION
 
-    def begin(self, ticket: Ticket) -> int:
+    def begin(self, optimizer: Any) -> int:
         """The iteration of a step that an optimizer is about to make.
 
         Other optimizers may step before the positions, not at all, or several times. Such a step
         begins an iteration only if the positions have stepped in the present one, and did not step
         first there.
+
+        Args:
+            optimizer: has `next_iteration`, the one that it steps next, which is put forward, and
+                `has_means`, whether it holds positions.
         """
         present = self.iteration + self._resumed
-        iteration = max(ticket.next_iteration, present, 0)
-        if ticket.has_means:
+        iteration = max(optimizer.next_iteration, present, 0)
+        if optimizer.has_means:
             if iteration > self._means_at:  # of two sets' optimizers the first
                 self._means_open = iteration > self._begun
             self._means_at = iteration
@@ -73,7 +64,7 @@ class Clock:
             begins = self._means_at >= present and not self._means_open
             iteration = max(present + begins, 0)
         self._resumed, self._begun = False, iteration
-        ticket.next_iteration = iteration + 1
+        optimizer.next_iteration = iteration + 1
         if iteration > self.iteration:
             self.go_to(iteration)
             self.advanced()

@@ -82,6 +82,16 @@ class Step:
         fade, frame, hold: see there; None: not in this step.
         put: whether the running mean, with this iterate in it, takes the parameter's place; None:
             this iterate is not averaged.
+
+    Adam's numbers are set when the parts have planned, from the group and the state:
+
+        lr, beta1, beta2, eps: as torch's.
+        correction1, sqrt_correction2: 1 - beta1^t and sqrt(1 - beta2^t).
+        shrink: factor on the parameter (decoupled weight decay).
+        decay: share of the parameter in the gradient (the other kind).
+        mean: the running mean; None: it takes no iterate now.
+        nonfinite: [1] int32 on the device, counts numbers; None on a CPU.
+        rounding: 32 bits on which the rounding of moments to codes depends.
     """
 
     param: Tensor
@@ -100,57 +110,50 @@ class Step:
     frame: Frame | None = None
     hold: Hold | None = None
     put: bool | None = None
-
-
-@dataclass(slots=True)
-class Hyper:
-    """The numbers of one Adam step, and the tensors that it changes beside the parameter."""
-
-    lr: float
-    beta1: float
-    beta2: float
-    eps: float
-    correction1: float  # 1 - beta1^t
-    sqrt_correction2: float  # sqrt(1 - beta2^t)
-    exp_avg: Tensor  # float32 or float64, or codes int16 of both: see `moments`
-    exp_avg_sq: Tensor
-    shrink: float = 1.0  # decoupled weight decay: factor on the parameter
-    decay: float = 0.0  # the other kind: share of the parameter in the gradient
+    lr: float = 0.0
+    beta1: float = 0.9
+    beta2: float = 0.999
+    eps: float = 1e-15
+    correction1: float = 1.0
+    sqrt_correction2: float = 1.0
+    shrink: float = 1.0
+    decay: float = 0.0
     mean: Mean | None = None
-    nonfinite: Tensor | None = None  # [1] int32 on the device: counts numbers
-    key: int = 0  # 32 bits on which this step's rounding of moments to codes depends
+    nonfinite: Tensor | None = None
+    rounding: int = 0
 
 
-def take_step(step: Step, hyper: Hyper) -> int:  # noqa: PLR0912  (all a step has)
+def take_step(step: Step) -> int:  # noqa: PLR0912  (all a step has)
     """Make the step in plain torch; how many numbers of the gradient were not finite (CPU only).
 
-    On other devices they are added to `hyper.nonfinite`, so that nothing waits.
+    On other devices they are added to `step.nonfinite`, so that nothing waits.
     """
     chance: Any = None
     fade, all_rows, bad = step.fade, step.param, 0
+    first, second = step.state["exp_avg"], step.state["exp_avg_sq"]
     chosen = None if fade is None else chosen_rows(fade, len(all_rows), all_rows.device)
     chunks: Sequence[Any] = (...,)
     if all_rows.is_cpu and all_rows.numel() > 2 * CHUNK:
         size = max(1, CHUNK * len(all_rows) // all_rows.numel())
         chunks = [slice(i, i + size) for i in range(0, len(all_rows), size)]
     for rows in chunks:
-        exp_avg, exp_avg_sq = codes = hyper.exp_avg[rows], hyper.exp_avg_sq[rows]
+        exp_avg, exp_avg_sq = codes = first[rows], second[rows]
         coded = exp_avg.dtype == CODES
         if coded:
             exp_avg, exp_avg_sq = decoded(exp_avg, exp_avg_sq)
             at = 0 if rows is ... else rows.start * (all_rows.numel() // len(all_rows))
-            chance = chances(exp_avg, hyper.key, at)
+            chance = chances(exp_avg, step.rounding, at)
         param = all_rows[rows]
-        grad, found = finite(step.grad[rows], hyper.nonfinite)
+        grad, found = finite(step.grad[rows], step.nonfinite)
         bad += found
         if fade is not None and chosen is not None:
             faded = like_rows(chosen[rows], param)
             exp_avg.copy_(torch.where(faded, exp_avg * fade.exp_avg, exp_avg))
             exp_avg_sq.copy_(torch.where(faded, exp_avg_sq * fade.exp_avg_sq, exp_avg_sq))
-        if hyper.shrink != 1.0:
-            param.mul_(hyper.shrink)
-        if hyper.decay:
-            grad = grad.add(param, alpha=hyper.decay)
+        if step.shrink != 1.0:
+            param.mul_(step.shrink)
+        if step.decay:
+            grad = grad.add(param, alpha=step.decay)
         axes = None if step.frame is None else axes_of(step.frame, rows)
         if axes is not None:
             grad = into_frame(axes, grad)
@@ -159,20 +162,20 @@ def take_step(step: Step, hyper: Hyper) -> int:  # noqa: PLR0912  (all a step ha
             least = torch.where(like_rows(step.hold.rows[rows], grad), least, 0.0)
             torch.maximum(exp_avg_sq, least, out=exp_avg_sq)
         if step.plain:
-            param.sub_(grad * (hyper.lr * step.factor))
+            param.sub_(grad * (step.lr * step.factor))
         else:
-            exp_avg.lerp_(grad, 1 - hyper.beta1)
-            exp_avg_sq.mul_(hyper.beta2).addcmul_(grad, grad, value=1 - hyper.beta2)
-            root = exp_avg_sq.sqrt().div_(hyper.sqrt_correction2).add_(hyper.eps)
+            exp_avg.lerp_(grad, 1 - step.beta1)
+            exp_avg_sq.mul_(step.beta2).addcmul_(grad, grad, value=1 - step.beta2)
+            root = exp_avg_sq.sqrt().div_(step.sqrt_correction2).add_(step.eps)
             if step.frame is not None and axes is not None:
-                rate = step.frame.rate * step.factor / hyper.correction1
+                rate = step.frame.rate * step.factor / step.correction1
                 param.sub_(out_of_frame(axes, (exp_avg / root).mul_(rate)))
             elif isinstance(step.factor, Tensor):  # a device's number, which the host does not know
-                param.sub_((exp_avg / root).mul_(step.factor * (hyper.lr / hyper.correction1)))
+                param.sub_((exp_avg / root).mul_(step.factor * (step.lr / step.correction1)))
             else:
-                param.addcdiv_(exp_avg, root, value=-(hyper.lr * step.factor / hyper.correction1))
-        if hyper.mean is not None:
-            take_into_mean(hyper.mean, param, rows, chance)
+                param.addcdiv_(exp_avg, root, value=-(step.lr * step.factor / step.correction1))
+        if step.mean is not None:
+            take_into_mean(step.mean, param, rows, chance)
         if coded and not step.plain:
             encode(exp_avg, exp_avg_sq, *codes, chance)
     return bad

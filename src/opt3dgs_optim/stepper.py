@@ -14,7 +14,7 @@ from opt3dgs_optim.clock import Phase
 from opt3dgs_optim.mean import OF_MEAN, Mean, mean_of, take_into_mean
 from opt3dgs_optim.messages import LOGGER
 from opt3dgs_optim.moments import CODES, MOMENTS, as_codes
-from opt3dgs_optim.step import Hyper, Step, mixed, take_step
+from opt3dgs_optim.step import Step, mixed, take_step
 from opt3dgs_optim.training import Training
 
 KEPT = (*OF_MEAN, "curvature.history")  # what a checkpoint may hold for rows beside moments
@@ -88,24 +88,23 @@ class ParamStepper:
         count[()] += 1
         t, (beta1, beta2) = count.item(), group["betas"]
         # A launcher would take an integer, or a number of numpy, for another kind of argument.
-        beta1, beta2, lr, eps = float(beta1), float(beta2), float(group["lr"]), float(group["eps"])
-        decay = group["weight_decay"]
-        coded = training.moments == 16
-        hyper = Hyper(
-            lr, beta1, beta2, eps if step.frame is None else FRAME_EPS,
-            1.0 - beta1**t, (1.0 - beta2**t) ** 0.5, state["exp_avg"], state["exp_avg_sq"],
-            nonfinite=self.counter, key=mixed(int(t)) if coded else 0,
-        )  # fmt: skip
-        if decay:
+        step.lr, step.beta1, step.beta2 = float(group["lr"]), float(beta1), float(beta2)
+        step.eps = FRAME_EPS if step.frame is not None else float(group["eps"])
+        step.correction1 = 1.0 - step.beta1**t
+        step.sqrt_correction2 = (1.0 - step.beta2**t) ** 0.5
+        step.nonfinite = self.counter
+        if decay := group["weight_decay"]:
             if group.get("decoupled_weight_decay"):
-                hyper.shrink = float(1.0 - lr * decay)
+                step.shrink = float(1.0 - step.lr * decay)
             else:
-                hyper.decay = float(decay)
+                step.decay = float(decay)
+        if training.moments == 16:
+            step.rounding = mixed(int(t))
         if step.put is not None:
-            hyper.mean = self.mean(step, int(t))
-        if self.counter is not None and triton.takes(step, hyper):
-            triton.take_step(step, hyper, self.later)
-        elif bad := take_step(step, hyper):
+            step.mean = self.mean(step, int(t))
+        if self.counter is not None and triton.takes(step):
+            triton.take_step(step, self.later)
+        elif bad := take_step(step):
             training.bad_numbers.add(bad)
         for part in self.acting[training.exploiting][2]:
             part.after(step, training)

@@ -4,30 +4,19 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Iterable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from torch import Tensor
 from torch.optim import Optimizer
 
 from opt3dgs_optim.checks import check_choice
-from opt3dgs_optim.clock import Clock, Ticket
+from opt3dgs_optim.clock import Clock
 from opt3dgs_optim.device import BadNumbers
 from opt3dgs_optim.mean import OF_MEAN
 from opt3dgs_optim.messages import Messages
 
 LOOK_INTERVAL = 100  # iterations between two looks at the numbers that were not finite
 AnyPart = TypeVar("AnyPart")
-
-
-class Member(NamedTuple):
-    """Who holds a Gaussian parameter: an optimizer, in which of its groups, and its ticket.
-
-    A weak reference: one that the trainer has replaced is freed at once, with its moments.
-    """
-
-    optimizer: weakref.ref[Optimizer]
-    at: int
-    ticket: Ticket
 
 
 class Training(Clock):
@@ -40,7 +29,8 @@ class Training(Clock):
 
     Attributes:
         changes_steps: whether the steps are others than torch's.
-        members: by set and gsplat's name, who holds a Gaussian parameter.
+        members: by set and gsplat's name, which optimizer holds a Gaussian parameter, and in which
+            of its groups. References are weak: what a trainer replaces is freed at once.
         finished: whether the training has been ended early.
         averages: whether there is room for the mean of the last iterates.
         messages: what has been said, each thing once.
@@ -59,7 +49,7 @@ class Training(Clock):
         self.parts = tuple(parts)  # `part` needs this class for its own hints
         self.moments = check_choice(type(self).__name__, "moments", moments, (32, 16))
         self.changes_steps = bool(self.parts) or moments != 32
-        self.members: dict[tuple[str, str], Member] = {}
+        self.members: dict[tuple[str, str], tuple[weakref.ref[Optimizer], int]] = {}
         self.finished, self.averages = False, True
         self.messages, self.bad_numbers = Messages(), BadNumbers()
         self.unsaved: dict[Any, Any] = {}
@@ -86,8 +76,7 @@ class Training(Clock):
     def param_of(self, set_name: str, name: str) -> Tensor | None:
         """The present tensor of a Gaussian parameter, by gsplat's name; None if nobody holds it."""
         member = self.members.get((set_name, name))
-        optimizer = None if member is None else member[0]()
-        if member is None or optimizer is None:
+        if member is None or (optimizer := member[0]()) is None:
             return None
         return optimizer.param_groups[member[1]]["params"][0]
 
@@ -99,13 +88,13 @@ class Training(Clock):
 
     def optimizers(self) -> list[Any]:
         """Those that hold Gaussian parameters."""
-        found = {id(o): o for m in self.members.values() if (o := m.optimizer()) is not None}
+        found = {id(o): o for m in self.members.values() if (o := m[0]()) is not None}
         return list(found.values())
 
     def clocks(self) -> list[int]:
         """Of each optimizer whose steps are counted, the iteration that it steps next."""
-        tickets = [each.ticket for each in self.optimizers()]
-        return [each.next_iteration for each in tickets if each.has_means or not self.counts_means]
+        counted = [o for o in self.optimizers() if o.has_means or not self.counts_means]
+        return [each.next_iteration for each in counted]
 
     def numbers(self) -> dict[str, float | Tensor]:
         """What the parts say of the present iteration."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim import PhaseScheduler, triton
-from opt3dgs_optim.step import Hyper, Step, chosen_rows, take_step
+from opt3dgs_optim.step import Step, chosen_rows, take_step
 from opt3dgs_optim.triton.check import case, combinations, tensors
 
 pytestmark = [
@@ -28,12 +28,11 @@ def moved(value: Any) -> Any:
     return type(value)(*map(moved, value)) if isinstance(value, tuple) else value
 
 
-def on_gpu(step: Step, hyper: Hyper) -> None:
+def on_gpu(step: Step) -> None:
     """Move what a step has."""
-    for owner in (step, hyper):
-        for name in owner.__slots__:
-            setattr(owner, name, moved(getattr(owner, name)))
-    step.state = {"exp_avg": hyper.exp_avg, "exp_avg_sq": hyper.exp_avg_sq}
+    for name in step.__slots__:
+        setattr(step, name, moved(getattr(step, name)))
+    step.state = {key: moved(moment) for key, moment in step.state.items()}
 
 
 def test_triton_launches_here() -> None:
@@ -45,32 +44,32 @@ def test_a_step_is_that_of_a_cpu(at: int) -> None:
     options, shape = CASES[at]
     made = []
     for gpu in (False, True):
-        step, hyper = case(shape, torch.Generator().manual_seed(0), **options)
+        step = case(shape, torch.Generator().manual_seed(0), **options)
         if gpu:
-            on_gpu(step, hyper)
-            assert triton.takes(step, hyper)
-            triton.take_step(step, hyper)
+            on_gpu(step)
+            assert triton.takes(step)
+            triton.take_step(step)
         else:
-            bad = take_step(step, hyper)
-            assert hyper.nonfinite is not None
-            hyper.nonfinite += bad
-        made.append((step, hyper))
-    assert torch.equal(made[0][1].nonfinite, made[1][1].nonfinite.cpu())
-    for ours, theirs in zip(tensors(*made[0]), tensors(*made[1]), strict=True):
+            bad = take_step(step)
+            assert step.nonfinite is not None
+            step.nonfinite += bad
+        made.append(step)
+    assert torch.equal(made[0].nonfinite, made[1].nonfinite.cpu())
+    for ours, theirs in zip(tensors(made[0]), tensors(made[1]), strict=True):
         size = ours.abs()
         size = size.amax(1, keepdim=True) if options.get("frame") and ours.dim() > 1 else size
         assert ((ours - theirs.cpu()).abs() <= TOLERANCE * size.clamp(min=1.0)).all()
 
 
 def test_the_same_rows_fade() -> None:
-    step, hyper = case((4099, 3), torch.Generator().manual_seed(0), fade=True)
-    hyper.exp_avg.fill_(1.0)
-    on_gpu(step, hyper)
+    step = case((4099, 3), torch.Generator().manual_seed(0), fade=True)
+    step.state["exp_avg"].fill_(1.0)
+    on_gpu(step)
     step.grad.zero_()
-    triton.take_step(step, hyper)
+    triton.take_step(step)
     assert step.fade is not None
     chosen = chosen_rows(step.fade, 4099, torch.device("cpu"))
-    assert torch.equal((hyper.exp_avg < 0.5).any(1).cpu(), chosen)
+    assert torch.equal((step.state["exp_avg"] < 0.5).any(1).cpu(), chosen)
 
 
 QUIET = pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype:UserWarning")

@@ -34,9 +34,9 @@ def driver(monkeypatch: pytest.MonkeyPatch) -> FakeDriver:
 
 def launched(driver: FakeDriver, shape: tuple[int, ...], **options: Any) -> list[Any]:
     """The grid and the arguments of a step's launch, tensors as their addresses."""
-    step, hyper = case(shape, torch.Generator().manual_seed(0), **options)
+    step = case(shape, torch.Generator().manual_seed(0), **options)
     before = len(driver.launched)
-    triton.launch(step, hyper)
+    triton.launch(step)
     assert len(driver.launched) == before + 1
     return [x.data_ptr() if isinstance(x, torch.Tensor) else x for x in driver.launched[-1]]
 
@@ -93,13 +93,13 @@ def test_a_kernel_is_launched_on_the_gpu_of_its_tensors(
     monkeypatch.setattr(triton, "several_gpus", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: current[-1])
     monkeypatch.setattr(torch.cuda, "device", on)
-    step, hyper = case((9, 3), torch.Generator().manual_seed(0))
+    step = case((9, 3), torch.Generator().manual_seed(0))
     for _ in range(2):
-        triton.launch(step, hyper)
+        triton.launch(step)
     assert current == [0]  # that of the CPU is every GPU's
     step.param = step.param.as_subclass(There)
     for _ in range(2):
-        triton.launch(step, hyper)
+        triton.launch(step)
     assert current == [0, 1, 0, 1, 0]
     assert len(driver.launched) == 4
 
@@ -118,10 +118,10 @@ def test_nothing_that_changes_from_step_to_step_compiles_anew(driver: FakeDriver
 def test_tensors_that_begin_anywhere_have_a_kernel_of_their_own(driver: FakeDriver) -> None:
     """A view that begins at 4 bytes is compiled for by itself; others go on as they were."""
     whole, _ = launched(driver, (64, 3)), launched(driver, (64, 3))
-    step, hyper = case((64, 3), torch.Generator().manual_seed(0))
+    step = case((64, 3), torch.Generator().manual_seed(0))
     step.grad = torch.zeros(64 * 3 + 1)[1:].view(64, 3)
     for _ in range(2):
-        triton.launch(step, hyper)
+        triton.launch(step)
     assert len(driver.loaded) == 2
     assert driver.launched[-1][4] == step.grad.data_ptr()
     assert len(launched(driver, (64, 3))) == len(whole)
@@ -166,9 +166,9 @@ def test_codes_are_read_four_at_a_time(driver: FakeDriver) -> None:
     """Of moments, and of a mean of 16 bits, which has a kernel of its own beside one of 32."""
     for mean in (False, True):
         launched(driver, (64, 4), coded=True, mean=mean)
-    step, hyper = case((64, 4), torch.Generator().manual_seed(0), coded=True, mean=True)
-    hyper.mean = Mean(False, 10, torch.zeros(64, 4), torch.zeros(64))
-    triton.launch(step, hyper)
+    step = case((64, 4), torch.Generator().manual_seed(0), coded=True, mean=True)
+    step.mean = Mean(False, 10, torch.zeros(64, 4), torch.zeros(64))
+    triton.launch(step)
     assert len(driver.loaded) == 3
     reads = ROWS_BLOCK // (4 * 32 * triton.WARPS["step_rows"])
     for made, codes, numbers in zip(triton._COMPILED.values(), (2, 3, 2), (2, 2, 3), strict=True):

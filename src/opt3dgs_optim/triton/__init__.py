@@ -21,8 +21,8 @@ from torch import Tensor
 from opt3dgs_optim.cuda import several_gpus
 from opt3dgs_optim.mean import Mean, mean_of
 from opt3dgs_optim.messages import LOGGER
-from opt3dgs_optim.moments import CODES
-from opt3dgs_optim.step import Hold, Hyper, Step
+from opt3dgs_optim.moments import CODES, MOMENTS
+from opt3dgs_optim.step import Hold, Step
 
 ROWS_BLOCK, FRAME_BLOCK, LOOK_BLOCK = 1024, 128, 1024  # as in `kernels`
 WARPS = {"step_rows": 8, "step_in_own_frame": 2, "look_at_positions": 4}  # fastest on an H200
@@ -49,9 +49,9 @@ def missing_on(device: torch.device) -> str | None:
         return error
     try:
         p, g, m, v = torch.zeros(4, 1, device=device)
-        hyper = Hyper(0.0, 0.9, 0.999, 1.0, 1.0, 1.0, m, v)
+        step = Step(p, g, None, "", {}, {"exp_avg": m, "exp_avg_sq": v}, 0, -1)
         for _ in range(2):  # by Triton's launcher, and as in all later steps
-            launch(Step(p, g, None, "", {}, {}, 0, -1), hyper)
+            launch(step)
     except Exception as error:  # no C compiler, a GPU that is too old, a folder that is read-only
         return (
             f"Triton cannot launch a kernel ({type(error).__name__}: {error}), so that a step on "
@@ -81,23 +81,25 @@ def _kernels() -> Any:
     return importlib.import_module("opt3dgs_optim.triton.kernels")
 
 
-def takes(step: Step, hyper: Hyper) -> bool:
+def takes(step: Step) -> bool:
     """Whether the kernels make this step: float32 without gaps, on a GPU with Triton."""
-    return step.param.is_cuda and _runs(step.param.device) and fits(step, hyper)
+    return step.param.is_cuda and _runs(step.param.device) and fits(step)
 
 
-def fits(step: Step, hyper: Hyper) -> bool:  # noqa: PLR0911
+def fits(step: Step) -> bool:  # noqa: PLR0911
     """`takes`, wherever the tensors lie."""
-    frame, hold, mean = step.frame, step.hold, hyper.mean
-    for tensor in (step.param, step.grad, hyper.exp_avg, hyper.exp_avg_sq):
+    frame, hold, mean, state = step.frame, step.hold, step.mean, step.state
+    for tensor in (step.param, step.grad, state["exp_avg"], state["exp_avg_sq"]):
         if tensor.dtype not in DTYPES or not tensor.is_contiguous():
             return False
-    kept = () if mean is None else (mean.tensor, mean.began, mean.rest)
-    kept = kept if hold is None else (*kept, hold.rows)
-    factor, device = step.factor, step.param.device
-    if isinstance(factor, Tensor) and not (_plain(factor) and factor.device == device):
+    if mean is not None:
+        for tensor in (mean.tensor, mean.began, mean.rest):
+            if tensor is not None and not tensor.is_contiguous():
+                return False
+    if hold is not None and not hold.rows.is_contiguous():
         return False
-    if not all(tensor is None or tensor.is_contiguous() for tensor in kept):
+    factor = step.factor
+    if isinstance(factor, Tensor) and not (_plain(factor) and factor.device == step.param.device):
         return False
     if frame is None:
         numbers = step.param.numel()
@@ -113,19 +115,21 @@ def _plain(tensor: Tensor) -> bool:
     return tensor.dtype is torch.float32 and tensor.is_contiguous()
 
 
-def take_step(step: Step, hyper: Hyper, later: tuple[str, ...] = ()) -> None:
+def take_step(step: Step, later: tuple[str, ...] = ()) -> None:
     """Make the step in one launch: what `opt3dgs_optim.step.take_step` means.
 
-    Numbers that are not finite are added to `hyper.nonfinite` [1] int32. Nothing waits for the
+    Numbers that are not finite are added to `step.nonfinite` [1] int32. Nothing waits for the
     device, and nothing is allocated there. At a parameter's first step the kernels that its later
     steps will need (`Part.later`) are compiled, too.
     """
-    key = step.name, step.param.device, hyper.exp_avg.dtype, later, step.frame is None
-    if later and key not in _PREPARED:
-        _PREPARED.add(key)
-        for forms in _subsets(later):
-            launch(*_stand_in(step, hyper, forms))
-    launch(step, hyper)
+    if later:
+        dtype = step.state["exp_avg"].dtype
+        key = step.name, step.param.device, dtype, later, step.frame is None
+        if key not in _PREPARED:
+            _PREPARED.add(key)
+            for forms in _subsets(later):
+                launch(_stand_in(step, forms))
+    launch(step)
     # Autograd is to see that a parameter has changed, as after an operator of torch's.
     torch.autograd.graph.increment_version(step.param)
 
@@ -134,11 +138,14 @@ def _subsets(later: tuple[str, ...]) -> list[tuple[str, ...]]:
     return [c for size in range(len(later) + 1) for c in itertools.combinations(later, size)]
 
 
-def _stand_in(step: Step, hyper: Hyper, forms: tuple[str, ...]) -> tuple[Step, Hyper]:
+def _stand_in(step: Step, forms: tuple[str, ...]) -> Step:
     """A step of one row that changes nothing of the training, and compiles what others need."""
     param = step.param
     one: Any = torch.zeros((1, *param.shape[1:]) if param.dim() else (), device=param.device)
-    made = dataclasses.replace(step, param=one, grad=torch.zeros_like(one), fade=None, hold=None)
+    state = {key: torch.zeros_like(one, dtype=step.state[key].dtype) for key in MOMENTS}
+    made = dataclasses.replace(
+        step, param=one, grad=torch.zeros_like(one), state=state, fade=None, hold=None, mean=None
+    )
     if step.frame is not None:
         quats, scales = one.new_zeros(1, 4), one.new_zeros(1, 3)
         made.frame = step.frame._replace(quats=quats, scales=scales)
@@ -146,11 +153,9 @@ def _stand_in(step: Step, hyper: Hyper, forms: tuple[str, ...]) -> tuple[Step, H
         made.factor = torch.ones((), device=one.device)
     if "hold" in forms:
         made.hold = Hold(torch.zeros(1, dtype=torch.bool, device=one.device), 1.0)
-    m, v = (torch.zeros_like(one, dtype=hyper.exp_avg.dtype) for _ in range(2))
-    numbers = dataclasses.replace(hyper, exp_avg=m, exp_avg_sq=v, mean=None)
     if "mean" in forms:
-        numbers.mean = mean_of(one, {"exp_avg": m}, step.name, False, 1)
-    return made, numbers
+        made.mean = mean_of(one, state, step.name, False, 1)
+    return made
 
 
 def looks(grad: Tensor) -> bool:
@@ -185,42 +190,43 @@ def look(
     )  # fmt: skip
 
 
-def launch(step: Step, hyper: Hyper) -> None:
-    param = step.param
+def launch(step: Step) -> None:
+    """Launch the kernel of this step, whatever device it is on."""
+    param, exp_avg, exp_avg_sq = step.param, step.state["exp_avg"], step.state["exp_avg_sq"]
     numbers = param.numel()
     if not numbers:
         return
     frame, fade, hold, factor = step.frame, step.fade, step.hold, step.factor
-    size = hyper.lr if frame is None else frame.rate
+    size = step.lr if frame is None else frame.rate
     on_device = None
     if isinstance(factor, Tensor):
         on_device = factor
     else:
         size *= factor
     if not step.plain:
-        size /= hyper.correction1
-    kept = NO_MEAN if hyper.mean is None else hyper.mean
+        size /= step.correction1
+    kept = NO_MEAN if step.mean is None else step.mean
     mean, began, rest = kept.tensor, kept.began, kept.rest
     number, put = float(kept.count), 1.0 if kept.put else 0.0
-    coded = hyper.exp_avg.dtype is CODES, mean is not None and mean.dtype is CODES
+    coded = exp_avg.dtype is CODES, mean is not None and mean.dtype is CODES
     adam = (
-        hyper.beta2, 1 - hyper.beta1, 1 - hyper.beta2, hyper.eps, hyper.sqrt_correction2,
-        hyper.shrink, hyper.decay, hyper.key and _signed(hyper.key),
+        step.beta2, 1 - step.beta1, 1 - step.beta2, step.eps, step.sqrt_correction2,
+        step.shrink, step.decay, step.rounding and _signed(step.rounding),
     )  # fmt: skip
     if frame is not None:
         _run(
             "step_in_own_frame", -(-param.shape[0] // FRAME_BLOCK),
-            (param, step.grad, hyper.exp_avg, hyper.exp_avg_sq, frame.quats, frame.scales, mean,
-             rest, began, on_device, hyper.nonfinite),
+            (param, step.grad, exp_avg, exp_avg_sq, frame.quats, frame.scales, mean,
+             rest, began, on_device, step.nonfinite),
             (param.shape[0], frame.min_aspect, size, *adam, number, put), coded,
         )  # fmt: skip
         return
     key, share, fade_m, fade_v = NO_FADE if fade is None else fade
     held, weight = (None, 0.0) if hold is None else (hold.rows.view(torch.uint8), hold.weight)
-    m, v = (None, None) if step.plain else (hyper.exp_avg, hyper.exp_avg_sq)
+    m, v = (None, None) if step.plain else (exp_avg, exp_avg_sq)
     _run(
         "step_rows", -(-numbers // ROWS_BLOCK),
-        (param, step.grad, m, v, mean, rest, began, held, on_device, hyper.nonfinite),
+        (param, step.grad, m, v, mean, rest, began, held, on_device, step.nonfinite),
         (numbers, numbers // param.shape[0] if param.dim() else 1, size, *adam,
          key and _signed(key), share, fade_m, fade_v, weight, number, put, kept.grid),
         coded,

@@ -19,7 +19,6 @@ from opt3dgs_optim.step import (
     Fade,
     Frame,
     Hold,
-    Hyper,
     Step,
     mixed,
     take_step,
@@ -44,7 +43,7 @@ def case(
     decay: float = 0.0,
     bad: int = 0,
     coded: bool = False,
-) -> tuple[Step, Hyper]:
+) -> Step:
     """A step of a parameter amid a training, with what is asked for, from random numbers.
 
     Args:
@@ -74,10 +73,9 @@ def case(
         step.frame = Frame(0.1, 0.1, draw(rows, 4), draw(rows, 3) - 3)
     if hold:
         step.hold = Hold(draw(rows) < 0, 7.0)
-    hyper = Hyper(
-        1e-2, 0.9, 0.999, 1e-15, 1 - 0.9**steps, (1 - 0.999**steps) ** 0.5, exp_avg, exp_avg_sq,
-        shrink, decay, nonfinite=torch.zeros(1, dtype=torch.int32), key=mixed(steps),
-    )  # fmt: skip
+    step.lr, step.shrink, step.decay = 1e-2, shrink, decay
+    step.correction1, step.sqrt_correction2 = 1 - 0.9**steps, (1 - 0.999**steps) ** 0.5
+    step.nonfinite, step.rounding = torch.zeros(1, dtype=torch.int32), mixed(steps)
     if mean:
         began, grid = torch.randint(0, steps, (rows,), generator=generator).to(torch.float32), 1.0
         kept = (param + 0.1 * draw(*shape)).mul_(like_rows(began > 0, param))  # others begin now
@@ -86,38 +84,38 @@ def case(
             kept = (kept / grid).to(torch.int32).to(CODES)
         sums = kept.dtype != CODES and shape[1:] == (3,)  # as positions have it
         rest = 1e-8 * draw(*shape) if sums else None
-        hyper.mean = Mean(put, steps, kept, began, grid, rest)
-    return step, hyper
+        step.mean = Mean(put, steps, kept, began, grid, rest)
+    return step
 
 
-def tensors(step: Step, hyper: Hyper) -> list[Tensor]:
+def tensors(step: Step) -> list[Tensor]:
     """What a step changes."""
-    moments = [hyper.exp_avg, hyper.exp_avg_sq]
-    if hyper.exp_avg.dtype == CODES:
+    moments = [step.state["exp_avg"], step.state["exp_avg_sq"]]
+    if moments[0].dtype == CODES:
         moments = list(decoded(*moments))
     found = [step.param, *moments]
-    if hyper.mean is None:
+    if step.mean is None:
         return found
-    mean = hyper.mean.tensor
+    mean = step.mean.tensor
     if mean.dtype == CODES:
-        mean = mean_of_residue(step.param, mean, hyper.mean.grid)
-    rest = [] if hyper.mean.rest is None else [hyper.mean.rest]
-    return [*found, mean, *rest, hyper.mean.began]
+        mean = mean_of_residue(step.param, mean, step.mean.grid)
+    rest = [] if step.mean.rest is None else [step.mean.rest]
+    return [*found, mean, *rest, step.mean.began]
 
 
 def both(options: dict[str, Any], shape: tuple[int, ...], seed: int = 0) -> tuple[Any, Any]:
-    """The same case, stepped by plain torch, and by the kernels; each a step and its numbers."""
+    """The same case, stepped by plain torch, and by the kernels."""
     made = []
     for kernels in (False, True):
-        step, hyper = case(shape, torch.Generator().manual_seed(seed), **options)
+        step = case(shape, torch.Generator().manual_seed(seed), **options)
         if kernels:
-            assert triton.fits(step, hyper), options
-            triton.launch(step, hyper)
+            assert triton.fits(step), options
+            triton.launch(step)
         else:
-            bad = take_step(step, hyper)
-            assert hyper.nonfinite is not None
-            hyper.nonfinite += bad
-        made.append((step, hyper))
+            bad = take_step(step)
+            assert step.nonfinite is not None
+            step.nonfinite += bad
+        made.append(step)
     return made[0], made[1]
 
 
@@ -127,13 +125,13 @@ def difference(options: dict[str, Any], shape: tuple[int, ...], seed: int = 0) -
     In the own frame, of the longest of the row's three: they are sums that may cancel.
     Infinite where one is not finite and the other is, or other numbers were counted as not finite.
     """
-    (step, hyper), (step2, hyper2) = both(options, shape, seed)
-    assert hyper.nonfinite is not None
-    assert hyper2.nonfinite is not None
-    if not torch.equal(hyper.nonfinite, hyper2.nonfinite):
+    step, step2 = both(options, shape, seed)
+    assert step.nonfinite is not None
+    assert step2.nonfinite is not None
+    if not torch.equal(step.nonfinite, step2.nonfinite):
         return float("inf")
     worst = 0.0
-    for ours, theirs in zip(tensors(step, hyper), tensors(step2, hyper2), strict=True):
+    for ours, theirs in zip(tensors(step), tensors(step2), strict=True):
         if not ours.numel():
             continue
         known = torch.isfinite(ours)
@@ -160,11 +158,11 @@ def combinations() -> Iterator[tuple[dict[str, Any], tuple[int, ...]]]:
 
 def interprets() -> bool:
     """Whether this Triton's interpreter writes into tensors of a CPU: beside numpy 2, from 3.2."""
-    step, hyper = case((triton.ROWS_BLOCK + 1,), torch.Generator().manual_seed(0))
-    before = [each.clone() for each in tensors(step, hyper)]
-    triton.launch(step, hyper)
+    step = case((triton.ROWS_BLOCK + 1,), torch.Generator().manual_seed(0))
+    before = [each.clone() for each in tensors(step)]
+    triton.launch(step)
     # Anything: a kernel that leaves something out is a wrong one, not an old interpreter.
-    return not all(map(torch.equal, before, tensors(step, hyper)))
+    return not all(map(torch.equal, before, tensors(step)))
 
 
 def main() -> None:
