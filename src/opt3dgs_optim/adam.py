@@ -32,7 +32,7 @@ from opt3dgs_optim.checkpoint import (
     steps_of_a_stock_adam,
     take_from_groups,
 )
-from opt3dgs_optim.contract import Slots, bare, check_held, check_supported, own_step
+from opt3dgs_optim.contract import Slots, bare, check_groups, check_held, check_supported, own_step
 from opt3dgs_optim.mean import put_mean
 from opt3dgs_optim.moments import MOMENTS, as_numbers
 from opt3dgs_optim.names import split_name
@@ -101,8 +101,11 @@ class StepAdam(Adam):
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """As torch's; refuses what `upgrade` would, with nothing changed."""
+        ours = "training" in vars(self)
+        if ours:
+            check_groups(f"{type(self).__name__}.add_param_group", self.param_groups, self._slots)
         super().add_param_group(param_group)
-        if "training" not in vars(self):
+        if not ours:
             return
         slots = [*self._slots, split_name(self.param_groups[-1].get("name"))]
         try:
@@ -192,12 +195,8 @@ class StepAdam(Adam):
             self._new_steppers(check=False)
 
     def _new_steppers(self, check: bool = True) -> list[ParamStepper]:
-        if len(self._slots) != len(self.param_groups):
-            raise ValueError(
-                f"{type(self).__name__}.step: {len(self.param_groups)} parameter groups, but "
-                f"{len(self._slots)} when it was upgraded; upgrade it again where they change"
-            )
         old, made, call = self._steppers, [], type(self).__name__
+        check_groups(f"{call}.step", self.param_groups, self._slots)
         for group, slot in zip(self.param_groups, self._slots, strict=True):
             for param in group["params"]:
                 i = len(made)
@@ -207,9 +206,9 @@ class StepAdam(Adam):
                     stepper.follow(old[i], param, state)
                 else:
                     stepper.stepped_in = self._last[i] if i < len(self._last) else None
-                    if state:
+                    if "exp_avg" in state:
                         stepper.framed = stepper.name == "means" and stepper.set in self._own_frame
-                        stepper.remember(state)
+                        stepper.remember(state["exp_avg"])
                 if check:
                     stepper.check_rows(param, state)
                 made.append(stepper)

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from opt3dgs_optim.checks import as_float, check_choice, check_count, check_number
 from opt3dgs_optim.contract import REFUSED, Slots
-from opt3dgs_optim.mean import BEGAN, MEAN, OF_MEAN, RESIDUE, REST
+from opt3dgs_optim.mean import BEGAN, MEAN, RESIDUE, REST, drop_means
 from opt3dgs_optim.moments import CODES, MOMENTS, recode
-from opt3dgs_optim.stepper import KEPT, kept_in
+from opt3dgs_optim.stepper import KEPT, drop_kept, kept_in
 from opt3dgs_optim.training import Training
 
 # In each group of a checkpoint, as a line of JSON, so that a group may be moved or dropped, and
@@ -171,17 +171,16 @@ def drop_other_means(
             "curvature pairs, that it has (torch.distributed.checkpoint loads only what the new "
             "optimizer has); they begin anew"
         )
-    dropped = KEPT if saved is None or saved["total_steps"] != training.total_steps else ()
+    if saved is None or saved["total_steps"] != training.total_steps:
+        for state in states:
+            drop_kept(state)
     if saved is not None and saved["moments"] != training.moments:
-        dropped = dropped or OF_MEAN
         if any(BEGAN in state for state in states):
             training.messages.say_once(
                 "opt3dgs_optim: the mean of the last iterates begins anew, at "
                 f"{training.moments} bits"
             )
-    for state in states:
-        for key in dropped:
-            state.pop(key, None)
+        drop_means(states)
 
 
 def recode_all(

@@ -111,6 +111,16 @@ def check_held(call: str, optimizer: Optimizer, param: Tensor) -> None:
         )
 
 
+def check_groups(call: str, groups: list[dict[str, Any]], slots: Slots) -> None:
+    """ValueError unless the groups are those that slots were found for, in their order."""
+    now = [group.get("gaussian", name) for group, (_, name) in zip(groups, slots, strict=False)]
+    if len(groups) != len(slots) or now != [name for _, name in slots]:
+        raise ValueError(
+            f"{call}: {len(groups)} parameter groups, {now}, but {len(slots)} when it was upgraded"
+            f", {[name for _, name in slots]}; upgrade it again where they change"
+        )
+
+
 def _check_bare(optimizer: Any) -> None:
     """Refuse a wrapper around an optimizer, and a function over its step."""
     kind = type(optimizer)

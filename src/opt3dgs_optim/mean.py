@@ -9,7 +9,7 @@ fractions, so that a second tensor has what rounding leaves of its mean (Kahan 1
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,8 +58,7 @@ def mean_of(param: Tensor, state: dict[str, Any], name: str | None, put: bool, c
         mean is None or began is None or rows != param.numel()
         or (name == "means" and (rest is None or rest.numel() != rows))
     ):  # fmt: skip
-        for each in OF_MEAN:
-            state.pop(each, None)
+        drop_means([state])
         mean = torch.zeros_like(param, dtype=None if grid is None else CODES)
         began = torch.zeros(param.shape[:1], dtype=param.dtype, device=param.device)
         rest = torch.zeros_like(param) if name == "means" else None
@@ -68,6 +67,13 @@ def mean_of(param: Tensor, state: dict[str, Any], name: str | None, put: bool, c
     elif mean.dtype is not CODES and grid is not None:
         mean = state[key] = mean.to(CODES)  # an edit of rows, and torch's loading, make it float32
     return Mean(put, count, mean, began, grid or 1.0, rest)
+
+
+def drop_means(states: Iterable[dict[str, Any]]) -> None:
+    """Have no running means."""
+    for state in states:
+        for key in OF_MEAN:
+            state.pop(key, None)
 
 
 def like_rows(numbers: Tensor, param: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from opt3dgs_optim import triton
 from opt3dgs_optim.clock import Phase
-from opt3dgs_optim.mean import OF_MEAN, Mean, mean_of, take_into_mean
+from opt3dgs_optim.mean import OF_MEAN, Mean, drop_means, mean_of, take_into_mean
 from opt3dgs_optim.messages import LOGGER
 from opt3dgs_optim.moments import CODES, MOMENTS, as_codes
 from opt3dgs_optim.step import Step, mixed, take_step
@@ -199,12 +199,11 @@ class ParamStepper:
             return
         if self._exp_avg is not None:
             drop_kept(state)
-        self._exp_avg = weakref.ref(exp_avg)
+        self.remember(exp_avg)
 
-    def remember(self, state: dict[str, Any]) -> None:
-        """Know the `exp_avg` beside which something is kept, of a state that was loaded."""
-        if "exp_avg" in state:
-            self._exp_avg = weakref.ref(state["exp_avg"])
+    def remember(self, exp_avg: Tensor) -> None:
+        """Know the `exp_avg` beside which something is kept."""
+        self._exp_avg = weakref.ref(exp_avg)
 
     def follow(self, before: ParamStepper, param: Tensor, state: dict[str, Any]) -> None:
         """Go on where the one before was, whose Parameter may be another."""
@@ -233,8 +232,7 @@ def begin_moments_anew(state: dict[str, Any]) -> None:
     state["step"].zero_()
     for key in MOMENTS:
         state[key].zero_()
-    for key in OF_MEAN:
-        state.pop(key, None)
+    drop_means([state])
 
 
 def kept_in(state: dict[str, Any]) -> list[str]:

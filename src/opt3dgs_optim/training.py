@@ -12,7 +12,7 @@ from torch.optim import Optimizer
 from opt3dgs_optim.checks import check_choice
 from opt3dgs_optim.clock import Clock
 from opt3dgs_optim.device import BadNumbers
-from opt3dgs_optim.mean import OF_MEAN
+from opt3dgs_optim.mean import drop_means
 from opt3dgs_optim.messages import Messages
 
 LOOK_INTERVAL = 100  # iterations between two looks at the numbers that were not finite
@@ -115,9 +115,7 @@ class Training(Clock):
         """Go on without the mean of the last iterates, for which a device has no room."""
         self.averages = False
         for optimizer in self.optimizers():
-            for state in optimizer.state.values():
-                for key in OF_MEAN:
-                    state.pop(key, None)
+            drop_means(optimizer.state.values())
         self.messages.warn_once(
             "memory",
             f"opt3dgs_optim: iteration {self.iteration}: the device has no room for the mean of "
