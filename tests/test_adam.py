@@ -291,17 +291,19 @@ def test_a_gradient_of_another_shape_is_refused(found: Any) -> None:
 # -- what changes without a new Parameter ----------------------------------------------------------
 
 
-@pytest.mark.parametrize("change", [list.pop, list.reverse])
-def test_groups_that_were_taken_away_or_reordered_are_refused(change: Any) -> None:
+def test_a_group_that_was_taken_away_is_told() -> None:
     params = parameters(ROWS)
     optimizer = PhaseScheduler(TOTAL).upgrade(adam_of(params))
     steps({"all": optimizer}, params, 2)
-    change(optimizer.param_groups)
+    optimizer.param_groups.pop()
     start = {name: param.detach().clone() for name, param in params.items()}
-    with pytest.raises(ValueError, match=r"parameter groups, .* but 6 when it was upgraded"):
-        steps({"all": optimizer}, params, 1)
-    with pytest.raises(ValueError, match=r"parameter groups, .* but 6 when it was upgraded"):
-        optimizer.add_param_group({"params": [Parameter(torch.zeros(2))]})
+    for call in (
+        lambda: steps({"all": optimizer}, params, 1),
+        lambda: optimizer.add_param_group({"params": [Parameter(torch.zeros(2))]}),
+        lambda: PhaseScheduler(TOTAL).upgrade(optimizer),
+    ):
+        with pytest.raises(ValueError, match="5 parameter groups, but 6 when it was upgraded"):
+            call()
     assert all(torch.equal(params[name], start[name]) for name in params)
 
 

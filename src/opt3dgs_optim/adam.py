@@ -32,7 +32,14 @@ from opt3dgs_optim.checkpoint import (
     steps_of_a_stock_adam,
     take_from_groups,
 )
-from opt3dgs_optim.contract import Slots, bare, check_groups, check_held, check_supported, own_step
+from opt3dgs_optim.contract import (
+    Slots,
+    bare,
+    check_group_count,
+    check_held,
+    check_supported,
+    own_step,
+)
 from opt3dgs_optim.mean import put_mean
 from opt3dgs_optim.moments import MOMENTS, as_numbers
 from opt3dgs_optim.names import split_name
@@ -63,14 +70,15 @@ class StepAdam(Adam):
     def follow(self, training: Training, slots: Slots) -> None:
         """Have the parts of `training` from now on; slots are, by group, set and name."""
         self._last, self._own_frame = self.last_steps(), self.own_frame()
-        if len(self._last) != sum(len(group["params"]) for group in self.param_groups):
+        params = [param for group in self.param_groups for param in group["params"]]
+        if len(self._last) != len(params):
             self._last = ()  # groups are others now
         self.training, self._slots, self._steppers, self._in_order = training, slots, [], []
         if not self.state:
             self.coded = training.moments == 16
         self._masked = own_step(self._base) is not None
         self._step_supports_amp_scaling = False  # a GradScaler unscales, and leaves steps out
-        self._on_gpu = any(p.is_cuda for group in self.param_groups for p in group["params"])
+        self._on_gpu = any(map(operator.attrgetter("is_cuda"), params))
         self._name_groups()
         self._count_on_host()
         self._remember_rows()
@@ -78,6 +86,7 @@ class StepAdam(Adam):
     def _name_groups(self) -> None:
         """Say in each group which Gaussian parameter it holds, by gsplat's name, or None."""
         members = self.training.members
+        self.has_means = False
         for slot in [slot for slot, each in members.items() if each[0]() is self]:
             del members[slot]
         for at, (which, name) in enumerate(self._slots):
@@ -103,7 +112,9 @@ class StepAdam(Adam):
         """As torch's; refuses what `upgrade` would, with nothing changed."""
         ours = "training" in vars(self)
         if ours:
-            check_groups(f"{type(self).__name__}.add_param_group", self.param_groups, self._slots)
+            check_group_count(
+                f"{type(self).__name__}.add_param_group", self.param_groups, self._slots
+            )
         super().add_param_group(param_group)
         if not ours:
             return
@@ -196,7 +207,7 @@ class StepAdam(Adam):
 
     def _new_steppers(self, check: bool = True) -> list[ParamStepper]:
         old, made, call = self._steppers, [], type(self).__name__
-        check_groups(f"{call}.step", self.param_groups, self._slots)
+        check_group_count(f"{call}.step", self.param_groups, self._slots)
         for group, slot in zip(self.param_groups, self._slots, strict=True):
             for param in group["params"]:
                 i = len(made)

@@ -13,13 +13,13 @@ from opt3dgs_optim.checks import as_float, check_choice, check_count, check_numb
 from opt3dgs_optim.contract import REFUSED, Slots
 from opt3dgs_optim.mean import BEGAN, MEAN, RESIDUE, REST, drop_means
 from opt3dgs_optim.moments import CODES, MOMENTS, recode
-from opt3dgs_optim.stepper import KEPT, drop_kept, kept_in
+from opt3dgs_optim.stepper import KEPT, begin_moments_anew, drop_kept, kept_in
 from opt3dgs_optim.training import Training
 
 # In each group of a checkpoint, as a line of JSON, so that a group may be moved or dropped, and
 # that who takes nested states apart (torch.distributed.checkpoint) finds one leaf.
 STATE_KEY = "opt3dgs"
-FORMAT = 4
+FORMAT = 5
 COMMON = {"format", "iteration", "total_steps", "steps", "moments", "notes", "parts", "kept"}
 OF_GROUP = {"last", "own_frame"}
 
@@ -116,12 +116,12 @@ def complete_groups(
 def forget_own_frames(
     groups: list[dict[str, Any]], slots: Slots, framed: Container[str], states: Mapping[Any, Any]
 ) -> None:
-    """Zero the moments of positions that are in the own frame's units, for a stock step."""
+    """Have moments of positions in the own frame's units begin anew, for a stock step."""
     for group, (which, name) in zip(groups, slots, strict=True):
         if name == "means" and which in framed:
             state = states.get(group["params"][0], {})
-            for key in set(state) & set(MOMENTS):
-                state[key].zero_()
+            if "exp_avg" in state:
+                begin_moments_anew(state)
 
 
 def saved_numbers(line: Any) -> dict[str, Any] | None:

@@ -111,13 +111,12 @@ def check_held(call: str, optimizer: Optimizer, param: Tensor) -> None:
         )
 
 
-def check_groups(call: str, groups: list[dict[str, Any]], slots: Slots) -> None:
-    """ValueError unless the groups are those that slots were found for, in their order."""
-    now = [group.get("gaussian", name) for group, (_, name) in zip(groups, slots, strict=False)]
-    if len(groups) != len(slots) or now != [name for _, name in slots]:
+def check_group_count(call: str, groups: list[dict[str, Any]], slots: Slots) -> None:
+    """ValueError unless there are as many groups as slots were found for."""
+    if len(groups) != len(slots):
         raise ValueError(
-            f"{call}: {len(groups)} parameter groups, {now}, but {len(slots)} when it was upgraded"
-            f", {[name for _, name in slots]}; upgrade it again where they change"
+            f"{call}: {len(groups)} parameter groups, but {len(slots)} when it was upgraded; "
+            "upgrade it again, by the same scheduler, where they change"
         )
 
 

@@ -34,14 +34,16 @@ class Mean:
     """The running mean of a parameter, and what this step does with it."""
 
     put: bool  # whether it takes the parameter's place
-    count: int  # Adam's steps of the parameter with this one, by which the mean counts
+    count: float  # of iterates, with this one, since the training began
     tensor: Tensor  # [N, ...] like the parameter, or int16: see `take_into_residue`
     began: Tensor  # [N] the `count` with which a row's mean began; 0: not yet
     grid: float = 1.0  # of a mean of int16
     rest: Tensor | None = None  # [N, 3] of positions, beside the mean
 
 
-def mean_of(param: Tensor, state: dict[str, Any], name: str | None, put: bool, count: int) -> Mean:
+def mean_of(
+    param: Tensor, state: dict[str, Any], name: str | None, put: bool, count: float
+) -> Mean:
     """The running mean of a parameter, in the form that goes with its moments; made if need be.
 
     Args:

@@ -82,6 +82,7 @@ class Step:
         fade, frame, hold: see there; None: not in this step.
         put: whether the running mean, with this iterate in it, takes the parameter's place; None:
             this iterate is not averaged.
+        every: of so many of Adam's steps one goes into the mean, and all where it is put.
 
     Adam's numbers are set when the parts have planned, from the group and the state:
 
@@ -110,6 +111,7 @@ class Step:
     frame: Frame | None = None
     hold: Hold | None = None
     put: bool | None = None
+    every: int = 1
     lr: float = 0.0
     beta1: float = 0.9
     beta2: float = 0.999

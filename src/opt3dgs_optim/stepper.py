@@ -111,7 +111,8 @@ class ParamStepper:
 
     def after(self, step: Step, count: int) -> None:
         """What comes after a step that another has made, which was Adam's so many-th."""
-        if step.put is not None and (mean := self.mean(step, count)) is not None:
+        mean = None if step.put is None else self.mean(step, count)
+        if mean is not None:
             take_into_mean(mean, step.param)
         for part in self.acting[self.training.exploiting][2]:
             part.after(step, self.training)
@@ -181,13 +182,13 @@ class ParamStepper:
         return tensor
 
     def mean(self, step: Step, count: int) -> Mean | None:
-        """The running mean; None where there is no room for it."""
-        if not self.training.averages:
+        """The running mean; None where this iterate is left out, or there is no room for it."""
+        if not self.training.averages or (count % step.every and not step.put):
             return None
         if self._exp_avg is None or self._exp_avg() is not step.state["exp_avg"]:
             self.begin_edited_rows_anew(step.state)
         try:
-            return mean_of(step.param, step.state, self.name, bool(step.put), count)
+            return mean_of(step.param, step.state, self.name, bool(step.put), count / step.every)
         except torch.cuda.OutOfMemoryError:
             self.training.end_averaging()
             return None

@@ -11,6 +11,7 @@ from opt3dgs_optim.step import Step
 from opt3dgs_optim.training import Training
 
 SHARE = 1 / 30  # of the run
+ITERATES = 250  # at least are averaged, where there are as many; more gain nothing
 
 
 @dataclass(frozen=True, repr=False)
@@ -19,8 +20,9 @@ class Averaging(Part):
 
     Every step follows one view, so the parameters wander about what fits all of them, the further
     the higher their learning rates; their mean does not. Averaging covers the last thirtieth of the
-    run. In the last tenth of that, in the last two iterations at least, the mean takes the
-    parameters' place, because trainers save before their last step. Until then nothing is changed.
+    run: 250 iterates of it, or all where there are fewer than 500. In the last tenth of that, in
+    the last two iterations at least, the mean takes the parameters' place, because trainers save
+    before their last step. Until then nothing is changed.
 
     After an edit of rows the means of the edited parameters begin anew: density control should end
     before. Iterates that are not finite are left out. In the last thirtieth it takes the memory of
@@ -50,14 +52,15 @@ class Averaging(Part):
         total, now = training.total_steps, step.iteration
         if total is None or training.finished:
             return
-        start, put = _window(total)
+        start, put, every = _window(total)
         if start <= now < total:
-            step.put = now >= put
+            step.put, step.every = now >= put, every
 
 
 @functools.lru_cache(maxsize=8)  # every step asks
-def _window(total_steps: int) -> tuple[int, int]:
-    """The first iteration that is averaged, and the first after which the mean is put."""
+def _window(total_steps: int) -> tuple[int, int, int]:
+    """The first iteration that is averaged, the first after which the mean is put, and `every`."""
     length = math.floor(SHARE * total_steps)
     # A short run puts the mean where it begins, or has none.
-    return total_steps - length, total_steps - min(length, max(2, math.floor(length / 10)))
+    put = total_steps - min(length, max(2, math.floor(length / 10)))
+    return total_steps - length, put, max(1, length // ITERATES)
