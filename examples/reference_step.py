@@ -25,18 +25,12 @@ BETA1, BETA2, EPS = 0.9, 0.999, 1e-15  # as the 3DGS trainers set them
 K = 5  # curvature pairs of a point
 COLORS = ("sh0", "shN")
 
-# Which tensors each part acts on: for 3DGS-MCMC's relocation, and for clone, split and prune.
-RELOCATION = {
+# Which tensors each part acts on.
+DEFAULTS = {
     "own_frame": ("means",),
     "fading": ("scales", "quats", "opacities", *COLORS),
     "out_of_view": ("scales", "opacities"),
     "averaging": ("means", "scales", "quats", "opacities", *COLORS),
-}
-CLONE_AND_SPLIT = {
-    "annealing": ("quats", "opacities", *COLORS),
-    "fading": ("means", "quats", "opacities", *COLORS),
-    "out_of_view": RELOCATION["out_of_view"],
-    "averaging": RELOCATION["averaging"],
 }
 
 
@@ -69,9 +63,9 @@ def default_step(
     rates: dict,
     iteration: int,
     total: int,
-    parts: dict = RELOCATION,
+    parts: dict = DEFAULTS,
 ) -> None:
-    """OwnFrame, Fading, OutOfView, Annealing and Averaging around Adam, as far as `parts` has them.
+    """OwnFrame, Fading, OutOfView and Averaging around Adam, as far as `parts` has them.
 
     parts: by part, the tensors that it acts on.
     """
@@ -86,14 +80,9 @@ def default_step(
         grad, own, rate = grads[name].nan_to_num(0.0, 0.0, 0.0), state[name], rates[name]
         in_own_frame = name in parts.get("own_frame", ())
 
-        # Annealing: rates of shapes and colours fall from four times the trainer's to 0.4 times.
-        if name in parts.get("annealing", ()):
-            rate *= (1.0 if name == "opacities" else 4.0) ** (1.0 - progress) * 0.4**progress
-
         # Fading: the moments of a random fifth of the points are shrunk, the same in all tensors.
-        # Events since the tensor's last step are one. Beside Annealing they end earlier.
-        stop = 0.5 if "annealing" in parts else 0.7
-        done, now = (events_before(each + 1, total, stop) for each in (own["last"], iteration))
+        # Events since the tensor's last step are one.
+        done, now = (events_before(each + 1, total) for each in (own["last"], iteration))
         due = range(done, now)
         own["last"] = iteration
         if name in parts.get("fading", ()) and any(happens(event, num_points) for event in due):
@@ -152,9 +141,9 @@ def views(grad: Tensor | None, state: dict, iteration: int) -> tuple[Tensor | No
     return ~in_view, share
 
 
-def events_before(iteration: int, total: int, stop: float) -> int:
-    """Fading's events before an iteration: 300 from 3 % of the run to `stop`, at least 4 apart."""
-    length = stop - 0.03
+def events_before(iteration: int, total: int) -> int:
+    """Fading's events before an iteration: 300 from 3 to 70 % of the run, at least 4 apart."""
+    length = 0.7 - 0.03
     share = min(max((iteration / total - 0.03) / length, 0.0), 1.0)
     return int(share * min(300, length * total / 4))
 

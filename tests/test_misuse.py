@@ -8,15 +8,14 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-import row_edits
 import torch
 from gaussians import adams_of, parameters, steps
 from torch.nn import Parameter
 from torch.optim import Adam
 
+import opt3dgs_optim
 from opt3dgs_optim import (
     DEFAULTS,
-    DEFAULTS_ADC,
     Averaging,
     Curvature,
     EnergyHistogram,
@@ -233,22 +232,11 @@ def test_several_ranks_without_a_process_group(
     assert not found or (told in found[0] and "give process_group=torch.distributed" in found[0])
 
 
-@pytest.mark.parametrize("chosen", [None, DEFAULTS_ADC])
-def test_rows_removed_under_the_default_parts(
-    chosen: Any, recwarn: pytest.WarningsRecorder
-) -> None:
-    """Once; a user who has chosen parts knows what density control there is."""
-    params: dict[str, Any] = parameters(9)
-    optimizers = PhaseScheduler(100, parts=chosen).upgrade(adams_of(params))
-    steps(optimizers, params, 1)
-    for _ in range(2):
-        gone = row_edits.removed(torch.tensor([0]))
-        row_edits.apply(gone, params, optimizers.values(), list(params), False)
-        steps(optimizers, params, 1)
-    found = [str(each.message) for each in recwarn]
-    assert len(found) == (chosen is None)
-    assert chosen is not None or "1 Gaussians were removed by iteration 1" in found[0]
-    assert chosen is not None or "give parts=DEFAULTS_ADC" in found[0]
+def test_the_preset_of_version_0_1_is_the_defaults() -> None:
+    with pytest.warns(UserWarning, match="leave parts=DEFAULTS_ADC out"):
+        assert opt3dgs_optim.DEFAULTS_ADC is DEFAULTS  # pyright: ignore
+    with pytest.raises(AttributeError, match="no attribute 'DEFAULT'"):
+        _ = opt3dgs_optim.DEFAULT  # pyright: ignore
 
 
 def test_a_run_that_is_longer_than_it_was_said(recwarn: pytest.WarningsRecorder) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from opt3dgs_optim import AWSGLD, DEFAULTS_ADC, LQNAdam, PhaseScheduler
+from opt3dgs_optim import AWSGLD, LQNAdam, PhaseScheduler
 from opt3dgs_optim.moments import CODES, NEAREST, chances, decoded, encode
 from opt3dgs_optim.step import mixed
 
@@ -45,7 +45,7 @@ def trained(count: int = 200, moments: Any = 16, total: int = 60) -> tuple[Any, 
         name: Adam([Parameter(torch.randn(count, *shape, generator=draw))], lr=1e-2, eps=1e-15)
         for name, shape in SHAPES.items()
     }
-    phases = PhaseScheduler(total, parts=DEFAULTS_ADC, moments=moments)
+    phases = PhaseScheduler(total, moments=moments)
     return phases.upgrade(adams), phases
 
 
@@ -209,7 +209,7 @@ def test_a_resume_is_bit_for_bit(order: str, at: int, total: int) -> None:
         param_of(adam).data.copy_(values_)
         adam.load_state_dict(state)
     if order == "INRIA":
-        PhaseScheduler(total, parts=DEFAULTS_ADC, moments=16).upgrade(again)
+        PhaseScheduler(total, moments=16).upgrade(again)
     iterate(again, at, total)
     assert same(values(adams), values(again))
 

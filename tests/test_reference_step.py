@@ -14,8 +14,6 @@ import reference_step
 import torch
 from gaussians import RATES, SHAPES, adams_of, decayed, make_gaussians, same_tensors
 from reference_step import (
-    CLONE_AND_SPLIT,
-    RELOCATION,
     adam_,
     default_step,
     new_moments,
@@ -27,8 +25,6 @@ from torch.nn import Parameter
 
 from opt3dgs_optim import (
     DEFAULTS,
-    DEFAULTS_ADC,
-    Annealing,
     Averaging,
     Curvature,
     EnergyHistogram,
@@ -155,7 +151,6 @@ def l1(error: Tensor, iteration: int) -> Tensor:
     return error.abs().mean()
 
 
-@pytest.mark.parametrize("has", [RELOCATION, CLONE_AND_SPLIT], ids=["relocation", "adc"])
 @pytest.mark.parametrize(
     ("num_points", "share", "total"),
     [
@@ -163,22 +158,19 @@ def l1(error: Tensor, iteration: int) -> Tensor:
         (1, 1.0, 90),
     ],
 )
-def test_the_default_step(num_points: int, share: float, total: int, has: dict) -> None:
+def test_the_default_step(num_points: int, share: float, total: int) -> None:
     scene = Scene(num_points, share)
-    theirs, state = with_the_reference(scene, total, partial(default_step, parts=has), l1)
-    parts = DEFAULTS if has is RELOCATION else DEFAULTS_ADC
-    assert first_difference(with_the_package(scene, total, parts), theirs) is None
+    theirs, state = with_the_reference(scene, total, default_step, l1)
+    assert first_difference(with_the_package(scene, total, DEFAULTS), theirs) is None
     assert (state["share"] < 1 / 3) == (num_points == 57)
 
 
-@pytest.mark.parametrize("has", [RELOCATION, CLONE_AND_SPLIT], ids=["relocation", "adc"])
-def test_more_points_than_a_cpu_takes_at_a_time(has: dict) -> None:
+def test_more_points_than_a_cpu_takes_at_a_time() -> None:
     """And more than every event of fading fades; views see little of them."""
     num_points, total = 45_001, 30
     ours = {name: Parameter(each) for name, each in make_gaussians(num_points).items()}
     theirs, state = make_gaussians(num_points), {}
-    parts = DEFAULTS if has is RELOCATION else DEFAULTS_ADC
-    optimizers = PhaseScheduler(total, parts=parts).upgrade(adams_of(ours))
+    optimizers = PhaseScheduler(total).upgrade(adams_of(ours))
     generator = torch.Generator().manual_seed(0)
     for iteration in range(total):
         seen = torch.rand(num_points, generator=generator) < 0.05
@@ -188,7 +180,7 @@ def test_more_points_than_a_cpu_takes_at_a_time(has: dict) -> None:
         for optimizer in optimizers.values():
             optimizer.step()
         grads: Any = {name: param.grad for name, param in ours.items()}
-        default_step(theirs, grads, state, RATES, iteration, total, has)
+        default_step(theirs, grads, state, RATES, iteration, total)
     assert same_tensors(ours, theirs)
     assert state["share"] != 1
 
@@ -198,7 +190,6 @@ ALONE: list[tuple[Part, dict]] = [
     (Fading(names=("means", "sh0")), {"fading": ("means", "sh0")}),
     (OutOfView(), {"out_of_view": ("scales", "opacities")}),
     (Averaging(), {"averaging": tuple(SHAPES)}),
-    (Annealing(), {"annealing": ("scales", *CLONE_AND_SPLIT["annealing"])}),
 ]
 
 

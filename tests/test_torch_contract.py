@@ -13,7 +13,7 @@ import pytest
 import torch
 from gaussians import adam_of, adams_of, parameters, same_tensors, steps
 from masked_adams import SelectiveAdam
-from row_edits import added, apply, relocated, removed
+from row_edits import added, apply, relocated
 from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 from torch.optim.optimizer import (
@@ -22,8 +22,6 @@ from torch.optim.optimizer import (
 )
 
 from opt3dgs_optim import (
-    DEFAULTS_ADC,
-    Annealing,
     Averaging,
     Curvature,
     EnergyHistogram,
@@ -273,7 +271,7 @@ def test_a_scalar_beside_the_rows_resumes(kind: Any) -> None:
 
 @pytest.mark.parametrize("inria", [False, True])
 @pytest.mark.parametrize("moments", [32, 16])
-@pytest.mark.parametrize("parts", [None, [*DEFAULTS_ADC], [Averaging()], paper_parts(TOTAL)])
+@pytest.mark.parametrize("parts", [None, [Averaging()], paper_parts(TOTAL)])
 def test_nothing_keeps_an_old_parameter_state_or_mean_alive(
     parts: Any, moments: int, inria: bool
 ) -> None:
@@ -385,34 +383,6 @@ def test_groups_with_a_row_for_each_gaussian_and_another_name_are_told() -> None
     adam.add_param_group({"params": [Parameter(torch.ones(9 + 1, 3))], "name": "cameras"})
     with pytest.warns(UserWarning, match=r"\['rgb_colors', 'unnorm_rotations'\] have a row"):
         PhaseScheduler(TOTAL).upgrade(adam)
-
-
-@pytest.mark.parametrize("prune", [True, False])
-def test_gaussians_that_disappear_while_their_number_grows_are_told(prune: bool) -> None:
-    params = parameters(400)
-    params["scales"].data.sub_(3.0)
-    optimizers = adams_of(params)
-    phases, draw = PhaseScheduler(600), torch.Generator().manual_seed(0)
-    phases.upgrade(optimizers)
-    said: list[str] = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(phases.messages, "warn_once", lambda _, text: said.append(text))
-        for iteration in range(200):
-            steps(optimizers, params, 1, seed=iteration)
-            if iteration % 20 == 19:
-                count = len(params["means"])
-                few = (torch.rand(count, generator=draw) < 0.08).nonzero()[:, 0]
-                half = len(few) // 2
-                edits = [removed(few) if prune else relocated(few[:half], few[-half:])]
-                for edit in (*edits, added(torch.arange(int(0.15 * count)))):
-                    apply(edit, params, optimizers.values(), list(params), False)
-    assert any("were removed" in text and "DEFAULTS_ADC" in text for text in said) == prune
-
-
-def test_annealing_with_a_masked_adam_is_told() -> None:
-    adam = adam_of(parameters(ROWS), SelectiveAdam)
-    with pytest.warns(UserWarning, match="Annealing with a masked Adam"):
-        PhaseScheduler(TOTAL, parts=[Annealing()]).upgrade(adam)
 
 
 @pytest.mark.parametrize("eps", [1e-15, 1e-8])

@@ -23,7 +23,7 @@ from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 
 from opt3dgs_optim import (
-    AWSGLD, DEFAULTS, DEFAULTS_ADC, Annealing, Averaging, Training, Curvature, EnergyHistogram,
+    AWSGLD, DEFAULTS, Averaging, Training, Curvature, EnergyHistogram,
     Fading, FreshMoments, IsotropicNoise, LQNAdam, Part, Phase, PhaseScheduler,
     PositionNoise, SquaredLoss, backend_info, two_loop,
 )
@@ -46,7 +46,7 @@ class Gaussians:
 
     def __init__(self, iterations: int) -> None:
         self.optimizer = Adam([{"params": [Parameter(torch.ones(3))], "name": "xyz"}])
-        phases = PhaseScheduler(iterations, parts=DEFAULTS_ADC)
+        phases = PhaseScheduler(iterations, parts=DEFAULTS[1:])
         self.optimizer = phases.upgrade(self.optimizer)
         phases.observe(iteration=0)
         phases.finish()
@@ -68,7 +68,7 @@ class SignAgreement(Part):
 
 parts: list[Part] = [*DEFAULTS, SignAgreement()]
 phases = PhaseScheduler(30_000, 0.9, parts)
-phases = PhaseScheduler(30_000, 29_000, [Annealing(4.0, names=("means",)), Fading(seed=3)])
+phases = PhaseScheduler(30_000, 29_000, [OwnFrame(0.2), Fading(seed=3)])
 phases = PhaseScheduler(300, parts=[FreshMoments(), SquaredLoss(), Curvature(history_size=3)])
 phases = PhaseScheduler.paper(total_steps=3_000)
 phase: Phase = phases.phase

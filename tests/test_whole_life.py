@@ -12,6 +12,7 @@ import pickle
 from typing import Any
 
 import pytest
+import reference_step
 import row_edits
 import torch
 from gaussians import RATES, adam_of, adams_of, make_gaussians, parameters
@@ -26,8 +27,6 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 from reference_step import (
-    CLONE_AND_SPLIT,
-    RELOCATION,
     default_step,
     new_moments,
     paper_step,
@@ -35,10 +34,9 @@ from reference_step import (
 )
 from torch import Tensor
 
-from opt3dgs_optim import DEFAULTS, DEFAULTS_ADC, PhaseScheduler, paper_parts
+from opt3dgs_optim import DEFAULTS, PhaseScheduler, paper_parts
 
 NAMES = ("means", "scales", "quats", "opacities", "sh0")
-PRESETS = {"relocation": (DEFAULTS, RELOCATION), "adc": (DEFAULTS_ADC, CLONE_AND_SPLIT)}
 OF_THE_END = (
     "mean",
     "rest",
@@ -53,7 +51,7 @@ class WholeLife(RuleBasedStateMachine):
     """A training by the package, and beside it one by the reference step."""
 
     @initialize(
-        preset=st.sampled_from(["relocation", "adc", "paper"]),
+        preset=st.sampled_from(["defaults", "paper"]),
         family=st.sampled_from(["gsplat", "inria"]),
         total=st.sampled_from([60, 120, 330]),
         num_points=st.integers(2, 8),
@@ -73,7 +71,7 @@ class WholeLife(RuleBasedStateMachine):
         return make(self.params, **self.options)
 
     def new_phases(self) -> PhaseScheduler:
-        parts = paper_parts(self.total) if self.preset == "paper" else PRESETS[self.preset][0]
+        parts = paper_parts(self.total) if self.preset == "paper" else DEFAULTS
         return PhaseScheduler(self.total, parts=parts)
 
     def upgrade(self, optimizers: Any) -> None:
@@ -127,7 +125,7 @@ class WholeLife(RuleBasedStateMachine):
         if self.preset == "paper":
             paper_step(*given, energy)
         else:
-            parts = dict(PRESETS[self.preset][1])
+            parts = dict(reference_step.DEFAULTS)
             if self.finished:
                 del parts["averaging"]
             default_step(*given, parts)
@@ -262,7 +260,7 @@ class WholeLife(RuleBasedStateMachine):
         for name in NAMES:
             own = self.state[name]
             own["last"] = self.iteration - 1
-            if self.preset == "relocation" and name == "means":
+            if self.preset == "defaults" and name == "means":
                 own |= new_moments(self.theirs[name])
         self.train(1, seed, 1.0)
 
@@ -339,7 +337,6 @@ def edit_own(edit: row_edits.Edit, own: dict[str, Any]) -> None:
 
 @pytest.mark.filterwarnings(
     "ignore:opt3dgs_optim. iteration .* not been finite",
-    "ignore:PhaseScheduler. . Gaussians were removed",
     "ignore:PhaseScheduler. iteration .* of total_steps",
     "ignore:PhaseScheduler. iteration .* comes after finish",
 )

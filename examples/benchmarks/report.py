@@ -50,8 +50,7 @@ class Evidence:
 
     def of(self, arm: str, scene: str, *, gpu: bool = False, **those: Any) -> list[Line]:
         """The lines of an arm; what is not said is as usual. One a seed, in order."""
-        density = "clone-and-split" if arm.startswith("adc") else "relocation"
-        wanted = evidence.USUAL | {"density": density} | those | {"arm": arm, "scene": scene}
+        wanted = evidence.USUAL | {"density": "relocation"} | those | {"arm": arm, "scene": scene}
         found = [x for x in self.lines if all(x.get(k) == v for k, v in wanted.items())]
         found = [x for x in found if ("NVIDIA" in x["device"]) is gpu]
         return sorted(found, key=lambda x: str(x["seed"]))
@@ -123,22 +122,39 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 # -- the tables -----------------------------------------------------------------------------------
 
 
-PHOTOS = {"bonsai": "220 of 400x266", "lego": "87 of 400x400", "plush": "84 of 320x240"}
+DENSITIES = {"relocation": DEFAULT, "clone-and-split": "defaults"}  # and the defaults' arm
+PHOTOS = {
+    "bonsai": "220 of 400x266",
+    "lego": "87 of 400x400",
+    "plush": "84 of 320x240",
+    "train": "263 of 489x271",
+}
 
 
 def front(all_: Evidence) -> str:
     """A third of stock's iterations against all of them, of the same seeds."""
     rows = []
-    for scene, photos in PHOTOS.items():
-        ours = all_.of(DEFAULT, scene, iterations=10_000, **HALF)
-        stock = all_.of("mcmc", scene, iterations=30_000, **HALF)
-        stock = [x for x in stock if x["seed"] in seeds_of(ours)]
-        ours = [x for x in ours if x["seed"] in seeds_of(stock)]
-        forms = {"psnr": "{:.2f}", "ssim": "{:.3f}", "lpips": "{:.3f}"}
-        cells = (" / ".join(f.format(mean(x, m)) for m, f in forms.items()) for x in (stock, ours))
-        rows.append((scene, photos, str(len(ours)), *cells))
-    third = "with the three lines, 10,000"
-    return table(("scene", "photos", "seeds", "stock 3DGS-MCMC, 30,000 iterations", third), rows)
+    for density, arm in DENSITIES.items():
+        for scene, photos in PHOTOS.items():
+            stock, ours = third(all_, scene, density, arm)
+            if not ours:
+                continue
+            forms = {"psnr": "{:.2f}", "ssim": "{:.3f}", "lpips": "{:.3f}"}
+            cells = (
+                " / ".join(f.format(mean(x, m)) for m, f in forms.items()) for x in (stock, ours)
+            )
+            rows.append((density.replace("-", " "), scene, photos, str(len(ours)), *cells))
+    heads = ("density control", "scene", "photos", "seeds", "stock, 30,000 iterations")
+    return table((*heads, "with the three lines, 10,000"), rows)
+
+
+def third(all_: Evidence, scene: str, density: str, arm: str) -> tuple[list[Line], list[Line]]:
+    """Stock's 30,000 iterations and a third of them with the package, of the same seeds."""
+    those = {"density": density, **HALF}
+    stock = all_.of("mcmc", scene, iterations=30_000, **those)
+    ours = all_.of(arm, scene, iterations=10_000, **those)
+    both = set(seeds_of(stock)) & set(seeds_of(ours))
+    return [x for x in stock if x["seed"] in both], [x for x in ours if x["seed"] in both]
 
 
 SHORTER = (
@@ -414,14 +430,6 @@ TRIED = (  # and not taken: what, its arm, its control, size and iterations
     ("the same to 0.5", "own-growing-0.5", "own-aspect-0.25", "quarter", 7_500),
     ("`min_aspect` 0.25 in a long training", "own-late-0.25", DEFAULT, "quarter", 30_000),
     ("`Fading` to 80 %", "own-late-stop-0.8", DEFAULT, "half", 10_000),
-    ("with clone and split: more events", "adc-fourth", "adc-defaults", "quarter", 7_500),
-    (
-        "with clone and split: own frame, root of the axes",
-        "adc-own-root",
-        "adc-defaults",
-        "quarter",
-        7_500,
-    ),
 )
 
 
@@ -440,15 +448,33 @@ def tried(all_: Evidence) -> str:
 
 
 def adaptive(all_: Evidence) -> str:
-    """Clone, split, prune and reset."""
+    """Clone, split, prune and reset: held out, on the photos trained on, and Gaussians."""
     rows = []
+    for scene in PHOTOS:
+        pair = third(all_, scene, "clone-and-split", "defaults")
+        for name, lines in zip(("stock, 30,000", "the defaults, 10,000"), pair, strict=True):
+            if lines:
+                first = scene if lines is pair[0] else ""
+                trained = f"{mean(lines, 'train_psnr'):.2f}"
+                rows.append((first, name, shown(lines), trained, of_gaussians(lines)))
+    heads = ("scene", "training", "PSNR / SSIM / LPIPS", "PSNR trained on", "Gaussians")
+    return table(heads, rows)
+
+
+def of_gaussians(lines: Sequence[Line]) -> str:
+    """Their number at the end."""
+    return f"{mean(lines, 'gaussians'):,.0f}"
+
+
+def adaptive_long(all_: Evidence) -> str:
+    """The same at quarter size, of equal iterations."""
+    rows, those = [], {"density": "clone-and-split", "iterations": 30_000, **QUARTER}
     for scene in ("lego", "plush"):
-        stock = all_.of("adc", scene, iterations=30_000, **QUARTER)
-        for arm in ("adc", "adc-own", "adc-annealed-faded-averaged"):
-            lines = all_.of(arm, scene, iterations=30_000, **QUARTER)
+        stock = all_.of("adc", scene, **those)
+        for arm in ("adc", "adc-own"):
+            lines = all_.of(arm, scene, **those)
             first, less = (scene, "") if arm == "adc" else ("", gained(lines, stock))
-            count = f"{mean(lines, 'gaussians'):,.0f}"
-            rows.append((first, NAMES[arm], shown(lines), less, count))
+            rows.append((first, NAMES[arm], shown(lines), less, of_gaussians(lines)))
     heads = ("scene", "training", "PSNR / SSIM / LPIPS", "less stock", "Gaussians")
     return table(heads, rows)
 
@@ -521,13 +547,13 @@ NAMES = {
     "learn2splat": "Learn2Splat's tuned Adam",
     "adc": "stock",
     "adc-own": "`OwnFrame` and `Averaging`",
-    "adc-annealed-faded-averaged": "`DEFAULTS_ADC`",
 }
 TABLES: dict[str, Callable[[Evidence], str]] = {
     f.__name__: f
     for f in (
         front, iterations, quarter, kept_aside, gpu, whole, gpu_step, gpu_iteration, bits, equal,
-        short, ratios, cost, few, events, aspects, late, tried, adaptive, capture, closed,
+        short, ratios, cost, few, events, aspects, late, tried, adaptive, adaptive_long, capture,
+        closed,
     )
 }  # fmt: skip
 

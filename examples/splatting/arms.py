@@ -11,7 +11,6 @@ from typing import Literal
 
 from opt3dgs_optim import (
     DEFAULTS,
-    DEFAULTS_ADC,
     Averaging,
     Fading,
     OutOfView,
@@ -104,7 +103,6 @@ _ARMS = (
     ),
     Arm("paper", "everything that the paper has, with its settings", paper_parts),
     Arm("adc", "3DGS with clone, split, prune and reset as published", density="adc"),
-    Arm("adc-defaults", "as adc, the package's defaults for it", of(*DEFAULTS_ADC), "adc"),
     Arm("adc-own", "as adc, own frame, averaged", of(OwnFrame(0.1, 0.01, 0.1), Averaging()), "adc"),
 )
 ARMS = {arm.name: arm for arm in _ARMS}

@@ -71,39 +71,6 @@ class BadNumbers:
         return {**vars(self), "_readings": {}}
 
 
-class Rows:
-    """Whether rows of positions are other Gaussians after an edit, of which a few are looked at."""
-
-    LOOKED_AT = 64
-    FAR = 0.25  # of the spread of the positions: further than a Gaussian goes between two edits
-
-    def __init__(self) -> None:
-        self._places: Tensor | None = None
-        self._was: Tensor | None = None
-        self._moved: Reading | None = None
-
-    @torch.no_grad()
-    def shifted(self, means: Tensor) -> bool:
-        """Look at positions [N, 3] after an edit; whether those of an earlier look had shifted.
-
-        That is known without a wait, an edit later.
-        """
-        if len(means) < self.LOOKED_AT:
-            return False
-        found = self._moved.take() if self._moved is not None else None
-        if self._places is not None and self._was is not None and len(means) > self._last:
-            now = means[self._places]
-            far = self.FAR * (self._was - self._was.mean(0)).norm(dim=1).mean()
-            self._moved = Reading(((now - self._was).norm(dim=1) > far).float().mean().reshape(1))
-            self._moved.ask()
-        # Of the last half, where all that was pruned has shifted rows.
-        self._last = len(means) - 1
-        step = max(len(means) // (2 * self.LOOKED_AT), 1)
-        self._places = torch.arange(self._last, self._last // 2, -step, device=means.device)
-        self._was = means[self._places].clone()
-        return found is not None and found[0] > 0.5
-
-
 def num_ranks() -> int:
     """How many processes train together."""
     distributed = torch.distributed

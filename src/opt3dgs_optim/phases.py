@@ -21,14 +21,12 @@ from opt3dgs_optim.contract import (
     check_parts,
     check_supported,
     named,
-    own_step,
     slots_of,
 )
-from opt3dgs_optim.device import Rows, mean_over_ranks, num_ranks
+from opt3dgs_optim.device import mean_over_ranks, num_ranks
 from opt3dgs_optim.messages import LOGGER, End, say
 from opt3dgs_optim.names import GAUSSIAN_NAMES
 from opt3dgs_optim.part import Part
-from opt3dgs_optim.parts.annealing import Annealing
 from opt3dgs_optim.parts.averaging import Averaging
 from opt3dgs_optim.parts.fading import Fading
 from opt3dgs_optim.parts.own_frame import OwnFrame
@@ -47,8 +45,8 @@ Optimizers = TypeVar(
 class PhaseScheduler(Training):
     """Put parts into the steps of a 3DGS trainer's optimizers, in two phases.
 
-    By default `DEFAULTS`, for 3DGS-MCMC's relocation; `DEFAULTS_ADC` is for clone, split and prune,
-    and `PhaseScheduler.paper` is Opt3DGS.
+    By default `DEFAULTS`, for relocation as in 3DGS-MCMC and for clone, split and prune alike.
+    `PhaseScheduler.paper` is Opt3DGS.
 
     The optimizers count their own steps, so that nothing else need be called: the clock is that of
     the positions' optimizer, whatever others step between. The state travels with their
@@ -105,7 +103,6 @@ class PhaseScheduler(Training):
             switch_step = check_count(CALL, "switch", switch, 0, total_steps)
         else:
             switch_step = round(check_number(CALL, "switch", switch, 0.0, 1.0) * total_steps)
-        self._chosen = parts is not None  # by the user
         super().__init__(
             DEFAULTS if parts is None else check_parts(CALL, parts),
             total_steps,
@@ -115,7 +112,7 @@ class PhaseScheduler(Training):
         if log is not None and not hasattr(log, "step"):
             raise TypeError(f"{CALL}: log={log!r}, but a RunLog or None is needed")
         self.log, self._loss = log, None
-        self._group, self._rows = process_group, Rows()
+        self._group = process_group
         own = (part for part in self.parts if part.overrides("pixel_loss"))
         self._pixel: Part | None = next(own, None)
         averaging = self.part(Averaging)
@@ -222,12 +219,6 @@ class PhaseScheduler(Training):
                 f"{CALL}.upgrade: the groups {others} have a row for each Gaussian, but names that "
                 "are not known, so that plain Adam steps them; name them as one of "
                 f"{', '.join(GAUSSIAN_NAMES)} (other trainers' names too) where they are these",
-            )
-        if self.part(Annealing) is not None and any(own_step(type(o)._base) for o in optimizers):
-            self.messages.warn_once(
-                "masked",
-                f"{CALL}.upgrade: Annealing with a masked Adam lost 0.4 to 1.1 dB in our trials; "
-                "leave it out of parts, or have the trainer make a torch.optim.Adam",
             )
 
     def _upgrade(self, optimizer: Any, slots: Slots) -> None:
@@ -360,30 +351,13 @@ class PhaseScheduler(Training):
                 "loss would differ between them; give process_group=torch.distributed.group.WORLD",
             )
 
-    def rows_edited(self, means: Tensor, rows_before: int) -> None:
-        """See whether Gaussians disappear, under parts that are made for relocation.
-
-        Pruning moves other Gaussians into a row, and relocation does not. So pruning is seen even
-        if the number of Gaussians grows.
-        """
-        if self._chosen:
-            return
-        removed = rows_before - len(means)
-        if removed > 0 or (self._rows.shifted(means) and self.iteration > 0):
-            self.messages.warn_once(
-                "removed",
-                f"{CALL}: {max(removed, 0) or 'some'} Gaussians were removed by iteration "
-                f"{self.iteration}, but the default parts are made for 3DGS-MCMC's relocation; for "
-                "clone, split and prune give parts=DEFAULTS_ADC",
-            )
-
     def end_line(self) -> str | None:
         """What is said of a training that ends now, before its end; None where it does not."""
         return self._end.line()
 
     def __getstate__(self) -> dict[str, Any]:
         # Two would write into one file; another process has groups of its own.
-        return {**super().__getstate__(), "log": None, "_group": None, "_rows": Rows()}
+        return {**super().__getstate__(), "log": None, "_group": None}
 
     def __repr__(self) -> str:
         clock = f"iteration {self.iteration} of {self.total_steps}"

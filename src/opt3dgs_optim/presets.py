@@ -1,10 +1,9 @@
-"""What is on: the parts that paid, for each kind of density control, and those of the paper."""
+"""What is on: the parts that paid, and those of the paper."""
 
 from __future__ import annotations
 
 from opt3dgs_optim.checks import check_count
 from opt3dgs_optim.part import Part
-from opt3dgs_optim.parts.annealing import Annealing
 from opt3dgs_optim.parts.averaging import Averaging
 from opt3dgs_optim.parts.curvature import Curvature
 from opt3dgs_optim.parts.fading import Fading
@@ -18,18 +17,10 @@ PAPER_SWITCH = 29_000 / PAPER_STEPS
 PAPER_WARMUP = 2_500 / PAPER_STEPS
 
 
-# For 3DGS-MCMC's relocation (docs/evidence.md).
+# For relocation as in 3DGS-MCMC, and for clone, split and prune (docs/evidence.md).
 DEFAULTS: tuple[Part, ...] = (
     OwnFrame(),
     Fading(names=("scales", "quats", "opacities", "sh0", "shN")),
-    OutOfView(),
-    Averaging(),
-)
-# For clone, split and prune: longer steps let scales grow until they are pruned as too big. It was
-# trained with events in the first half alone.
-DEFAULTS_ADC: tuple[Part, ...] = (
-    Annealing(names=("quats", "opacities", "sh0", "shN")),
-    Fading(stop=0.5, names=("means", "quats", "opacities", "sh0", "shN")),
     OutOfView(),
     Averaging(),
 )

@@ -30,7 +30,6 @@ class ParamStepper:
 
     Attributes:
         param: the Parameter, a weak reference: an old one lives no longer than the trainer wants.
-        rows: how many it has.
         name, set: which Gaussian parameter it is, and of which set of Gaussians.
         acting: by `Training.exploiting`: the parts with a `plan`, with a `before`, with an `after`.
         later: what later steps may have and the first has not, see `Part.later`.
@@ -49,7 +48,7 @@ class ParamStepper:
         slot: tuple[str, str | None],
     ) -> None:
         self.call, self.training, self.group = call, training, group
-        self.param, self.rows = weakref.ref(param), len(param) if param.dim() else 1
+        self.param = weakref.ref(param)
         self.counter = training.bad_numbers.counter_on(param.device)
         self.set, self.name = slot
         mine = [
@@ -213,8 +212,6 @@ class ParamStepper:
             self._exp_avg = before._exp_avg
             return
         drop_kept(state)
-        if self.name == "means":
-            self.training.rows_edited(param, before.rows)
 
     def check_rows(self, param: Tensor, state: dict[str, Any]) -> None:
         """Refuse moments of other rows than the parameter has, as a checkpoint may bring them."""

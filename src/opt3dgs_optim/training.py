@@ -108,9 +108,6 @@ class Training(Clock):
         for part in self.observers:
             part.observe(loss, self)
 
-    def rows_edited(self, means: Tensor, rows_before: int) -> None:
-        """Density control has edited the positions since the last step, which were so many."""
-
     def end_averaging(self) -> None:
         """Go on without the mean of the last iterates, for which a device has no room."""
         self.averages = False

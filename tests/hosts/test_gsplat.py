@@ -12,10 +12,10 @@ import torch
 from gaussians import RATES, same_tensors
 from gsplat_host import ORDERS, POINTS, TOTAL, VERSIONS, Trainer
 
-from opt3dgs_optim import DEFAULTS_ADC, PhaseScheduler
+from opt3dgs_optim import PhaseScheduler
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "hosts" / "gsplat.md"
-KINDS = {"mcmc": None, "default": DEFAULTS_ADC}
+KINDS = ("mcmc", "default")
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 each_kind = pytest.mark.parametrize("kind", KINDS)
@@ -50,7 +50,7 @@ def test_without_parts_it_is_gsplats_own_training(version: str, kind: str) -> No
 def test_a_training_ends_at_the_mean(version: str, kind: str, order: str) -> None:
     """Rows stay rows through every edit, the learning rates are the trainer's."""
     trainer = Trainer(version, kind, order)
-    phases = trainer.upgrade(KINDS[kind])
+    phases = trainer.upgrade()
     rate = RATES["means"]
     for step in range(TOTAL):
         trainer.run(step, step + 1)
@@ -107,12 +107,12 @@ def test_the_pages_lines_save_and_resume_bit_for_bit(kind: str, at: int, tmp_pat
     lines = lines_that_resume()
     whole, first = (Trainer("1.5.3", kind) for _ in range(2))
     for trainer, end in ((whole, TOTAL), (first, at)):
-        trainer.upgrade(KINDS[kind])
+        trainer.upgrade()
         trainer.run(0, end)
     names: dict[str, Any] = {"torch": torch, "os": os, "PATH": tmp_path / "resume.pt"}
     exec(lines["save"], {**names, "self": first, "step": 4_999})  # an iteration in which it saves
     resumed = Trainer("1.5.3", kind, seed=1)  # all must come from the file
-    phases = resumed.upgrade(KINDS[kind])
+    phases = resumed.upgrade()
     names |= {"self": resumed, "device": "cpu", "phases": phases}
     exec(lines["resume"], names)
     assert names["init_step"] == at

@@ -10,7 +10,7 @@ import torch
 from gsplat_host import POINTS, splats
 from inria_host import ATTRIBUTES, OPTIONS, SimulatedModel, made_model
 
-from opt3dgs_optim import DEFAULTS_ADC, PhaseScheduler
+from opt3dgs_optim import PhaseScheduler
 
 TOTAL = 60  # steps: the trainer's iterations less one
 
@@ -80,17 +80,16 @@ def test_a_training_with_iterations_that_step_nothing() -> None:
     assert rates == [2.5e-3, 2.5e-3 / 20, 5e-2, 5e-3, 1e-3]
 
 
-@pytest.mark.parametrize("parts", [None, DEFAULTS_ADC], ids=["relocation", "clone and split"])
 @pytest.mark.parametrize("at", [20, 35, TOTAL - 1])
-def test_capture_and_restore_are_bit_exact(parts: Any, at: int) -> None:
+def test_capture_and_restore_are_bit_exact(at: int) -> None:
     """A stock Adam takes the state, before it is upgraded."""
     whole, first, second = (made_model(splats()) for _ in range(3))
-    upgrade(whole, parts)
+    upgrade(whole)
     run(whole, 0, TOTAL)
-    upgrade(first, parts)
+    upgrade(first)
     run(first, 0, at)
     second.restore(saved(first), OPTIONS)
-    assert upgrade(second, parts).iteration == at - 1
+    assert upgrade(second).iteration == at - 1
     run(second, at, TOTAL)
     assert same(whole, second)
 
@@ -111,7 +110,7 @@ def test_a_checkpoint_of_the_unchanged_trainer() -> None:
 def test_an_optimizer_made_anew_under_way() -> None:
     """mini-splatting: `training_setup` in the loop, and the line with `upgrade` below it."""
     model = made_model(splats())
-    phases = upgrade(model, DEFAULTS_ADC)
+    phases = upgrade(model)
     for start in range(0, TOTAL, 20):
         run(model, start, start + 20)
         assert phases.iteration == start + 19

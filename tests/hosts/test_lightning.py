@@ -18,7 +18,7 @@ import torch
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from opt3dgs_optim import DEFAULTS, DEFAULTS_ADC
+from opt3dgs_optim import DEFAULTS
 
 TOTAL = 60
 NAMES = (("means",), ("shs_dc", "shs_rest", "scales", "rotations", "opacities"))
@@ -99,7 +99,7 @@ def values(host: Any) -> list[torch.Tensor]:
 def test_a_run_and_its_resume(lightning: Any, density: str) -> None:
     whole, half, again = (trainer(density) for _ in range(3))
     phases = set_up(lightning, whole).phases
-    assert phases.parts == tuple(DEFAULTS if density.startswith("MCMC") else DEFAULTS_ADC)
+    assert phases.parts == DEFAULTS
     run(whole, 1, TOTAL)
     assert phases.iteration == TOTAL - 1
     assert phases.end_line() is None  # it has ended, with the mean

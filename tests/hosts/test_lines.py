@@ -16,11 +16,7 @@ from opt3dgs_optim.hosts.trainers import TRAINERS
 ROOT = Path(__file__).resolve().parents[2]
 PATCHES = ROOT / "examples" / "hosts"
 PYTHON = [name for name, trainer in TRAINERS.items() if trainer.places]
-PARTS = {
-    **dict.fromkeys(["gsplat-mcmc", "3dgs-mcmc"], r"None"),
-    **dict.fromkeys(["gsplat", "faster-gs", "3dgrut", "fvdb"], r"None if .+ else DEFAULTS_ADC"),
-    "citygaussian": r"None if .+ else DEFAULTS_ADC",
-}
+FLAT = ("gsplat-2dgs", "2dgs")  # flat Gaussians, whose frame has no third axis
 
 
 def test_the_list_has_every_name(capsys: pytest.CaptureFixture[str]) -> None:
@@ -63,7 +59,7 @@ def test_a_place_is_one_of_a_file(name: str) -> None:
 
 @pytest.mark.parametrize("name", PYTHON)
 def test_the_lines_are_three_statements(name: str) -> None:
-    """An import, a scheduler with the preset of the density control, an upgrade; nothing else."""
+    """An import, a scheduler, an upgrade; nothing else."""
     trainer = TRAINERS[name]
     tree = ast.parse(trainer.block)
     scheduler = next(
@@ -72,8 +68,8 @@ def test_the_lines_are_three_statements(name: str) -> None:
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "PhaseScheduler"
     )
     parts = {k.arg: ast.unparse(k.value) for k in scheduler.keywords}.get("parts", "None")
-    assert re.fullmatch(PARTS.get(name, "DEFAULTS_ADC"), parts)
-    imported = {"PhaseScheduler"} | ({"DEFAULTS_ADC"} if parts != "None" else set())
+    assert parts == ("DEFAULTS[1:]" if name in FLAT else "None")
+    imported = {"PhaseScheduler"} | ({"DEFAULTS"} if parts != "None" else set())
     first = tree.body[0]
     assert isinstance(first, ast.ImportFrom)
     assert {alias.name for alias in first.names} == imported

@@ -16,7 +16,7 @@ import pytest
 import torch
 from torch.nn import Parameter
 
-from opt3dgs_optim import DEFAULTS, DEFAULTS_ADC
+from opt3dgs_optim import DEFAULTS
 
 ROOT = Path(__file__).resolve().parents[2]
 TOTAL = 40
@@ -116,8 +116,7 @@ def set_up(ours: Any, spec: Any, trainer: Any) -> tuple[Any, dict[str, torch.opt
 def test_the_optimizers_are_upgraded(ours: Any, attribute: str) -> None:
     spec = getattr(ours, attribute)
     model, optimizers = set_up(ours, spec, Trainer())
-    relocates = getattr(spec.config.pipeline.model, "strategy", "default") == "mcmc"
-    assert model.phases.parts == tuple(DEFAULTS if relocates else DEFAULTS_ADC)
+    assert model.phases.parts == DEFAULTS
     for _ in range(TOTAL):
         for param in model.gauss_params.values():
             param.grad = torch.randn_like(param)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 from oracles import covariance
+from splatting.arms import Longer
 from torch import Tensor
 from torch.nn import Parameter
 
-from opt3dgs_optim import Annealing, IsotropicNoise, Phase, PhaseScheduler, PositionNoise
-from opt3dgs_optim.names import GAUSSIAN
+from opt3dgs_optim import IsotropicNoise, Phase, PhaseScheduler, PositionNoise
 from opt3dgs_optim.parts.noise import covariance_noise
 
 
@@ -149,8 +149,8 @@ def test_it_can_begin_or_stop_at_the_switch(during: Phase | None) -> None:
 def test_its_size_goes_by_the_trainers_rate_without_any_factor() -> None:
     """And it finds scales, quaternions and opacities among the upgraded optimizers."""
     splats = dim()
-    annealing = Annealing(8.0, 0.5, names=GAUSSIAN)
-    _, adams = upgraded(splats, annealing, PositionNoise(scale=2.0, generator=draw()))
+    longer = Longer(8.0)
+    _, adams = upgraded(splats, longer, PositionNoise(scale=2.0, generator=draw()))
     adams["means"].param_groups[0]["lr"] = 0.03
     eta = torch.randn(12, 3, generator=draw())
     others = {name: splats[name].detach() for name in ("scales", "quats", "opacities")}

@@ -39,11 +39,10 @@ def parts_of(draw: random.Random) -> list[Any] | None:
     if kind == 0:
         return None
     if kind == 1:
-        return [*package.DEFAULTS_ADC]
+        return [package.Fading(stop=0.5), package.OutOfView(), package.Averaging()]
     if kind == 2:
         return package.paper_parts(draw.choice([40, 3_000]))
     choices: list[Any] = [
-        package.Annealing(),
         package.Averaging(),
         package.EnergyHistogram(),
         package.Fading(share=0.5, events=draw.choice([3, 30])),

@@ -36,7 +36,7 @@ from splatting.relocation import relocated_values
 from torch import Tensor
 from torch.nn import Parameter
 
-from opt3dgs_optim import DEFAULTS_ADC, PhaseScheduler
+from opt3dgs_optim import PhaseScheduler
 
 ITERATIONS = 60
 POINTS = 40
@@ -338,8 +338,6 @@ def train(host: Host, first: int, last: int) -> None:
 def begun(make: Callable[..., Host], *saved: Any, parts: Any = None) -> tuple[Host, PhaseScheduler]:
     """The trainer with its lines."""
     host = make(*saved)
-    if parts is None and not host.relocates:
-        parts = DEFAULTS_ADC
     phases = PhaseScheduler(ITERATIONS, parts=parts)
     phases.upgrade(host.optimizer())
     return host, phases

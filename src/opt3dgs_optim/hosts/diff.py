@@ -18,8 +18,7 @@ from opt3dgs_optim import PhaseScheduler
 
 # above the training loop, when the optimizers are made and a checkpoint is loaded
 phases = PhaseScheduler(N)  # N: how many steps the training makes
-phases.upgrade(OPTIMIZERS)  # a torch.optim.Adam with named groups, a dict of them, or a list
-# with clone, split and prune: PhaseScheduler(N, parts=DEFAULTS_ADC), imported beside it"""
+phases.upgrade(OPTIMIZERS)  # a torch.optim.Adam with named groups, a dict of them, or a list"""
 
 
 def misses(trainer: Trainer, text: str) -> list[str]:
@@ -47,7 +46,7 @@ def edited(text: str) -> tuple[Trainer, str]:
         ValueError: the file is not known, or has been edited; the message has what to do by hand.
     """
     plain = "\n".join(line.rstrip() for line in text.split("\n"))
-    if word := re.search(r"\b(opt3dgs_optim|PhaseScheduler|DEFAULTS_ADC|phases)\b", plain):
+    if word := re.search(r"\b(opt3dgs_optim|PhaseScheduler|phases)\b", plain):
         line = plain.count("\n", 0, word.start()) + 1
         raise ValueError(f"line {line} has `{word[0]}` already, so that nothing is inserted")
     fit = [each for each in TRAINERS.values() if each.signs and not misses(each, plain)]

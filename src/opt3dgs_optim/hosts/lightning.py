@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from opt3dgs_optim import DEFAULTS_ADC, PhaseScheduler
+from opt3dgs_optim import PhaseScheduler
 
 try:
     from internal.plugins.plugin import Plugin, PluginModule  # pyright: ignore
@@ -62,8 +62,7 @@ class Opt3DGSModule(PluginModule):
                 f"Opt3DGS: opt_strategy={strategy} would not accumulate gradients for upgraded "
                 "optimizers; VanillaOptStrategy is needed"
             )
-        relocates = type(pl_module.density_controller).__name__.startswith("MCMC")
-        self.phases = PhaseScheduler(total, parts=None if relocates else DEFAULTS_ADC)
+        self.phases = PhaseScheduler(total)
         self.phases.upgrade(pl_module.gaussian_optimizers)
         pl_module.on_after_backward_hooks.append(self._count)
 

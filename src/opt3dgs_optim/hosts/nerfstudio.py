@@ -11,7 +11,7 @@ import inspect
 from dataclasses import dataclass, field
 from typing import Any
 
-from opt3dgs_optim import DEFAULTS_ADC, PhaseScheduler
+from opt3dgs_optim import PhaseScheduler
 
 try:
     from nerfstudio.models.splatfacto import (  # pyright: ignore
@@ -56,8 +56,7 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
                 "Opt3DGSSplatfactoModel: total_steps=None and no trainer, but the number of "
                 "iterations is needed; set pipeline.model.total_steps"
             )
-        relocates = getattr(self.config, "strategy", "default") == "mcmc"
-        self.phases = PhaseScheduler(total, parts=None if relocates else DEFAULTS_ADC)
+        self.phases = PhaseScheduler(total)
         self.phases.upgrade(attributes.optimizers.optimizers)
         return super().get_training_callbacks(attributes)
 
