@@ -112,7 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     add = parser.add_argument
-    said = "; ".join(f"{arm.name}: {arm.what}" for arm in ARMS.values() if arm.density == "mcmc")
+    said = "; ".join(f"{arm.name}: {arm.what}" for arm in ARMS.values())
     add("--scene", default="embedded", metavar="DIR", help="scene folder, or 'embedded'")
     add("--size", default="images_2", choices=get_args(Size), help="folder of the photos")
     add("--background", default="black", choices=get_args(Background), help="behind the scene")
@@ -125,8 +125,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("-o", "--out", type=Path, default=Path("runs/error_vs_time"), metavar="DIR", help="folder")
     args = parser.parse_args(arguments)
     arms = [find_arm(name.strip()) for name in args.arms.split(",")]
-    if any(arm.density != "mcmc" for arm in arms):
-        raise ValueError("arm 'adc' and those like it: examples/benchmarks/train.py has them")
     for name in ("seeds", "looks"):
         if getattr(args, name) < 1:
             raise ValueError(f"--{name} {getattr(args, name)}: must be at least 1")

@@ -69,6 +69,8 @@ class AdaptiveFit(Fit):
     images of a quarter of the width four times of it leaves as many Gaussians per pixel.
     """
 
+    relocates = False
+
     def _density_control(self) -> DefaultDensityControl:
         width = self.scene.train[0].camera.width
         shrunk = FULL_WIDTH.get(self.scene.name, width) / width

@@ -34,7 +34,6 @@ HALF: dict[str, Any] = {"size": "images_2", "points": 50_000, "sh_degree": 0}
 WHOLE: dict[str, Any] = {"size": "images", "points": 200_000, "sh_degree": 3}
 QUARTER: dict[str, Any] = {"size": "images_4", "sh_degree": 0}
 SIZES = {"half": HALF, "whole": WHOLE, "quarter": QUARTER, "few photos": QUARTER}
-DEFAULT = "own-late"  # the arm of the package's defaults; "own" was that of those before
 METRICS = ("psnr", "ssim", "lpips")
 COUNTS = ("10000", "100000", "1000000", "5000000")  # of Gaussians, as steps.json has them
 FORMS = {"psnr": "{:.2f}", "ssim": "{:.4f}", "lpips": "{:.4f}"}
@@ -122,7 +121,7 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 # -- the tables -----------------------------------------------------------------------------------
 
 
-DENSITIES = {"relocation": DEFAULT, "clone-and-split": "defaults"}  # and the defaults' arm
+DENSITIES = ("relocation", "clone-and-split")
 PHOTOS = {
     "bonsai": "220 of 400x266",
     "lego": "87 of 400x400",
@@ -134,9 +133,9 @@ PHOTOS = {
 def front(all_: Evidence) -> str:
     """A third of stock's iterations against all of them, of the same seeds."""
     rows = []
-    for density, arm in DENSITIES.items():
+    for density in DENSITIES:
         for scene, photos in PHOTOS.items():
-            stock, ours = third(all_, scene, density, arm)
+            stock, ours = third(all_, scene, density)
             if not ours:
                 continue
             forms = {"psnr": "{:.2f}", "ssim": "{:.3f}", "lpips": "{:.3f}"}
@@ -148,24 +147,24 @@ def front(all_: Evidence) -> str:
     return table((*heads, "with the three lines, 10,000"), rows)
 
 
-def third(all_: Evidence, scene: str, density: str, arm: str) -> tuple[list[Line], list[Line]]:
+def third(all_: Evidence, scene: str, density: str) -> tuple[list[Line], list[Line]]:
     """Stock's 30,000 iterations and a third of them with the package, of the same seeds."""
     those = {"density": density, **HALF}
-    stock = all_.of("mcmc", scene, iterations=30_000, **those)
-    ours = all_.of(arm, scene, iterations=10_000, **those)
+    stock = all_.of("stock", scene, iterations=30_000, **those)
+    ours = all_.of("defaults", scene, iterations=10_000, **those)
     both = set(seeds_of(stock)) & set(seeds_of(ours))
     return [x for x in stock if x["seed"] in both], [x for x in ours if x["seed"] in both]
 
 
 SHORTER = (
-    *((DEFAULT, count) for count in (15_000, 10_000, 7_500)),
-    *((arm, 10_000) for arm in ("mcmc", "x2", "x3", "averaged", "learn2splat")),
+    *(("defaults", count) for count in (15_000, 10_000, 7_500)),
+    *((arm, 10_000) for arm in ("stock", "x2", "x3", "averaged", "learn2splat")),
 )
 
 
 def iterations(all_: Evidence) -> str:
     """Shorter trainings less stock's 30,000 iterations, seed by seed."""
-    stock = {scene: all_.of("mcmc", scene, iterations=30_000, **HALF) for scene in MAIN}
+    stock = {scene: all_.of("stock", scene, iterations=30_000, **HALF) for scene in MAIN}
     rows = [("stock, 30,000", *map(shown, stock.values()))]
     for arm, count in SHORTER:
         cells = (
@@ -180,29 +179,19 @@ def quarter(all_: Evidence) -> str:
     """A quarter of stock's iterations against all of them, at quarter size."""
     rows = []
     for scene in MAIN:
-        stock = all_.of("mcmc", scene, iterations=30_000, **QUARTER)
+        stock = all_.of("stock", scene, iterations=30_000, **QUARTER)
         points = stock[0]["points"]
-        ours = all_.of(DEFAULT, scene, iterations=7_500, points=points, **QUARTER)
+        ours = all_.of("defaults", scene, iterations=7_500, points=points, **QUARTER)
         rows.append((scene, f"{points:,}", shown(stock), gained(ours, stock)))
     return table(("scene", "Gaussians", "stock, 30,000", "the defaults, 7,500, less stock"), rows)
-
-
-def kept_aside(all_: Evidence) -> str:
-    """A scene that nobody tuned to."""
-    rows = []
-    for arm in ("mcmc", "x2", "defaults", "own"):
-        found = [x for x in all_.lines if x["scene"] == "kept-aside" and x["arm"] == arm]
-        cells = {x["iterations"]: one_seed(shown([x])) for x in found}
-        rows.append((NAMES[arm], *(cells.get(n, "-") for n in (1_875, 2_500, 3_750, 7_500))))
-    return table(("training", "1,875", "2,500", "3,750", "7,500 iterations"), rows)
 
 
 def gpu(all_: Evidence) -> str:
     """Half of the iterations at whole size, on a GPU."""
     rows = []
     for scene in ("bonsai", "lego"):
-        stock = all_.of("mcmc", scene, gpu=True, iterations=15_000, **WHOLE)
-        ours = all_.of("own-41-events", scene, gpu=True, iterations=7_500, **WHOLE)
+        stock = all_.of("stock", scene, gpu=True, iterations=15_000, **WHOLE)
+        ours = all_.of("0.1.0", scene, gpu=True, iterations=7_500, **WHOLE)
         for lines in (stock, ours):
             name = f"{NAMES[lines[0]['arm']]}, {lines[0]['iterations']:,}"
             first, less = (scene, "") if lines is stock else ("", one_seed(gained(lines, stock)))
@@ -215,8 +204,8 @@ def whole(all_: Evidence) -> str:
     """Half of the iterations at whole size, on a CPU, less stock's trainings on the GPU."""
     rows = []
     for scene in ("bonsai", "lego"):
-        stock = all_.of("mcmc", scene, gpu=True, iterations=15_000, **WHOLE)
-        ours = all_.of(DEFAULT, scene, iterations=7_500, **WHOLE)
+        stock = all_.of("stock", scene, gpu=True, iterations=15_000, **WHOLE)
+        ours = all_.of("defaults", scene, iterations=7_500, **WHOLE)
         rows.append((scene, one_seed(shown(ours)), one_seed(gained(ours, stock))))
     return table(("scene", "the defaults, 7,500, on a CPU", "less stock, 15,000, on the GPU"), rows)
 
@@ -248,28 +237,12 @@ def gpu_iteration(_: Evidence) -> str:
     return table(("", *heads), rows)
 
 
-def bits(all_: Evidence) -> str:
-    """Moments and mean of 16 bits beside those of 32; of some seeds both have more events."""
-    rows = []
-    for scene in MAIN:
-        pairs = [
-            (wide, half)
-            for arm in ("own", "own-fourth")
-            for half in all_.of(f"{arm}-16", scene, iterations=15_000, **HALF)
-            for wide in all_.of(arm, scene, iterations=15_000, **HALF)
-            if wide["seed"] == half["seed"]
-        ]
-        wide, half = zip(*pairs, strict=True)
-        rows.append((scene, shown(wide), shown(half), gained(half, wide)))
-    return table(("scene", "32 bits", "16 bits", "16 less 32 bits, same seeds"), rows)
-
-
 def equal(all_: Evidence) -> str:
     """All of 30,000 iterations."""
-    rows, arms = [], (DEFAULT, "own", "defaults", "x2")
+    rows, arms = [], ("defaults", "0.1.0", "x2")
     for size in ("half", "quarter"):
         for scene in MAIN:
-            stock = all_.of("mcmc", scene, iterations=30_000, **SIZES[size])
+            stock = all_.of("stock", scene, iterations=30_000, **SIZES[size])
             those = {"iterations": 30_000, **SIZES[size], "points": stock[0]["points"]}
             lines = (all_.of(arm, scene, **those) for arm in arms)
             rows.append((scene, size, shown(stock), *(gained(x, stock) for x in lines)))
@@ -284,7 +257,7 @@ def short(all_: Evidence) -> str:
         gains = []
         for scene in MAIN:
             stock, ours = (
-                all_.of(arm, scene, iterations=count, **HALF) for arm in ("mcmc", DEFAULT)
+                all_.of(arm, scene, iterations=count, **HALF) for arm in ("stock", "defaults")
             )
             found = gain(ours, stock)
             gains.append(found)
@@ -329,129 +302,19 @@ def cost(_: Evidence) -> str:
 def few(all_: Evidence) -> str:
     """Scenes with 10 to 15 photos; all beside stock at 30,000."""
     rows = []
-    others = (("mcmc", 3_000), (DEFAULT, 3_000), ("own", 10_000), ("own", 30_000))
+    others = (("stock", 3_000), ("defaults", 3_000), ("0.1.0", 10_000), ("0.1.0", 30_000))
     for scene in FEW:
-        stock = all_.of("mcmc", scene, iterations=30_000, **QUARTER)
+        stock = all_.of("stock", scene, iterations=30_000, **QUARTER)
         lines = (all_.of(arm, scene, iterations=n, **QUARTER) for arm, n in others)
         rows.append((scene, shown(stock), *(gained(x, stock) for x in lines)))
     return table(("scene", "stock, 30,000", *(f"{NAMES[a]}, {n:,}" for a, n in others)), rows)
-
-
-EVENTS = (  # size, iterations, arms with fewer and with more events of `Fading`, how many they have
-    ("half", 10_000, "own", "own-fourth", "102", "200"),
-    ("whole", 7_500, "own-41-events", "own", "41", "100"),
-    ("whole", 7_500, "own-41-events", "own-120-events", "41", "120"),
-    ("whole", 7_500, "own-41-events", "own-fourth", "41", "141"),
-)
-
-
-def events(all_: Evidence) -> str:
-    """More events of `Fading`, each beside the same training with fewer."""
-    rows = []
-    for size, count, *arms, fewer, more in EVENTS:
-        those = {"iterations": count, **SIZES[size]}
-        for scene in MAIN:
-            without, with_more = (all_.of(arm, scene, **those) for arm in arms)
-            if without and with_more:
-                changes = gained(with_more, without)
-                rows.append((scene, size, fewer, shown(without), more, changes))
-    heads = ("scene", "size", "events", "PSNR / SSIM / LPIPS", "more events", "what they change")
-    return table(heads, rows)
-
-
-LENGTHS = (  # where longer steps to the end were tried: size, iterations, scenes
-    *(("half", count, MAIN) for count in (7_500, 10_000, 15_000, 30_000)),
-    ("whole", 7_500, MAIN),
-    ("quarter", 7_500, MAIN),
-    ("quarter", 30_000, MAIN),
-    ("few photos", 3_000, FEW),
-)
-
-
-def aspects(all_: Evidence) -> str:
-    """How thin an axis of the own frame may count as, each beside the same training with 0.1."""
-    rows = []
-    for size, count, scenes in LENGTHS:
-        those = {"iterations": count, **SIZES[size]}
-        for scene in scenes:
-            wider = [all_.of(f"own-aspect-{least}", scene, **those) for least in (0.25, 0.5)]
-            if wider[0]:
-                points = wider[0][0]["points"]
-                thin = all_.of("own", scene, **those | {"points": points})
-                changes = (gained(lines, thin) for lines in wider)
-                name = f"{size}, {points:,} Gaussians"
-                rows.append((scene, name, f"{count:,}", shown(thin), *changes))
-    return table(("scene", "size", "iterations", "0.1", "0.25", "0.5"), rows)
-
-
-def late(all_: Evidence) -> str:
-    """Longer steps to the end, each beside the same training with the defaults before."""
-    rows = []
-    for size, count, scenes in LENGTHS:
-        those = {"iterations": count, **SIZES[size]}
-        for scene in scenes:
-            for points in sorted({x["points"] for x in all_.of(DEFAULT, scene, **those)}):
-                before, ours = (
-                    all_.of(arm, scene, **those | {"points": points}) for arm in ("own", DEFAULT)
-                )
-                name = f"{size}, {points:,} Gaussians"
-                rows.append((scene, name, f"{count:,}", shown(before), gained(ours, before)))
-    heads = ("scene", "size", "iterations", NAMES["own"], "what the defaults change")
-    return table(heads, rows)
-
-
-TRIED = (  # and not taken: what, its arm, its control, size and iterations
-    ("new rows: a full first step", "own-first", "own", "quarter", 7_500),
-    ("new rows: a full first step", "own-first", "own", "half", 10_000),
-    ("new rows: a count for each row", "own-aged", "own", "quarter", 7_500),
-    ("`Annealing` beside the own frame", "own-annealed", "own", "quarter", 7_500),
-    ("rotations in angles", "angles", "own", "quarter", 7_500),
-    ("smaller angles for longer Gaussians", "angles-own", "own", "quarter", 7_500),
-    ("the same, longer at first", "angles-own-fall", "own", "quarter", 7_500),
-    ("own frame in pixels", "own-pixels", "own", "quarter", 7_500),
-    ("own frame, axes to the power 3/4", "own-power", "own", "quarter", 7_500),
-    ("own frame, rate 0.15", "own-rate-0.15", "own", "quarter", 7_500),
-    ("own frame, rate 0.15", "own-rate-0.15", "own", "half", 10_000),
-    ("own frame, rate 0.2", "own-r2", "own", "quarter", 7_500),
-    (
-        "rate 0.15 beside the longer steps",
-        "own-final-0.03-aspect-0.25-rate-0.15",
-        "own-final-0.03-aspect-0.25",
-        "quarter",
-        7_500,
-    ),
-    (
-        "`min_aspect` from 0.1 to 0.35, beside 0.25",
-        "own-growing-0.35",
-        "own-final-0.03-aspect-0.25",
-        "quarter",
-        7_500,
-    ),
-    ("the same to 0.5", "own-growing-0.5", "own-aspect-0.25", "quarter", 7_500),
-    ("`min_aspect` 0.25 in a long training", "own-late-0.25", DEFAULT, "quarter", 30_000),
-    ("`Fading` to 80 %", "own-late-stop-0.8", DEFAULT, "half", 10_000),
-)
-
-
-def tried(all_: Evidence) -> str:
-    """What was not taken, each beside the same training without it, scene by scene."""
-    rows = []
-    for what, arm, control, size, count in TRIED:
-        those, cells = {"iterations": count, **SIZES[size]}, []
-        for scene in MAIN:
-            lines = all_.of(arm, scene, **those)
-            points = {"points": lines[0]["points"]} if lines else {}
-            without = all_.of(control, scene, **those | points)
-            cells.append(gained(lines, without))
-        rows.append((what, f"{size}, {count:,}", *cells))
-    return table(("what", "size, iterations", *MAIN), rows)
 
 
 def adaptive(all_: Evidence) -> str:
     """Clone, split, prune and reset: held out, on the photos trained on, and Gaussians."""
     rows = []
     for scene in PHOTOS:
-        pair = third(all_, scene, "clone-and-split", "defaults")
+        pair = third(all_, scene, "clone-and-split")
         for name, lines in zip(("stock, 30,000", "the defaults, 10,000"), pair, strict=True):
             if lines:
                 first = scene if lines is pair[0] else ""
@@ -466,103 +329,29 @@ def of_gaussians(lines: Sequence[Line]) -> str:
     return f"{mean(lines, 'gaussians'):,.0f}"
 
 
-def adaptive_long(all_: Evidence) -> str:
-    """The same at quarter size, of equal iterations."""
-    rows, those = [], {"density": "clone-and-split", "iterations": 30_000, **QUARTER}
-    for scene in ("lego", "plush"):
-        stock = all_.of("adc", scene, **those)
-        for arm in ("adc", "adc-own"):
-            lines = all_.of(arm, scene, **those)
-            first, less = (scene, "") if arm == "adc" else ("", gained(lines, stock))
-            rows.append((first, NAMES[arm], shown(lines), less, of_gaussians(lines)))
-    heads = ("scene", "training", "PSNR / SSIM / LPIPS", "less stock", "Gaussians")
-    return table(heads, rows)
-
-
-def capture(all_: Evidence) -> str:
-    """A large capture, where views see little."""
-    rows = []
-    for arm in ("mcmc", "out-of-view", "defaults-without", "defaults"):
-        lines = all_.of(arm, "capture")
-        rows.append((lines[0]["note"].split(";")[0], shown(lines)))
-    return table(("training", "PSNR / SSIM"), rows)
-
-
-CLOSED = (  # what, its arm, the same training without it
-    ("the paper's preset", "paper", "mcmc"),
-    ("the same, beside a constant multiplier of its mean nu", "paper", "paper-constant"),
-    (
-        "AW-SGLD, this package's form, beside such a constant",
-        "awsgld-stable",
-        "awsgld-stable-constant",
-    ),
-    ("L2 loss in the last thirtieth", "l2@1/30", "mcmc"),
-    ("fresh moments in the last thirtieth", "l1+reset@1/30", "mcmc"),
-    ("L-BFGS directions in the last thirtieth", "l2+reset+lqn@1/30", "l2+reset@1/30"),
-    ("L-BFGS directions in the last quarter", "l1+reset+lqn@1/4", "l1+reset@1/4"),
-    ("`Annealing` beside the defaults before 0.1.0", "annealed+averaged", "defaults"),
-    ("one second moment a Gaussian", "faded+pooled+averaged", "defaults"),
-    ("rates times 3", "x3", "mcmc"),
-    ("the positions' rate times 3", "positions-x3", "mcmc"),
-    ("rates times 2", "x2", "mcmc"),
-    ("averaging", "averaged", "mcmc"),
-    ("`Fading` of all parameters, `OutOfView` and `Averaging`: before 0.1.0", "defaults", "mcmc"),
-    ("the defaults of version 0.1.0", "own", "mcmc"),
-)
-
-
-def closed(all_: Evidence) -> str:
-    """What was tried, each beside the same training without it, quarter size, 30,000 iterations."""
-    rows = []
-    for what, arm, control in CLOSED:
-        gains, trainings = {}, 0
-        for scene in (*MAIN, "bonsai-misposed"):
-            pair = [all_.of(a, scene, iterations=30_000, **QUARTER) for a in (arm, control)]
-            if "bonsai" in gains and scene == "bonsai-misposed":
-                continue
-            if found := gain(*pair):
-                gains[scene] = found
-                trainings += len({*seeds_of(pair[0])} & {*seeds_of(pair[1])})
-        cells = [spread([g[m] for g in gains.values()], m) for m in METRICS]
-        star = "*" * ("bonsai" not in gains)
-        rows.append((what + star, f"{len(gains)}, {trainings}", *cells))
-    return table(("what", "scenes, trainings", "PSNR", "SSIM", "LPIPS"), rows)
-
-
-def spread(values: Sequence[float], metric: str) -> str:
-    """Mean and standard error over the scenes."""
-    error = statistics.stdev(values) / len(values) ** 0.5 if len(values) > 1 else 0.0
-    return f"{signed(statistics.mean(values), metric)} ± {FORMS[metric].format(error)}"
-
-
 NAMES = {
-    "mcmc": "stock",
-    DEFAULT: "the defaults",
-    "own": "version 0.1.0",
-    "own-41-events": "version 0.1.0",
-    "defaults": "before 0.1.0",
+    "stock": "stock",
+    "defaults": "the defaults",
+    "0.1.0": "version 0.1.0",
     "x2": "rates times 2",
     "x3": "rates times 3",
     "averaged": "stock, averaged",
     "learn2splat": "Learn2Splat's tuned Adam",
-    "adc": "stock",
-    "adc-own": "`OwnFrame` and `Averaging`",
 }
 TABLES: dict[str, Callable[[Evidence], str]] = {
     f.__name__: f
     for f in (
-        front, iterations, quarter, kept_aside, gpu, whole, gpu_step, gpu_iteration, bits, equal,
-        short, ratios, cost, few, events, aspects, late, tried, adaptive, adaptive_long, capture,
-        closed,
+        front, iterations, quarter, gpu, whole, gpu_step, gpu_iteration, equal, short, ratios, cost,
+        few, adaptive,
     )
 }  # fmt: skip
 
 
 DRAWN = (
-    ("mcmc", 30_000, "#555555"),
-    (DEFAULT, 15_000, "#7fc4ea"),
-    (DEFAULT, 10_000, "#0072b2"),
-    (DEFAULT, 7_500, "#08306b"),
+    ("stock", 30_000, "#555555"),
+    ("defaults", 15_000, "#7fc4ea"),
+    ("defaults", 10_000, "#0072b2"),
+    ("defaults", 7_500, "#08306b"),
 )
 
 
@@ -591,10 +380,10 @@ def draw(all_: Evidence, path: Path) -> None:
             ]
             at = sorted(set.intersection(*map(set, pairs)))
             curve = [statistics.mean(each[n] for each in pairs) for n in at]
-            label = "stock" if arm == "mcmc" else f"{NAMES[arm]}, planned for {count:,}"
+            label = "stock" if arm == "stock" else f"{NAMES[arm]}, planned for {count:,}"
             (entries[label],) = axis.plot([n / 1000 for n in at], curve, color=colour, lw=2)
             axis.plot(at[-1] / 1000, curve[-1], "o", color=colour, ms=6)
-            if arm == "mcmc":
+            if arm == "stock":
                 axis.axhline(end := curve[-1], color=colour, lw=1, ls="--", zorder=0)
                 axis.set_ylim(end - 5, end + 1.6)
         count = len(seeds)

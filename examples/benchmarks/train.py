@@ -1,6 +1,6 @@
 """Train one line of the evidence, from where an earlier start was stopped.
 
-    python examples/benchmarks/train.py --scene scenes/lego --arm own-late --size images_2 \\
+    python examples/benchmarks/train.py --scene scenes/lego --arm defaults --size images_2 \\
         --iterations 10000 --points 50000 --seed 0 --background white
 
 Writes `--out` (JSON: the training and its curve) and a checkpoint beside it at each of ten
@@ -34,7 +34,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 EVALUATIONS = 10
-DENSITIES = {"relocation": "mcmc", "clone-and-split": "adc"}
+DENSITIES = ("relocation", "clone-and-split")
 Lpips = Callable[[Tensor, Tensor], float]  # of images [H, W, 3] in 0..1
 
 
@@ -48,9 +48,9 @@ def scene_of(args: argparse.Namespace) -> Scene:
     return replace(scene, train=[scene.train[i] for i in kept])
 
 
-def fit_of(scene: Scene, arm: Arm, options: FitOptions) -> Fit:
-    """The trainer of an arm."""
-    if arm.density == "mcmc":
+def fit_of(scene: Scene, arm: Arm, options: FitOptions, density: str = DENSITIES[0]) -> Fit:
+    """The trainer of an arm, with that kind of density control."""
+    if density == DENSITIES[0]:
         return Fit(scene, arm, options)
     from benchmarks.adaptive import AdaptiveFit  # needs gsplat, which is optional
 
@@ -123,7 +123,7 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     add = made.add_argument
     add("--scene", default="embedded", metavar="DIR", help="scene folder, or 'embedded'")
-    add("--arm", default="own-late", choices=ARMS, metavar="ARM", help=", ".join(ARMS))
+    add("--arm", default="defaults", choices=ARMS, metavar="ARM", help=", ".join(ARMS))
     add("--size", default="images_4", choices=get_args(Size), help="folder of the photos")
     add("--background", default="black", choices=get_args(Background))
     add("--iterations", type=int, default=7_500)
@@ -132,7 +132,7 @@ def parser() -> argparse.ArgumentParser:
     add("--seed", type=int, default=0)
     add("--views", type=int, default=0, metavar="N", help="evenly spaced ones to train on; 0: all")
     add("--rates", type=float, default=1.0, help="factor on all of the trainer's learning rates")
-    add("--density", default="", choices=["", *DENSITIES], help="default: the arm's")
+    add("--density", default=DENSITIES[0], choices=DENSITIES)
     add("--threshold", type=float, default=1.0, help="factor on that of clone and split")
     add("--lpips", nargs=2, type=Path, metavar=("FILE.py", "WEIGHTS"), help="see `lpips_of`")
     add("-o", "--out", type=Path, metavar="FILE", help="default: in runs/benchmarks")
@@ -145,9 +145,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     torch.set_num_threads(1)
     scene, arm = scene_of(args), find_arm(args.arm)
-    if args.density:
-        arm = replace(arm, density=DENSITIES[args.density])
-    args.density = next(name for name, short in DENSITIES.items() if short == arm.density)
     options = FitOptions(
         args.iterations,
         args.points,
@@ -164,7 +161,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     name = "-".join(str(record[key]) for key in ("scene", *kept))
     out = args.out or Path("runs/benchmarks", f"{name}.json")
     out.parent.mkdir(parents=True, exist_ok=True)
-    train(fit_of(scene, arm, options), record, out, args.lpips and lpips_of(*args.lpips))
+    fit = fit_of(scene, arm, options, args.density)
+    train(fit, record, out, args.lpips and lpips_of(*args.lpips))
     print(out)
     return 0
 

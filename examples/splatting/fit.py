@@ -71,6 +71,8 @@ class Fit:
         options: what it shares with the trainings that it is compared with.
     """
 
+    relocates = True  # as 3DGS-MCMC, with its noise and its regularisers
+
     def __init__(self, scene: Scene, arm: Arm, options: FitOptions) -> None:
         self.scene, self.arm, self.options = scene, arm, options
         self.draws = {
@@ -96,7 +98,7 @@ class Fit:
         self.views: list[int] = []  # what is left of this epoch
 
     def _initial_gaussians(self) -> dict[str, Parameter]:
-        preset = MCMC_PRESET if self.arm.density == "mcmc" else DEFAULT_PRESET
+        preset = MCMC_PRESET if self.relocates else DEFAULT_PRESET
         return gaussians_from_points(
             self.scene.points,
             self.scene.colors,
@@ -118,10 +120,10 @@ class Fit:
 
     def step(self) -> Tensor:
         """One iteration; returns the detached loss."""
-        view, mcmc = self.scene.train[self._next_view()], self.arm.density == "mcmc"
+        view = self.scene.train[self._next_view()]
         pixel_loss = None if self.phases is None else self.phases.pixel_loss
         loss = photometric_loss(self._train_image(view), view.image, pixel_loss)
-        if mcmc:
+        if self.relocates:
             loss = loss + regularisers(self.gaussians)
         loss.backward()
         if self.phases is not None:
@@ -130,7 +132,7 @@ class Fit:
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
         means = self.optimizers["means"].param_groups[0]
-        if mcmc:
+        if self.relocates:
             add_noise(self.gaussians, means["lr"], self.draws["noise"])
         self.relocated += self.density.step(self.iteration, self.gaussians, self.optimizers)
         self.iteration += 1

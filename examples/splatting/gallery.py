@@ -16,7 +16,7 @@ from splatting.metrics import psnr
 from splatting.scenes import View
 
 COLOURS = ("#555555", "#0072b2", "#d55e00", "#009e73", "#cc79a7")
-NAMES = {"mcmc": "stock 3DGS-MCMC", "defaults": "opt3dgs_optim", "x3": "rates times 3"}
+NAMES = {"stock": "stock 3DGS-MCMC", "defaults": "opt3dgs_optim", "x3": "rates times 3"}
 SHOWN = 0.5  # of the range of PSNR, from above: the first iterations would flatten the rest
 
 

@@ -44,7 +44,7 @@ def strict_lines(path):
 
 
 def write_sample(path):
-    with RunLog(path, metadata={"arm": "mcmc", "seed": 0}) as log:
+    with RunLog(path, metadata={"arm": "stock", "seed": 0}) as log:
         for i in range(1, 5):
             log.step(i, phase="exploration", energy=0.1 * i, nu=float("nan"))
         log.evaluation(4, psnr=20.5)
@@ -73,7 +73,7 @@ def test_first_line_describes_the_run(tmp_path):
     write_sample(tmp_path / "plush" / "run.jsonl")
     run = read_run(tmp_path / "plush" / "run.jsonl")
     assert run.name == "plush/run"
-    assert run.metadata == {"arm": "mcmc", "seed": 0}
+    assert run.metadata == {"arm": "stock", "seed": 0}
     assert f", {os.cpu_count()} CPUs" in run.origin["machine"]
     assert not torch.cuda.is_initialized()
 

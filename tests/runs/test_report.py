@@ -43,8 +43,8 @@ def write_run(path, arm, seed, points, *, steps=(), metric="psnr", **metadata):
 def two_arms(folder):
     """Baseline: 20 -> 24 dB in 100 s (both seeds +-1); other: 20 -> 28 dB in 200 s (+-0.5)."""
     return [
-        write_run(folder / "m0.jsonl", "mcmc", 0, [(0, 0.0, 19.0), (50, 100.0, 23.0)]),
-        write_run(folder / "m1.jsonl", "mcmc", 1, [(0, 0.0, 21.0), (50, 100.0, 25.0)]),
+        write_run(folder / "m0.jsonl", "stock", 0, [(0, 0.0, 19.0), (50, 100.0, 23.0)]),
+        write_run(folder / "m1.jsonl", "stock", 1, [(0, 0.0, 21.0), (50, 100.0, 25.0)]),
         write_run(folder / "f0.jsonl", "faded", 0, [(0, 0.0, 19.5), (100, 200.0, 27.5)]),
         write_run(folder / "f1.jsonl", "faded", 1, [(0, 0.0, 20.5), (100, 200.0, 28.5)]),
     ]
@@ -57,7 +57,7 @@ def arms_of(runs, metric=None, baseline=None) -> tuple[Any, dict[str, Any]]:
 
 def test_numbers_match_hand_computed_ones(tmp_path):
     comparison, arms = arms_of(two_arms(tmp_path))
-    assert comparison.baseline == "mcmc"
+    assert comparison.baseline == "stock"
     assert comparison.target == 24.0
     faded = arms["faded"]
     final = faded.numbers["final psnr"]
@@ -68,7 +68,7 @@ def test_numbers_match_hand_computed_ones(tmp_path):
     assert reached.mean == pytest.approx(100.0)
     assert reached.error == pytest.approx(12.5)
     # The baseline's seed 0 ends at 23 dB, below 24; seed 1 passes it at 3/4 of 100 s.
-    reached = arms["mcmc"].numbers["seconds to baseline psnr"]
+    reached = arms["stock"].numbers["seconds to baseline psnr"]
     assert (reached.mean, reached.n) == (75.0, 1)
     # At 100 s: 23.5 - 23 and 24.5 - 25, paired by seed.
     gain = faded.numbers["psnr gain at equal seconds"]
@@ -76,7 +76,7 @@ def test_numbers_match_hand_computed_ones(tmp_path):
     assert gain.error == pytest.approx(0.5)
     assert faded.numbers["iterations"].mean == 100
     assert faded.numbers["seconds"].mean == 200.0
-    assert arms["mcmc"].numbers["psnr gain at equal seconds"] is None
+    assert arms["stock"].numbers["psnr gain at equal seconds"] is None
 
 
 def test_another_baseline_and_lower_is_better(tmp_path):
@@ -84,15 +84,15 @@ def test_another_baseline_and_lower_is_better(tmp_path):
         points = [(0, 0.0, 0.5), (10, 100.0, end)]
         return write_run(tmp_path / f"{arm}.jsonl", arm, 0, points, metric="lpips")
 
-    runs = [run("mcmc", 0.3), run("b", 0.1)]
+    runs = [run("stock", 0.3), run("b", 0.1)]
     b = arms_of(runs, "lpips")[1]["b"]
     assert b.numbers["seconds to baseline lpips"].mean == pytest.approx(50.0)
     gain = b.numbers["lpips gain at equal seconds"]
     assert (gain.mean, gain.error) == (pytest.approx(0.2), None)
     comparison, arms = arms_of(runs, "lpips", "b")
     assert comparison.baseline == "b"
-    assert arms["mcmc"].numbers["seconds to baseline lpips"] is None
-    assert arms["mcmc"].numbers["lpips gain at equal seconds"].mean == pytest.approx(-0.2)
+    assert arms["stock"].numbers["seconds to baseline lpips"] is None
+    assert arms["stock"].numbers["lpips gain at equal seconds"].mean == pytest.approx(-0.2)
 
 
 # -- which way a metric is better ------------------------------------------------------------------
@@ -122,7 +122,7 @@ def test_directions_are_known_by_words_and_not_by_substrings(names, direction):
 
 
 def test_a_metric_whose_direction_is_not_known_is_refused(tmp_path, capsys):
-    for arm, end in (("mcmc", 0.3), ("b", 0.1)):
+    for arm, end in (("stock", 0.3), ("b", 0.1)):
         points = [(0, 0.0, 0.5), (10, 100.0, end)]
         write_run(tmp_path / f"logs/{arm}.jsonl", arm, 0, points, metric="ssim_loss")
     words = [str(tmp_path / "logs"), "-o", str(tmp_path / "out")]
@@ -147,7 +147,7 @@ def test_lines_between_evaluations_are_walked_to_the_first_crossing(tmp_path):
     """From 20 to 26 to 22 to 27 dB: 24 after a second third, and not in the last stretch."""
     ours = [(0, 0.0, 20.0), (1, 3.0, 26.0), (2, 6.0, 22.0), (3, 9.0, 27.0)]
     runs = [
-        write_run(tmp_path / "m.jsonl", "mcmc", 0, [(0, 0.0, 20.0), (1, 5.0, 24.0)]),
+        write_run(tmp_path / "m.jsonl", "stock", 0, [(0, 0.0, 20.0), (1, 5.0, 24.0)]),
         write_run(tmp_path / "x.jsonl", "x", 0, ours),
         write_run(tmp_path / "y.jsonl", "y", 0, [(0, 0.5, 25.0), (1, 1.0, 23.0)]),
     ]
@@ -183,7 +183,7 @@ def seeded(folder, seeds, arm, end):
     ],
 )
 def test_runs_are_paired_by_a_seed_that_both_have(tmp_path, baseline, other, gains):
-    runs = [*seeded(tmp_path, baseline, "mcmc", 20.0), *seeded(tmp_path, other, "x", 25.0)]
+    runs = [*seeded(tmp_path, baseline, "stock", 20.0), *seeded(tmp_path, other, "x", 25.0)]
     for order in (runs, runs[::-1]):
         comparison = compare(order)[0]
         (arm,) = [each for each in comparison.arms if each.name == "x"]
@@ -220,9 +220,9 @@ def test_the_table_shows_the_numbers(tmp_path):
                 digits = len(shown.partition(".")[2])
                 assert float(shown) == pytest.approx(stat.mean, abs=0.51 * 10**-digits)
     assert "Testix-1, 3 CPUs" in markdown
-    assert "75" in cells["mcmc"]["seconds to baseline psnr"]
-    assert "(1 of 2)" in cells["mcmc"]["seconds to baseline psnr"]
-    assert cells["mcmc"]["psnr gain at equal seconds"] == "baseline"
+    assert "75" in cells["stock"]["seconds to baseline psnr"]
+    assert "(1 of 2)" in cells["stock"]["seconds to baseline psnr"]
+    assert cells["stock"]["psnr gain at equal seconds"] == "baseline"
 
 
 def picture(path):
@@ -259,7 +259,7 @@ def test_empty_log_and_mixed_metrics(tmp_path):
 
 def test_an_arm_has_one_colour_on_all_scenes_and_the_first_is_the_baselines(tmp_path):
     points = [(1, 1.0, 20.0), (2, 2.0, 21.0)]
-    arms = {"x": ("b", "mcmc", "a"), "y": ("a", "b"), "y/z": ("a", "mcmc")}
+    arms = {"x": ("b", "stock", "a"), "y": ("a", "b"), "y/z": ("a", "stock")}
     runs = [
         write_run(tmp_path / scene / f"{arm}.jsonl", arm, 0, points, scene=scene)
         for scene, names in arms.items()
@@ -267,7 +267,7 @@ def test_an_arm_has_one_colour_on_all_scenes_and_the_first_is_the_baselines(tmp_
     ]
     found = compare(runs)
     colours = [{arm.name: arm.colour for arm in each.arms} for each in found]
-    assert colours == [{"mcmc": 0, "b": 1, "a": 2}, {"b": 1, "a": 2}, {"mcmc": 0, "a": 2}]
+    assert colours == [{"stock": 0, "b": 1, "a": 2}, {"b": 1, "a": 2}, {"stock": 0, "a": 2}]
     gains = [each.arms[-1].numbers["psnr gain at equal seconds"] for each in found]
     assert [gain is None for gain in gains] == [False, True, False]  # of y there is no baseline
     report.write_report(runs, tmp_path / "out")
@@ -340,8 +340,8 @@ def test_command_line_says_in_one_line_what_is_wrong(tmp_path, capsys):
         ([str(tmp_path / "nowhere"), "-o", out], "No such file or directory"),
         ([str(tmp_path / "void"), "-o", out], "no runs: pass run logs"),
         ([str(tmp_path / "file"), "-o", out], "file, line 1"),
-        ([logs, f"{logs}/m0.jsonl", "-o", out], "arm 'mcmc' has two runs of seed 0"),
-        ([logs, "-o", out, "--baseline", "x"], "no such arm; there are faded, mcmc"),
+        ([logs, f"{logs}/m0.jsonl", "-o", out], "arm 'stock' has two runs of seed 0"),
+        ([logs, "-o", out, "--baseline", "x"], "no such arm; there are faded, stock"),
         ([logs, "-o", out, "--metric", "lpips"], "--metric 'lpips': not among those that a run"),
         ([logs, "-o", str(tmp_path / "file")], "file"),
     ):

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+
+import torch
+from torch import Tensor
 
 from opt3dgs_optim.checks import check_number, set_options
 from opt3dgs_optim.part import Part
@@ -36,10 +40,11 @@ class OwnFrame(Part):
 
     Adam's moments of the positions then belong to the own frame. Where a training begins with it in
     the middle, from a checkpoint of the unchanged trainer, they begin anew, which is logged.
-    Scales [N, 3] (log) and quaternions [N, 4] (wxyz) of the same points must be among the upgraded
+    Scales (log) and quaternions [N, 4] (wxyz) of the same points must be among the upgraded
     optimizers' groups; where they are not, it is said once, and the positions are stepped by Adam.
-    gsplat's trainer of flat Gaussians (2DGS) has a third scale that nothing trains: leave the part
-    out there. A Gaussian whose axes are not finite is not moved.
+    Scales are [N, 3], [N, 2] of flat Gaussians (2DGS), whose third axis counts as `min_aspect` of
+    the longest, or [N, 1] of round ones. gsplat's trainer of flat Gaussians has a third scale that
+    nothing trains: leave the part out there. A Gaussian whose axes are not finite is not moved.
 
     It keeps nothing from step to step.
 
@@ -98,7 +103,7 @@ class OwnFrame(Part):
         rows = len(step.param)
         if (
             quats is None or scales is None
-            or quats.shape != (rows, 4) or scales.shape != (rows, 3)
+            or quats.shape != (rows, 4) or scales.shape not in ((rows, 3), (rows, 2), (rows, 1))
             or not quats.dtype == scales.dtype == step.param.dtype
         ):  # fmt: skip
             found = {
@@ -107,19 +112,28 @@ class OwnFrame(Part):
             }
             training.messages.warn_once(
                 CALL,
-                f"{CALL}: positions [{rows}, 3] need scales [N, 3] and quats [N, 4] of the same "
-                f"points among the upgraded optimizers, which hold {found}; Adam steps them",
+                f"{CALL}: positions [{rows}, 3] need scales [N, 3] (or 2, or 1) and quats "
+                f"[N, 4] of the same points among the upgraded optimizers, which hold {found}; "
+                "Adam steps them",
             )
             return
         rate = self.at(training.progress) if step.group["lr"] else 0.0
         least = self.min_aspect
         if least is None:
             least = min_aspect_of(training.total_steps)
-        step.frame = Frame(rate, least, quats, scales)
+        step.frame = Frame(rate, least, quats, scales if scales.shape[1] == 3 else three_of(scales))
 
     def numbers(self, training: Training) -> Mapping[str, float]:
         """`own_frame_rate`: standard deviations of a full step."""
         return {"own_frame_rate": self.at(training.progress)}
+
+
+def three_of(scales: Tensor) -> Tensor:
+    """Scales [N, 3] of flat Gaussians [N, 2], whose third axis is no length, or of round [N, 1]."""
+    scales = scales.detach()
+    if scales.shape[1] == 1:
+        return scales.expand(-1, 3).contiguous()
+    return torch.nn.functional.pad(scales, (0, 1), value=-math.inf)
 
 
 @functools.lru_cache(maxsize=64)  # every step asks

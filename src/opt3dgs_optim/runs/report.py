@@ -37,7 +37,7 @@ def write_report(
         out: folder, made if it is missing.
         metric: to compare by; None takes psnr if it is logged, else the first whose name says
             whether higher or lower is better.
-        baseline: reference arm; None takes "mcmc" if there, else the first.
+        baseline: reference arm; None takes "stock" if there, else the first.
 
     Raises:
         ValueError, OSError: as `stats.compare` raises; `out` cannot be written.
@@ -116,7 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("runs", nargs="+", metavar="RUN", help="run log, or folder of *.jsonl")
     add("-o", "--out", default="report", metavar="DIR", help="to write into (default: report)")
     add("--metric", help="to compare by (default: psnr if logged, else the first that is known)")
-    add("--baseline", metavar="ARM", help="reference arm (default: mcmc if there, else the first)")
+    add("--baseline", metavar="ARM", help="reference arm (default: stock if there, else the first)")
     options = parser.parse_args(arguments)
     try:
         paths = map(Path, options.runs)

@@ -83,7 +83,7 @@ def compare(
             raise ValueError(f"arm {arm!r} has two runs of seed {_seed(run)}; one is {run.name!r}")
         own.append(run)
     names = list(dict.fromkeys(name for arms in scenes.values() for name in arms))
-    baseline = baseline or ("mcmc" if "mcmc" in names else names[0])
+    baseline = baseline or ("stock" if "stock" in names else names[0])
     if baseline not in names:
         raise ValueError(f"--baseline {baseline!r}: no such arm; there are {', '.join(names)}")
     metrics = _logged(runs, "evaluations")

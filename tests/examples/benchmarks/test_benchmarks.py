@@ -10,15 +10,12 @@ from typing import Any
 import pytest
 import torch
 from benchmarks import evidence, report, steps, train
-from splatting.arms import ARMS
 
-from opt3dgs_optim import DEFAULTS
-
-TINY = ["--scene", "embedded", "--arm", "own", "--iterations", "20", "--points", "60"]
+TINY = ["--scene", "embedded", "--arm", "defaults", "--iterations", "20", "--points", "60"]
 
 
 def line(**changes: Any) -> dict[str, Any]:
-    made = {"scene": "lego", "size": "images_2", "arm": "mcmc", "iterations": 30_000}
+    made = {"scene": "lego", "size": "images_2", "arm": "stock", "iterations": 30_000}
     made |= {"density": "relocation"}
     made |= {"points": 50_000, "sh_degree": 0, "seed": 0, "psnr": 30.0, "ssim": 0.9, "lpips": 0.1}
     made |= {"seconds": 1.0, "device": "a CPU", "date": "2026-11-27", "command": "train"}
@@ -54,7 +51,7 @@ def test_a_stopped_training_goes_on_and_becomes_a_line(stopped: Path, tmp_path: 
     found = evidence.line_of(json.loads(whole.read_text()))
     assert found["psnr"] == other["curve"][-1]["psnr"]
     assert found["command"] == (
-        "python examples/benchmarks/train.py --scene embedded --arm own --size images_4 "
+        "python examples/benchmarks/train.py --scene embedded --arm defaults --size images_4 "
         "--iterations 20 --points 60 --seed 0"
     )
 
@@ -71,20 +68,20 @@ def test_seed_and_views_say_what_is_trained_on(tmp_path: Path) -> None:
 def test_lines_are_replaced_and_kept_in_order(tmp_path: Path) -> None:
     path = tmp_path / "evidence.jsonl"
     evidence.add([line(seed=1), line(psnr=31.0), line(views=14)], path)
-    evidence.add([line(psnr=32.0), line(arm="own")], path)
+    evidence.add([line(psnr=32.0), line(arm="defaults")], path)
     lines = evidence.read(path)
     assert [(x["arm"], x["seed"], x["views"], x["psnr"]) for x in lines] == [
-        ("mcmc", 0, 0, 32.0),
-        ("mcmc", 1, 0, 30.0),
-        ("own", 0, 0, 30.0),
-        ("mcmc", 0, 14, 30.0),
+        ("defaults", 0, 0, 30.0),
+        ("stock", 0, 0, 32.0),
+        ("stock", 1, 0, 30.0),
+        ("stock", 0, 14, 30.0),
     ]
     assert "rotated" not in path.read_text()
 
 
 def test_gains_are_of_seeds_that_both_have() -> None:
     stock = [line(seed=s, psnr=p) for s, p in ((0, 30.0), (1, 20.0))]
-    ours = [line(arm="own", seed=s, psnr=p) for s, p in ((1, 21.0), (2, 40.0))]
+    ours = [line(arm="defaults", seed=s, psnr=p) for s, p in ((1, 21.0), (2, 40.0))]
     assert report.gained(ours, stock).startswith("+1.00 / ")
     assert report.gained(ours, stock).endswith("(1 seed)")
     assert report.gained([], stock) == "not trained"
@@ -100,13 +97,6 @@ def test_the_pages_are_made_of_the_evidence() -> None:
         assert report.filled(page, report.Evidence()) == page
     with pytest.raises(ValueError, match="evidence:nothing, but there are"):
         report.filled("<!-- evidence:nothing --><!-- end -->", report.Evidence())
-
-
-def test_what_the_pages_call_the_defaults_is_the_defaults() -> None:
-    """The arm writes its options out, since lines of the evidence keep its name."""
-    parts = ARMS[report.DEFAULT].parts
-    assert parts is not None
-    assert (*parts(30_000),) == DEFAULTS
 
 
 def test_the_picture_is_drawn(tmp_path: Path) -> None:
@@ -130,7 +120,10 @@ def test_steps_are_timed_beside_six_adams() -> None:
 def test_clone_split_and_resets_are_gsplats_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """It grows from the first refinement on; a reset leaves no opacity above twice the limit."""
     fit = train.fit_of(
-        train.load_scene("embedded"), train.find_arm("adc-own"), train.FitOptions(700, 200)
+        train.load_scene("embedded"),
+        train.find_arm("defaults"),
+        train.FitOptions(700, 200),
+        "clone-and-split",
     )
     strategy = fit.density.strategy  # pyright: ignore[reportAttributeAccessIssue]
     monkeypatch.setattr(strategy, "reset_every", 650)

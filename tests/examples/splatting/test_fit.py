@@ -14,7 +14,7 @@ from splatting.fit import Fit, FitOptions
 from splatting.scenes import Scene
 
 OPTIONS = FitOptions(iterations=90, points=150)
-RESUMED = ("mcmc", "own", "x2", "learn2splat", "paper")  # what the others have, too
+RESUMED = ("stock", "defaults", "x2", "learn2splat", "paper")  # what the others have, too
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def test_an_arm_trains_and_resumes_bit_for_bit(scene: Scene, name: str, tmp_path
 
 def test_arms_are_what_they_say(scene: Scene) -> None:
     """Steps times 2; Learn2Splat's rates, beta1 and constant rate of the positions."""
-    first = [Fit(scene, ARMS[name], OPTIONS) for name in ("mcmc", "x2")]
+    first = [Fit(scene, ARMS[name], OPTIONS) for name in ("stock", "x2")]
     before = values(first[0])
     for fit in first:
         fit.step()
@@ -70,7 +70,7 @@ def test_arms_are_what_they_say(scene: Scene) -> None:
 
 def test_the_number_of_gaussians_grows_to_the_budget(scene: Scene) -> None:
     few = replace(scene, points=scene.points[:20], colors=scene.colors[:20])
-    fit = Fit(few, ARMS["mcmc"], replace(OPTIONS, iterations=200, points=100))
+    fit = Fit(few, ARMS["stock"], replace(OPTIONS, iterations=200, points=100))
     assert len(fit.gaussians["means"]) == 20
     losses = trained(fit, 200)
     assert len(fit.gaussians["means"]) == 100
@@ -79,7 +79,7 @@ def test_the_number_of_gaussians_grows_to_the_budget(scene: Scene) -> None:
 
 def test_spherical_harmonics_come_degree_by_degree(scene: Scene, monkeypatch) -> None:
     monkeypatch.setattr("splatting.fit.SH_DEGREE_INTERVAL", 5)
-    fit = Fit(scene, ARMS["own"], replace(OPTIONS, sh_degree=2))
+    fit = Fit(scene, ARMS["defaults"], replace(OPTIONS, sh_degree=2))
     trained_degrees, degrees = [], []
     for _ in range(12):
         degrees.append(fit.active_sh_degree)
@@ -93,14 +93,14 @@ def test_spherical_harmonics_come_degree_by_degree(scene: Scene, monkeypatch) ->
 
 def test_checkpoints_of_other_trainings_are_refused(scene: Scene, tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.pt"
-    Fit(scene, ARMS["mcmc"], OPTIONS).save(path)
+    Fit(scene, ARMS["stock"], OPTIONS).save(path)
     first = scene.train[0]
     smaller = replace(first, image=first.image[::2])
     others: list[tuple[Scene, Arm, FitOptions]] = [
         (scene, ARMS["x2"], OPTIONS),
-        (scene, ARMS["mcmc"], replace(OPTIONS, seed=1)),
-        (replace(scene, background=torch.ones(3)), ARMS["mcmc"], OPTIONS),
-        (replace(scene, train=[smaller, *scene.train[1:]]), ARMS["mcmc"], OPTIONS),
+        (scene, ARMS["stock"], replace(OPTIONS, seed=1)),
+        (replace(scene, background=torch.ones(3)), ARMS["stock"], OPTIONS),
+        (replace(scene, train=[smaller, *scene.train[1:]]), ARMS["stock"], OPTIONS),
     ]
     for other in others:
         with pytest.raises(ValueError, match="choose another folder"):
@@ -108,13 +108,13 @@ def test_checkpoints_of_other_trainings_are_refused(scene: Scene, tmp_path: Path
     for content in (b"", b"no checkpoint"):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=r"checkpoint\.pt: no checkpoint of this trainer"):
-            Fit(scene, ARMS["mcmc"], OPTIONS).load(path)
+            Fit(scene, ARMS["stock"], OPTIONS).load(path)
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: find_arm("sgd"), "'sgd' is unknown; there are mcmc, defaults"),
+        (lambda: find_arm("sgd"), "'sgd' is unknown; there are stock, defaults"),
         (lambda: FitOptions(iterations=0), "iterations=0"),
         (lambda: FitOptions(points=0), "points=0"),
         (lambda: FitOptions(rates=0.0), r"rates=0\.0"),
