@@ -24,8 +24,8 @@ from torch.optim import Adam, Optimizer
 
 from opt3dgs_optim import (
     AWSGLD, DEFAULTS, Averaging, Training, Curvature, EnergyHistogram,
-    Fading, FreshMoments, IsotropicNoise, LQNAdam, Part, Phase, PhaseScheduler,
-    PositionNoise, SquaredLoss, backend_info, two_loop,
+    Fading, FreshMoments, IsotropicNoise, LQNAdam, OwnFrame, Part, Phase,
+    PhaseScheduler, PositionNoise, SquaredLoss, backend_info, two_loop,
 )
 from opt3dgs_optim.step import Step
 

@@ -86,6 +86,17 @@ def product(q: Tensor, others: Tensor) -> Tensor:
     return torch.cat([real[:, None], imaginary], 1)
 
 
+@pytest.mark.parametrize("width", [1, 2])
+def test_flat_and_round_gaussians_step_as_those_with_three_scales(width: int) -> None:
+    """2DGS has two, and its third axis none; it steps as the thinnest that there may be."""
+    grad, whole, few = draw(7, ROWS, 3), parameters(ROWS, *NAMES), parameters(ROWS, *NAMES)
+    for params in (whole, few):
+        params["scales"].data[:, width:] = params["scales"].data[:, :1] if width == 1 else -40.0
+    few["scales"] = Parameter(few["scales"].detach()[:, :width].clone())
+    moved = [stepped(params, grad, OwnFrame(), 5) for params in (whole, few)]
+    assert torch.equal(*moved)
+
+
 def test_the_rate_decays() -> None:
     part = OwnFrame(rate=0.2, final=0.01)
     assert [part.at(t) for t in (0.0, 0.5, 1.0, 2.0)] == pytest.approx([0.2, 0.02, 0.002, 0.002])
