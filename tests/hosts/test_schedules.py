@@ -61,7 +61,7 @@ def options(words: list[str]) -> dict[str, Any]:
 def edits(name: str, iterations: int) -> Iterator[tuple[str, str]]:
     """Lines of the trainer's file, and what takes their place."""
     for group in shortened(STOCK[name], iterations).split("\n\n"):
-        found = re.fullmatch(r"# in the place of `(.+)`, indented by (\d+) as it is\n(.+)", group)
+        found = re.fullmatch(r"# in the place of `(.+)`, indented by (\d+) like it\n(.+)", group)
         if found:
             yield " " * int(found[2]) + found[1], " " * int(found[2]) + found[3]
 
@@ -92,7 +92,7 @@ python train.py -s SCENE --iterations 10000 --position_lr_max_steps 10000 \\
   --densify_from_iter 167 --densify_until_iter 5000 --densification_interval 34 --opacity_reset_interval 1000 \\
   --test_iterations 2334 10000 --save_iterations 2334 10000
 
-# in the place of `if iteration % 1000 == 0:`, indented by 8 as it is
+# in the place of `if iteration % 1000 == 0:`, indented by 8 like it
 if iteration % 334 == 0:
 
 """  # noqa: E501

@@ -67,6 +67,11 @@ def put(path: Path, *, write: bool) -> tuple[str, str]:
         done = f"written, the old file is {kept}"
     before, after = (each.replace("\r", "").split("\n") for each in (old, new))
     changes = "\n".join(difflib.unified_diff(before, after, str(path), str(path), lineterm=""))
+    if schedule(trainer) is not None:
+        name = next(name for name, each in TRAINERS.items() if each is trainer)
+        done += (
+            f"; `opt3dgs lines {name} --iterations N` prints its schedule shortened to N iterations"
+        )
     return changes, f"{trainer.title}: {done}"
 
 

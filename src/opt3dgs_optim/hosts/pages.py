@@ -13,7 +13,7 @@ from pathlib import Path
 COPY = Path(__file__).with_name("pages")
 PAGES = COPY if COPY.is_dir() else Path(__file__).parents[3] / "docs" / "hosts"
 WHERE = re.compile(
-    r"# (above|below) `(.+)`(?:, indented by (\d+) as it is)?(?:, at each of its (\d+) places)?"
+    r"# (above|below) `(.+)`(?:, indented by (\d+) like it)?(?:, at each of its (\d+) places)?"
 )
 
 
