@@ -32,14 +32,7 @@ from opt3dgs_optim.checkpoint import (
     steps_of_a_stock_adam,
     take_from_groups,
 )
-from opt3dgs_optim.contract import (
-    Slots,
-    bare,
-    check_group_count,
-    check_held,
-    check_supported,
-    own_step,
-)
+from opt3dgs_optim.contract import Slots, bare, check_held, check_slots, check_supported, own_step
 from opt3dgs_optim.mean import put_mean
 from opt3dgs_optim.moments import MOMENTS, as_numbers
 from opt3dgs_optim.names import split_name
@@ -112,9 +105,7 @@ class StepAdam(Adam):
         """As torch's; refuses what `upgrade` would, with nothing changed."""
         ours = "training" in vars(self)
         if ours:
-            check_group_count(
-                f"{type(self).__name__}.add_param_group", self.param_groups, self._slots
-            )
+            check_slots(f"{type(self).__name__}.add_param_group", self.param_groups, self._slots)
         super().add_param_group(param_group)
         if not ours:
             return
@@ -207,7 +198,7 @@ class StepAdam(Adam):
 
     def _new_steppers(self, check: bool = True) -> list[ParamStepper]:
         old, made, call = self._steppers, [], type(self).__name__
-        check_group_count(f"{call}.step", self.param_groups, self._slots)
+        check_slots(f"{call}.step", self.param_groups, self._slots)
         for group, slot in zip(self.param_groups, self._slots, strict=True):
             for param in group["params"]:
                 i = len(made)

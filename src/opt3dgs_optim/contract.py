@@ -111,7 +111,7 @@ def check_held(call: str, optimizer: Optimizer, param: Tensor) -> None:
         )
 
 
-def check_group_count(call: str, groups: list[dict[str, Any]], slots: Slots) -> None:
+def check_slots(call: str, groups: list[dict[str, Any]], slots: Slots) -> None:
     """ValueError unless there are as many groups as slots were found for."""
     if len(groups) != len(slots):
         raise ValueError(

@@ -17,8 +17,8 @@ from opt3dgs_optim.checks import check_count, check_energy, check_number
 from opt3dgs_optim.clock import Phase
 from opt3dgs_optim.contract import (
     Slots,
-    check_group_count,
     check_parts,
+    check_slots,
     check_supported,
     named,
     slots_of,
@@ -160,7 +160,7 @@ class PhaseScheduler(Training):
                     f"{error}; or leave {key!r} out, which holds no Gaussians"
                 ) from None
             if isinstance(optimizer, StepAdam) and optimizer.training is not self:
-                check_group_count(f"{CALL}.upgrade", optimizer.param_groups, optimizer._slots)
+                check_slots(f"{CALL}.upgrade", optimizer.param_groups, optimizer._slots)
             saved.append(check_groups(f"{CALL}.upgrade", optimizer.param_groups))
         if not held:
             names = [g.get("name") or key for key, o in given for g in o.param_groups]
