@@ -104,6 +104,23 @@ def summary(runs: Sequence[Run], baseline: str) -> str:
     return "\n".join([*lines, f"Means over {seeds} seeds." if seeds > 1 else "One seed."])
 
 
+def won(runs: Sequence[Run], baseline: str, picture: Path) -> str:
+    """What the last line says of the first arm beside the baseline."""
+    (comparison,) = compare(runs, "psnr", baseline)
+    first, *others = comparison.arms
+    ours = others[0] if others else first
+    psnr, theirs = (arm.numbers["final psnr"] for arm in (ours, first))
+    reached = ours.numbers["seconds to baseline psnr"]
+    assert psnr is not None
+    assert theirs is not None
+    if not others or reached is None:
+        return f"{ours.name} ends at {psnr.mean:.2f} dB: {picture}"
+    return (
+        f"{ours.name} ends {psnr.mean - theirs.mean:+.2f} dB from {baseline}, whose PSNR it has "
+        f"after {reached.mean:.0f} seconds: {picture}"
+    )
+
+
 @command("error_vs_time")
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line."""
@@ -133,8 +150,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for seed in range(args.seeds)
     ]
     check_folder(args.out)
-    if vars(args) == vars(parser.parse_args([])):
-        print("Three trainings: one minute on a free core, two on a busy one.")
+    names = ", ".join(arm.name for arm in arms)
+    took = "" if vars(args) != vars(parser.parse_args([])) else ": one to two minutes"
+    print(
+        f"{len(arms) * args.seeds} trainings of {args.iterations:,} iterations on {args.scene} in "
+        f"turns ({names}), then pictures in {args.out}{took}."
+    )
     torch.set_num_threads(1)
     scene = load_scene(args.scene, args.size, background=args.background)
     fits = [Fit(scene, arm, each) for each in options for arm in arms]
@@ -146,7 +167,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     shown = [(fit.arm.name, fit.image(view)) for fit in fits if fit.options.seed == 0]
     picture = args.out / "comparison.png"
     draw_comparison(compare(runs, "psnr", baseline)[0].arms, view, shown, picture)
-    print(summary(runs, baseline), picture, *written, sep="\n")
+    print(summary(runs, baseline), *written, won(runs, baseline, picture), sep="\n")
     return 0
 
 

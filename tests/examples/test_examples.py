@@ -42,11 +42,12 @@ def test_the_arms_of_the_comparison_do_not_disturb_each_other(
     alone = read_run(tmp_path / "defaults" / "seed-0.jsonl")
     beside = read_run(compared / "defaults" / "seed-0.jsonl")
     assert alone.evaluations["psnr"].tolist() == beside.evaluations["psnr"].tolist()
-    head, row, seeds, *files = capsys.readouterr().out.splitlines()[-6:]
+    head, row, seeds, *files, last = capsys.readouterr().out.splitlines()[-6:]
     assert head.split()[:2] == ["PSNR", "SSIM"]
     assert row.split()[0] == "defaults"
     assert seeds == "One seed."
-    assert all(Path(file).exists() for file in files)
+    assert all(Path(file).exists() for file in (*files, last.split(": ")[1]))
+    assert last.startswith("defaults ends ")
 
 
 @pytest.mark.parametrize(
