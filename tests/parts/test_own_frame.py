@@ -97,6 +97,21 @@ def test_flat_and_round_gaussians_step_as_those_with_three_scales(width: int) ->
     assert torch.equal(*moved)
 
 
+def test_the_rate_follows_a_batch_by_its_beta() -> None:
+    """gsplat has beta1 = 1 - 0.1 b for b views; a larger beta1 than 0.9 is no batch."""
+    moved = {}
+    for beta1 in (0.95, 0.9, 0.6):
+        params = parameters(ROWS, *NAMES)
+        optimizers = adams_of(params, betas=(beta1, 0.999))
+        PhaseScheduler(TOTAL, parts=[OwnFrame()]).upgrade(optimizers)
+        before = params["means"].detach().clone()
+        params["means"].grad = draw(7, ROWS, 3)
+        optimizers["means"].step()
+        moved[beta1] = params["means"].detach() - before
+    assert torch.allclose(moved[0.95], moved[0.9], rtol=1e-4, atol=1e-7)
+    assert torch.allclose(moved[0.6], 2 * moved[0.9], rtol=1e-4, atol=1e-7)
+
+
 def test_the_rate_decays() -> None:
     part = OwnFrame(rate=0.2, final=0.01)
     assert [part.at(t) for t in (0.0, 0.5, 1.0, 2.0)] == pytest.approx([0.2, 0.02, 0.002, 0.002])

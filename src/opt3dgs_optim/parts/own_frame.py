@@ -16,6 +16,7 @@ from opt3dgs_optim.step import Frame, Step
 from opt3dgs_optim.training import Training
 
 CALL = "OwnFrame"
+BETA1 = 0.9  # of one view an iteration
 
 
 @dataclass(frozen=True, repr=False)
@@ -37,6 +38,9 @@ class OwnFrame(Part):
     `min_aspect` of the longest. The fewer steps a training has, the longer those must be: where
     nothing is said the share is 3,000 / total_steps, within 0.1 (from 30,000 iterations on) and
     0.25 (up to 12,000).
+
+    gsplat takes a batch of b views, or as many ranks, by beta1 = 1 - 0.1 b and rates times sqrt(b).
+    The rate here follows beta1: it is times sqrt((1 - beta1) / 0.1) where beta1 is below 0.9.
 
     Adam's moments of the positions then belong to the own frame. Where a training begins with it in
     the middle, from a checkpoint of the unchanged trainer, they begin anew, which is logged.
@@ -118,6 +122,8 @@ class OwnFrame(Part):
             )
             return
         rate = self.at(training.progress) if step.group["lr"] else 0.0
+        if (beta1 := step.group["betas"][0]) < BETA1:
+            rate *= math.sqrt((1 - beta1) / (1 - BETA1))
         least = self.min_aspect
         if least is None:
             least = min_aspect_of(training.total_steps)
