@@ -115,9 +115,10 @@ def won(runs: Sequence[Run], baseline: str, picture: Path) -> str:
     assert theirs is not None
     if not others or reached is None:
         return f"{ours.name} ends at {psnr.mean:.2f} dB: {picture}"
+    gain = psnr.mean - theirs.mean
     return (
-        f"{ours.name} ends {psnr.mean - theirs.mean:+.2f} dB from {baseline}, whose PSNR it has "
-        f"after {reached.mean:.0f} seconds: {picture}"
+        f"{ours.name} ends {abs(gain):.2f} dB {'above' if gain > 0 else 'below'} {baseline}, whose "
+        f"PSNR it has after {reached.mean:.0f} seconds: {picture}"
     )
 
 
