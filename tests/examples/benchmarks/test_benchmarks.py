@@ -99,6 +99,32 @@ def test_the_pages_are_made_of_the_evidence() -> None:
         report.filled("<!-- evidence:nothing --><!-- end -->", report.Evidence())
 
 
+def test_the_readme_says_what_was_measured() -> None:
+    """Its numbers beside the table's are those of the evidence, of steps and of states."""
+    words = " ".join((report.ROOT / "README.md").read_text(encoding="utf-8").split())
+    all_ = report.Evidence()
+    lost = []
+    for scene in report.MAIN:
+        short = all_.of("stock", scene, iterations=10_000, **report.HALF)
+        found = report.gain(short, all_.of("stock", scene, iterations=30_000, **report.HALF))
+        assert found is not None
+        lost.append(f"{-found['psnr']:.1f}")
+    assert "loses {} dB on bonsai, {} on lego and {} on plush".format(*lost) in words
+    made = json.loads(report.GPU.read_text(encoding="utf-8"))["steps"]["results"]
+    ratios = [made[count]["defaults"]["ratio"] for count in ("100000", "1000000", "5000000")]
+    assert f"[{100 * min(ratios):.0f} to {100 * max(ratios):.0f} %]" in words
+    numbers = 59  # of a Gaussian with harmonics of degree 3
+    assert f"{4 * (numbers + 9)} bytes more" in words
+    assert f"{4 * 2 * numbers} bytes" in words
+    whole = [all_.of("defaults", s, iterations=7_500, **report.WHOLE) for s in ("bonsai", "lego")]
+    stock = [
+        all_.of("stock", s, gpu=True, iterations=15_000, **report.WHOLE) for s in ("bonsai", "lego")
+    ]
+    gains = [report.gain(*pair) for pair in zip(whole, stock, strict=True)]
+    assert all(gain is not None and gain["psnr"] > -0.05 for gain in gains)
+    assert "7,500 iterations end where stock's 15,000 do (bonsai and lego, one seed)" in words
+
+
 def test_the_picture_is_drawn(tmp_path: Path) -> None:
     report.draw(report.Evidence(), tmp_path / "iterations.png")
     assert (tmp_path / "iterations.png").stat().st_size > 20_000
