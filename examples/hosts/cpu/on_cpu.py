@@ -86,22 +86,22 @@ def keep_ends() -> None:
 
     from opt3dgs_optim import PhaseScheduler
 
-    begun: list[Any] = []
-    init: Any = PhaseScheduler.__init__
+    begun: list[Any] = []  # schedulers with their optimizers, which they hold weakly
+    upgrade: Any = PhaseScheduler.upgrade
 
-    def kept(self: Any, *args: Any, **options: Any) -> None:
-        init(self, *args, **options)
-        begun.append(self)
+    def kept(self: Any, optimizers: Any) -> Any:
+        begun.append((self, optimizers))
+        return upgrade(self, optimizers)
 
     def write() -> None:
         ends = {}
-        for phases in begun:
+        for phases, _ in begun:
             for key in phases.members:
                 state = phases.state_of_param(*key) or {}
                 ends[key[1]] = phases.param_of(*key).detach(), state.get("averaging.mean")
         torch.save(ends, os.environ["OPT3DGS_END"])
 
-    PhaseScheduler.__init__ = kept  # type: ignore[method-assign]
+    PhaseScheduler.upgrade = kept  # type: ignore[method-assign]
     atexit.register(write)
 
 
