@@ -45,7 +45,7 @@ class StepAdam(Adam):
     """`torch.optim.Adam` whose steps have the parts of a `Training`.
 
     Made by `PhaseScheduler.upgrade`, `AWSGLD` and `LQNAdam`. An upgraded optimizer is an instance
-    of this class *and* of the class that it had. Without parts its step is that class's own. What
+    of this class *and* of its former class. Without parts it steps as its former class does. What
     it keeps lies beside Adam's moments in `state[param]`, rows first.
     """
 
@@ -61,7 +61,7 @@ class StepAdam(Adam):
     _own_frame: frozenset[str] = frozenset()
 
     def follow(self, training: Training, slots: Slots) -> None:
-        """Have the parts of `training` from now on; slots are, by group, set and name."""
+        """Use `training`'s parts from now on; `slots` has each group's set and name."""
         self._last, self._own_frame = self.last_steps(), self.own_frame()
         params = [param for group in self.param_groups for param in group["params"]]
         if len(self._last) != len(params):
@@ -187,7 +187,7 @@ class StepAdam(Adam):
         return steppers if i == len(steppers) else self._new_steppers()
 
     def notice_edits(self) -> None:
-        """Drop what is kept for rows that are others since the last step; a copy knows no more."""
+        """Drop what is kept for rows replaced since the last step; a copy could not tell."""
         if self._steppers:
             self.steppers()
 
@@ -240,9 +240,9 @@ class StepAdam(Adam):
 
     @torch.no_grad()
     def put_means(self) -> int:
-        """Put the running means in the parameters' place, also after noise; of how many parameters.
+        """Put the running means in the parameters' place, also after noise; return how many.
 
-        Those stay as they are that have gone on since the end of the training.
+        Parameters stepped after the end of the training stay as they are.
         """
         found, end = 0, self.training.total_steps
         for stepper in self.steppers():
@@ -255,7 +255,7 @@ class StepAdam(Adam):
         return found
 
     def state_dict(self) -> dict[str, Any]:
-        """As torch's, with what is ours in each group, `"opt3dgs"`: a line of JSON.
+        """As torch's, with a line of JSON of ours in each group, under `"opt3dgs"`.
 
         Any Adam may load it, with the trainer's `fused` and `foreach`. Moments of 16 bits are
         float32 in it, on the host.
@@ -287,9 +287,9 @@ class StepAdam(Adam):
         note_in_groups(self.param_groups, self._slots, common, last, now, self.own_frame())
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """As torch's; the training goes on where the checkpoint was, by Adam's own count if stock.
+        """As torch's; training goes on where the checkpoint was (a stock one: by Adam's count).
 
-        Load hooks run first: they may order or drop groups.
+        Load hooks run first: they may reorder or drop groups.
 
         Raises:
             ValueError: it is damaged, or of another version; nothing has been changed.
@@ -354,7 +354,7 @@ class StepAdam(Adam):
         return tuple(made) or self._last
 
     def own_frame(self) -> frozenset[str]:
-        """The sets whose positions' moments are those of the own frame."""
+        """The sets whose positions have moments in the own frame."""
         if not self._steppers:
             return self._own_frame
         return frozenset(each.set for each in self._steppers if each.framed)

@@ -37,10 +37,10 @@ class AWSGLD(StepAdam):
             (the group named `means` or `xyz`, or the only group), or None.
         preconditioner: `"adam"`, or `"none"` for the plain SGLD drift `lr * nu * grad`, which
             samples exp(-energy / temperature) together with `IsotropicNoise(temperature=...)`.
-        moments: bits of each of Adam's two moments of a number; 16 take half of Adam's memory.
+        moments: bits per number of each of Adam's two moments; 16 halves Adam's memory.
 
     The energy is the closure's value, or comes from `histogram.observe(loss)`, called once per
-    iteration before `step()`. One that is not finite leaves nu as it is.
+    iteration before `step()`. A non-finite energy leaves nu as it is.
 
     Its state is `torch.optim.Adam`'s, and what the histogram has learnt is in `state_dict()`.
 

@@ -46,7 +46,7 @@ def check_supported(optimizer: Any, slots: Slots, moments: int = 32) -> None:
         moments: bits of each of Adam's moments of a number.
 
     Raises:
-        TypeError: it is no Adam of torch's, nor gsplat's or INRIA's masked one.
+        TypeError: it is not torch's Adam, nor gsplat's or INRIA's masked one.
         ValueError: an option or a tensor is not taken.
     """
     kind = type(optimizer)

@@ -24,8 +24,8 @@ class LQNAdam(StepAdam):
     problem of n coordinates is one row, [1, n]. A parameter [N] would be N problems of one
     coordinate, which have no curvature to speak of: there is a warning.
 
-    The gradient's place in Adam is taken by H g, scaled to the gradient's length. Adam then divides
-    by its own second moment, so that of H g little more than the direction is left. It follows that
+    In Adam, H g replaces the gradient, scaled to the gradient's length. Adam then divides by its
+    own second moment, so little more than the direction of H g is left. It follows that
 
     - on quadratics it is **slower than Adam** with a tuned learning rate for the first few hundred
       steps. After 200 steps, with three coordinates in random axes, Adam's error is smaller by more
@@ -36,15 +36,15 @@ class LQNAdam(StepAdam):
     - in the last phase of a splatting training, for which the paper proposes it, it changes next to
       nothing here: positions hardly move by then (`docs/evidence.md`).
 
-    The first two compare the best of six learning rates for each; `tests/test_lqnadam_claims.py`
-    of a clone measures them.
+    The first two compare each one's best of six learning rates; `tests/test_lqnadam_claims.py`
+    in a clone measures them.
 
-    Memory: Adam's, and for each row of three coordinates 160 bytes with five pairs.
+    Memory: Adam's, plus 160 bytes per row of three coordinates with five pairs.
 
     Args:
         params, lr, betas, eps, weight_decay: as in `torch.optim.Adam`.
         history_size, min_cosine, graft, backend: as in `Curvature`.
-        moments: bits of each of Adam's two moments of a number; 16 take half of Adam's memory.
+        moments: bits per number of each of Adam's two moments; 16 halves Adam's memory.
 
     Examples:
         Fifty starts in Rosenbrock's valley, each optimizer with the best of its rates there:

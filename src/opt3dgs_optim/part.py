@@ -17,10 +17,10 @@ from opt3dgs_optim.training import Training
 class Part:
     """One thing that a training's steps can have: a factor, fading, another gradient, ...
 
-    A part says *what* the step of a parameter has, in `plan`, by plain values; one function makes
-    the step of them (`opt3dgs_optim.step`), on a GPU in one launch. A part that needs its own
-    arithmetic has `before`, which replaces the gradient after all plans, and `after`, in torch
-    operations, at a launch for each of them.
+    In `plan`, a part sets plain values that say *what* a parameter's step has; one function makes
+    the step from them (`opt3dgs_optim.step`), on a GPU in one launch. A part with arithmetic of its
+    own has `before`, which replaces the gradient after all plans, and `after`; both use torch
+    operations, at one launch each.
 
     What a part learns of a training goes into `training.notes_of(self)`, a dict of plain numbers by
     name, which is saved with the optimizers; a part object whose state lives in itself sets
@@ -32,8 +32,8 @@ class Part:
         during: the phase in which the part acts; None: in both.
         names: the Gaussian parameters that it acts on, gsplat's names; None: every parameter.
         learns: whether the object itself changes in a training.
-        later: what it may put into a step that the first step has not, of "factor" (on a device),
-            "hold" and "mean": a GPU's kernels for it are compiled at the first step.
+        later: which of "factor" (on a device), "hold" and "mean" it may add in steps after the
+            first: a GPU's kernels for them are compiled at the first step.
     """
 
     during: ClassVar[Phase | None] = None

@@ -45,11 +45,11 @@ Optimizers = TypeVar(
 class PhaseScheduler(Training):
     """Put parts into the steps of a 3DGS trainer's optimizers, in two phases.
 
-    By default `DEFAULTS`, for relocation as in 3DGS-MCMC and for clone, split and prune alike.
+    The default, `DEFAULTS`, suits relocation as in 3DGS-MCMC and clone, split and prune alike.
     `PhaseScheduler.paper` is Opt3DGS.
 
-    The optimizers count their own steps, so that nothing else need be called: the clock is that of
-    the positions' optimizer, whatever others step between. The state travels with their
+    The optimizers count their own steps, so nothing else need be called: the positions' optimizer
+    sets the clock, whatever steps others make in between. The state travels in their
     `state_dict()`.
 
     Args:
@@ -57,15 +57,15 @@ class PhaseScheduler(Training):
         switch: where exploitation starts: a fraction of `total_steps` in (0, 1] if a float, an
             iteration if an int (`total_steps`: never). The paper: 29/30.
         parts: what the steps have, in order; None: `DEFAULTS`.
-        moments: bits of each of Adam's two moments of a number, and of the mean of the last
-            thirtieth; 16 take half of the memory, and are for the Gaussians alone (see
+        moments: bits per number of each of Adam's two moments, and of the mean of the last
+            thirtieth; 16 halves the memory, and is for the Gaussians alone (see
             docs/performance.md).
-        log: a `RunLog` that gets one line an iteration, with what the parts say of themselves.
+        log: a `RunLog` that gets one line per iteration, with what the parts report.
         process_group: a `torch.distributed` process group over whose ranks the loss is averaged,
             for parts that read it.
 
-    Memory: that of Adam, or half of it with `moments=16`. In the last thirtieth `Averaging` keeps a
-    copy of the parameters, or half of one.
+    Memory: Adam's; in the last thirtieth `Averaging` keeps a copy of the parameters, too. With
+    `moments=16` each takes half.
 
     Examples:
         >>> import torch
@@ -81,7 +81,7 @@ class PhaseScheduler(Training):
 
     Raises:
         ValueError: an option is outside what is allowed, or a part serves another training.
-        TypeError: one of the parts is none.
+        TypeError: a part is not a `Part`.
     """
 
     def __init__(
@@ -130,9 +130,9 @@ class PhaseScheduler(Training):
     def upgrade(self, optimizers: Optimizers) -> Optimizers:
         """Put the parts into a trainer's optimizers, in place; return what was given.
 
-        Which parameter a group holds is said by its `name`, or by its optimizer's key in a dict, in
-        the words of gsplat, INRIA, nerfstudio, 3DGRUT, fVDB and others. Groups of other names are
-        stepped by plain Adam. An optimizer that has loaded a checkpoint goes on where that was.
+        A group's `name`, or its optimizer's key in a dict, says which parameter it holds, in the
+        words of gsplat, INRIA, nerfstudio, 3DGRUT, fVDB and others. Groups with other names are
+        stepped by plain Adam. An optimizer that has loaded a checkpoint goes on from there.
 
         Args:
             optimizers: an Adam, a dict of them (by what they hold), or a list.
@@ -218,7 +218,7 @@ class PhaseScheduler(Training):
                 "names",
                 f"{CALL}.upgrade: the groups {others} have a row for each Gaussian, but names that "
                 "are not known, so that plain Adam steps them; name them as one of "
-                f"{', '.join(GAUSSIAN_NAMES)} (other trainers' names too) where they are these",
+                f"{', '.join(GAUSSIAN_NAMES)} (other trainers' names too) if they hold these",
             )
 
     def _upgrade(self, optimizer: Any, slots: Slots) -> None:
@@ -241,12 +241,12 @@ class PhaseScheduler(Training):
         """Give the loss to parts that read it, or put the clock where the trainer's count is.
 
         Args:
-            loss: of this iteration, 0-d; before the steps. None of `DEFAULTS` reads it.
-            iteration: from 0; for trainers whose count is another than the number of their steps.
+            loss: this iteration's, 0-d, before its steps. No part in `DEFAULTS` reads it.
+            iteration: from 0; for trainers whose count differs from the number of their steps.
 
         Raises:
-            ValueError: the loss is no single number; or the clock would go back, or further beyond
-                the end than the run is long.
+            ValueError: the loss is not a single number; or the clock would go back, or beyond
+                2 * `total_steps`.
         """
         if iteration is not None:
             iteration = check_count(f"{CALL}.observe", "iteration", iteration, 0)
@@ -269,9 +269,9 @@ class PhaseScheduler(Training):
     def pixel_loss(self, render: Tensor, target: Tensor) -> Tensor:
         """The photometric term of two images in 0..1: mean |error|, unless a part says another.
 
-        It is that of the iteration after the last step.
+        It is for the iteration after the last step.
 
-        `SquaredLoss` has the paper's mean squared error, while exploiting.
+        `SquaredLoss` has the paper's mean squared error while exploiting.
         """
         if render.shape != target.shape:
             raise ValueError(
@@ -352,7 +352,7 @@ class PhaseScheduler(Training):
             )
 
     def end_line(self) -> str | None:
-        """What is said of a training that ends now, before its end; None where it does not."""
+        """The warning if the training stops now, before its end; None if there is none."""
         return self._end.line()
 
     def __getstate__(self) -> dict[str, Any]:

@@ -25,12 +25,12 @@ class Training(Clock):
     Args:
         parts: `Part` objects, what the steps have, in order.
         total_steps, switch_step: as in `Clock`.
-        moments: bits of each of Adam's moments of a number, 32 or 16.
+        moments: bits per number of each of Adam's moments, 32 or 16.
 
     Attributes:
-        changes_steps: whether the steps are others than torch's.
-        members: by set and gsplat's name, which optimizer holds a Gaussian parameter, and in which
-            of its groups. References are weak: what a trainer replaces is freed at once.
+        changes_steps: whether the steps differ from torch's.
+        members: by set and gsplat's name, the optimizer that holds this Gaussian parameter, and its
+            group's index. References are weak: what a trainer replaces is freed at once.
         finished: whether the training has been ended early.
         averages: whether there is room for the mean of the last iterates.
         messages: what has been said, each thing once.
@@ -87,12 +87,12 @@ class Training(Clock):
         return None if optimizer is None or param is None else optimizer.state.get(param) or None
 
     def optimizers(self) -> list[Any]:
-        """Those that hold Gaussian parameters."""
+        """Optimizers with Gaussian parameters."""
         found = {id(o): o for m in self.members.values() if (o := m[0]()) is not None}
         return list(found.values())
 
     def clocks(self) -> list[int]:
-        """Of each optimizer whose steps are counted, the iteration that it steps next."""
+        """The next iteration of each optimizer whose steps are counted."""
         counted = [o for o in self.optimizers() if o.has_means or not self.counts_means]
         return [each.next_iteration for each in counted]
 
@@ -128,7 +128,7 @@ class Training(Clock):
             self.look_at_numbers()
 
     def resume(self, iteration: int) -> None:
-        """Go on at an iteration; what was kept from step to step is of another one."""
+        """Go on at an iteration; drop what was kept from step to step before."""
         super().resume(iteration)
         self.unsaved.clear()
         self._look_at = min(self._look_at, iteration + LOOK_INTERVAL)

@@ -107,5 +107,5 @@ def _by_hand(text: str) -> str:
     differs = misses(best, text) if best.signs else ["a line of it must be replaced"]
     return (
         f"it is like {best.title}, but {'; '.join(differs[:3])}. Read the file, then write by hand "
-        f"what holds of these lines ({', '.join(numbers)}):\n\n{best.block}"
+        f"those lines that fit ({', '.join(numbers)}):\n\n{best.block}"
     )

@@ -165,11 +165,11 @@ def take_pairs(
 def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:
     """The history of points whose curvature pairs are known, for `two_loop`.
 
-    A pair says how the gradient of a point changes along a displacement of it, y = B s with the
-    Hessian B of the point's own function. A pair with s.y > 0 is kept; for a point without one, as
-    where the function is concave along s, or where a number is not finite, that pair is left out,
-    and the point holds one pair less. H would not be positive definite with it. Both vectors of a
-    pair are stored divided by sqrt(s.y), which changes nothing: H depends on their ratio.
+    A pair says how a point's gradient changes along a displacement of it, y = B s with the Hessian
+    B of the point's own function. A pair is kept if s.y > 0. Otherwise, as where the function is
+    concave along s, or where a number is not finite, it is left out, and the point holds one pair
+    less: with it, H would not be positive definite. Both vectors of a pair are stored divided by
+    sqrt(s.y), which changes nothing: H depends on their ratio.
 
     Args:
         s: [K, N, D] differences of the parameters of N points of D coordinates, in the parameters'

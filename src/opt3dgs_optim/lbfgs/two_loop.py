@@ -38,9 +38,9 @@ def two_loop(
     quasi-Newton direction, but with the minus sign it has to be the pseudo-gradient H g.
     `Curvature` and `LQNAdam` collect pairs while they train, and use it so.
 
-    On an NVIDIA GPU, points of three coordinates with at most five pairs are one CUDA kernel, where
-    `backend_info` says that kernels run. All else, and what `torch.compile` traces, is pure torch.
-    Both have the same numbers up to rounding. Nothing waits for the GPU. The result has no autograd
+    On an NVIDIA GPU where `backend_info` says that kernels run, points of three coordinates with at
+    most five pairs take one CUDA kernel. All else, and what `torch.compile` traces, is pure torch.
+    Both give the same numbers up to rounding. Nothing waits for the GPU. The result has no autograd
     graph.
 
     Args:
@@ -48,9 +48,9 @@ def two_loop(
             in units of the loss per unit of the parameters.
         history: [N, slots, 2 (D + 1)] of the gradient's dtype, as `history_from_pairs` makes it. It
             is not changed.
-        history_size: K, the number of pairs that the history has room for, at least 1. Of D
-            coordinates, the history of D pairs has the shape of one of D + 1: the shape does not
-            tell them apart.
+        history_size: K, the number of pairs that the history has room for, at least 1. For D
+            coordinates, histories of D and of D + 1 pairs have the same shape, which does not tell
+            them apart.
         backend: `"auto"` takes the CUDA kernel where it can run; `"cuda"` and `"torch"` insist.
 
     Returns:

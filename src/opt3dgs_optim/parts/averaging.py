@@ -18,17 +18,17 @@ ITERATES = 250  # at least are averaged, where there are as many; more gain noth
 class Averaging(Part):
     """Put the mean of the last iterates in the place of the last one (Polyak and Juditsky 1992).
 
-    Every step follows one view, so the parameters wander about what fits all of them, the further
-    the higher their learning rates; their mean does not. Averaging covers the last thirtieth of the
-    run: 250 iterates of it, or all where there are fewer than 500. In the last tenth of that, in
-    the last two iterations at least, the mean takes the parameters' place, because trainers save
-    before their last step. Until then nothing is changed.
+    Every step follows one view, so the parameters wander around what fits all views, further with
+    higher learning rates; their mean does not. Averaging covers the last thirtieth of the run: 250
+    of its iterates, or all if there are fewer than 500. In the last tenth of it, at least the last
+    two iterations, the mean takes the parameters' place, because trainers save before their last
+    step. Until then nothing is changed.
 
-    After an edit of rows the means of the edited parameters begin anew: density control should end
-    before. Iterates that are not finite are left out. In the last thirtieth it takes the memory of
-    the parameters once more, and four numbers a row. Beside moments of 16 bits each number of the
-    mean has 16, too, except positions. Where a GPU has no room for it, the training goes on
-    without, which is said.
+    After an edit of rows the edited parameters' means begin anew: density control should end before
+    the averaging. Iterates that are not finite are left out. In the last thirtieth it takes the
+    parameters' memory once more, plus four numbers a row. With moments of 16 bits the mean's
+    numbers have 16 bits, too, except positions. If a GPU has no room for it, there is a warning,
+    and the training goes on without.
     """
 
     later = ("mean",)

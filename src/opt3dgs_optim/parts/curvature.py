@@ -106,11 +106,11 @@ class Curvature(Part):
         return {} if share is None else {"accepted": share}
 
     def state_dict(self) -> dict[str, Any]:
-        """Of how many pairs the history is; the pairs are in the optimizers' state."""
+        """How many pairs the history has; the pairs are in the optimizers' state."""
         return {"history_size": self.history_size}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Refuse pairs of another number than this part keeps: ValueError."""
+        """ValueError if the number of pairs differs from this part's."""
         if state.get("history_size") != self.history_size:
             raise ValueError(
                 f"Curvature.load_state_dict: history_size={state.get('history_size')!r}, but pairs "

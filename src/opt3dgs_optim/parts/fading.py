@@ -30,18 +30,18 @@ class Fading(Part):
     an event is as long as before. Later ones are up to five times longer, until exp_avg_sq has
     recovered, which takes about a thousand iterations.
 
-    The same points are faded in all these parameters. Which ones depends on `seed`, on the event
-    and on the point's index alone: a resumed run repeats them, and every device chooses the same.
+    The same points are faded in all of `names`. Which ones depends only on `seed`, the event and
+    the point's index: a resumed run repeats them, and every device chooses the same.
     It costs no memory. Positions that `OwnFrame` steps are left alone: a faded step of them would
     be half a standard deviation long.
 
     Args:
-        share: of the points in each event, chance per point in (0, 1].
+        share: each point's chance to be faded in an event, in (0, 1].
         exp_avg, exp_avg_sq: factors on the moments, in [0, 1]. exp_avg^2 <= exp_avg_sq keeps the
             next step from being longer than the last.
-        events: how many over the run, but never less than 4 iterations apart. Where there are many
-            points they are small and lose detail by so many events. So with N > 10,000 points only
-            (10,000 / N)^(2/3) of the events happen, and a third of them at least.
+        events: how many over the run, but never less than 4 iterations apart. Where points are
+            many, they are small, and so many events cost detail. So with N > 10,000 points only
+            (10,000 / N)^(2/3) of the events happen, but at least a third of them.
         start, stop: the stretch over which they are spread, as shares of the run; the last event
             is at its end.
         seed: of the choice of points.

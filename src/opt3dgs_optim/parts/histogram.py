@@ -36,24 +36,24 @@ class EnergyHistogram(Part):
     range and a temperature it is the paper's update, to the letter (`FixedPartitions`);
     `EnergyHistogram.paper()` has its numbers.
 
-    The default is made for trainings. **For sampling** a fixed energy give both `energy_range`,
-    from the lowest energy to a little above the barriers that are to be crossed, and `temperature`,
-    that of the noise (`IsotropicNoise`), and `warmup=0`. The default's partitions follow the walk,
-    so that the well in which it began looks like all there is. In a double well whose barrier is
+    The default is made for trainings. **To sample** a fixed energy, give `energy_range`, from the
+    lowest energy to a little above the barriers that are to be crossed, `temperature`, the same as
+    the noise's (`IsotropicNoise`), and `warmup=0`. The default's partitions follow the walk, so
+    the well in which it began looks like all there is. In a double well whose barrier is
     six times the temperature, a walk of 20,000 steps of 0.006 crossed it once without a histogram,
     5 times with the default, and some 40 times with a range and a temperature
     (`python tests/test_lqnadam_claims.py`).
 
     Args:
-        num_partitions: number of partitions; None for 48 that follow the energy, 200 of a range.
+        num_partitions: number of partitions; None: 48 if they follow the energy, 200 for a range.
         energy_range: (low, high) in units of the loss, cut uniformly; the first and the last
             partition are open (eq. 7). `"auto"`: see above.
         zeta: flattening exponent, from 0 to 1. With an automatic temperature it must be neither 0
             nor 1, and cancels.
-        temperature: tau, in units of the loss; automatic where the range is, and only there.
+        temperature: tau, in units of the loss; `"auto"` exactly when `energy_range` is.
         warmup: number of energies during which nu is 1 while Theta is being estimated.
         clamp: (low, high) bounds of nu, around 1, or None; `"auto"` is (-1, 3) for partitions that
-            follow the energy, where nu seldom leaves 0 to 2, and (-5, 5) for those of a range.
+            follow the energy, where nu seldom leaves 0 to 2, and (-5, 5) for a range.
 
     Raises:
         ValueError: an option is outside what is allowed.

@@ -23,9 +23,9 @@ GATE_OPACITY = 0.005  # t of eq. 2's gate: the opacity under which a Gaussian co
 class PositionNoise(Part):
     """3DGS-MCMC's position noise: `scale * lr * covariance_noise(...)` after each step (eq. 2).
 
-    For trainers that do not inject it themselves; gsplat's MCMCStrategy and 3dgs-mcmc do, and
-    then this part must be left out (or their noise_lr be 0). lr is the trainer's own present
-    learning rate of the positions, without any factor.
+    For trainers that do not inject it themselves. gsplat's MCMCStrategy and 3dgs-mcmc do: leave
+    this part out there (or set their noise_lr to 0). lr is the trainer's own present learning
+    rate of the positions, without any factor.
 
     Args:
         gaussians: the trainer's dict with `scales` [N, 3] log, `quats` [N, 4] wxyz and
@@ -101,8 +101,8 @@ class IsotropicNoise(Part):
     """Langevin noise of a landscape: `sqrt(2 lr temperature)`, or a fixed deviation, times eta.
 
     Args:
-        temperature: that of the law exp(-energy / temperature) which plain SGLD drift
-            (`AWSGLD(preconditioner="none")`) then samples, in units of the energy.
+        temperature: in units of the energy. Plain SGLD drift
+            (`AWSGLD(preconditioner="none")`) then samples exp(-energy / temperature).
         std: a fixed deviation per step, in units of the parameters, instead of a temperature.
         generator: random generator of the parameters' device, or None for torch's own.
 

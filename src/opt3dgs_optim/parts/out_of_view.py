@@ -30,15 +30,15 @@ MIN_SEEN_SHARE = 0.01  # a view counts as seeing at least so much
 class OutOfView(Part):
     """Hold the scales and opacities of points out of view, which regularisers would destroy.
 
-    3DGS-MCMC's regularisers pull at the scale and the opacity of every point in every iteration,
-    and Adam makes a full step of a gradient however small it is. Relocation and `Fading` empty
-    second moments, so a point out of view then shrinks and fades until a view sees it again. Where
-    each view sees a tenth of the points, most of them are dead by then.
+    3DGS-MCMC's regularisers pull on the scale and the opacity of every point in every iteration,
+    and Adam takes a full step however small a gradient is. Relocation and `Fading` empty second
+    moments, so a point out of view then shrinks and fades until a view sees it again. Where each
+    view sees a tenth of the points, most points are dead by then.
 
-    This part keeps the mean share s of the points that a view sees, over the last 100 views, of
+    This part keeps s, the mean share of the points that a view sees, over the last 100 views, of
     which it looks at one in four. While s is below a third, the second moment of a point out of
-    view is raised to at least (gradient / (3 s))^2, so that its steps are at most about 3 s of a
-    full one. Above a third nothing is changed, bit for bit.
+    view is raised to at least (gradient / (3 s))^2, so its steps are at most about 3 s times a full
+    step. Above a third nothing is changed, bit for bit.
 
     A point is out of view where the gradient of its position is zero. Points whose position has
     never had a gradient do not count in s: frozen positions are not out of view. The positions'
@@ -49,7 +49,7 @@ class OutOfView(Part):
     later = ("hold",)
 
     def plan(self, step: Step, training: Training) -> None:
-        """See at the positions [N, 3] who is out of view; hold the others' second moments."""
+        """Find points out of view by `means.grad`; hold the other names' second moments."""
         seen = training.unsaved.get((OutOfView, step.set))
         if seen is None:
             seen = _Seen(f"share {step.set}".rstrip(), training.notes_of(self))

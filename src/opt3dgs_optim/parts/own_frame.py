@@ -29,36 +29,35 @@ class OwnFrame(Part):
     3DGS moves every centre by one learning rate in world units, while the sizes of the Gaussians of
     one scene differ by a factor of fifty, and the axes of one Gaussian by twenty. A step that a
     large Gaussian does not notice throws a small one out of its place. Here Adam is fed the
-    gradient in the Gaussian's own frame, and what it answers is a step along the Gaussian's axes: a
-    full step is `rate` standard deviations. It does not depend on the unit of the scene, nor on the
-    positions' learning rate, but that a learning rate of 0 holds them.
+    gradient in the Gaussian's own frame, and returns a step along the Gaussian's axes: a full step
+    is `rate` standard deviations. It does not depend on the unit of the scene, nor on the
+    positions' learning rate, except that a learning rate of 0 holds them.
 
     Trained Gaussians are thin, often far thinner than a pixel. Steps in proportion to such an axis
-    would hold the Gaussian fast across its own surface, so that an axis counts as no thinner than
-    `min_aspect` of the longest. The fewer steps a training has, the longer those must be: where
-    nothing is said the share is 3,000 / total_steps, within 0.1 (from 30,000 iterations on) and
-    0.25 (up to 12,000).
+    would pin the Gaussian across its own surface, so an axis counts as no thinner than `min_aspect`
+    of the longest. The fewer steps a training has, the longer they must be: by default this share
+    is 3,000 / total_steps, but between 0.1 (from 30,000 iterations on) and 0.25 (up to 12,000).
 
-    gsplat takes a batch of b views, or as many ranks, by beta1 = 1 - 0.1 b and rates times sqrt(b).
-    The rate here follows beta1: it is times sqrt((1 - beta1) / 0.1) where beta1 is below 0.9.
+    For b views in a batch, or b ranks, gsplat sets beta1 = 1 - 0.1 b and scales rates by sqrt(b).
+    The rate here follows beta1: below beta1 = 0.9 it is scaled by sqrt((1 - beta1) / 0.1).
 
-    Adam's moments of the positions then belong to the own frame. Where a training begins with it in
-    the middle, from a checkpoint of the unchanged trainer, they begin anew, which is logged.
+    Adam's moments of the positions then belong to the own frame. In a training that adds it midway,
+    from a checkpoint of the unchanged trainer, they begin anew, which is logged.
     Scales (log) and quaternions [N, 4] (wxyz) of the same points must be among the upgraded
-    optimizers' groups; where they are not, it is said once, and the positions are stepped by Adam.
-    Scales are [N, 3], [N, 2] of flat Gaussians (2DGS), whose third axis counts as `min_aspect` of
-    the longest, or [N, 1] of round ones. gsplat's trainer of flat Gaussians has a third scale that
-    nothing trains: leave the part out there. A Gaussian whose axes are not finite is not moved.
+    optimizers' groups; if not, there is one warning, and plain Adam steps the positions.
+    Scales are [N, 3]; [N, 2] for flat Gaussians (2DGS), whose third axis counts as `min_aspect` of
+    the longest; or [N, 1] for round ones. gsplat's trainer for flat Gaussians has a third scale
+    that nothing trains: leave the part out there. A Gaussian with non-finite axes is not moved.
 
     It keeps nothing from step to step.
 
     Args:
-        rate: standard deviations of a full step in the first iteration, above 0.
-        final: share of `rate` in the last iteration, above 0. 3DGS trainers give the positions'
-            learning rate a decay to 0.01; here longer steps at the end gain in short trainings.
-        min_aspect: share of a Gaussian's longest standard deviation that a shorter one counts as,
-            at least, in 0..1; 0: every axis counts as it is, 1: a Gaussian counts as a ball; None:
-            by the length of the training.
+        rate: a full step in the first iteration, in standard deviations; above 0.
+        final: share of `rate` in the last iteration, above 0. 3DGS trainers decay the positions'
+            learning rate to 0.01 of it; here longer last steps help in short trainings.
+        min_aspect: least share of a Gaussian's longest standard deviation that a shorter one counts
+            as, in 0..1; 0: every axis counts as it is, 1: a Gaussian counts as a ball; None: set by
+            the length of the training.
 
     Raises:
         ValueError: an option is outside what is allowed.

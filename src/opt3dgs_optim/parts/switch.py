@@ -14,9 +14,9 @@ from opt3dgs_optim.training import Training
 
 @dataclass(frozen=True, repr=False)
 class SquaredLoss(Part):
-    """The photometric term is L2 in the place of L1 while exploiting (Opt3DGS, section 4.2).
+    """The photometric term is L2 instead of L1 while exploiting (Opt3DGS, section 4.2).
 
-    The trainer calls `phases.pixel_loss(render, target)` in the place of its L1.
+    The trainer calls `phases.pixel_loss(render, target)` instead of its L1.
     """
 
     during = Phase.EXPLOITATION

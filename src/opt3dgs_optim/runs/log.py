@@ -53,13 +53,13 @@ class RunLog(AbstractContextManager["RunLog"]):
 
     Args:
         path: the log file, a new one unless the run resumes. Missing parent folders are made.
-        metadata: what describes the run, as JSON can hold it; others, as paths, by their `str`. The
-            report groups runs by `scene` and `arm`, and pairs those of two arms by `seed`.
-        resume: the iteration of the checkpoint from which the run goes on in the log at `path`, and
-            its clock with it. Readers leave out what was logged past that iteration. `metadata` is
-            added to the log's, and its entries win.
-        clock: returns seconds. `time.process_time` counts those of this process alone: a CPU that
-            is busy with others changes nothing.
+        metadata: what describes the run, as JSON; what JSON cannot hold, such as paths, as a `str`.
+            The report groups runs by `scene` and `arm`, and pairs runs of two arms by `seed`.
+        resume: the iteration of the checkpoint from which the run and its clock go on, in the log
+            at `path`. Readers leave out what was logged past that iteration. `metadata` is added to
+            the log's, and its entries win.
+        clock: returns seconds. `time.process_time` counts this process alone: a CPU that is busy
+            with others changes nothing.
 
     Raises:
         FileExistsError: two runs in one file would be compared as one.
@@ -122,9 +122,9 @@ class RunLog(AbstractContextManager["RunLog"]):
     def step(self, iteration: int, *, phase: str | None = None, **columns: Number) -> None:
         """Log one optimization step: `log.step(iteration, loss=loss, lr=1e-3)`.
 
-        `columns` are numbers of Python or numpy, or tensors of one element on any device, by a name
-        of your own. Not every step needs the same ones. The report shows the means over the run of
-        the columns whose name says no loss.
+        `columns` are Python or numpy numbers, or tensors of one element on any device, under names
+        of your own. Not every step needs the same ones. The report shows each column's mean over
+        the run, except for losses (by name).
 
         Raises:
             ValueError: a negative iteration, a name of the log's own, what is not one number, or
