@@ -57,7 +57,7 @@ class ParamStepper:
         self.parts = mine
         self._arrange(-1)
         self.later = tuple(sorted({each for p in mine for each in p.later}))
-        self.stepped_in: int | None = -1
+        self.stepped_in: int | None = None
         self.framed: bool | None = None
         self._exp_avg: Any = None  # a weak reference to that beside which something is kept
 

@@ -82,9 +82,9 @@ class Training(Clock):
 
     def state_of_param(self, set_name: str, name: str) -> dict[str, Any] | None:
         """The optimizer's state of a Gaussian parameter; None before its first step."""
-        param, member = self.param_of(set_name, name), self.members.get((set_name, name))
-        optimizer = None if member is None else member[0]()
-        return None if optimizer is None or param is None else optimizer.state.get(param) or None
+        param = self.param_of(set_name, name)
+        optimizer = None if param is None else self.members[set_name, name][0]()
+        return None if param is None or optimizer is None else optimizer.state.get(param) or None
 
     def optimizers(self) -> list[Any]:
         """Optimizers with Gaussian parameters."""
