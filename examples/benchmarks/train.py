@@ -34,6 +34,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 EVALUATIONS = 10
+KEPT = ("size", "density", "arm", "iterations", "points", "sh_degree", "seed", "views")
+KEPT += ("rates", "threshold")
 DENSITIES = ("relocation", "clone-and-split")
 Lpips = Callable[[Tensor, Tensor], float]  # of images [H, W, 3] in 0..1
 
@@ -139,13 +141,9 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-@command("train")
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line."""
-    args = parser().parse_args(arguments)
-    torch.set_num_threads(1)
-    scene, arm = scene_of(args), find_arm(args.arm)
-    options = FitOptions(
+def options_of(args: argparse.Namespace) -> FitOptions:
+    """How to fit."""
+    return FitOptions(
         args.iterations,
         args.points,
         args.seed,
@@ -153,15 +151,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         rates=args.rates,
         threshold=args.threshold,
     )
-    kept = ("size", "density", "arm", "iterations", "points", "sh_degree", "seed", "views")
-    kept += ("rates", "threshold")
-    record = {"scene": scene.name, **{name: vars(args)[name] for name in kept}}
+
+
+def record_of(args: argparse.Namespace, scene: Scene) -> dict[str, Any]:
+    """What is trained, where and when."""
+    record = {"scene": scene.name, **{name: vars(args)[name] for name in KEPT}}
     record |= {"machine": f"{platform.system()} {platform.machine()}, torch {torch.__version__}"}
-    record |= {"date": time.strftime("%Y-%m-%d", time.gmtime())}
-    name = "-".join(str(record[key]) for key in ("scene", *kept))
+    return record | {"date": time.strftime("%Y-%m-%d", time.gmtime())}
+
+
+@command("train")
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line."""
+    args = parser().parse_args(arguments)
+    torch.set_num_threads(1)
+    scene, arm = scene_of(args), find_arm(args.arm)
+    record = record_of(args, scene)
+    name = "-".join(str(record[key]) for key in ("scene", *KEPT))
     out = args.out or Path("runs/benchmarks", f"{name}.json")
     out.parent.mkdir(parents=True, exist_ok=True)
-    fit = fit_of(scene, arm, options, args.density)
+    fit = fit_of(scene, arm, options_of(args), args.density)
     train(fit, record, out, args.lpips and lpips_of(*args.lpips))
     print(out)
     return 0

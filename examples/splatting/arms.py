@@ -43,13 +43,15 @@ class Arm:
     beta1: float = 0.9
     decays: bool = True  # the positions' rate, to a hundredth
     moments: Literal[32, 16] = 32  # bits of Adam's moments
+    open_end: bool = False  # whether the scheduler is told no number of iterations
 
     def scheduler(self, iterations: int) -> PhaseScheduler | None:
         """Of one training; None where the trainer's own Adam stays as it is."""
         if self.parts is None:
             return None
         parts = self.parts(iterations)
-        return PhaseScheduler(iterations, parts=parts, moments=self.moments)
+        total = None if self.open_end else iterations
+        return PhaseScheduler(total, parts=parts, moments=self.moments)
 
 
 def of(*parts: Part) -> Callable[[int], Sequence[Part]]:
@@ -61,6 +63,13 @@ _ARMS = (
     Arm(BASELINE, "the trainer as its authors publish it: the baseline"),
     Arm("defaults", "the package's defaults", of(*DEFAULTS)),
     Arm("defaults-16", "as defaults, Adam's moments in 16 bits", of(*DEFAULTS), moments=16),
+    Arm(
+        "open-end",
+        "the defaults without a planned end, for `benchmarks/open_end.py`",
+        of(*DEFAULTS),
+        decays=False,
+        open_end=True,
+    ),
     Arm("averaged", "the baseline, its last thirtieth averaged", of(Averaging())),
     Arm("x2", "the baseline, all steps times 2", of(Longer(2.0))),
     Arm("x3", "the baseline, all steps times 3", of(Longer(3.0))),

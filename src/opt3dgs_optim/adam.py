@@ -27,8 +27,8 @@ from opt3dgs_optim.checkpoint import (
     note_in_groups,
     numbers_of,
     recode_all,
-    restore_notes,
     restore_parts,
+    restore_training,
     steps_of_a_stock_adam,
     take_from_groups,
 )
@@ -330,17 +330,16 @@ class StepAdam(Adam):
         missed = steps_of_a_stock_adam(counts, saved, training)
         ours = None if missed else saved  # what it says of the moments holds
         self._last, self._own_frame = ((), frozenset()) if ours is None else (last, own_frame)
-        drop_other_means(self.state.values(), ours, training)
         if saved is not None:
-            iteration = saved["iteration"] + max(missed, 0)
+            restore_training(training, saved)
+            iteration = saved["iteration"] + missed
         else:
             iteration = iteration_by_counts(type(self).__name__, counts, training)
+        drop_other_means(self.state.values(), ours, training)
         self._steppers, self._in_order, self.next_iteration = [], [], iteration
         clocks = training.clocks()
         if saved is not None or (counts and (self.has_means or not any(clocks))):
             training.resume(max([iteration, *clocks]))  # one that steps now and then lags
-        if saved is not None:
-            restore_notes(training, saved)
         recode_all(self.state, self.coded, saved, training)
         self.coded = training.moments == 16
         if not training.changes_steps:

@@ -19,8 +19,9 @@ from opt3dgs_optim.training import Training
 # In each group of a checkpoint, as a line of JSON, so that a group may be moved or dropped, and
 # that who takes nested states apart (torch.distributed.checkpoint) finds one leaf.
 STATE_KEY = "opt3dgs"
-FORMAT = 5
-COMMON = {"format", "iteration", "total_steps", "steps", "moments", "notes", "parts", "kept"}
+FORMAT = 6
+COMMON = {"format", "iteration", "total_steps", "fall_step", "steps", "moments", "notes", "parts"}
+COMMON |= {"kept"}
 OF_GROUP = {"last", "own_frame"}
 
 
@@ -43,6 +44,7 @@ def numbers_of(training: Training, next_iteration: int, steps: int, kept: int) -
         "format": FORMAT,
         "iteration": max(next_iteration, training.iteration),  # it may have been put on
         "total_steps": training.total_steps,
+        "fall_step": training.fall_step,
         "steps": steps,
         "moments": training.moments,
         "kept": kept,
@@ -146,8 +148,10 @@ def restore_parts(training: Training, saved: Iterable[Mapping[str, Any]]) -> Non
         raise
 
 
-def restore_notes(training: Training, saved: Mapping[str, Any]) -> None:
-    """Have the parts know what they had noted."""
+def restore_training(training: Training, saved: Mapping[str, Any]) -> None:
+    """Have the parts know what they had noted, and a training of no planned end of its fall."""
+    if training.open_end and saved["fall_step"] is not None:
+        training.plan_fall(saved["fall_step"], saved["total_steps"])
     for part in training.parts:
         if type(part).__name__ in saved["notes"]:
             notes = training.notes_of(part)
@@ -263,8 +267,9 @@ def check_numbers(call: str, saved: Any, count: int) -> None:
             "Adam's moments alone"
         )
     check_count(call, "iteration", saved["iteration"], 0)
-    if saved["total_steps"] is not None:
-        check_count(call, "total_steps", saved["total_steps"], 1)
+    for name in ("total_steps", "fall_step"):
+        if saved[name] is not None:
+            check_count(call, name, saved[name], int(name == "total_steps"))
     check_count(call, "steps", saved["steps"], 0)
     check_count(call, "kept", saved["kept"], 0)
     check_choice(call, "moments", saved["moments"], (32, 16))

@@ -18,13 +18,16 @@ class Clock:
     """Optimizers count their own steps: an iteration begins with the first that steps again.
 
     Args:
-        total_steps: iterations of the training; None: it has no end.
+        total_steps: iterations of the training; None: no end is planned.
         switch_step: the iteration in which exploitation starts; None: never.
 
     Attributes:
         iteration: the present one, from 0; -1 before the first step.
         exploiting: whether it is past the switch. exploits_next: whether the next one is.
-        progress: the share of the training that is over, 0..1; 0 where it has no end.
+        progress: the share of a planned training that is over, 0..1.
+        open_end: whether no end was planned. Then `total_steps` is None, but in a fall.
+        fall_step: the iteration with which the fall to the end begins; None: there is none.
+        fallen: the share of the fall that is over, 0..1.
         counts_means: whether one of the optimizers holds positions: it alone counts.
     """
 
@@ -33,6 +36,8 @@ class Clock:
         self._switch = math.inf if switch_step is None else switch_step
         self.iteration, self.exploiting, self.exploits_next = -1, False, self._switch <= 0
         self.progress, self.counts_means = 0.0, False
+        self.open_end, self.fallen = total_steps is None, 0.0
+        self.fall_step: int | None = None
         self._means_at = -1  # the iteration of the positions' last step
         self._means_open = False  # whether they were stepped first there
         self._begun = -1  # the iteration of the last step: `observe` puts the clock beyond it
@@ -85,10 +90,21 @@ class Clock:
 
     def go_to(self, iteration: int) -> None:
         """Be at that iteration."""
+        start, end = self.fall_step, self.total_steps
+        if end is not None and start is None:
+            self.progress = min(max(iteration / end, 0.0), 1.0)
+        elif end is not None and start is not None:
+            self.fallen = max((iteration - start) / (end - start), 0.0)
+            if iteration >= end:  # it goes on
+                self.plan_fall(None, None)
         self.iteration, self.exploiting = iteration, iteration >= self._switch
         self.exploits_next = iteration + 1 >= self._switch
-        if self.total_steps:
-            self.progress = min(max(iteration / self.total_steps, 0.0), 1.0)
+
+    def plan_fall(self, start: int | None, end: int | None) -> None:
+        """Have a training of no planned end fall from one iteration to another, or no more."""
+        self.fall_step, self.total_steps, self.fallen = start, end, 0.0
+        if self.switch_step is None:
+            self._switch = math.inf if start is None else start
 
     def advanced(self) -> None:
         """Called once in each iteration, before its first step."""

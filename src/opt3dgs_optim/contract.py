@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.optim import Adam, AdamW, Optimizer
 
-from opt3dgs_optim.names import split_name
+from opt3dgs_optim.names import GAUSSIAN_NAMES, split_name
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.parts.curvature import Curvature
 from opt3dgs_optim.parts.own_frame import OwnFrame
@@ -208,3 +208,53 @@ def slots_of(key: str | None, optimizer: Any) -> Slots:
     if key is not None and len(groups) == 1 and found[0][1] is None:
         found = [split_name(key)]
     return found
+
+
+def check_held_together(
+    call: str, given: list[tuple[Any, Any]], slots: list[Slots], moments: int
+) -> None:
+    """ValueError unless optimizers, with their keys, hold Gaussians, each parameter once."""
+    held = [slot for each in slots for slot in each if slot[1] is not None]
+    if not held:
+        names = [g.get("name") or key for key, o in given for g in o.param_groups]
+        raise ValueError(
+            f"{call}: no Gaussians among the groups {names}; name the groups, or the "
+            f"keys of a dict, as one of {', '.join(GAUSSIAN_NAMES)} (other trainers' names too)"
+        )
+    for (_, optimizer), its in zip(given, slots, strict=True):
+        if moments == 16 and not any(name for _, name in its):
+            raise ValueError(
+                f"{call}: moments=16, but the {type(optimizer).__name__} of "
+                f"{len(optimizer.param_groups)} other groups holds no Gaussians; upgrade those "
+                "of the Gaussians alone, or take moments=32"
+            )
+    doubled = sorted({name for name in held if held.count(name) > 1})
+    if doubled:
+        raise ValueError(
+            f"{call}: {doubled[0][1]!r} is held twice; for two sets of Gaussians name "
+            "the groups 'first#means', 'second#means', or make a scheduler for each"
+        )
+
+
+def line_of_unknown_groups(
+    call: str, given: list[tuple[Any, Any]], slots: list[Slots]
+) -> str | None:
+    """What to say of groups that have a row for each Gaussian, under names that are not known."""
+    groups = [
+        (group, name)
+        for (_, optimizer), its in zip(given, slots, strict=True)
+        for group, (_, name) in zip(optimizer.param_groups, its, strict=True)
+    ]
+    rows = {len(group["params"][0]) for group, name in groups if name and group["params"]}
+    found = [
+        str(group.get("name"))
+        for group, name in groups
+        if name is None and any(p.dim() and len(p) > 1 and len(p) in rows for p in group["params"])
+    ]
+    if not found:
+        return None
+    return (
+        f"{call}: the groups {found} have a row for each Gaussian, but names that are not known, "
+        f"so that plain Adam steps them; name them as one of {', '.join(GAUSSIAN_NAMES)} (other "
+        "trainers' names too) if they hold these"
+    )

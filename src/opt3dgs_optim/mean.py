@@ -79,8 +79,8 @@ def drop_means(states: Iterable[dict[str, Any]]) -> None:
 
 
 def like_rows(numbers: Tensor, param: Tensor) -> Tensor:
-    """Numbers of rows [N] that broadcast with a parameter [N, ...]."""
-    return numbers.view(-1, *[1] * (param.dim() - 1))
+    """Numbers of rows [N] that broadcast with a parameter [N, ...]; of one number [] alone."""
+    return numbers.view((*numbers.shape, *[1] * (param.dim() - numbers.dim())))
 
 
 def take_into_mean(

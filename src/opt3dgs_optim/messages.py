@@ -52,12 +52,15 @@ class End:
     """Whether a training ended early, which is told when its scheduler goes, or at exit.
 
     Attributes:
-        mean_at: the first iteration after which the mean is in the parameters' place;
-            `total_steps`: there is none, without `Averaging`, or in so short a training.
+        total_steps: of the training; None: its end is not planned yet.
+        mean_at: the first iteration after which the mean is in the parameters' place; infinity: it
+            is not planned yet; `total_steps`: there is none, without `Averaging`, or in so short a
+            training.
     """
 
-    def __init__(self, total_steps: int, mean_at: int) -> None:
-        self.total_steps, self.mean_at = total_steps, mean_at
+    def __init__(self) -> None:
+        self.total_steps: int | None = None
+        self.mean_at: float | None = None
         self.upgraded = False  # and not resumed: a checkpoint may be loaded to be looked at
         self.done = 0  # iterations, if any was made here
         self.finished = False
@@ -71,7 +74,15 @@ class End:
                 "opt3dgs_optim: the optimizers that were upgraded have made no step; upgrade those "
                 "that the training steps, after they have been made"
             )
-        if not 0 < self.done <= self.mean_at < self.total_steps:
+        if self.mean_at is None or self.mean_at == self.total_steps or not self.done:
+            return None
+        if self.total_steps is None:
+            return (
+                f"opt3dgs_optim: the training ended at iteration {self.done} without a fall to "
+                "the end, so that the parameters are the last iterate and no mean; call "
+                "phases.finish_in(n) n iterations before it ends"
+            )
+        if self.done > self.mean_at:
             return None
         return (
             f"opt3dgs_optim: the training ended at iteration {self.done} of {self.total_steps}, so "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import weakref
 from collections.abc import Mapping, Sequence
 from numbers import Integral
@@ -17,19 +18,21 @@ from opt3dgs_optim.checks import check_count, check_energy, check_number
 from opt3dgs_optim.clock import Phase
 from opt3dgs_optim.contract import (
     Slots,
+    check_held_together,
     check_parts,
     check_slots,
     check_supported,
+    line_of_unknown_groups,
     named,
     slots_of,
 )
 from opt3dgs_optim.device import mean_over_ranks, num_ranks
 from opt3dgs_optim.messages import LOGGER, End, say
-from opt3dgs_optim.names import GAUSSIAN_NAMES
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.parts.averaging import Averaging
 from opt3dgs_optim.parts.fading import Fading
 from opt3dgs_optim.parts.own_frame import OwnFrame
+from opt3dgs_optim.plateau import Plateau
 from opt3dgs_optim.presets import DEFAULTS, PAPER_STEPS, PAPER_SWITCH, paper_parts
 from opt3dgs_optim.training import Training
 
@@ -53,9 +56,11 @@ class PhaseScheduler(Training):
     `state_dict()`.
 
     Args:
-        total_steps: iterations of the training, each with one step of the positions' optimizer.
+        total_steps: iterations of the training, each with one step of the positions' optimizer;
+            None: it goes on until `finish_in` is called.
         switch: where exploitation starts: a fraction of `total_steps` in (0, 1] if a float, an
-            iteration if an int (`total_steps`: never). The paper: 29/30.
+            iteration if an int (`total_steps`: never). The paper: 29/30. Without `total_steps` it
+            starts with the fall to the end.
         parts: what the steps have, in order; None: `DEFAULTS`.
         moments: bits per number of each of Adam's two moments, and of the mean of the last
             thirtieth; 16 halves the memory, and is for the Gaussians alone (see
@@ -86,7 +91,7 @@ class PhaseScheduler(Training):
 
     def __init__(
         self,
-        total_steps: int,
+        total_steps: int | None = None,
         switch: float | int = PAPER_SWITCH,
         parts: Sequence[Part] | None = None,
         *,
@@ -94,7 +99,8 @@ class PhaseScheduler(Training):
         log: RunLog | None = None,
         process_group: Any = None,
     ) -> None:
-        total_steps = check_count(CALL, "total_steps", total_steps, 1)
+        if total_steps is not None:
+            total_steps = check_count(CALL, "total_steps", total_steps, 1)
         if isinstance(switch, (list, tuple)):
             raise TypeError(
                 f"{CALL}: parts in the second place, where `switch` is; write parts=..."
@@ -102,22 +108,18 @@ class PhaseScheduler(Training):
         if isinstance(switch, Integral) and not isinstance(switch, bool):
             switch_step = check_count(CALL, "switch", switch, 0, total_steps)
         else:
-            switch_step = round(check_number(CALL, "switch", switch, 0.0, 1.0) * total_steps)
-        super().__init__(
-            DEFAULTS if parts is None else check_parts(CALL, parts),
-            total_steps,
-            switch_step,
-            moments,
-        )
+            share = check_number(CALL, "switch", switch, 0.0, 1.0)
+            switch_step = None if total_steps is None else round(share * total_steps)
+        parts = DEFAULTS if parts is None else check_parts(CALL, parts)
+        super().__init__(parts, total_steps, switch_step, moments)
         if log is not None and not hasattr(log, "step"):
             raise TypeError(f"{CALL}: log={log!r}, but a RunLog or None is needed")
         self.log, self._loss = log, None
         self._group = process_group
         own = (part for part in self.parts if part.overrides("pixel_loss"))
         self._pixel: Part | None = next(own, None)
-        averaging = self.part(Averaging)
-        put = total_steps if averaging is None else averaging.put_from(total_steps)
-        self._end = End(total_steps, put)
+        self._end, self._plateau = End(), Plateau()
+        self._plan_end()
         weakref.finalize(self, self._end.say)  # at exit, or where the function that trains ends
 
     @classmethod
@@ -143,7 +145,6 @@ class PhaseScheduler(Training):
         """
         given = named(optimizers)
         slots = [slots_of(key, optimizer) for key, optimizer in given]
-        held = [slot for each in slots for slot in each if slot[1] is not None]
         saved: list[Any] = []
         for (key, optimizer), its in zip(given, slots, strict=True):
             if not isinstance(getattr(optimizer, "training", self), PhaseScheduler):
@@ -162,64 +163,27 @@ class PhaseScheduler(Training):
             if isinstance(optimizer, StepAdam) and optimizer.training is not self:
                 check_slots(f"{CALL}.upgrade", optimizer.param_groups, optimizer._slots)
             saved.append(check_groups(f"{CALL}.upgrade", optimizer.param_groups))
-        if not held:
-            names = [g.get("name") or key for key, o in given for g in o.param_groups]
-            raise ValueError(
-                f"{CALL}.upgrade: no Gaussians among the groups {names}; name the groups, or the "
-                f"keys of a dict, as one of {', '.join(GAUSSIAN_NAMES)} (other trainers' names too)"
-            )
-        for (_, optimizer), its in zip(given, slots, strict=True):
-            if self.moments == 16 and not any(name for _, name in its):
-                raise ValueError(
-                    f"{CALL}.upgrade: moments=16, but the {type(optimizer).__name__} of "
-                    f"{len(optimizer.param_groups)} other groups holds no Gaussians; upgrade those "
-                    "of the Gaussians alone, or take moments=32"
-                )
-        doubled = sorted({name for name in held if held.count(name) > 1})
-        if doubled:
-            raise ValueError(
-                f"{CALL}.upgrade: {doubled[0][1]!r} is held twice; for two sets of Gaussians name "
-                "the groups 'first#means', 'second#means', or make a scheduler for each"
-            )
+        check_held_together(f"{CALL}.upgrade", given, slots, self.moments)
         restore_parts(self, [each for each in saved if each is not None])
         self._end.upgraded = True
         for (_, optimizer), its in zip(given, slots, strict=True):
             self._upgrade(optimizer, its)
-        self._warn_of_what_was_given([optimizer for _, optimizer in given], slots)
-        self._say_upgraded(" ".join(name for _, name in held if name))
+        others = line_of_unknown_groups(f"{CALL}.upgrade", given, slots)
+        if others and any(part.names is not None for part in self.parts):
+            self.messages.warn_once("names", others)
+        self._say_upgraded(" ".join(name for its in slots for _, name in its if name))
         return optimizers
 
     def _say_upgraded(self, names: str) -> None:
         """One line, so that a user sees that something has happened."""
         means, fading = self.param_of("", "means"), self.part(Fading)
         parts = [type(part).__name__ for part in self.parts]
-        if means is not None and fading is not None:
-            events = fading.num_events(self.total_steps or 0, len(means))
+        if means is not None and fading is not None and self.total_steps is not None:
+            events = fading.num_events(self.total_steps, len(means))
             parts[self.parts.index(fading)] += f" ({events} times)"
         listed = ", ".join(parts) or "no parts"
-        say(f"opt3dgs_optim: {self.total_steps} iterations, {listed}, in the steps of {names}")
-
-    def _warn_of_what_was_given(self, optimizers: list[Any], slots: list[Slots]) -> None:
-        """Say what of it will not do what a user may expect."""
-        groups = [
-            (group, name)
-            for optimizer, its in zip(optimizers, slots, strict=True)
-            for group, (_, name) in zip(optimizer.param_groups, its, strict=True)
-        ]
-        rows = {len(group["params"][0]) for group, name in groups if name and group["params"]}
-        others = [
-            str(group.get("name"))
-            for group, name in groups
-            if name is None
-            and any(p.dim() and len(p) > 1 and len(p) in rows for p in group["params"])
-        ]
-        if others:
-            self.messages.warn_once(
-                "names",
-                f"{CALL}.upgrade: the groups {others} have a row for each Gaussian, but names that "
-                "are not known, so that plain Adam steps them; name them as one of "
-                f"{', '.join(GAUSSIAN_NAMES)} (other trainers' names too) if they hold these",
-            )
+        length = "no planned end" if self.open_end else f"{self.total_steps} iterations"
+        say(f"opt3dgs_optim: {length}, {listed}, in the steps of {names}")
 
     def _upgrade(self, optimizer: Any, slots: Slots) -> None:
         if isinstance(optimizer, StepAdam):
@@ -250,17 +214,21 @@ class PhaseScheduler(Training):
         """
         if iteration is not None:
             iteration = check_count(f"{CALL}.observe", "iteration", iteration, 0)
-            assert self.total_steps is not None
-            if iteration < self.iteration or iteration > 2 * self.total_steps:
+            most = math.inf if self.total_steps is None else 2 * self.total_steps
+            if not self.iteration <= iteration <= most:
                 raise ValueError(
                     f"{CALL}.observe: iteration={iteration}, but the clock stands at "
                     f"{self.iteration} of total_steps={self.total_steps} and goes forward, to "
-                    f"{2 * self.total_steps} at most; make a new PhaseScheduler for another run"
+                    f"{most} at most; make a new PhaseScheduler for another run"
                 )
             self.put_on(iteration)
         if loss is None:
             return
         self._loss = energy = check_energy(f"{CALL}.observe", "loss", loss)
+        if self.open_end and self.fall_step is None:
+            line = self._plateau.line(energy, self.iteration + 1)
+            if line is not None:
+                self.messages.say_once(line)
         if self.observers:
             if self._group is not None:
                 energy = mean_over_ranks(energy, self._group)
@@ -285,21 +253,85 @@ class PhaseScheduler(Training):
             return error.abs().mean()
         return part.pixel_loss(error)
 
+    def finish_in(self, iterations: int) -> None:
+        """End a training of no planned length after so many iterations more.
+
+        Over them the steps of the positions become small, nothing is faded, and the last fifth is
+        averaged. Have the trainer relocate and densify no more. After the end the training may go
+        on, with steps as long as before, and be ended again.
+
+        Args:
+            iterations: at least 1; a fifth of those so far is enough.
+
+        Raises:
+            ValueError: no count; `total_steps` was given; or the end has begun.
+
+        Examples:
+            >>> import torch
+            >>> from opt3dgs_optim import PhaseScheduler
+            >>> means = torch.nn.Parameter(torch.ones(4, 3))
+            >>> optimizers = {"means": torch.optim.Adam([means], lr=0.01, eps=1e-15)}
+            >>> phases = PhaseScheduler()
+            >>> optimizers = phases.upgrade(optimizers)
+            >>> def train(iterations):
+            ...     for _ in range(iterations):
+            ...         (means**2).sum().backward()
+            ...         optimizers["means"].step()
+            ...         optimizers["means"].zero_grad()
+            >>> train(50)
+            >>> phases.finish_in(10)
+            >>> train(10)
+            >>> phases.iteration, phases.ended
+            (59, True)
+        """
+        call = f"{CALL}.finish_in"
+        iterations = check_count(call, "iterations", iterations, 1)
+        if not self.open_end:
+            raise ValueError(
+                f"{call}: total_steps={self.total_steps} plans the end; PhaseScheduler() does not"
+            )
+        if self.fall_step is not None and not self.ended:
+            raise ValueError(
+                f"{call}: the end has begun, from iteration {self.fall_step} to {self.total_steps}"
+            )
+        self.drop_means()
+        self.plan_fall(self.iteration + 1, self.iteration + 1 + iterations)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the last iteration that is planned has been made."""
+        return self.total_steps is not None and self.iteration + 1 >= self.total_steps
+
+    def plan_fall(self, start: int | None, end: int | None) -> None:
+        """Have the training fall to its end, and know where its mean is."""
+        super().plan_fall(start, end)
+        self._plan_end()
+
+    def _plan_end(self) -> None:
+        total, averaging = self.total_steps, self.part(Averaging)
+        at = total if averaging is None else math.inf
+        if averaging is not None and total is not None:
+            at = averaging.put_from(total, self.fall_step)
+        self._end.total_steps, self._end.mean_at = total, at
+
     @torch.no_grad()
     def finish(self) -> None:
         """End the run here: the mean of the last iterates takes the parameters' place.
 
-        Before the last thirtieth there is no mean, and the parameters stay as they are. They stay,
-        too, if the training went on past `total_steps` or past an earlier `finish()`.
+        Before the last thirtieth, or the last fifth of `finish_in`, there is no mean, and the
+        parameters stay as they are. They stay, too, if the training went on past its end or past an
+        earlier `finish()`.
         """
         if not self.finished:
-            found = sum(each.put_means() for each in self.optimizers())
-            assert self.total_steps is not None
-            if not found and self.iteration < self._end.mean_at < self.total_steps:
+            found, total = sum(each.put_means() for each in self.optimizers()), self.total_steps
+            last = self._end.mean_at
+            if not found and last is not None and self.iteration < last and last != total:
+                begins = "with the end that finish_in plans"
+                if total is not None:
+                    begins = f"at {Averaging.start(total, self.fall_step)} of {total}"
                 LOGGER.warning(
-                    "opt3dgs_optim: finish() at iteration %d of %d: averaging begins at %d, and "
-                    "the parameters stay the last iterate", self.iteration + 1, self.total_steps,
-                    Averaging.start(self.total_steps),
+                    "opt3dgs_optim: finish() at iteration %d: averaging begins %s, and the "
+                    "parameters stay the last iterate", self.iteration + 1, begins,
                 )  # fmt: skip
         self.finished = self._end.finished = True
 
@@ -324,14 +356,14 @@ class PhaseScheduler(Training):
             if self._loss is not None:
                 numbers["loss"], self._loss = self._loss, None
             self.log.step(self.iteration, phase=self.phase.value, **numbers)
-        assert self.total_steps is not None
-        ends = not self.averages or self.finished
-        if self.iteration == self._end.mean_at < self.total_steps and not ends:
+        total, ends = self.total_steps, not self.averages or self.finished
+        if self.iteration == self._end.mean_at != total and not ends:
             say(
-                f"opt3dgs_optim: iteration {self.iteration + 1} of {self.total_steps}: from this "
-                "step on the parameters are the mean of the last thirtieth's iterates"
+                f"opt3dgs_optim: iteration {self.iteration + 1} of {total}: from this step on the "
+                "parameters are the mean of the last iterates"
             )
-        if self.iteration > self.total_steps:  # trainers that count from 1 end at total_steps
+        # Trainers that count from 1 end at total_steps.
+        if total is not None and self.iteration > total:
             self.messages.warn_once(
                 "overrun",
                 f"{CALL}: iteration {self.iteration} of total_steps={self.total_steps}: the "
@@ -360,7 +392,8 @@ class PhaseScheduler(Training):
         return {**super().__getstate__(), "log": None, "_group": None}
 
     def __repr__(self) -> str:
-        clock = f"iteration {self.iteration} of {self.total_steps}"
+        end = "no planned end" if self.total_steps is None else self.total_steps
+        clock = f"iteration {self.iteration} of {end}"
         if any(part.during is not None for part in self.parts):
             clock += f", {self.phase.value}"
         return "\n".join([f"{CALL}(", f"  {clock}", *(f"  {part!r}" for part in self.parts), ")"])

@@ -108,11 +108,15 @@ class Training(Clock):
         for part in self.observers:
             part.observe(loss, self)
 
+    def drop_means(self) -> None:
+        """Have no means of iterates."""
+        for optimizer in self.optimizers():
+            drop_means(optimizer.state.values())
+
     def end_averaging(self) -> None:
         """Go on without the mean of the last iterates, for which a device has no room."""
         self.averages = False
-        for optimizer in self.optimizers():
-            drop_means(optimizer.state.values())
+        self.drop_means()
         self.messages.warn_once(
             "memory",
             f"opt3dgs_optim: iteration {self.iteration}: the device has no room for the mean of "
@@ -122,7 +126,10 @@ class Training(Clock):
 
     def go_to(self, iteration: int) -> None:
         """Be at that iteration; now and then look for numbers that were not finite."""
+        fell = self.fall_step is not None
         super().go_to(iteration)
+        if fell and self.fall_step is None:
+            self.drop_means()
         if iteration >= self._look_at or iteration + 1 == self.total_steps:
             self._look_at = iteration + LOOK_INTERVAL
             self.look_at_numbers()

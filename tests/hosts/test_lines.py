@@ -81,6 +81,40 @@ def test_the_lines_are_three_statements(name: str) -> None:
     ) - (name == "mini-splatting")  # one of its lines goes to two places
 
 
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("3dgs-mcmc", "phases = PhaseScheduler()"),
+        ("gsplat", "phases = PhaseScheduler()"),
+        ("gsplat-2dgs", "phases = PhaseScheduler(parts=DEFAULTS[1:])"),
+    ],
+)
+def test_the_lines_without_a_planned_end(
+    name: str, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert lines.main([name, "--open-end"]) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("= PhaseScheduler(") == 1
+    assert f"{line}\n" in printed
+    assert "Open end: " in printed
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["nerfstudio"], "nerfstudio plans its length"),
+        (["train.py"], "need the name of a trainer"),
+        (["inria", "--iterations", "300"], "give one of them"),
+    ],
+)
+def test_where_there_is_no_open_end(
+    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        lines.main([*words, "--open-end"])
+    assert said in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("word", ["gsplt", "3dgs_mcmc"])
 def test_an_unknown_trainer(word: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert lines.main([word]) == 2

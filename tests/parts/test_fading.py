@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from torch.nn import Parameter
 from torch.optim import Adam
 
 from opt3dgs_optim import Fading, PhaseScheduler
+from opt3dgs_optim.clock import Clock
 
 CPU = torch.device("cpu")
 
@@ -44,15 +46,26 @@ def test_events_are_in_their_stretch_and_four_iterations_apart(
     total: int, events: int, start: float, length: float
 ) -> None:
     stop = min(start + length, 1.0)
+    clock = Clock(total)
     part = Fading(events=events, start=start, stop=stop)
-    assert part.events_before(int(start * total), total) == 0
-    whole = part.events_before(total, total)
+    assert part.events_before(int(start * total), clock) == 0
+    whole = part.events_before(total, clock)
     assert whole <= min(events, (stop - start) * total / 4 + 1)
-    assert whole == part.events_before(int(stop * total) + 1, total)
+    assert whole == part.events_before(int(stop * total) + 1, clock)
     middle = int((start + stop) / 2 * total)
-    counts = [part.events_before(i, total) for i in range(middle, middle + 40)]
+    counts = [part.events_before(i, clock) for i in range(middle, middle + 40)]
     assert all(b - a in (0, 1) for a, b in itertools.pairwise(counts))
     assert all(b - a <= 1 for a, b in zip(counts, counts[3:], strict=False))
+
+
+@given(events=st.integers(1, 3_000), fall=st.integers(1, 50_000))
+def test_events_become_rarer_where_no_end_is_planned(events: int, fall: int) -> None:
+    part, clock = Fading(events=events), Clock()
+    counts = [part.events_before(i, clock) for i in range(0, 50_000, 4)]
+    assert all(b - a in (0, 1) for a, b in itertools.pairwise(counts))
+    assert counts[-1] - counts[6_250] == pytest.approx(events / 3 * math.log(2), abs=1.1)
+    clock.plan_fall(fall, fall + 100)
+    assert part.events_before(fall + 100, clock) == part.events_before(fall, clock)
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from torch.optim import Adam
 
 from opt3dgs_optim import OwnFrame, PhaseScheduler
 from opt3dgs_optim.parts.own_frame import min_aspect_of
+from opt3dgs_optim.training import Training
 
 ROWS, TOTAL = 12, 300
 NAMES = ("means", "scales", "quats")
@@ -113,17 +114,29 @@ def test_the_rate_follows_a_batch_by_its_beta() -> None:
 
 
 def test_the_rate_decays() -> None:
-    part = OwnFrame(rate=0.2, final=0.01)
-    assert [part.at(t) for t in (0.0, 0.5, 1.0, 2.0)] == pytest.approx([0.2, 0.02, 0.002, 0.002])
+    training, rates = Training([part := OwnFrame(rate=0.2, final=0.01)], 100), []
+    for iteration in (0, 50, 100, 200):
+        training.go_to(iteration)
+        rates.append(part.at(training))
+    assert rates == pytest.approx([0.2, 0.02, 0.002, 0.002])
+
+
+def test_the_rate_where_no_end_is_planned() -> None:
+    training, rates = Training([part := OwnFrame(rate=0.2, final=0.01)]), []
+    for iteration in (0, 15_000, 15_001, 15_256, 16_024, 16_025):
+        training.go_to(iteration)
+        rates.append(part.at(training))
+        if iteration == 15_000:
+            training.plan_fall(15_001, 16_025)
+    assert rates[:3] == pytest.approx([0.2, 0.025, 0.025], rel=1e-3)
+    assert rates[3:] == pytest.approx([0.5 * 0.025, 0.01 * 0.025, 0.2 * 17.025**-0.75], rel=0.04)
 
 
 @pytest.mark.parametrize(
     ("steps_of_run", "least"),
-    [(1, 0.25), (12_000, 0.25), (15_000, 0.2), (30_000, 0.1), (100_000, 0.1), (None, 0.1)],
+    [(1, 0.25), (12_000, 0.25), (15_000, 0.2), (30_000, 0.1), (100_000, 0.1), (0, 0.25)],
 )
-def test_thin_axes_count_for_less_in_a_long_training(
-    steps_of_run: int | None, least: float
-) -> None:
+def test_thin_axes_count_for_less_in_a_long_training(steps_of_run: int, least: float) -> None:
     assert min_aspect_of(steps_of_run) == pytest.approx(least)
 
 

@@ -17,16 +17,29 @@ from opt3dgs_optim.hosts.schedules import schedule, shortened
 from opt3dgs_optim.hosts.trainers import TRAINERS
 
 WIDTH = 100
+OPEN_END = "Open end"  # the topic of a page's note
 
 
-def text(name: str, iterations: int | None = None) -> str:
-    """All that is known of a trainer, and its schedule shortened to so many iterations.
+def text(name: str, iterations: int | None = None, open_end: bool = False) -> str:
+    """All that is known of a trainer.
+
+    Args:
+        name: the trainer's.
+        iterations: to which its schedule is shortened.
+        open_end: whether the lines are for a training of no planned end.
 
     Raises:
         KeyError: no trainer of this name is known.
-        ValueError: no schedule of it is known, or not for so many iterations.
+        ValueError: no schedule of it is known, or not for so many iterations; its page does not
+            say how to train without a planned end.
     """
     trainer = TRAINERS[name]
+    if open_end and OPEN_END not in trainer.notes:
+        known = ", ".join(each for each, one in TRAINERS.items() if OPEN_END in one.notes)
+        raise ValueError(f"--open-end is for {known}; {name} plans its length")
+    block = trainer.block
+    if open_end:  # without the number
+        block = re.sub(r"(PhaseScheduler\()[^,()]+(, )?", r"\1", block)
     notes = "\n".join(
         textwrap.fill(
             f"{topic}: {_plain(said)}", WIDTH, subsequent_indent="  ", break_on_hyphens=False
@@ -35,11 +48,11 @@ def text(name: str, iterations: int | None = None) -> str:
     )
     head = textwrap.fill(trainer.head, WIDTH, break_on_hyphens=False)
     if iterations is None:
-        return "\n\n".join([head, trainer.block, notes])
+        return "\n\n".join([head, block, notes])
     if (stock := schedule(trainer)) is None:
         known = ", ".join(each for each, one in TRAINERS.items() if schedule(one))
         raise ValueError(f"--iterations is for {known}; the schedule of {name} was not read")
-    return "\n\n".join([head, trainer.block, shortened(stock, iterations), notes])
+    return "\n\n".join([head, block, shortened(stock, iterations), notes])
 
 
 def _plain(said: str) -> str:
@@ -97,19 +110,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="N",
         help="with NAME: also what shortens the whole schedule of its trainer to N iterations",
     )
+    parser.add_argument(
+        "--open-end",
+        action="store_true",
+        help="with NAME: the lines of a training of no planned end",
+    )
     options = parser.parse_args(arguments)
     word = options.trainer
     is_file = word is not None and (Path(word).exists() or word.endswith(".py"))
     if options.write and (word in TRAINERS or not is_file):
         parser.error("--write needs the path of a trainer's script")
-    if options.iterations is not None and word not in TRAINERS:
-        parser.error("--iterations needs the name of a trainer")
+    if (options.iterations is not None or options.open_end) and word not in TRAINERS:
+        parser.error("--iterations and --open-end need the name of a trainer")
+    if options.iterations is not None and options.open_end:
+        parser.error("--iterations plans an end, --open-end does not; give one of them")
     if word is None:
         print("\n".join(f"{name:18} {trainer.title}" for name, trainer in TRAINERS.items()))
         print(f"\nAny other trainer:\n\n{ANY}")
     elif word in TRAINERS:
         try:
-            print(text(word, options.iterations))
+            print(text(word, options.iterations, options.open_end))
         except ValueError as error:
             parser.error(str(error))
     elif is_file:

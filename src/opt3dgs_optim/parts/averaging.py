@@ -6,11 +6,14 @@ import functools
 import math
 from dataclasses import dataclass
 
+from opt3dgs_optim.checks import set_options
+from opt3dgs_optim.names import GAUSSIAN, check_names
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.step import Step
 from opt3dgs_optim.training import Training
 
-SHARE = 1 / 30  # of the run
+SHARE = 1 / 30  # of a planned training
+SHARE_OF_FALL = 1 / 5
 ITERATES = 250  # at least are averaged, where there are as many; more gain nothing
 
 
@@ -29,38 +32,55 @@ class Averaging(Part):
     parameters' memory once more, plus four numbers a row. With moments of 16 bits the mean's
     numbers have 16 bits, too, except positions. If a GPU has no room for it, there is a warning,
     and the training goes on without.
+
+    Args:
+        names: the Gaussian parameters, under gsplat's or INRIA's names; None: every parameter of
+            the upgraded optimizers, as cameras, exposures, anchors and networks.
+
+    Raises:
+        ValueError: a name is no Gaussian parameter's.
     """
+
+    names: tuple[str, ...] | None = GAUSSIAN
 
     later = ("mean",)
 
-    @staticmethod
-    def start(total_steps: int) -> int:
-        """The first iteration that is averaged."""
-        return _window(total_steps)[0]
+    def __post_init__(self) -> None:
+        names = None if self.names is None else check_names(type(self).__name__, self.names)
+        set_options(self, names=names)
 
     @staticmethod
-    def put_from(total_steps: int) -> int:
+    def start(total_steps: int, fall_step: int | None = None) -> int:
+        """The first iteration that is averaged."""
+        return _window(total_steps, fall_step)[0]
+
+    @staticmethod
+    def put_from(total_steps: int, fall_step: int | None = None) -> int:
         """The first iteration after which the mean is in the parameters' place."""
-        return _window(total_steps)[1]
+        return _window(total_steps, fall_step)[1]
 
     def begins(self, training: Training) -> int:
-        """The first iteration that is averaged."""
-        return self.start(training.total_steps) if training.total_steps else 0
+        """The first iteration that is averaged, where it is known beforehand."""
+        total = training.total_steps
+        return 0 if training.open_end or total is None else self.start(total)
 
     def plan(self, step: Step, training: Training) -> None:
         """Take the iterate into the mean."""
         total, now = training.total_steps, step.iteration
         if total is None or training.finished:
             return
-        start, put, every = _window(total)
+        start, put, every = _window(total, training.fall_step)
         if start <= now < total:
             step.put, step.every = now >= put, every
 
 
 @functools.lru_cache(maxsize=8)  # every step asks
-def _window(total_steps: int) -> tuple[int, int, int]:
+def _window(total_steps: int, fall_step: int | None) -> tuple[int, int, int]:
     """The first iteration that is averaged, the first after which the mean is put, and `every`."""
-    length = math.floor(SHARE * total_steps)
+    if fall_step is None:
+        length = math.floor(SHARE * total_steps)
+    else:
+        length = math.floor(SHARE_OF_FALL * (total_steps - fall_step))
     # A short run puts the mean where it begins, or has none.
     put = total_steps - min(length, max(2, math.floor(length / 10)))
     return total_steps - length, put, max(1, length // ITERATES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.checks import check_count, check_number, set_options
+from opt3dgs_optim.clock import Clock
 from opt3dgs_optim.names import GAUSSIAN, check_names
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.step import Fade, Step, chosen_rows, mixed
@@ -32,8 +34,9 @@ class Fading(Part):
 
     The same points are faded in all of `names`. Which ones depends only on `seed`, the event and
     the point's index: a resumed run repeats them, and every device chooses the same.
-    It costs no memory. Positions that `OwnFrame` steps are left alone: a faded step of them would
-    be half a standard deviation long.
+    Where no end is planned, iteration i has `events` / (3 i) of them, until the fall to the end
+    begins. It costs no memory. Positions that `OwnFrame` steps are left alone: a faded step of them
+    would be half a standard deviation long.
 
     Args:
         share: each point's chance to be faded in an event, in (0, 1].
@@ -76,20 +79,19 @@ class Fading(Part):
 
     def plan(self, step: Step, training: Training) -> None:
         """Fade by the newest event since this parameter's last step, if there was one."""
-        total = training.total_steps
-        if total is None:
-            return
-        options = total, self.start, self.stop, self.events
-        done = _events_before(step.stepped_in + 1, *options)
-        now = _events_before(step.iteration + 1, *options)
+        done = self.events_before(step.stepped_in + 1, training)
+        now = self.events_before(step.iteration + 1, training)
         # Several are due where the trainer has left steps out; they are one. Most steps have none,
         # and an empty `any` costs a third of this.
         if now > done and any(self.happens(e, len(step.param)) for e in range(done, now)):
             step.fade = self.fade(now - 1)
 
-    def events_before(self, iteration: int, total_steps: int) -> int:
+    def events_before(self, iteration: int, training: Clock) -> int:
         """Number of events before the step of this iteration (from 0)."""
-        return _events_before(iteration, total_steps, self.start, self.stop, self.events)
+        total, fall = training.total_steps, training.fall_step
+        if not training.open_end and total is not None:
+            return _events_before(iteration, total, self.start, self.stop, self.events)
+        return _open_events_before(iteration if fall is None else min(iteration, fall), self.events)
 
     def happens(self, event: int, num_points: int) -> bool:
         """Whether an event fades any of so many points: of more than 10,000, some do."""
@@ -98,7 +100,8 @@ class Fading(Part):
 
     def num_events(self, total_steps: int, num_points: int) -> int:
         """How many events a run of so many points has."""
-        return int(self.events_before(total_steps, total_steps) * share_of_events(num_points))
+        events = self.events_before(total_steps, Clock(total_steps))
+        return int(events * share_of_events(num_points))
 
     def fade(self, event: int) -> Fade:
         """What an event does."""
@@ -111,8 +114,8 @@ class Fading(Part):
 
     def numbers(self, training: Training) -> Mapping[str, float]:
         """`faded`: the share of up to 10,000 points that the present iteration's event fades."""
-        now, total = training.iteration, training.total_steps or 1
-        happened = self.events_before(now + 1, total) > self.events_before(now, total)
+        now = training.iteration
+        happened = self.events_before(now + 1, training) > self.events_before(now, training)
         return {"faded": self.share * happened}
 
 
@@ -129,3 +132,11 @@ def _events_before(iteration: int, total_steps: int, start: float, stop: float, 
     share = (iteration / total_steps - start) / length
     most = min(events, length * total_steps / MIN_ITERATIONS_BETWEEN_EVENTS)
     return int(min(max(share, 0.0), 1.0) * most)
+
+
+@functools.lru_cache(maxsize=64)
+def _open_events_before(iteration: int, events: int) -> int:
+    """Of a training of no planned end: `events` / (3 i) of them in iteration i."""
+    each = events / 3
+    first = MIN_ITERATIONS_BETWEEN_EVENTS * each
+    return int(each * math.log(max(iteration / first, 1.0)))

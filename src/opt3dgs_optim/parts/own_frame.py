@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from opt3dgs_optim.training import Training
 
 CALL = "OwnFrame"
 BETA1 = 0.9  # of one view an iteration
+STEADY, POWER = 1_000, 0.75  # where no end is planned: see `OwnFrame`
 
 
 @dataclass(frozen=True, repr=False)
@@ -25,6 +25,10 @@ class OwnFrame(Part):
 
         mu <- mu - rate(t) B Adam(B^T g),    B = R diag(s),    Sigma = B B^T
         rate(t) = rate * final^t,            t = iteration / total_steps in 0..1
+
+    Where no end is planned, in iteration i, and in the fall of which a share x is over:
+
+        rate(i, x) = rate * (1 + i / 1,000)^(-3/4) * (1 - (1 - final) sqrt(x))
 
     3DGS moves every centre by one learning rate in world units, while the sizes of the Gaussians of
     one scene differ by a factor of fifty, and the axes of one Gaussian by twenty. A step that a
@@ -95,9 +99,12 @@ class OwnFrame(Part):
             min_aspect=least,
         )
 
-    def at(self, progress: float) -> float:
-        """Standard deviations of a full step, where that share of the run is over."""
-        return self.rate * self.final ** min(max(progress, 0.0), 1.0)
+    def at(self, training: Training) -> float:
+        """Standard deviations of a full step in the present iteration."""
+        if not training.open_end:
+            return self.rate * self.final**training.progress
+        slowed = (1 + max(training.iteration, 0) / STEADY) ** -POWER
+        return self.rate * slowed * (1 - (1 - self.final) * math.sqrt(training.fallen))
 
     def plan(self, step: Step, training: Training) -> None:
         """Step the positions [N, 3] in their own frames."""
@@ -120,17 +127,17 @@ class OwnFrame(Part):
                 "Adam steps them",
             )
             return
-        rate = self.at(training.progress) if step.group["lr"] else 0.0
+        rate = self.at(training) if step.group["lr"] else 0.0
         if (beta1 := step.group["betas"][0]) < BETA1:
             rate *= math.sqrt((1 - beta1) / (1 - BETA1))
         least = self.min_aspect
         if least is None:
-            least = min_aspect_of(training.total_steps)
+            least = min_aspect_of(training.total_steps or step.iteration)
         step.frame = Frame(rate, least, quats, scales if scales.shape[1] == 3 else three_of(scales))
 
     def numbers(self, training: Training) -> Mapping[str, float]:
         """`own_frame_rate`: standard deviations of a full step."""
-        return {"own_frame_rate": self.at(training.progress)}
+        return {"own_frame_rate": self.at(training)}
 
 
 def three_of(scales: Tensor) -> Tensor:
@@ -141,7 +148,6 @@ def three_of(scales: Tensor) -> Tensor:
     return torch.nn.functional.pad(scales, (0, 1), value=-math.inf)
 
 
-@functools.lru_cache(maxsize=64)  # every step asks
-def min_aspect_of(total_steps: int | None) -> float:
-    """`min_aspect` where nothing is said; None: a training without an end, the longest there is."""
-    return min(max(3_000 / total_steps, 0.1), 0.25) if total_steps else 0.1
+def min_aspect_of(iterations: int) -> float:
+    """`min_aspect` where nothing is said, in a training of that length, or as long so far."""
+    return min(max(3_000 / max(iterations, 1), 0.1), 0.25)

@@ -11,9 +11,10 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
+from opt3dgs_optim.plateau import WINDOW
 from opt3dgs_optim.runs.lines import Run, read_run
 from opt3dgs_optim.runs.plot import draw
-from opt3dgs_optim.runs.stats import Comparison, Stat, compare
+from opt3dgs_optim.runs.stats import Comparison, Stat, compare, gain_at_end
 
 NO_PICTURE = "report: no picture without matplotlib: pip install 'opt3dgs_optim[report]'"
 READING = (
@@ -69,7 +70,7 @@ def write_report(
         scene = comparison.scene
         if scene or len(comparisons) > 1:
             parts.append(f"## {_cell(scene) or 'Runs without a scene'}")
-        parts.append(_table(comparison))
+        parts += [_table(comparison), *_gains(comparison)]
         if find_spec("matplotlib"):
             tail = f"-{scene}" if len(comparisons) > 1 else ""
             picture = out / (re.sub(r"[^\w.-]+", "_", f"report{tail}")[:60] + ".png")
@@ -79,6 +80,20 @@ def write_report(
     text = "\n\n".join([*parts, READING, origin]).rstrip() + "\n"
     written[0].write_text(text, encoding="utf-8")
     return written
+
+
+def _gains(comparison: Comparison) -> list[str]:
+    """A sentence for each arm whose steps have the loss: whether its last iterations still gain."""
+    found = []
+    for arm in comparison.arms:
+        gains = [gain for run in arm.runs if (gain := gain_at_end(run)) is not None]
+        if gains:
+            listed = ", ".join(f"{gain:.2f} ± {error:.2f}" for gain, error in gains)
+            found.append(
+                f"The last {WINDOW:,} iterations of {_cell(arm.name)} gained {listed} dB in the "
+                "loss over as many before (± standard error)."
+            )
+    return found
 
 
 def _cell(text: str) -> str:

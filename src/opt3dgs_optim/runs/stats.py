@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from opt3dgs_optim.plateau import BLOCK, WINDOW, gain
 from opt3dgs_optim.runs.lines import Run
 
 COUNTS = ("iteration", "seconds")  # of the columns, no values of the trainer's
@@ -172,3 +173,18 @@ def _gain(run: Run, reference: Run, metric: str) -> float | None:
     if time < max(ours[0][0], theirs[0][0]):
         return None
     return float(np.interp(time, *ours) - np.interp(time, *theirs))
+
+
+def gain_at_end(run: Run) -> tuple[float, float] | None:
+    """Decibels that the loss gained in the last iterations, and their standard error.
+
+    None where the run's steps have no `loss` (or `energy`), or not that of every iteration.
+    """
+    for name in ("loss", "energy"):
+        iterations, _, losses = run.series(name, "step")
+        last = losses[-2 * WINDOW :]
+        if len(last) == 2 * WINDOW and iterations[-1] - iterations[-2 * WINDOW] < 2 * WINDOW:
+            means = last.reshape(-1, BLOCK).mean(1)
+            before, now = np.split(means, 2)
+            return gain(before.tolist(), now.tolist())
+    return None

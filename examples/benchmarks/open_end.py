@@ -1,0 +1,115 @@
+"""Train without a planned end, and end the one training at several lengths.
+
+    python examples/benchmarks/open_end.py 5000 7500 10000 15000 30000 --scene scenes/lego \\
+        --size images_4 --points 10000 --background white
+
+At five sixths of each length the state is kept, and `finish_in` ends the training; from the kept
+state it goes on to the next. Each end is written as `train.py` writes a finished training, into the
+folder `--out`. The trainer plans no end either: it relocates every 50 iterations until then, and
+the rate of the positions, which sets the noise, is a constant.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import torch
+from splatting.arms import find_arm
+from splatting.density import MCMCDensityControl
+from splatting.fit import Fit
+from splatting.stopping import command
+from tqdm import trange
+
+from benchmarks import evidence, train
+from opt3dgs_optim import PhaseScheduler
+
+FALL = 6  # the fall is a sixth of the training, a fifth of what is before it
+RATE = 0.03  # of the positions' first rate in a planned training
+REFINE_EVERY = 50
+
+
+class OpenFit(Fit):
+    """`Fit`, in which nothing is planned by the length of the training."""
+
+    phases: PhaseScheduler
+
+    def _density_control(self) -> MCMCDensityControl:
+        self.optimizers["means"].param_groups[0]["lr"] *= RATE
+        return MCMCDensityControl(
+            self.options.points,
+            refine_stop=self.options.iterations,
+            refine_every=REFINE_EVERY,
+            generator=self.draws["density"],
+        )
+
+    def end_at(self, iterations: int) -> None:
+        """Begin the fall to the end."""
+        self.phases.finish_in(iterations - self.iteration)
+        assert isinstance(self.density, MCMCDensityControl)
+        self.density.refine_stop = self.iteration
+
+
+def train_to(fit: Fit, iterations: int) -> float:
+    """Train until so many iterations have been made; the seconds that it took."""
+    begin = time.process_time()
+    for _ in trange(fit.iteration, iterations, unit="it"):
+        fit.step()
+    return time.process_time() - begin
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options: those of `train.py`, and the ends."""
+    made = argparse.ArgumentParser(
+        description=(__doc__ or "").splitlines()[0], parents=[train.parser()], add_help=False
+    )
+    made.add_argument("ends", nargs="+", type=int, metavar="ITERATIONS", help="lengths, ascending")
+    made.set_defaults(arm="open-end", out=Path("runs/open-end"))
+    return made
+
+
+@command("open_end")
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line."""
+    args = parser().parse_args(arguments)
+    torch.set_num_threads(1)
+    ends, scene = args.ends, train.scene_of(args)
+    if sorted(set(ends)) != ends or ends[0] < FALL:
+        raise ValueError(f"ends {ends}: ascending numbers, {FALL} or more, are needed")
+    options = replace(train.options_of(args), iterations=ends[-1])
+    lpips = args.lpips and train.lpips_of(*args.lpips)
+    name = f"{scene.name}-{args.size}-{args.seed}"
+    args.out.mkdir(parents=True, exist_ok=True)
+    state = args.out / f"{name}.pt"
+    fit, seconds = OpenFit(scene, find_arm(args.arm), options), 0.0
+    fit.compile_kernels()
+    for end in ends:
+        seconds += train_to(fit, end - end // FALL)
+        fit.save(state)
+        fit.end_at(end)
+        fall = train_to(fit, end)
+        args.iterations = end
+        record = train.record_of(args, scene)
+        words = evidence.command_of(record).replace(f" --arm {args.arm}", "")
+        words = words.replace(f" --iterations {end}", "")
+        record["command"] = words.replace("train.py", " ".join(map(str, ["open_end.py", *ends])))
+        record |= {"finished": True, "curve": [train.look(fit, seconds + fall, lpips)]}
+        out = args.out / f"{name}-{end}.json"
+        out.write_text(json.dumps(record), encoding="utf-8")
+        print(out, f"{record['curve'][-1]['psnr']:.2f} dB", flush=True)
+        if end < ends[-1]:
+            fit = OpenFit(scene, find_arm(args.arm), options)
+            fit.load(state)
+    state.unlink()
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

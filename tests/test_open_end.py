@@ -1,0 +1,183 @@
+"""A training of no planned end: it goes on, falls to an end when it is told to, and may go on."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+import torch
+from gaussians import adams_of, parameters, same_tensors, steps
+
+from opt3dgs_optim import DEFAULTS, Averaging, Curvature, Part, PhaseScheduler
+from opt3dgs_optim.clock import Phase
+from opt3dgs_optim.parts.averaging import SHARE_OF_FALL
+
+ROWS = 6
+
+
+def begun(parts: Any = None, **options: Any) -> tuple[PhaseScheduler, Any, Any]:
+    """A scheduler without a number, its optimizers, and the Gaussians."""
+    params = parameters(ROWS)
+    phases = PhaseScheduler(parts=parts, **options)
+    return phases, phases.upgrade(adams_of(params)), params
+
+
+@pytest.mark.parametrize("moments", [32, 16])
+def test_it_ends_at_the_mean_of_the_last_fifth_of_its_fall(moments: Any) -> None:
+    phases, optimizers, params = begun([Averaging()], moments=moments)
+    steps(optimizers, params, 33)
+    phases.finish_in(100)
+    iterates: list[Any] = []
+    for i in range(100):
+        steps(optimizers, params, 1, seed=i)
+        if 100 - int(SHARE_OF_FALL * 100) <= i < 98:
+            iterates.append(params["sh0"].detach().double())
+    mean = torch.stack(iterates).mean(0)
+    assert (params["sh0"].double() - mean).abs().max() < 0.01
+    assert (iterates[-1] - mean).abs().max() > 0.02
+    assert phases.total_steps == 133
+    assert phases.end_line() is None
+
+
+def test_steps_fall_to_the_end_and_are_as_long_as_before_after_it() -> None:
+    phases, optimizers, params = begun()
+    rates = []
+    for count in (200, 50, 20):
+        for i in range(count):
+            steps(optimizers, params, 1, seed=i)
+            rates.append(float(phases.numbers()["own_frame_rate"]))
+        if count == 200:
+            phases.finish_in(50)
+    fall = rates[200:250]
+    assert fall == sorted(fall, reverse=True)
+    assert fall[-1] < 0.1 * fall[0]
+    assert rates[250] > 0.9 * rates[199]
+    assert phases.total_steps is None
+    assert "without a fall" in (phases.end_line() or "")
+    phases.finish_in(10)
+    steps(optimizers, params, 10)
+    assert phases.total_steps == 280
+    assert phases.end_line() is None
+
+
+def test_its_mean_is_gone_where_it_goes_on() -> None:
+    phases, optimizers, params = begun([Averaging()])
+    phases.finish_in(60)
+    steps(optimizers, params, 60)
+    assert "averaging.mean" in optimizers["sh0"].state[params["sh0"]]
+    steps(optimizers, params, 1)
+    assert all("averaging.mean" not in optimizers[n].state[params[n]] for n in params)
+
+
+def test_an_end_that_is_planned_early_is_the_same_as_one_that_is_planned_late() -> None:
+    """Nothing but the fall itself depends on when it is told."""
+    ends = []
+    for early in (True, False):
+        phases, optimizers, params = begun()
+        steps(optimizers, params, 80)
+        if early:
+            steps(optimizers, params, 1, seed=1)
+            phases.finish_in(40)
+        else:
+            copied = copy.deepcopy((phases, optimizers, params))
+            phases, optimizers, params = copied
+            steps(optimizers, params, 1, seed=1)
+            phases.finish_in(40)
+        steps(optimizers, params, 40, seed=2)
+        ends.append({name: p.detach() for name, p in params.items()})
+    assert same_tensors(*ends)
+
+
+@pytest.mark.parametrize("saved_at", [50, 75, 98])
+def test_a_checkpoint_knows_of_the_fall(saved_at: int) -> None:
+    phases, optimizers, params = begun()
+    steps(optimizers, params, 40)
+    phases.finish_in(60)
+    steps(optimizers, params, saved_at - 40, seed=1)
+    saved = {name: copy.deepcopy(each.state_dict()) for name, each in optimizers.items()}
+    values = {name: p.detach().clone() for name, p in params.items()}
+    again, others, new = begun()
+    for name, each in others.items():
+        new[name].data.copy_(values[name])
+        each.load_state_dict(saved[name])
+    assert (again.fall_step, again.total_steps) == (40, 100)
+    for its, of in ((optimizers, params), (others, new)):
+        steps(its, of, 100 - saved_at, seed=2)
+    assert same_tensors(params, new)
+
+
+def test_a_planned_training_goes_on_without_an_end_and_the_other_way_round() -> None:
+    for first, then in ((100, None), (None, 100)):
+        params = parameters(ROWS)
+        optimizers: Any = PhaseScheduler(first).upgrade(adams_of(params))
+        steps(optimizers, params, 99)
+        phases = PhaseScheduler(then)
+        phases.upgrade(optimizers)
+        assert phases.iteration == 98
+        assert phases.total_steps == then
+        steps(optimizers, params, 1)
+        kept = "averaging.mean" in optimizers["sh0"].state[params["sh0"]]
+        assert kept is (then == 100)
+
+
+def test_exploitation_is_the_fall() -> None:
+    phases, optimizers, params = begun([Curvature()])
+    steps(optimizers, params, 20)
+    assert phases.phase is Phase.EXPLORATION
+    phases.finish_in(10)
+    steps(optimizers, params, 10)
+    assert phases.phase is Phase.EXPLOITATION
+    steps(optimizers, params, 1)
+    assert phases.phase is Phase.EXPLORATION
+
+
+@pytest.mark.parametrize("count", [0, -1, 2.5, True, None])
+def test_what_is_no_number_of_iterations_is_refused(count: Any) -> None:
+    phases, _, _ = begun()
+    with pytest.raises(ValueError, match=r"finish_in: iterations=.* an integer at least 1"):
+        phases.finish_in(count)
+
+
+def test_an_end_that_is_planned_or_begun_is_refused() -> None:
+    phases, optimizers, params = begun()
+    steps(optimizers, params, 3)
+    phases.finish_in(5)
+    with pytest.raises(ValueError, match="the end has begun, from iteration 3 to 8"):
+        phases.finish_in(5)
+    with pytest.raises(ValueError, match="total_steps=100 plans the end; "):
+        PhaseScheduler(100).finish_in(5)
+
+
+def test_what_ends_without_a_fall_is_told(caplog: Any) -> None:
+    phases, optimizers, params = begun()
+    steps(optimizers, params, 7)
+    assert "ended at iteration 7 without a fall" in (phases.end_line() or "")
+    phases.finish()
+    assert "the parameters stay the last iterate" in caplog.text
+
+
+class _Lengths(Part):
+    """What a part of the user's own sees of the clock."""
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[Any, float]] = []
+
+    def plan(self, step: Any, training: Any) -> None:
+        self.seen.append((training.total_steps, training.fallen))
+
+
+def test_a_part_sees_how_far_the_fall_is() -> None:
+    part = _Lengths()
+    phases, optimizers, params = begun([part])
+    steps(optimizers, {"means": params["means"]}, 2)
+    phases.finish_in(4)
+    steps(optimizers, {"means": params["means"]}, 5)
+    fall = [(6, 0.0), (6, 0.25), (6, 0.5), (6, 0.75)]
+    assert part.seen == [(None, 0.0), (None, 0.0), *fall, (None, 0.0)]
+
+
+def test_the_defaults_say_how_it_ends(caplog: Any) -> None:
+    caplog.set_level("INFO")
+    begun(DEFAULTS)
+    assert "no planned end" in caplog.text
