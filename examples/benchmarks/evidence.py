@@ -21,8 +21,9 @@ FILE = Path(__file__).resolve().parents[2] / "docs" / "results" / "evidence.json
 TRAINED = ("scene", "size", "density", "arm", "iterations", "points", "sh_degree", "seed")
 # `rotated`: the seed says which views are held out. `views`: trained on, 0 is all of them.
 # `rates`: factor on all learning rates. `threshold`: factor on that of clone and split. `pieces`:
-# every photo was cut into so many.
+# every photo was cut into so many. `host`: whose own script trained, see simple_trainer.py.
 USUAL = {"rotated": True, "views": 0, "init": "sfm", "rates": 1.0, "threshold": 1.0, "pieces": 0}
+USUAL |= {"host": ""}
 MEASURED = ("psnr", "ssim", "lpips", "train_psnr", "seconds")
 CURVE = ("iteration", "psnr", "ssim", "lpips")
 SHOWN = ("bonsai", "lego", "plush")  # whose curves of half size are kept
