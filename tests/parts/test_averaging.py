@@ -212,3 +212,28 @@ def test_a_saved_mean_needs_to_know_when_each_row_began(began: Any, moments: Any
         saved["state"][0]["averaging.began"] = began
     with pytest.raises(ValueError, match=r"load_state_dict: .*(a number for each row|same rows)"):
         optimizer.load_state_dict(saved)
+
+
+def test_whatever_the_optimizers_hold_is_averaged() -> None:
+    """The groups of Scaffold-GS, whose anchors are no Gaussians, and an exposure of one number."""
+    draw = torch.Generator().manual_seed(0)
+    shapes = {"anchor": (8, 3), "offset": (8, 10, 3), "anchor_feat": (8, 32), "opacity": (8, 1)}
+    shapes |= {"scaling": (8, 6), "rotation": (8, 4), "mlp_color": (32, 35), "exposure": ()}
+    params = {n: Parameter(torch.randn(s, generator=draw)) for n, s in shapes.items()}
+    phases = PhaseScheduler(TOTAL, parts=[Averaging(names=None)])
+    optimizer = phases.upgrade(adam_of(params))
+    last: dict[str, list[Any]] = {name: [] for name in params}
+    for iteration in range(Averaging.put_from(TOTAL)):
+        steps({"all": optimizer}, params, 1, seed=iteration)
+        if iteration >= Averaging.start(TOTAL):
+            for name, param in params.items():
+                last[name].append(param.detach().clone())
+    phases.finish()
+    for name, param in params.items():
+        assert torch.allclose(param, torch.stack(last[name]).mean(0), atol=1e-5)
+        assert not torch.allclose(param, last[name][-1], atol=1e-5)
+
+
+def test_averaging_names_what_is_no_gaussian_parameter() -> None:
+    with pytest.raises(ValueError, match="Averaging: names=\\('anchor',\\)"):
+        Averaging(names=("anchor",))

@@ -22,8 +22,9 @@ class Averaging(Part):
     """Put the mean of the last iterates in the place of the last one (Polyak and Juditsky 1992).
 
     Every step follows one view, so the parameters wander around what fits all views, further with
-    higher learning rates; their mean does not. Averaging covers the last thirtieth of the run: 250
-    of its iterates, or all if there are fewer than 500. In the last tenth of it, at least the last
+    higher learning rates; their mean does not. Averaging covers the last thirtieth of the run, or
+    the last fifth of the fall where no end was planned: 250 of its iterates, or all if there are
+    fewer than 500. In the last tenth of it, at least the last
     two iterations, the mean takes the parameters' place, because trainers save before their last
     step. Until then nothing is changed.
 

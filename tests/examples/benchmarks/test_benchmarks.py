@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from benchmarks import evidence, report, steps, train
+from benchmarks import evidence, open_end, report, steps, train
 
 TINY = ["--scene", "embedded", "--arm", "defaults", "--iterations", "20", "--points", "60"]
 
@@ -54,6 +54,34 @@ def test_a_stopped_training_goes_on_and_becomes_a_line(stopped: Path, tmp_path: 
         "python examples/benchmarks/train.py --scene embedded --arm defaults --size images_4 "
         "--iterations 20 --points 60 --seed 0"
     )
+
+
+def test_a_training_without_a_planned_end_is_ended_at_several_lengths(tmp_path: Path) -> None:
+    """What comes after an end does not depend on it."""
+    options = ["--scene", "embedded", "--points", "60"]
+    for ends in (["24", "90"], ["90"]):
+        out = tmp_path / str(len(ends))
+        assert open_end.main([*ends, *options, "-o", str(out)]) == 0
+        assert sorted(path.name for path in out.iterdir()) == [
+            f"embedded-images_4-0-{end}.json" for end in ends
+        ]
+    last = "embedded-images_4-0-90.json"
+    one, other = (json.loads((tmp_path / n / last).read_text()) for n in ("1", "2"))
+    for each in (one, other):
+        del each["curve"][0]["seconds"]
+    assert one["curve"] == other["curve"]
+    line = evidence.line_of(json.loads((tmp_path / "2" / last).read_text()))
+    assert (line["arm"], line["iterations"]) == ("open-end", 90)
+    assert line["command"] == (
+        "python examples/benchmarks/open_end.py 24 90 --scene embedded --size images_4 "
+        "--points 60 --seed 0"
+    )
+
+
+@pytest.mark.parametrize("ends", [["90", "24"], ["5"], ["24", "24"]])
+def test_ends_that_do_not_ascend_are_refused(ends: list[str], tmp_path: Path, capsys: Any) -> None:
+    assert open_end.main([*ends, "--points", "60", "-o", str(tmp_path)]) == 2
+    assert "ascending numbers" in capsys.readouterr().err
 
 
 def test_seed_and_views_say_what_is_trained_on(tmp_path: Path) -> None:
