@@ -5,8 +5,7 @@
 A line has what was trained (scene, size of the photos, density control, arm, iterations, points,
 sh_degree, seed), what came of it on views that were held out (psnr, ssim, lpips) and of some that
 were not (train_psnr), how many Gaussians there were at the end, CPU or GPU seconds, device, date
-and command. What is not in a line is as usual, see `USUAL`. Where `seed` is a list, the line has
-the means of these seeds: results of questions that are closed.
+and command. What is not in a line is as usual, see `USUAL`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Make the tables and the picture of docs/evidence.md anew: python examples/benchmarks/report.py
 
-So it does with the tables of README and of docs/trials.md. All comes from
-docs/results/evidence.jsonl, and the cost of a step, which docs/performance.md has, from steps.json
-and gpu.json beside it. In a page a table stands between `<!-- evidence:NAME -->` and
-`<!-- end -->`, where NAME is a function of `TABLES`.
+So it does with the tables of README and of docs/performance.md. All comes from
+docs/results/evidence.jsonl, and the cost of a step from steps.json and gpu.json beside it. In a
+page a table stands between `<!-- evidence:NAME -->` and `<!-- end -->`, where NAME is a function of
+`TABLES`.
 """
 
 from __future__ import annotations
@@ -11,325 +11,35 @@ from __future__ import annotations
 import argparse
 import json
 import re
-import statistics
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import evidence, steps
+from benchmarks.evidence import Line
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = tuple(
-    ROOT / page
-    for page in ("README.md", "docs/evidence.md", "docs/trials.md", "docs/performance.md")
-)
+PAGES = tuple(ROOT / each for each in ("README.md", "docs/evidence.md", "docs/performance.md"))
 GPU = evidence.FILE.with_name("gpu.json")
 PICTURE = evidence.FILE.with_name("iterations.png")
 MAIN = ("bonsai", "lego", "plush")
 FEW = ("banana", "brighton_beach", "lund_door")
-HALF: dict[str, Any] = {"size": "images_2", "points": 50_000, "sh_degree": 0}
-WHOLE: dict[str, Any] = {"size": "images", "points": 200_000, "sh_degree": 3}
-QUARTER: dict[str, Any] = {"size": "images_4", "sh_degree": 0}
-SIZES = {"half": HALF, "quarter": QUARTER}
-METRICS = ("psnr", "ssim", "lpips")
-COUNTS = ("10000", "100000", "1000000", "5000000")  # of Gaussians, as steps.json has them
-FORMS = {"psnr": "{:.2f}", "ssim": "{:.4f}", "lpips": "{:.4f}"}
-GAINS = {"psnr": "{:+.2f}", "ssim": "{:+.4f}", "lpips": "{:+.4f}"}
-Line = dict[str, Any]
-
-
-class Evidence:
-    """All lines, to choose from."""
-
-    def __init__(self, path: Path = evidence.FILE) -> None:
-        self.lines = evidence.read(path)
-
-    def of(self, arm: str, scene: str, *, gpu: bool = False, **those: Any) -> list[Line]:
-        """The lines of an arm; what is not said is as usual. One a seed, in order."""
-        wanted = evidence.USUAL | {"density": "relocation"} | those | {"arm": arm, "scene": scene}
-        found = [x for x in self.lines if all(x.get(k) == v for k, v in wanted.items())]
-        found = [x for x in found if ("NVIDIA" in x["device"]) is gpu]
-        return sorted(found, key=lambda x: str(x["seed"]))
-
-
-def seeds_of(lines: Iterable[Line]) -> list[int]:
-    """All seeds of the lines."""
-    return sorted(
-        s for x in lines for s in (x["seed"] if isinstance(x["seed"], list) else [x["seed"]])
-    )
-
-
-def mean(lines: Sequence[Line], metric: str) -> float:
-    """Over the seeds."""
-    weights = [len(seeds_of([x])) for x in lines]
-    return sum(w * x[metric] for w, x in zip(weights, lines, strict=True)) / sum(weights)
-
-
-def shown(lines: Sequence[Line]) -> str:
-    """PSNR / SSIM / LPIPS and the number of seeds."""
-    if not lines:
-        return "not trained"
-    values = (FORMS[m].format(mean(lines, m)) for m in METRICS if lines[0][m] is not None)
-    count = len(seeds_of(lines))
-    return f"{' / '.join(values)} ({count} seed{'s' * (count > 1)})"
-
-
-def one_seed(cell: str) -> str:
-    """A cell of a table whose text says that all have one seed."""
-    return cell.removesuffix(" (1 seed)")
-
-
-def gain(lines: Sequence[Line], control: Sequence[Line]) -> dict[str, float] | None:
-    """Mean difference over the seeds that both have; None where there is none."""
-    common = set(seeds_of(lines)) & set(seeds_of(control))
-    if not common or any(isinstance(x["seed"], list) for x in (*lines, *control)):
-        same = lines and control and seeds_of(lines) == seeds_of(control)
-        return {m: mean(lines, m) - mean(control, m) for m in METRICS} if same else None
-    ours, theirs = ([x for x in each if x["seed"] in common] for each in (lines, control))
-    return {m: mean(ours, m) - mean(theirs, m) for m in METRICS if ours[0][m] is not None}
-
-
-def gained(lines: Sequence[Line], control: Sequence[Line]) -> str:
-    """The gain, and over how many seeds."""
-    found = gain(lines, control)
-    if found is None:
-        return "not trained" if not lines else "-"
-    count = len(set(seeds_of(lines)) & set(seeds_of(control)))
-    return f"{all_signed(found)} ({count} seed{'s' * (count > 1)})"
-
-
-def all_signed(found: Mapping[str, float]) -> str:
-    """Differences of all metrics."""
-    return " / ".join(signed(value, metric) for metric, value in found.items())
-
-
-def signed(value: float, metric: str) -> str:
-    """With its sign, but for zero."""
-    form = GAINS[metric].format(value)
-    return form if float(form) else form[1:]
-
-
-def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Markdown."""
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-# -- the tables -----------------------------------------------------------------------------------
-
-
-DENSITIES = ("relocation", "clone-and-split")
 PHOTOS = {
     "bonsai": "220 of 400x266",
     "lego": "87 of 400x400",
     "plush": "84 of 320x240",
     "train": "263 of 489x271",
 }
-
-
-def front(all_: Evidence) -> str:
-    """A third of stock's iterations against all of them, of the same seeds."""
-    forms, rows = {"psnr": "{:.2f}", "ssim": "{:.3f}", "lpips": "{:.3f}"}, []
-    for scene, photos in PHOTOS.items():
-        pairs = [third(all_, scene, density) for density in DENSITIES]
-        cells = [
-            " / ".join(form.format(mean(x, m)) for m, form in forms.items()) if x else "-"
-            for pair in pairs
-            for x in pair
-        ]
-        if any(ours for _, ours in pairs):
-            rows.append((f"{scene}, {photos}", *cells))
-    heads = [
-        h for d in DENSITIES for h in (f"{d.replace('-', ' ')}: stock, 30,000", "ours, 10,000")
-    ]
-    return table(("photos", *heads), rows)
-
-
-def third(all_: Evidence, scene: str, density: str) -> tuple[list[Line], list[Line]]:
-    """Stock's 30,000 iterations and a third of them with the package, of the same seeds."""
-    those = {"density": density, **HALF}
-    stock = all_.of("stock", scene, iterations=30_000, **those)
-    ours = all_.of("defaults", scene, iterations=10_000, **those)
-    both = set(seeds_of(stock)) & set(seeds_of(ours))
-    return [x for x in stock if x["seed"] in both], [x for x in ours if x["seed"] in both]
-
-
-SHORTER = (
-    *(("defaults", count) for count in (15_000, 10_000, 7_500)),
-    *((arm, 10_000) for arm in ("stock", "x2", "x3", "averaged", "learn2splat")),
-)
-
-
-def iterations(all_: Evidence) -> str:
-    """Shorter trainings less stock's 30,000 iterations, seed by seed."""
-    stock = {scene: all_.of("stock", scene, iterations=30_000, **HALF) for scene in MAIN}
-    rows = [("stock, 30,000", *map(shown, stock.values()))]
-    for arm, count in SHORTER:
-        cells = (
-            gained(all_.of(arm, scene, iterations=count, **HALF), lines)
-            for scene, lines in stock.items()
-        )
-        rows.append((f"{NAMES[arm]}, {count:,}", *cells))
-    return table(("training", *MAIN), rows)
-
-
-def quarter(all_: Evidence) -> str:
-    """A quarter of stock's iterations against all of them, at quarter size."""
-    rows = []
-    for scene in MAIN:
-        stock = all_.of("stock", scene, iterations=30_000, **QUARTER)
-        points = stock[0]["points"]
-        ours = all_.of("defaults", scene, iterations=7_500, points=points, **QUARTER)
-        rows.append((scene, f"{points:,}", shown(stock), gained(ours, stock)))
-    return table(("scene", "Gaussians", "stock, 30,000", "the defaults, 7,500, less stock"), rows)
-
-
-def gpu(all_: Evidence) -> str:
-    """Half of the iterations at whole size, on a GPU."""
-    rows = []
-    for scene in ("bonsai", "lego"):
-        stock = all_.of("stock", scene, gpu=True, iterations=15_000, **WHOLE)
-        ours = all_.of("0.1.0", scene, gpu=True, iterations=7_500, **WHOLE)
-        for lines in (stock, ours):
-            name = f"{NAMES[lines[0]['arm']]}, {lines[0]['iterations']:,}"
-            first, less = (scene, "") if lines is stock else ("", one_seed(gained(lines, stock)))
-            took = f"{mean(lines, 'seconds'):.0f} s"
-            rows.append((first, name, one_seed(shown(lines)), less, took))
-    return table(("scene", "training", "PSNR / SSIM / LPIPS", "less stock", "took"), rows)
-
-
-def whole(all_: Evidence) -> str:
-    """Half of the iterations at whole size, on a CPU, less stock's trainings on the GPU."""
-    rows = []
-    for scene in ("bonsai", "lego"):
-        stock = all_.of("stock", scene, gpu=True, iterations=15_000, **WHOLE)
-        ours = all_.of("defaults", scene, iterations=7_500, **WHOLE)
-        rows.append((scene, one_seed(shown(ours)), one_seed(gained(ours, stock))))
-    return table(("scene", "the defaults, 7,500, on a CPU", "less stock, 15,000, on the GPU"), rows)
-
-
-def gpu_step(_: Evidence) -> str:
-    """What a step costs on a GPU."""
-    return steps.table(json.loads(GPU.read_text(encoding="utf-8"))["steps"]["results"])
-
-
-def gpu_iteration(_: Evidence) -> str:
-    """What a whole iteration of gsplat's training costs on a GPU."""
-    made = json.loads(GPU.read_text(encoding="utf-8"))
-    found, before = made["iterations"]["results"], made["before"]["iterations"]
-    names = {  # of the step before: its defaults had no own frame
-        "defaults": "the same with OwnFrame",
-        "defaults, last thirtieth": "the same in the last thirtieth",
-    }
-    rows = []
-    for name in found["1000000"]:
-        cells = []
-        for points, results in found.items():
-            row = results[name]
-            spread = "" if name == "stock" else f" ({row['low']:.2f} to {row['high']:.2f})"
-            cells.append(f"{row['ms']:.1f} ms, x{row['ratio']:.2f}{spread}")
-            old = before[points].get(names.get(name, ""))
-            cells.append("" if old is None else f"x{old:.2f}")
-        rows.append((name, *cells))
-    heads = [h for n in found for h in (f"{int(n):,} Gaussians", "the step before")]
-    return table(("", *heads), rows)
-
-
-def equal(all_: Evidence) -> str:
-    """All of 30,000 iterations."""
-    rows, arms = [], ("defaults", "0.1.0", "x2")
-    for size in ("half", "quarter"):
-        for scene in MAIN:
-            stock = all_.of("stock", scene, iterations=30_000, **SIZES[size])
-            those = {"iterations": 30_000, **SIZES[size], "points": stock[0]["points"]}
-            lines = (all_.of(arm, scene, **those) for arm in arms)
-            rows.append((scene, size, shown(stock), *(gained(x, stock) for x in lines)))
-    heads = ("scene", "size", "stock", *(NAMES[arm] for arm in arms))
-    return table(heads, rows)
-
-
-def short(all_: Evidence) -> str:
-    """Both with schedules as short."""
-    rows = []
-    for count in (15_000, 10_000, 7_500):
-        gains = []
-        for scene in MAIN:
-            stock, ours = (
-                all_.of(arm, scene, iterations=count, **HALF) for arm in ("stock", "defaults")
-            )
-            found = gain(ours, stock)
-            gains.append(found)
-            less = "not trained" if found is None else all_signed(found)
-            rows.append((f"{count:,}", scene, one_seed(shown(stock)), less))
-        rows.append((f"{count:,}", "*mean*", "", mean_gain(gains)))
-    return table(("iterations", "scene", "stock", "the defaults gain"), rows)
-
-
-def mean_gain(gains: Sequence[dict[str, float] | None]) -> str:
-    """Over the scenes; empty where one was not trained."""
-    found = [each for each in gains if each is not None]
-    if len(found) < len(gains):
-        return ""
-    return all_signed({m: statistics.mean(each[m] for each in found) for m in METRICS})
-
-
-def ratios(_: Evidence) -> str:
-    """What a step of the defaults costs, in short."""
-    gpu_made, cpu_made = (json.loads(p.read_text(encoding="utf-8")) for p in (GPU, steps.OUT))
-    rows = []
-    for device, made, beside, name in (
-        ("one H200", gpu_made["steps"], "six fused Adams", "defaults"),
-        ("", gpu_made["steps"], "the same, last thirtieth", "defaults, last thirtieth"),
-        ("a CPU, one thread", cpu_made, "six Adams", "defaults"),
-        ("", cpu_made, "the same, last thirtieth", "defaults, last thirtieth"),
-        ("", cpu_made, "six fused Adams", "defaults, fused"),
-    ):
-        found = made["results"]
-        cells = (f"{found[n][name]['ratio']:.2f}" if n in found else "-" for n in COUNTS)
-        rows.append((device, beside, *cells))
-    return table(("", "beside", *(f"{int(n):,}" for n in COUNTS)), rows)
-
-
-def cost(_: Evidence) -> str:
-    """What a step costs on a CPU."""
-    made = json.loads(steps.OUT.read_text(encoding="utf-8"))
-    about = f"{made['machine']}, {made['date']}, medians of {made['rounds']} rounds."
-    return f"{steps.table(made['results'])}\n\n{about}"
-
-
-def few(all_: Evidence) -> str:
-    """Scenes with 10 to 15 photos; all beside stock at 30,000."""
-    rows = []
-    others = (("stock", 3_000), ("defaults", 3_000), ("0.1.0", 10_000), ("0.1.0", 30_000))
-    for scene in FEW:
-        stock = all_.of("stock", scene, iterations=30_000, **QUARTER)
-        lines = (all_.of(arm, scene, iterations=n, **QUARTER) for arm, n in others)
-        rows.append((scene, shown(stock), *(gained(x, stock) for x in lines)))
-    return table(("scene", "stock, 30,000", *(f"{NAMES[a]}, {n:,}" for a, n in others)), rows)
-
-
-def adaptive(all_: Evidence) -> str:
-    """Clone, split, prune and reset: held out, on the photos trained on, and Gaussians."""
-    rows = []
-    for scene in PHOTOS:
-        pair = third(all_, scene, "clone-and-split")
-        for name, lines in zip(("stock, 30,000", "the defaults, 10,000"), pair, strict=True):
-            if lines:
-                first = scene if lines is pair[0] else ""
-                trained = f"{mean(lines, 'train_psnr'):.2f}"
-                rows.append((first, name, shown(lines), trained, of_gaussians(lines)))
-    heads = ("scene", "training", "PSNR / SSIM / LPIPS", "PSNR trained on", "Gaussians")
-    return table(heads, rows)
-
-
-def of_gaussians(lines: Sequence[Line]) -> str:
-    """Their number at the end."""
-    return f"{mean(lines, 'gaussians'):,.0f}"
-
-
+HALF: dict[str, Any] = {"size": "images_2", "points": 50_000, "sh_degree": 0}
+WHOLE: dict[str, Any] = {"size": "images", "points": 200_000, "sh_degree": 3}
+QUARTER: dict[str, Any] = {"size": "images_4", "sh_degree": 0}
+METRICS = ("psnr", "ssim", "lpips")
+COUNTS = ("10000", "100000", "1000000", "5000000")  # of Gaussians, as steps.json has them
 NAMES = {
     "stock": "stock",
     "defaults": "the defaults",
@@ -339,24 +49,253 @@ NAMES = {
     "averaged": "stock, averaged",
     "learn2splat": "Learn2Splat's tuned Adam",
 }
-TABLES: dict[str, Callable[[Evidence], str]] = {
-    f.__name__: f
-    for f in (
-        front, iterations, quarter, gpu, whole, gpu_step, gpu_iteration, equal, short, ratios, cost,
-        few, adaptive,
-    )
-}  # fmt: skip
+Run = tuple[str, int]  # an arm, and the iterations that it is planned for
+lines = cache(evidence.read)
 
 
-DRAWN = (
-    ("stock", 30_000, "#555555"),
-    ("defaults", 15_000, "#7fc4ea"),
-    ("defaults", 10_000, "#0072b2"),
-    ("defaults", 7_500, "#08306b"),
+def of(run: Run, scene: str, *, gpu: bool = False, **those: Any) -> list[Line]:
+    """The lines of a run; what is not said is as usual. One a seed, in order."""
+    wanted = evidence.USUAL | {"density": "relocation"} | those
+    wanted |= {"arm": run[0], "iterations": run[1], "scene": scene}
+    found = [x for x in lines() if all(x.get(k) == v for k, v in wanted.items())]
+    return sorted((x for x in found if ("NVIDIA" in x["device"]) is gpu), key=lambda x: x["seed"])
+
+
+def paired(*runs: list[Line]) -> list[list[Line]]:
+    """Those of the seeds that all have."""
+    common = set.intersection(*({x["seed"] for x in each} for each in runs))
+    return [[x for x in each if x["seed"] in common] for each in runs]
+
+
+def mean(found: Sequence[Line]) -> dict[str, float]:
+    """PSNR, SSIM and LPIPS over the seeds, as far as they were measured."""
+    return {m: fmean(x[m] for x in found) for m in METRICS if found[0][m] is not None}
+
+
+def gain(ours: list[Line], control: list[Line]) -> dict[str, float]:
+    """Mean difference over the seeds that both have; empty where there is none."""
+    ours, control = paired(ours, control)
+    return {m: mean(ours)[m] - mean(control)[m] for m in mean(ours)} if ours else {}
+
+
+def numbers(values: Mapping[str, float], sign: str = "", digits: int = 4) -> str:
+    """PSNR / SSIM / LPIPS; zero has no sign."""
+    said = (f"{v:{sign}.{2 if m == 'psnr' else digits}f}" for m, v in values.items())
+    return " / ".join(each if float(each) else each.lstrip("+-") for each in said)
+
+
+def seeds(found: Sequence[Any]) -> str:
+    """How many they are."""
+    return f"({len(found)} seed{'s' * (len(found) > 1)})"
+
+
+def shown(found: Sequence[Line]) -> str:
+    """PSNR / SSIM / LPIPS and the number of seeds."""
+    return f"{numbers(mean(found))} {seeds(found)}" if found else "not trained"
+
+
+def gained(ours: list[Line], control: list[Line]) -> str:
+    """The gain, and over how many seeds."""
+    found = gain(ours, control)
+    return f"{numbers(found, '+')} {seeds(paired(ours, control)[0])}" if found else "not trained"
+
+
+def beside(stock: Run, others: Iterable[Run], scene: str, **those: Any) -> list[str]:
+    """Stock's result, and what others gain over it with as many Gaussians."""
+    control = of(stock, scene, **those)
+    those["points"] = control[0]["points"]
+    return [shown(control), *(gained(of(run, scene, **those), control) for run in others)]
+
+
+def name(run: Run) -> str:
+    """An arm, and for how many iterations."""
+    return f"{NAMES[run[0]]}, {run[1]:,}"
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]], *, one_seed: bool = False) -> str:
+    """Markdown; `one_seed`: the page says that all have one."""
+    made = "\n".join(f"| {' | '.join(row)} |" for row in (heads, ["---"] * len(heads), *rows))
+    return made.replace(" (1 seed)", "") if one_seed else made
+
+
+def read(path: Path) -> dict[str, Any]:
+    """What steps were measured to cost."""
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+# -- the tables -----------------------------------------------------------------------------------
+
+STOCK, THIRD = ("stock", 30_000), ("defaults", 10_000)
+SHORTER = (
+    *(("defaults", count) for count in (15_000, 10_000, 7_500)),
+    *((arm, 10_000) for arm in ("stock", "x2", "x3", "averaged", "learn2splat")),
 )
 
 
-def draw(all_: Evidence, path: Path) -> None:
+def third(scene: str, density: str) -> list[list[Line]]:
+    """Stock and a third of its iterations with the package, of the same seeds."""
+    return paired(*(of(run, scene, density=density, **HALF) for run in (STOCK, THIRD)))
+
+
+def front() -> str:
+    """A third of stock's iterations against all of them."""
+    ours, rows = "ours, 10,000", []
+    for scene, photos in PHOTOS.items():
+        found = third(scene, "relocation") + third(scene, "clone-and-split")
+        if any(found):
+            cells = (numbers(mean(each), digits=3) if each else "-" for each in found)
+            rows.append((f"{scene}, {photos}", *cells))
+    heads = ("photos", "relocation: stock, 30,000", ours, "clone and split: stock, 30,000", ours)
+    return table(heads, rows)
+
+
+def iterations() -> str:
+    """Shorter trainings less stock's 30,000 iterations, seed by seed."""
+    columns = [beside(STOCK, SHORTER, scene, **HALF) for scene in MAIN]
+    return table(("training", *MAIN), zip(map(name, (STOCK, *SHORTER)), *columns, strict=True))
+
+
+def quarter() -> str:
+    """A quarter of stock's iterations against all of them, at quarter size."""
+    rows = []
+    for scene in MAIN:
+        points = of(STOCK, scene, **QUARTER)[0]["points"]
+        rows.append((scene, f"{points:,}", *beside(STOCK, [("defaults", 7_500)], scene, **QUARTER)))
+    return table(("scene", "Gaussians", name(STOCK), "the defaults, 7,500, less stock"), rows)
+
+
+def equal() -> str:
+    """All of 30,000 iterations."""
+    runs = [(arm, 30_000) for arm in ("defaults", "0.1.0", "x2")]
+    rows = [
+        (scene, size, *beside(STOCK, runs, scene, **those))
+        for size, those in (("half", HALF), ("quarter", QUARTER))
+        for scene in MAIN
+    ]
+    return table(("scene", "size", "stock", *(NAMES[arm] for arm, _ in runs)), rows)
+
+
+def short() -> str:
+    """Both with schedules as short."""
+    rows = []
+    for count in (15_000, 10_000, 7_500):
+        stock, ours = ("stock", count), ("defaults", count)
+        rows += [(f"{count:,}", s, *beside(stock, [ours], s, **HALF)) for s in MAIN]
+        gains = [gain(of(ours, s, **HALF), of(stock, s, **HALF)) for s in MAIN]
+        total = {m: fmean(each[m] for each in gains) for m in METRICS}
+        rows.append((f"{count:,}", "*mean*", "", numbers(total, "+")))
+    return table(("iterations", "scene", "stock", "the defaults gain"), rows, one_seed=True)
+
+
+def few() -> str:
+    """Scenes with 10 to 15 photos; all beside stock at 30,000."""
+    runs = (("stock", 3_000), ("defaults", 3_000), ("0.1.0", 10_000), ("0.1.0", 30_000))
+    rows = [(scene, *beside(STOCK, runs, scene, **QUARTER)) for scene in FEW]
+    return table(("scene", *map(name, (STOCK, *runs))), rows)
+
+
+def adaptive() -> str:
+    """Clone, split, prune and reset: held out, on the photos trained on, and Gaussians."""
+    rows = []
+    for scene in PHOTOS:
+        for run, found in zip((STOCK, THIRD), third(scene, "clone-and-split"), strict=True):
+            if found:
+                trained = f"{fmean(x['train_psnr'] for x in found):.2f}"
+                count = f"{fmean(x['gaussians'] for x in found):,.0f}"
+                rows.append((scene * (run == STOCK), name(run), shown(found), trained, count))
+    heads = ("scene", "training", "PSNR / SSIM / LPIPS", "PSNR trained on", "Gaussians")
+    return table(heads, rows)
+
+
+def gpu() -> str:
+    """Half of the iterations at whole size, on a GPU."""
+    rows = []
+    for scene in ("bonsai", "lego"):
+        runs = (("stock", 15_000), ("0.1.0", 7_500))
+        stock, ours = (of(run, scene, gpu=True, **WHOLE) for run in runs)
+        for run, found in zip(runs, (stock, ours), strict=True):
+            first, less = (scene, "") if found is stock else ("", gained(ours, stock))
+            took = f"{fmean(x['seconds'] for x in found):.0f} s"
+            rows.append((first, name(run), shown(found), less, took))
+    heads = ("scene", "training", "PSNR / SSIM / LPIPS", "less stock", "took")
+    return table(heads, rows, one_seed=True)
+
+
+def whole() -> str:
+    """Half of the iterations at whole size, on a CPU, less stock's trainings on the GPU."""
+    rows = []
+    for scene in ("bonsai", "lego"):
+        ours = of(("defaults", 7_500), scene, **WHOLE)
+        stock = of(("stock", 15_000), scene, gpu=True, **WHOLE)
+        rows.append((scene, shown(ours), gained(ours, stock)))
+    heads = ("scene", "the defaults, 7,500, on a CPU", "less stock, 15,000, on the GPU")
+    return table(heads, rows, one_seed=True)
+
+
+def gpu_step() -> str:
+    """What a step costs on a GPU."""
+    return steps.table(read(GPU)["steps"]["results"])
+
+
+def gpu_iteration() -> str:
+    """What a whole iteration of gsplat's training costs on a GPU."""
+    made, rows = read(GPU), []
+    found, before = made["iterations"]["results"], made["before"]["iterations"]
+    names = {  # of the step before: its defaults had no own frame
+        "defaults": "the same with OwnFrame",
+        "defaults, last thirtieth": "the same in the last thirtieth",
+    }
+    for subject in found["1000000"]:
+        cells = []
+        for points, results in found.items():
+            row, old = results[subject], before[points].get(names.get(subject, ""))
+            spread = "" if subject == "stock" else f" ({row['low']:.2f} to {row['high']:.2f})"
+            cells.append(f"{row['ms']:.1f} ms, x{row['ratio']:.2f}{spread}")
+            cells.append("" if old is None else f"x{old:.2f}")
+        rows.append((subject, *cells))
+    heads = [h for n in found for h in (f"{int(n):,} Gaussians", "the step before")]
+    return table(("", *heads), rows)
+
+
+def ratios() -> str:
+    """What a step of the defaults costs, in short."""
+    rows = []
+    on_gpu, on_cpu = read(GPU)["steps"]["results"], read(steps.OUT)["results"]
+    for device, found, other, subject in (
+        ("one H200", on_gpu, "six fused Adams", "defaults"),
+        ("", on_gpu, "the same, last thirtieth", "defaults, last thirtieth"),
+        ("a CPU, one thread", on_cpu, "six Adams", "defaults"),
+        ("", on_cpu, "the same, last thirtieth", "defaults, last thirtieth"),
+        ("", on_cpu, "six fused Adams", "defaults, fused"),
+    ):
+        cells = (f"{found[n][subject]['ratio']:.2f}" if n in found else "-" for n in COUNTS)
+        rows.append((device, other, *cells))
+    return table(("", "beside", *(f"{int(n):,}" for n in COUNTS)), rows)
+
+
+def cost() -> str:
+    """What a step costs on a CPU."""
+    made = read(steps.OUT)
+    about = f"{made['machine']}, {made['date']}, medians of {made['rounds']} rounds."
+    return f"{steps.table(made['results'])}\n\n{about}"
+
+
+TABLES = {f.__name__: f for f in (
+    front, iterations, quarter, equal, short, few, adaptive, gpu, whole, gpu_step, gpu_iteration,
+    ratios, cost,
+)}  # fmt: skip
+
+# -- the picture, and the pages -------------------------------------------------------------------
+
+DRAWN = {
+    STOCK: "#555555",
+    ("defaults", 15_000): "#7fc4ea",
+    ("defaults", 10_000): "#0072b2",
+    ("defaults", 7_500): "#08306b",
+}
+
+
+def draw(path: Path) -> None:
     """Quality over iterations at half size, with the end of stock's training as a line.
 
     The curves of a scene are means over the seeds that all of them have.
@@ -364,50 +303,39 @@ def draw(all_: Evidence, path: Path) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 3.7), dpi=130, layout="constrained")
-    axes, entries = figure.subplots(1, len(MAIN)), {}
+    axes = figure.subplots(1, len(MAIN))
     for axis, scene in zip(axes, MAIN, strict=True):
-        found = {
-            (arm, count, colour): {x["seed"]: x["curve"] for x in lines if x.get("curve")}
-            for arm, count, colour in DRAWN
-            if (lines := all_.of(arm, scene, iterations=count, **HALF))
-        }
-        seeds = sorted(set.intersection(*map(set, found.values())))
-        for (arm, count, colour), curves in found.items():
-            # Some were evaluated twice as often as others.
-            pairs = [
-                dict(zip(c["iteration"], c["psnr"], strict=True))
-                for c in map(curves.get, seeds)
-                if c
+        found = paired(*(of(run, scene, **HALF) for run in DRAWN))
+        for (run, colour), each in zip(DRAWN.items(), found, strict=True):
+            curves = [
+                dict(zip(x["curve"]["iteration"], x["curve"]["psnr"], strict=True)) for x in each
             ]
-            at = sorted(set.intersection(*map(set, pairs)))
-            curve = [statistics.mean(each[n] for each in pairs) for n in at]
-            label = "stock" if arm == "stock" else f"{NAMES[arm]}, planned for {count:,}"
-            (entries[label],) = axis.plot([n / 1000 for n in at], curve, color=colour, lw=2)
+            # Some were evaluated twice as often as others.
+            at = sorted(set.intersection(*map(set, curves)))
+            curve = [fmean(one[n] for one in curves) for n in at]
+            label = "stock" if run == STOCK else f"{NAMES[run[0]]}, planned for {run[1]:,}"
+            axis.plot([n / 1000 for n in at], curve, color=colour, lw=2, label=label)
             axis.plot(at[-1] / 1000, curve[-1], "o", color=colour, ms=6)
-            if arm == "stock":
-                axis.axhline(end := curve[-1], color=colour, lw=1, ls="--", zorder=0)
-                axis.set_ylim(end - 5, end + 1.6)
-        count = len(seeds)
-        axis.set_title(f"{scene} ({count} seed{'s' * (count > 1)})", fontsize=13)
+            if run == STOCK:
+                axis.axhline(curve[-1], color=colour, lw=1, ls="--", zorder=0)
+                axis.set_ylim(curve[-1] - 5, curve[-1] + 1.6)
+        axis.set_title(f"{scene} {seeds(found[0])}", fontsize=13)
         axis.set_xlabel("thousand iterations", fontsize=12)
         axis.set_xlim(0, 31)
         axis.grid(color="#e4e4e4", lw=0.8)
     axes[0].set_ylabel("PSNR of held-out photos, dB", fontsize=12)
-    order = ["stock", *(f"{NAMES[arm]}, planned for {n:,}" for arm, n, _ in DRAWN[1:])]
-    names = [name for name in order if name in entries]
-    handles = [entries[name] for name in names]
-    place = "outside lower center"
-    figure.legend(handles, names, loc=place, ncols=2, frameon=False, fontsize=11)
+    entries, place = axes[0].get_legend_handles_labels(), "outside lower center"
+    figure.legend(*entries, loc=place, ncols=2, frameon=False, fontsize=11)
     figure.savefig(path)
 
 
-def filled(page: str, all_: Evidence) -> str:
+def filled(page: str) -> str:
     """The page with its tables made anew; ValueError where it names one that there is not."""
 
     def made(found: re.Match[str]) -> str:
         if found[1] not in TABLES:
             raise ValueError(f"evidence:{found[1]}, but there are {', '.join(TABLES)}")
-        return f"<!-- evidence:{found[1]} -->\n{TABLES[found[1]](all_)}\n<!-- end -->"
+        return f"<!-- evidence:{found[1]} -->\n{TABLES[found[1]]()}\n<!-- end -->"
 
     return re.sub(r"<!-- evidence:(\w+) -->.*?<!-- end -->", made, page, flags=re.DOTALL)
 
@@ -415,10 +343,9 @@ def filled(page: str, all_: Evidence) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line."""
     argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0]).parse_args(arguments)
-    all_ = Evidence()
     for page in PAGES:
-        page.write_text(filled(page.read_text(encoding="utf-8"), all_), encoding="utf-8")
-    draw(all_, PICTURE)
+        page.write_text(filled(page.read_text(encoding="utf-8")), encoding="utf-8")
+    draw(PICTURE)
     print(*PAGES, PICTURE, sep="\n")
     return 0
 
