@@ -115,7 +115,7 @@ def test_where_there_is_no_open_end(
     assert said in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("word", ["gsplt", "3dgs_mcmc"])
+@pytest.mark.parametrize("word", ["gsplt", "gsplat-mcmc", "3dgs_mcmc"])
 def test_an_unknown_trainer(word: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert lines.main([word]) == 2
     said = capsys.readouterr().err

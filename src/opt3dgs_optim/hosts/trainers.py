@@ -31,7 +31,6 @@ _GSPLAT_COUNTS = {
     **{".backward(": 1, "break": 0, "continue": 1, "max_steps = ": 2, "self.optimizers = ": 1},
     "self.optimizers[": 1,
 }
-_GSPLAT = ("gsplat.md", "gsplat.md#simple_trainerpy")
 
 # -- INRIA's trainer and what derives from it ------------------------------------------------------
 
@@ -72,12 +71,10 @@ def _inria(
 
 TRAINERS: dict[str, Trainer] = {
     "gsplat": Trainer(
-        _GSPLAT,
+        ("gsplat.md", "gsplat.md#simple_trainerpy"),
         (*_GSPLAT_SIGNS, "from gsplat.strategy import DefaultStrategy, MCMCStrategy"),
         _GSPLAT_COUNTS,
     ),
-    "gsplat-mcmc": Trainer((*_GSPLAT, "gsplat.md#mcmc")),
-    "gsplat-default": Trainer((*_GSPLAT, "gsplat.md#default")),
     "gsplat-2dgs": Trainer(
         ("gsplat.md", "gsplat.md#simple_trainer_2dgspy"),
         (*_GSPLAT_SIGNS, "from gsplat.strategy import DefaultStrategy"),
