@@ -32,10 +32,11 @@ def check_number(
     found = as_float(value)
     outside = not low <= found <= high or not math.isfinite(found)
     if outside or (open_low and found == low) or (open_high and found == high):
-        left, right = ("(" if open_low else "["), (")" if open_high else "]")
-        raise ValueError(
-            f"{call}: {name}={value!r}, but a finite number in {left}{low}, {high}{right} is needed"
-        )
+        if high == math.inf:
+            allowed = "" if low == -math.inf else f" {'above' if open_low else 'at least'} {low}"
+        else:
+            allowed = f" in {'(' if open_low else '['}{low}, {high}{')' if open_high else ']'}"
+        raise ValueError(f"{call}: {name}={value!r}, but a finite number{allowed} is needed")
     return found
 
 

@@ -184,12 +184,19 @@ def test_two_sets_of_gaussians_in_one_adam() -> None:
 
 
 @pytest.mark.parametrize(
-    "option", [{"rate": 0.0}, {"final": 0.0}, {"min_aspect": 1.5}, {"rate": math.nan}]
+    ("name", "value", "allowed"),
+    [
+        ("rate", 0.0, "above 0.0"),
+        ("rate", math.nan, "above 0.0"),
+        ("rate", math.inf, "above 0.0"),
+        ("final", 0.0, "above 0.0"),
+        ("min_aspect", 1.5, r"in \[0.0, 1.0\]"),
+    ],
 )
-def test_options_that_are_refused(option: dict) -> None:
-    (name, value), *_ = option.items()
-    with pytest.raises(ValueError, match=f"OwnFrame: {name}={value}, but a finite number in"):
-        OwnFrame(**option)
+def test_options_that_are_refused(name: str, value: float, allowed: str) -> None:
+    said = f"OwnFrame: {name}={value}, but a finite number {allowed} is needed"
+    with pytest.raises(ValueError, match=said):
+        OwnFrame(**{name: value})
 
 
 def test_the_defaults_are_what_it_says_of_itself() -> None:
