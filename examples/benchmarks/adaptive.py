@@ -72,6 +72,7 @@ class AdaptiveFit(Fit):
     relocates = False
 
     def _density_control(self) -> DefaultDensityControl:
+        self.draws["split"] = torch.default_generator  # which gsplat draws from
         width = self.scene.train[0].camera.width
         shrunk = FULL_WIDTH.get(self.scene.name, width) / width
         threshold = shrunk * GROW_GRAD * self.options.threshold

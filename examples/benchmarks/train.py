@@ -170,8 +170,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     name = "-".join(str(record[key]) for key in ("scene", *KEPT))
     out = args.out or Path("runs/benchmarks", f"{name}.json")
     out.parent.mkdir(parents=True, exist_ok=True)
-    fit = fit_of(scene, arm, options_of(args), args.density)
-    train(fit, record, out, args.lpips and lpips_of(*args.lpips))
+    lpips = args.lpips and lpips_of(*args.lpips)
+    # gsplat's split draws from torch's global generator; `lpips_of` may have drawn from it, too.
+    torch.manual_seed(args.seed)
+    train(fit_of(scene, arm, options_of(args), args.density), record, out, lpips)
     print(out)
     return 0
 

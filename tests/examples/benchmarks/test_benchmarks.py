@@ -11,6 +11,9 @@ import pytest
 import torch
 from benchmarks import evidence, open_end, report, steps, train
 
+needs_gsplat = pytest.mark.skipif(
+    importlib.util.find_spec("gsplat") is None, reason="gsplat is not installed"
+)
 TINY = ["--scene", "embedded", "--arm", "defaults", "--iterations", "20", "--points", "60"]
 
 
@@ -22,10 +25,11 @@ def line(**changes: Any) -> dict[str, Any]:
     return made | changes
 
 
-@pytest.fixture
-def stopped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A training that was stopped in the middle of its sixth tenth."""
-    step, out = train.Fit.step, tmp_path / "one.json"
+def stopped_and_whole(
+    monkeypatch: pytest.MonkeyPatch, folder: Path, *words: str
+) -> list[dict[str, Any]]:
+    """The records of two trainings, of which one was stopped after iteration 11 and went on."""
+    step, paths = train.Fit.step, [folder / "stopped.json", folder / "whole.json"]
 
     def until(fit: train.Fit) -> torch.Tensor:
         if fit.iteration == 11:
@@ -33,22 +37,25 @@ def stopped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         return step(fit)
 
     monkeypatch.setattr(train.Fit, "step", until)
-    assert train.main([*TINY, "-o", str(out)]) == 130
+    assert train.main([*TINY, *words, "-o", str(paths[0])]) == 130
     monkeypatch.setattr(train.Fit, "step", step)
-    return out
+    assert 0 < json.loads(paths[0].read_text())["curve"][-1]["iteration"] < 11
+    for path in paths:
+        assert train.main([*TINY, *words, "-o", str(path)]) == 0
+    return [json.loads(path.read_text()) for path in paths]
 
 
-def test_a_stopped_training_goes_on_and_becomes_a_line(stopped: Path, tmp_path: Path) -> None:
-    assert [row["iteration"] for row in json.loads(stopped.read_text())["curve"]][-1] == 10
-    whole = tmp_path / "whole.json"
-    for out in (stopped, whole):
-        assert train.main([*TINY, "-o", str(out)]) == 0
-    one, other = (json.loads(path.read_text()) for path in (stopped, whole))
-    for row in (*one["curve"], *other["curve"]):
-        del row["seconds"]
-    assert one["curve"] == other["curve"]
+def without_seconds(record: dict[str, Any]) -> list[dict[str, Any]]:
+    return [{k: v for k, v in row.items() if k != "seconds"} for row in record["curve"]]
+
+
+def test_a_stopped_training_goes_on_and_becomes_a_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    one, other = stopped_and_whole(monkeypatch, tmp_path)
+    assert without_seconds(one) == without_seconds(other)
     assert [row["iteration"] for row in one["curve"]] == list(range(0, 21, 2))
-    found = evidence.line_of(json.loads(whole.read_text()))
+    found = evidence.line_of(other)
     assert found["psnr"] == other["curve"][-1]["psnr"]
     assert found["command"] == (
         "python examples/benchmarks/train.py --scene embedded --arm defaults --size images_4 "
@@ -164,7 +171,18 @@ def test_steps_are_timed_beside_six_adams() -> None:
     assert "| defaults | " in steps.table({64: found})
 
 
-@pytest.mark.skipif(importlib.util.find_spec("gsplat") is None, reason="gsplat is not installed")
+@needs_gsplat
+@pytest.mark.filterwarnings("ignore")  # gsplat's, at its import
+def test_splits_are_drawn_as_the_seed_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """gsplat draws them from torch's global generator, whose state a checkpoint keeps."""
+    words = ("--density", "clone-and-split", "--iterations", "40")
+    one, other = stopped_and_whole(monkeypatch, tmp_path, *words)
+    assert without_seconds(one) == without_seconds(other)
+    counts = {row["iteration"]: row["num_points"] for row in one["curve"]}
+    assert counts[20] > counts[8] > 60
+
+
+@needs_gsplat
 @pytest.mark.filterwarnings("ignore")  # gsplat's, at its import
 @pytest.mark.thorough
 def test_clone_split_and_resets_are_gsplats_own(monkeypatch: pytest.MonkeyPatch) -> None:
