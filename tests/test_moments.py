@@ -205,7 +205,8 @@ def test_a_resume_is_bit_for_bit(order: str, at: int, total: int) -> None:
         again, _ = trained(total=total)
     else:
         again = {k: Adam([Parameter(torch.zeros(200, *s))], lr=1e-2) for k, s in SHAPES.items()}
-    for adam, (values_, state) in zip(again.values(), torch.load(file), strict=True):
+    saved = torch.load(file, weights_only=True)
+    for adam, (values_, state) in zip(again.values(), saved, strict=True):
         param_of(adam).data.copy_(values_)
         adam.load_state_dict(state)
     if order == "INRIA":

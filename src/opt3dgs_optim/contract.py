@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -140,8 +141,12 @@ def _check_bare(optimizer: Any) -> None:
 
 def of_scheduler(step: Any, kind: type) -> bool:
     """Whether it is what a learning-rate scheduler puts over a step, to see that it is called."""
-    known = hasattr(step, "_wrapped_by_lr_sched") or hasattr(step, "_with_counter")
-    return known and bare(getattr(step, "__wrapped__", None)) is bare(getattr(kind, "step", None))
+    if not hasattr(step, "_wrapped_by_lr_sched"):
+        return False
+    within = getattr(step, "__wrapped__", None)
+    if within is None:  # torch 2.4 has it in the closure alone
+        within = inspect.getclosurevars(step).nonlocals.get("func")
+    return bare(within) is bare(getattr(kind, "step", None))
 
 
 def _check_bits(optimizer: Any, owner: type | None, slots: Slots, moments: int) -> None:
