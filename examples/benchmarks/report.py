@@ -187,6 +187,19 @@ def short() -> str:
     return table(("iterations", "scene", "stock", "the defaults gain"), rows, one_seed=True)
 
 
+def open_end() -> str:
+    """One training without a planned end, ended at several lengths, less those planned for them."""
+    rows = []
+    for scene, those in (*((scene, QUARTER) for scene in MAIN), ("lego", HALF)):
+        for count in (5_000, 7_500, 10_000, 15_000, 30_000):
+            ours, planned = (of((a, count), scene, **those) for a in ("open-end", "defaults"))
+            if ours and planned:
+                size = "half" if those is HALF else "quarter"
+                rows.append((scene, size, f"{count:,}", shown(planned), gained(ours, planned)))
+    heads = ("scene", "size", "iterations", "planned", "without a planned end, less that")
+    return table(heads, rows)
+
+
 def few() -> str:
     """Scenes with 10 to 15 photos; all beside stock at 30,000."""
     runs = (("stock", 3_000), ("defaults", 3_000), ("0.1.0", 10_000), ("0.1.0", 30_000))
@@ -281,7 +294,7 @@ def cost() -> str:
 
 
 TABLES = {f.__name__: f for f in (
-    front, iterations, quarter, equal, short, few, adaptive, gpu, whole, gpu_step, gpu_iteration,
+    front, iterations, quarter, equal, short, open_end, few, adaptive, gpu, whole, gpu_step, gpu_iteration,
     ratios, cost,
 )}  # fmt: skip
 

@@ -6,7 +6,7 @@
 GSPLAT is a checkout whose gsplat and whose examples' requirements are installed, SCENES a folder of
 scenes. A training is scene:arm:iterations:cap:seed; they begin in this order, two at a time. The
 script runs as it is (`stock`) or with the lines of `opt3dgs lines` (`defaults`), in a copy, with
-the schedule of `opt3dgs lines gsplat-mcmc --iterations N`. It has no option for its seed, 42: for
+the schedule of `opt3dgs lines gsplat --iterations N`. It has no option for its seed, 42: for
 seed N the copy has 42 + N. Every eighth photo is held out, whatever the seed. Finished trainings
 are lines of `evidence.jsonl` in `--out` and are not run again; what the limit stops begins anew.
 Seconds are the trainer's own, up to the save before its last step, what it compiles included.
@@ -78,8 +78,9 @@ def scene_of(folder: Path, out: Path, cpu: bool) -> Path:
 
 def words_of(line: Line, gsplat: Path, scene: Path, folder: Path, cpu: bool) -> list[str]:
     """The command of a training in its folder, and the copy of the script that it runs."""
-    stock = schedule(TRAINERS["gsplat-mcmc"]) or ""
+    stock = schedule(TRAINERS["gsplat"]) or ""  # `mcmc` first
     printed = shortened(stock, line["iterations"]).partition("simple_trainer.py ")[2]
+    printed = printed.partition("\n")[0]
     ours = f"--data_factor {4 if cpu else 1} --test_every 8 --sh_degree 3 --result_dir ."
     ours += f" --strategy.cap_max {line['points']} --disable_viewer --disable_video"
     ours += f" --eval_steps {STOCK} --save_steps {STOCK}"  # at the end: these are scaled as well
@@ -159,8 +160,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         pool.shutdown(cancel_futures=True)
     rows = []
     for line in (x for x in evidence.read(file) if evidence.key_of(x) in asked):
-        end, seconds = report.one_seed(report.shown([line])), f"{line['seconds']:.0f} s"
-        rows.append((line["command"].split()[-1], end, report.of_gaussians([line]), seconds))
+        end, seconds = report.numbers(report.mean([line])), f"{line['seconds']:.0f} s"
+        rows.append((line["command"].split()[-1], end, f"{line['gaussians']:,}", seconds))
     print(report.table(("training", "PSNR / SSIM / LPIPS", "Gaussians", "took"), rows))
     return int(len(rows) < len(asked))
 
