@@ -294,8 +294,8 @@ def cost() -> str:
 
 
 TABLES = {f.__name__: f for f in (
-    front, iterations, quarter, equal, short, open_end, few, adaptive, gpu, whole, gpu_step, gpu_iteration,
-    ratios, cost,
+    front, iterations, quarter, equal, short, open_end, few, adaptive, gpu, whole, gpu_step,
+    gpu_iteration, ratios, cost,
 )}  # fmt: skip
 
 # -- the picture, and the pages -------------------------------------------------------------------

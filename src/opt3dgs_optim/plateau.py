@@ -43,12 +43,14 @@ class Plateau:
         self._block: list[Tensor] = []
         self._means: list[Tensor] = []  # of blocks, on the loss's device until a window is full
         self._before: list[float] = []
+        self._said = False
 
     def line(self, loss: Tensor, iterations: int) -> str | None:
-        """Take the loss of an iteration, 0-d; say at the end of a window that it gained little."""
+        """Take the loss of an iteration, 0-d; say once, of a window, that it gained little."""
         gained = self._gained(loss)
-        if gained is None:
+        if gained is None or self._said:
             return None
+        self._said = True
         return (
             f"opt3dgs_optim: the {WINDOW:,} iterations up to {iterations:,} gained {gained:.2f} dB "
             f"in the loss; phases.finish_in({iterations // 5}) ends the training"

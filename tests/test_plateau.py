@@ -1,0 +1,61 @@
+"""Whether more iterations still help, by the losses that a training has seen."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+
+from opt3dgs_optim import PhaseScheduler
+from opt3dgs_optim.plateau import WINDOW, Plateau, gain
+
+
+def lines(losses: Any) -> list[tuple[int, str]]:
+    """The iterations in which something is said, and what."""
+    plateau = Plateau()
+    found = ((i, plateau.line(loss, i)) for i, loss in enumerate(losses, 1))
+    return [(i, said) for i, said in found if said is not None]
+
+
+def test_a_gain_is_in_decibels_of_an_amplitude() -> None:
+    assert gain([0.2, 0.2], [0.1, 0.1]) == pytest.approx((20 * math.log10(2), 0.0))
+    draw = torch.Generator().manual_seed(0)
+    noisy = 0.1 * (1 + 0.1 * torch.randn(2, 1_000, generator=draw, dtype=torch.float64))
+    found, error = gain(*noisy.tolist())
+    assert error == pytest.approx(8.686 * 0.1 * math.sqrt(2 / 1_000), rel=0.05)
+    assert abs(found) < 3 * error
+
+
+def test_a_loss_that_falls_no_more_is_told_once() -> None:
+    draw = torch.Generator().manual_seed(0)
+    losses = 0.05 * (1 + 0.02 * torch.randn(5 * WINDOW, generator=draw))
+    ((at, said),) = lines(losses)
+    assert at == 2 * WINDOW
+    assert "the 2,000 iterations up to 4,000 gained" in said
+    assert said.endswith("phases.finish_in(800) ends the training")
+
+
+def test_a_loss_that_falls_is_not() -> None:
+    iteration = torch.arange(5 * WINDOW)
+    assert not lines(0.05 * 10 ** (-0.1 / 20 * iteration / WINDOW))
+
+
+@pytest.mark.parametrize("loss", [0.0, -1.0, math.nan, math.inf])
+def test_where_nothing_can_be_said(loss: float) -> None:
+    assert not lines(torch.full((3 * WINDOW,), loss))
+
+
+def test_a_loss_whose_views_differ_too_much_says_nothing() -> None:
+    draw = torch.Generator().manual_seed(0)
+    assert not lines(0.05 * torch.randn(4 * WINDOW, generator=draw).exp().pow(2))
+
+
+@pytest.mark.parametrize(("total", "said"), [(None, True), (30_000, False)])
+def test_it_is_said_where_no_end_is_planned(total: Any, said: bool, caplog: Any) -> None:
+    caplog.set_level("INFO")
+    phases = PhaseScheduler(total)
+    for _ in range(2 * WINDOW):
+        phases.observe(0.1)
+    assert ("dB in the loss" in caplog.text) is said
