@@ -180,8 +180,8 @@ def test_a_part_that_learns_serves_one_training() -> None:
 @pytest.mark.parametrize(
     ("iteration", "said"),
     [
-        (6, "iteration=6, but the clock stands at 7 of total_steps=100 and goes forward, to 200"),
-        (201, "iteration=201, but the clock stands at 7 of total_steps=100"),
+        (6, "iteration=6, but the clock stands at 7 of 100 and goes forward, to 200"),
+        (201, "iteration=201, but the clock stands at 7 of 100"),
         (-1, "iteration=-1, but an integer at least 0"),
         (8.5, "iteration=8.5, but an integer"),
     ],

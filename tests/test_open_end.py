@@ -9,7 +9,15 @@ import pytest
 import torch
 from gaussians import adams_of, parameters, same_tensors, steps
 
-from opt3dgs_optim import DEFAULTS, Averaging, Curvature, Part, PhaseScheduler
+from opt3dgs_optim import (
+    DEFAULTS,
+    Averaging,
+    Curvature,
+    FreshMoments,
+    Part,
+    PhaseScheduler,
+    SquaredLoss,
+)
 from opt3dgs_optim.clock import Phase
 from opt3dgs_optim.parts.averaging import SHARE_OF_FALL
 
@@ -54,7 +62,7 @@ def test_steps_fall_to_the_end_and_are_as_long_as_before_after_it() -> None:
     assert fall[-1] < 0.1 * fall[0]
     assert rates[250] > 0.9 * rates[199]
     assert phases.total_steps is None
-    assert "without a fall" in (phases.end_line() or "")
+    assert "of no planned end" in (phases.end_line() or "")
     phases.finish_in(10)
     steps(optimizers, params, 10)
     assert phases.total_steps == 280
@@ -68,6 +76,97 @@ def test_its_mean_is_gone_where_it_goes_on() -> None:
     assert "averaging.mean" in optimizers["sh0"].state[params["sh0"]]
     steps(optimizers, params, 1)
     assert all("averaging.mean" not in optimizers[n].state[params[n]] for n in params)
+
+
+def test_what_holds_no_gaussians_is_averaged_and_forgets_it_too() -> None:
+    params = {**parameters(ROWS), "cameras": torch.nn.Parameter(torch.zeros(4, 9))}
+    phases = PhaseScheduler(parts=[Averaging(names=None)])
+    optimizers = phases.upgrade(adams_of(params))
+    cameras = params["cameras"]
+    phases.finish_in(100)
+    steps(optimizers, params, 95)
+    mean = optimizers["cameras"].state[cameras]["averaging.mean"].clone()
+    assert not torch.equal(cameras, mean)
+    phases.finish()
+    assert torch.equal(cameras, mean)
+    phases.finish_in(60)
+    assert "averaging.mean" not in optimizers["cameras"].state[cameras]
+
+
+def test_after_finish_it_may_be_ended_again() -> None:
+    phases, optimizers, params = begun([Averaging()])
+    for _ in range(2):
+        steps(optimizers, params, 20)
+        phases.finish_in(60)
+        steps(optimizers, params, 60)
+        assert phases.ended
+        assert "averaging.mean" in optimizers["sh0"].state[params["sh0"]]
+        phases.finish()
+        phases.finish_in(30)
+        steps(optimizers, params, 30)
+
+
+def test_the_end_is_known_until_another_is_planned() -> None:
+    """A trainer may look after two steps."""
+    phases, optimizers, params = begun()
+    assert not phases.ended
+    phases.finish_in(11)
+    ended = []
+    for _ in range(8):
+        steps(optimizers, params, 2)
+        ended.append(phases.ended)
+    assert ended == [False] * 5 + [True] * 3
+    phases.finish_in(10)
+    assert not phases.ended
+
+
+def test_back_to_a_checkpoint_from_before_the_end() -> None:
+    phases, optimizers, params = begun()
+    steps(optimizers, params, 50)
+    trunk = {name: copy.deepcopy(each.state_dict()) for name, each in optimizers.items()}
+    phases.finish_in(20)
+    steps(optimizers, params, 21)
+    for name, each in optimizers.items():
+        each.load_state_dict(trunk[name])
+    assert (phases.iteration, phases.fall_step, phases.total_steps) == (49, None, None)
+    assert not phases.ended
+    phases.finish_in(30)
+    assert phases.total_steps == 80
+
+
+def test_back_into_the_fall_with_the_positions_loaded_last() -> None:
+    phases, optimizers, params = begun([Averaging()])
+    steps(optimizers, params, 40)
+    phases.finish_in(60)
+    steps(optimizers, params, 56)
+    saved = {name: copy.deepcopy(each.state_dict()) for name, each in optimizers.items()}
+    steps(optimizers, params, 10)
+    for name in reversed(list(optimizers)):
+        optimizers[name].load_state_dict(saved[name])
+    assert all("averaging.mean" in optimizers[n].state[params[n]] for n in params)
+
+
+def test_a_mean_of_a_fall_is_none_of_a_planned_end() -> None:
+    """They count iterates by their own measure."""
+    phases, optimizers, params = begun([Averaging()])
+    steps(optimizers, params, 10)
+    phases.finish_in(90)
+    steps(optimizers, params, 85)
+    planned = PhaseScheduler(100, parts=[Averaging()])
+    others = planned.upgrade(adams_of(params))
+    for name, each in others.items():
+        each.load_state_dict(optimizers[name].state_dict())
+        assert "averaging.mean" not in each.state[params[name]]
+
+
+def test_pairs_of_one_fall_are_none_of_the_next() -> None:
+    phases, optimizers, params = begun([Curvature()])
+    phases.finish_in(20)
+    steps(optimizers, params, 20)
+    state = optimizers["means"].state[params["means"]]
+    assert "curvature.history" in state
+    steps(optimizers, params, 1)
+    assert "curvature.history" not in state
 
 
 def test_an_end_that_is_planned_early_is_the_same_as_one_that_is_planned_late() -> None:
@@ -132,27 +231,58 @@ def test_exploitation_is_the_fall() -> None:
     assert phases.phase is Phase.EXPLORATION
 
 
-@pytest.mark.parametrize("count", [0, -1, 2.5, True, None])
+def test_its_moments_begin_anew_and_its_loss_is_squared() -> None:
+    """The loss is that of the coming iteration."""
+    phases, optimizers, params = begun([FreshMoments(), SquaredLoss()])
+    half, none = torch.full((4,), 0.5), torch.zeros(4)
+    steps(optimizers, params, 5)
+    phases.finish_in(10)
+    losses, counts = [], []
+    for i in range(12):
+        losses.append(float(phases.pixel_loss(half, none)))
+        steps(optimizers, params, 1, seed=i)
+        counts.append(int(optimizers["sh0"].state[params["sh0"]]["step"]))
+    assert losses == [0.25] * 10 + [0.5] * 2
+    assert counts == list(range(1, 13))
+
+
+@pytest.mark.parametrize("count", [9, 0, -1, 12.5, True, None])
 def test_what_is_no_number_of_iterations_is_refused(count: Any) -> None:
     phases, _, _ = begun()
-    with pytest.raises(ValueError, match=r"finish_in: iterations=.* an integer at least 1"):
+    with pytest.raises(ValueError, match=r"finish_in: iterations=.* an integer at least 10"):
         phases.finish_in(count)
 
 
 def test_an_end_that_is_planned_or_begun_is_refused() -> None:
     phases, optimizers, params = begun()
     steps(optimizers, params, 3)
-    phases.finish_in(5)
-    with pytest.raises(ValueError, match="the end has begun, from iteration 3 to 8"):
-        phases.finish_in(5)
+    phases.finish_in(15)
+    with pytest.raises(ValueError, match="the end has begun, from iteration 3 to 18"):
+        phases.finish_in(15)
     with pytest.raises(ValueError, match="total_steps=100 plans the end; "):
-        PhaseScheduler(100).finish_in(5)
+        PhaseScheduler(100).finish_in(15)
+
+
+def test_a_jump_in_the_fall_is_refused() -> None:
+    """It could leave out the end, as of a trainer that counts images."""
+    phases, optimizers, params = begun()
+    phases.observe(iteration=400)
+    steps(optimizers, params, 1)
+    phases.finish_in(20)
+    phases.observe(iteration=401)
+    with pytest.raises(ValueError, match="to 402 at most; finish_in counts steps: leave out"):
+        phases.observe(iteration=404)
+    with pytest.raises(ValueError, match="401 of 421 and goes forward"):
+        phases.observe(iteration=3)
 
 
 def test_what_ends_without_a_fall_is_told(caplog: Any) -> None:
     phases, optimizers, params = begun()
     steps(optimizers, params, 7)
-    assert "ended at iteration 7 without a fall" in (phases.end_line() or "")
+    assert "ended at iteration 7 of no planned end, so" in (phases.end_line() or "")
+    phases.finish_in(10)
+    steps(optimizers, params, 4)
+    assert "ended at iteration 11 of 17, so" in (phases.end_line() or "")
     phases.finish()
     assert "the parameters stay the last iterate" in caplog.text
 
@@ -171,9 +301,9 @@ def test_a_part_sees_how_far_the_fall_is() -> None:
     part = _Lengths()
     phases, optimizers, params = begun([part])
     steps(optimizers, {"means": params["means"]}, 2)
-    phases.finish_in(4)
-    steps(optimizers, {"means": params["means"]}, 5)
-    fall = [(6, 0.0), (6, 0.25), (6, 0.5), (6, 0.75)]
+    phases.finish_in(10)
+    steps(optimizers, {"means": params["means"]}, 11)
+    fall = [(12, pytest.approx(i / 10)) for i in range(10)]
     assert part.seen == [(None, 0.0), (None, 0.0), *fall, (None, 0.0)]
 
 

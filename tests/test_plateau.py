@@ -15,7 +15,7 @@ from opt3dgs_optim.plateau import WINDOW, Plateau, gain
 def lines(losses: Any) -> list[tuple[int, str]]:
     """The iterations in which something is said, and what."""
     plateau = Plateau()
-    found = ((i, plateau.line(loss, i)) for i, loss in enumerate(losses, 1))
+    found = ((i + 1, plateau.line(loss, i)) for i, loss in enumerate(losses))
     return [(i, said) for i, said in found if said is not None]
 
 
@@ -56,6 +56,31 @@ def test_a_loss_whose_views_differ_too_much_says_nothing() -> None:
 def test_it_is_said_where_no_end_is_planned(total: Any, said: bool, caplog: Any) -> None:
     caplog.set_level("INFO")
     phases = PhaseScheduler(total)
-    for _ in range(2 * WINDOW):
-        phases.observe(0.1)
+    for iteration in range(2 * WINDOW):
+        phases.observe(0.1, iteration=iteration)
     assert ("dB in the loss" in caplog.text) is said
+
+
+def test_a_loss_that_rises_is_another_loss() -> None:
+    """As where a trainer resets opacities."""
+    iteration = torch.arange(5 * WINDOW)
+    assert not lines(0.05 * 10 ** (1.0 / 20 * iteration / WINDOW))
+
+
+@pytest.mark.parametrize(("stride", "calls", "at"), [(1, 4, 2 * WINDOW), (10, 1, None)])
+def test_iterations_count_and_not_calls(stride: int, calls: int, at: Any) -> None:
+    """Several losses of an iteration are one; without those of each iteration nothing is said."""
+    plateau, said = Plateau(), None
+    for iteration in range(0, 4 * WINDOW * stride, stride):
+        for _ in range(calls):
+            if plateau.line(torch.tensor(0.1), iteration) is not None:
+                said = iteration + 1
+    assert said == at
+
+
+def test_a_loss_that_is_changed_in_place_afterwards() -> None:
+    plateau, loss, said = Plateau(), torch.zeros(()), []
+    for iteration in range(2 * WINDOW):
+        said.append(plateau.line(loss.fill_(0.1), iteration))
+        loss.zero_()
+    assert "gained 0.00 dB" in said[-1]

@@ -33,11 +33,11 @@ from opt3dgs_optim.checkpoint import (
     take_from_groups,
 )
 from opt3dgs_optim.contract import Slots, bare, check_held, check_slots, check_supported, own_step
-from opt3dgs_optim.mean import put_mean
+from opt3dgs_optim.mean import kept_in, put_mean
 from opt3dgs_optim.moments import MOMENTS, as_numbers
 from opt3dgs_optim.names import split_name
 from opt3dgs_optim.sparse_adam import check_arguments, refuse_capture, refuse_mask, step_around
-from opt3dgs_optim.stepper import ParamStepper, kept_in
+from opt3dgs_optim.stepper import ParamStepper
 from opt3dgs_optim.training import Training
 
 
@@ -79,6 +79,7 @@ class StepAdam(Adam):
     def _name_groups(self) -> None:
         """Say in each group which Gaussian parameter it holds, by gsplat's name, or None."""
         members = self.training.members
+        self.training.all_optimizers.add(self)
         self.has_means = False
         for slot in [slot for slot, each in members.items() if each[0]() is self]:
             del members[slot]

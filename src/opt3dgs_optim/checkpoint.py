@@ -11,9 +11,9 @@ from torch import Tensor
 
 from opt3dgs_optim.checks import as_float, check_choice, check_count, check_number
 from opt3dgs_optim.contract import REFUSED, Slots
-from opt3dgs_optim.mean import BEGAN, MEAN, RESIDUE, REST, drop_means
+from opt3dgs_optim.mean import BEGAN, MEAN, RESIDUE, REST, drop_kept, drop_means, kept_in
 from opt3dgs_optim.moments import CODES, MOMENTS, recode
-from opt3dgs_optim.stepper import KEPT, begin_moments_anew, drop_kept, kept_in
+from opt3dgs_optim.stepper import KEPT, begin_moments_anew
 from opt3dgs_optim.training import Training
 
 # In each group of a checkpoint, as a line of JSON, so that a group may be moved or dropped, and
@@ -150,8 +150,9 @@ def restore_parts(training: Training, saved: Iterable[Mapping[str, Any]]) -> Non
 
 def restore_training(training: Training, saved: Mapping[str, Any]) -> None:
     """Have the parts know what they had noted, and a training of no planned end of its fall."""
-    if training.open_end and saved["fall_step"] is not None:
-        training.plan_fall(saved["fall_step"], saved["total_steps"])
+    if training.open_end:
+        start = saved["fall_step"]
+        training.plan_fall(start, None if start is None else saved["total_steps"])
     for part in training.parts:
         if type(part).__name__ in saved["notes"]:
             notes = training.notes_of(part)
@@ -175,7 +176,8 @@ def drop_other_means(
             "curvature pairs, that it has (torch.distributed.checkpoint loads only what the new "
             "optimizer has); they begin anew"
         )
-    if saved is None or saved["total_steps"] != training.total_steps:
+    ends = None if saved is None else (saved["total_steps"], saved["fall_step"])
+    if ends != (training.total_steps, training.fall_step):
         for state in states:
             drop_kept(state)
     if saved is not None and saved["moments"] != training.moments:
@@ -267,9 +269,10 @@ def check_numbers(call: str, saved: Any, count: int) -> None:
             "Adam's moments alone"
         )
     check_count(call, "iteration", saved["iteration"], 0)
-    for name in ("total_steps", "fall_step"):
-        if saved[name] is not None:
-            check_count(call, name, saved[name], int(name == "total_steps"))
+    if saved["total_steps"] is not None:
+        check_count(call, "total_steps", saved["total_steps"], 1)
+    if saved["fall_step"] is not None:
+        check_count(call, "fall_step", saved["fall_step"], 0, (saved["total_steps"] or 0) - 1)
     check_count(call, "steps", saved["steps"], 0)
     check_count(call, "kept", saved["kept"], 0)
     check_choice(call, "moments", saved["moments"], (32, 16))

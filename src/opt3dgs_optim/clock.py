@@ -28,15 +28,17 @@ class Clock:
         open_end: whether no end was planned. Then `total_steps` is None, but in a fall.
         fall_step: the iteration with which the fall to the end begins; None: there is none.
         fallen: the share of the fall that is over, 0..1.
+        switch_at: where exploitation starts: `switch_step`, or without it the present fall.
         counts_means: whether one of the optimizers holds positions: it alone counts.
     """
 
     def __init__(self, total_steps: int | None = None, switch_step: int | None = None) -> None:
         self.total_steps, self.switch_step = total_steps, switch_step
-        self._switch = math.inf if switch_step is None else switch_step
-        self.iteration, self.exploiting, self.exploits_next = -1, False, self._switch <= 0
+        self.switch_at = math.inf if switch_step is None else switch_step
+        self._switch_back = math.inf
+        self.iteration, self.exploiting, self.exploits_next = -1, False, self.switch_at <= 0
         self.progress, self.counts_means = 0.0, False
-        self.open_end, self.fallen = total_steps is None, 0.0
+        self.open_end, self.fallen, self._ended = total_steps is None, 0.0, False
         self.fall_step: int | None = None
         self._means_at = -1  # the iteration of the positions' last step
         self._means_open = False  # whether they were stepped first there
@@ -47,6 +49,11 @@ class Clock:
     def phase(self) -> Phase:
         """Of the present iteration."""
         return Phase.EXPLOITATION if self.exploiting else Phase.EXPLORATION
+
+    @property
+    def ended(self) -> bool:
+        """Whether the last iteration that was planned has been made."""
+        return self._ended
 
     def begin(self, optimizer: Any) -> int:
         """The iteration of a step that an optimizer is about to make.
@@ -71,16 +78,21 @@ class Clock:
         self._resumed, self._begun = False, iteration
         optimizer.next_iteration = iteration + 1
         if iteration > self.iteration:
-            self.go_to(iteration)
-            self.advanced()
+            self.advance(iteration)
         return iteration
 
     def put_on(self, iteration: int) -> None:
         """Put the clock forward, to where the trainer's own count is."""
         if iteration > self.iteration:
-            self.go_to(iteration)
             self._resumed = False
-            self.advanced()
+            self.advance(iteration)
+
+    def advance(self, iteration: int) -> None:
+        """Go on to an iteration; past the end of a fall the training has no end again."""
+        if self.fall_step is not None and iteration >= (self.total_steps or 0):
+            self.go_on()
+        self.go_to(iteration)
+        self.advanced()
 
     def resume(self, iteration: int) -> None:
         """Go on at an iteration, which is the next one that is made."""
@@ -91,20 +103,30 @@ class Clock:
     def go_to(self, iteration: int) -> None:
         """Be at that iteration."""
         start, end = self.fall_step, self.total_steps
-        if end is not None and start is None:
-            self.progress = min(max(iteration / end, 0.0), 1.0)
-        elif end is not None and start is not None:
-            self.fallen = max((iteration - start) / (end - start), 0.0)
-            if iteration >= end:  # it goes on
-                self.plan_fall(None, None)
-        self.iteration, self.exploiting = iteration, iteration >= self._switch
-        self.exploits_next = iteration + 1 >= self._switch
+        if end is not None:
+            self._ended = iteration + 1 >= end
+            if start is None:
+                self.progress = min(max(iteration / end, 0.0), 1.0)
+            else:
+                self.fallen = min(max((iteration - start) / (end - start), 0.0), 1.0)
+        self.iteration, self.exploiting = iteration, self._exploits(iteration)
+        self.exploits_next = self._exploits(iteration + 1)
+
+    def _exploits(self, iteration: int) -> bool:
+        return self.switch_at <= iteration < self._switch_back
 
     def plan_fall(self, start: int | None, end: int | None) -> None:
-        """Have a training of no planned end fall from one iteration to another, or no more."""
-        self.fall_step, self.total_steps, self.fallen = start, end, 0.0
+        """Have a training of no planned end fall from one iteration to another, or not at all."""
+        self.fall_step, self.total_steps, self.fallen, self._ended = start, end, 0.0, False
         if self.switch_step is None:
-            self._switch = math.inf if start is None else start
+            self.switch_at = math.inf if start is None else start
+            self._switch_back = math.inf if end is None else end
+        self.exploits_next = self._exploits(self.iteration + 1)
+
+    def go_on(self) -> None:
+        """Have no end any more, after one."""
+        self.plan_fall(None, None)
+        self._ended = True
 
     def advanced(self) -> None:
         """Called once in each iteration, before its first step."""

@@ -78,6 +78,17 @@ def drop_means(states: Iterable[dict[str, Any]]) -> None:
             state.pop(key, None)
 
 
+def kept_in(state: Mapping[str, Any]) -> list[str]:
+    """What is kept for rows beside Adam's moments, by name: means, and what parts keep."""
+    return [key for key in state if "." in key]
+
+
+def drop_kept(state: dict[str, Any]) -> None:
+    """Have nothing kept for rows beside Adam's moments."""
+    for key in kept_in(state):
+        del state[key]
+
+
 def like_rows(numbers: Tensor, param: Tensor) -> Tensor:
     """Numbers of rows [N] that broadcast with a parameter [N, ...]; of one number [] alone."""
     return numbers.view((*numbers.shape, *[1] * (param.dim() - numbers.dim())))

@@ -58,7 +58,8 @@ class End:
             training.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, open_end: bool) -> None:
+        self.open_end = open_end
         self.total_steps: int | None = None
         self.mean_at: float | None = None
         self.upgraded = False  # and not resumed: a checkpoint may be loaded to be looked at
@@ -76,14 +77,14 @@ class End:
             )
         if self.mean_at is None or self.mean_at == self.total_steps or not self.done:
             return None
-        if self.total_steps is None:
-            return (
-                f"opt3dgs_optim: the training ended at iteration {self.done} without a fall to "
-                "the end, so that the parameters are the last iterate and no mean; call "
-                "phases.finish_in(n) n iterations before it ends"
-            )
         if self.done > self.mean_at:
             return None
+        if self.open_end:
+            return (
+                f"opt3dgs_optim: the training ended at iteration {self.done} of "
+                f"{self.total_steps or 'no planned end'}, so that the parameters are the last "
+                "iterate and no mean; call phases.finish_in(n) n iterations before it ends"
+            )
         return (
             f"opt3dgs_optim: the training ended at iteration {self.done} of {self.total_steps}, so "
             "that the parameters are the last iterate and no mean; make total_steps the number of "

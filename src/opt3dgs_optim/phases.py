@@ -59,8 +59,8 @@ class PhaseScheduler(Training):
         total_steps: iterations of the training, each with one step of the positions' optimizer;
             None: it goes on until `finish_in` is called.
         switch: where exploitation starts: a fraction of `total_steps` in (0, 1] if a float, an
-            iteration if an int (`total_steps`: never). The paper: 29/30. Without `total_steps` it
-            starts with the fall to the end.
+            iteration if an int (`total_steps`: never). The paper: 29/30. Without `total_steps` a
+            fraction is the fall to the end.
         parts: what the steps have, in order; None: `DEFAULTS`.
         moments: bits per number of each of Adam's two moments, and of the mean of the last
             thirtieth; 16 halves the memory, and is for the Gaussians alone (see
@@ -118,7 +118,7 @@ class PhaseScheduler(Training):
         self._group = process_group
         own = (part for part in self.parts if part.overrides("pixel_loss"))
         self._pixel: Part | None = next(own, None)
-        self._end, self._plateau = End(), Plateau()
+        self._end, self._plateau = End(self.open_end), Plateau()
         self._plan_end()
         weakref.finalize(self, self._end.say)  # at exit, or where the function that trains ends
 
@@ -215,18 +215,21 @@ class PhaseScheduler(Training):
         if iteration is not None:
             iteration = check_count(f"{CALL}.observe", "iteration", iteration, 0)
             most = math.inf if self.total_steps is None else 2 * self.total_steps
+            cure = "make a new PhaseScheduler for another run"
+            if self.fall_step is not None:  # a jump would leave out its end
+                most, cure = self.iteration + 1, "finish_in counts steps: leave out iteration="
             if not self.iteration <= iteration <= most:
                 raise ValueError(
                     f"{CALL}.observe: iteration={iteration}, but the clock stands at "
-                    f"{self.iteration} of total_steps={self.total_steps} and goes forward, to "
-                    f"{most} at most; make a new PhaseScheduler for another run"
+                    f"{self.iteration} of {self.total_steps or 'no planned end'} and goes forward"
+                    f"{f', to {most} at most' * (most < math.inf)}; {cure}"
                 )
             self.put_on(iteration)
         if loss is None:
             return
         self._loss = energy = check_energy(f"{CALL}.observe", "loss", loss)
         if self.open_end and self.fall_step is None:
-            line = self._plateau.line(energy, self.iteration + 1)
+            line = self._plateau.line(energy, self.iteration)
             if line is not None:
                 self.messages.say_once(line)
         if self.observers:
@@ -261,17 +264,17 @@ class PhaseScheduler(Training):
         on, with steps as long as before, and be ended again.
 
         Args:
-            iterations: at least 1; a fifth of those so far is enough.
+            iterations: at least 10; a fifth of those so far is enough.
 
         Raises:
             ValueError: no count; `total_steps` was given; or the end has begun.
 
         Examples:
             >>> import torch
-            >>> from opt3dgs_optim import PhaseScheduler
+            >>> from opt3dgs_optim import Averaging, PhaseScheduler
             >>> means = torch.nn.Parameter(torch.ones(4, 3))
             >>> optimizers = {"means": torch.optim.Adam([means], lr=0.01, eps=1e-15)}
-            >>> phases = PhaseScheduler()
+            >>> phases = PhaseScheduler(parts=[Averaging()])
             >>> optimizers = phases.upgrade(optimizers)
             >>> def train(iterations):
             ...     for _ in range(iterations):
@@ -285,22 +288,18 @@ class PhaseScheduler(Training):
             (59, True)
         """
         call = f"{CALL}.finish_in"
-        iterations = check_count(call, "iterations", iterations, 1)
+        iterations = check_count(call, "iterations", iterations, 10)
         if not self.open_end:
             raise ValueError(
                 f"{call}: total_steps={self.total_steps} plans the end; PhaseScheduler() does not"
             )
-        if self.fall_step is not None and not self.ended:
+        if self.fall_step is not None and not (self.ended or self.finished):
             raise ValueError(
                 f"{call}: the end has begun, from iteration {self.fall_step} to {self.total_steps}"
             )
-        self.drop_means()
+        self.go_on()
         self.plan_fall(self.iteration + 1, self.iteration + 1 + iterations)
-
-    @property
-    def ended(self) -> bool:
-        """Whether the last iteration that is planned has been made."""
-        return self.total_steps is not None and self.iteration + 1 >= self.total_steps
+        self.finished = self._end.finished = False
 
     def plan_fall(self, start: int | None, end: int | None) -> None:
         """Have the training fall to its end, and know where its mean is."""

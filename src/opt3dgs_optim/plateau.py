@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
-import torch
 from torch import Tensor
 
 WINDOW = 2_000  # iterations whose losses are compared with those of as many before
@@ -24,13 +24,15 @@ def gain(before: Sequence[float], now: Sequence[float]) -> tuple[float, float]:
     Returns:
         NaN and NaN where a loss is not above 0, or not finite.
     """
+    if not all(map(math.isfinite, [*before, *now])):
+        return math.nan, math.nan
     found = []
     for losses in (before, now):
         mean = math.fsum(losses) / len(losses)
         variance = math.fsum((x - mean) ** 2 for x in losses) / (len(losses) - 1)
         found.append((mean, math.sqrt(variance / len(losses))))
     (old, old_error), (new, new_error) = found
-    if not (old > 0 and new > 0 and math.isfinite(old) and math.isfinite(new)):
+    if not (old > 0 and new > 0):
         return math.nan, math.nan
     relative = math.hypot(old_error / old, new_error / new)
     return 20 * math.log10(old / new), 20 / math.log(10) * relative
@@ -40,34 +42,41 @@ class Plateau:
     """Compares the losses of the last iterations with those of as many before."""
 
     def __init__(self) -> None:
-        self._block: list[Tensor] = []
-        self._means: list[Tensor] = []  # of blocks, on the loss's device until a window is full
+        self._last = -1  # the iteration of the last loss
+        self._sum: Any = 0.0
+        self._count = 0  # losses in the sum
+        self._means: list[Any] = []  # of blocks, on the loss's device until a window is full
         self._before: list[float] = []
         self._said = False
 
-    def line(self, loss: Tensor, iterations: int) -> str | None:
-        """Take the loss of an iteration, 0-d; say once, of a window, that it gained little."""
-        gained = self._gained(loss)
-        if gained is None or self._said:
-            return None
-        self._said = True
-        return (
-            f"opt3dgs_optim: the {WINDOW:,} iterations up to {iterations:,} gained {gained:.2f} dB "
-            f"in the loss; phases.finish_in({iterations // 5}) ends the training"
-        )
+    def line(self, loss: Tensor, iteration: int) -> str | None:
+        """Take the loss of an iteration, 0-d; say once, of a window, that it gained little.
 
-    def _gained(self, loss: Tensor) -> float | None:
-        """Decibels that a full window has gained, if they are surely less than `LITTLE`."""
-        self._block.append(loss)
-        if len(self._block) < BLOCK:
+        Of several losses of one iteration the first counts. Where iterations have none it begins
+        anew.
+        """
+        if self._said or iteration == self._last:
             return None
-        self._means.append(torch.stack(self._block).mean())
-        self._block = []
+        if iteration != self._last + 1:
+            self._sum, self._count, self._means, self._before = 0.0, 0, [], []
+        self._last = iteration
+        self._sum, self._count = self._sum + loss, self._count + 1
+        if self._count < BLOCK:
+            return None
+        self._means.append(self._sum / BLOCK)
+        self._sum, self._count = 0.0, 0
         if len(self._means) < WINDOW // BLOCK:
             return None
-        before, self._before = self._before, torch.stack(self._means).tolist()
+        before, self._before = self._before, [float(mean) for mean in self._means]
         self._means = []
         if not before:
             return None
-        found, error = gain(before, self._before)
-        return found if found + error < LITTLE else None
+        gained, error = gain(before, self._before)
+        self._said = abs(gained) + error < LITTLE  # where it rises, the loss has become another
+        if not self._said:
+            return None
+        return (
+            f"opt3dgs_optim: the {WINDOW:,} iterations up to {iteration + 1:,} gained "
+            f"{gained:.2f} dB in the loss; phases.finish_in({(iteration + 1) // 5}) ends the "
+            "training"
+        )

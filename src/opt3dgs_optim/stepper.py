@@ -11,7 +11,7 @@ from torch import Tensor
 
 from opt3dgs_optim import triton
 from opt3dgs_optim.clock import Phase
-from opt3dgs_optim.mean import OF_MEAN, Mean, drop_means, mean_of, take_into_mean
+from opt3dgs_optim.mean import OF_MEAN, Mean, drop_kept, drop_means, mean_of, take_into_mean
 from opt3dgs_optim.messages import LOGGER
 from opt3dgs_optim.moments import CODES, MOMENTS, as_codes
 from opt3dgs_optim.step import Step, mixed, take_step
@@ -231,17 +231,6 @@ def begin_moments_anew(state: dict[str, Any]) -> None:
     for key in MOMENTS:
         state[key].zero_()
     drop_means([state])
-
-
-def kept_in(state: dict[str, Any]) -> list[str]:
-    """What is kept for rows beside Adam's moments, by name."""
-    return [key for key in state if "." in key]
-
-
-def drop_kept(state: dict[str, Any]) -> None:
-    """Have nothing kept for rows beside Adam's moments."""
-    for key in kept_in(state):
-        del state[key]
 
 
 def checked_gradient(part: Any, found: Any, grad: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch.optim import Optimizer
 from opt3dgs_optim.checks import check_choice
 from opt3dgs_optim.clock import Clock
 from opt3dgs_optim.device import BadNumbers
-from opt3dgs_optim.mean import drop_means
+from opt3dgs_optim.mean import drop_kept, drop_means
 from opt3dgs_optim.messages import Messages
 
 LOOK_INTERVAL = 100  # iterations between two looks at the numbers that were not finite
@@ -31,6 +31,7 @@ class Training(Clock):
         changes_steps: whether the steps differ from torch's.
         members: by set and gsplat's name, the optimizer that holds this Gaussian parameter, and its
             group's index. References are weak: what a trainer replaces is freed at once.
+        all_optimizers: all that it steps, weakly.
         finished: whether the training has been ended early.
         averages: whether there is room for the mean of the last iterates.
         messages: what has been said, each thing once.
@@ -50,6 +51,7 @@ class Training(Clock):
         self.moments = check_choice(type(self).__name__, "moments", moments, (32, 16))
         self.changes_steps = bool(self.parts) or moments != 32
         self.members: dict[tuple[str, str], tuple[weakref.ref[Optimizer], int]] = {}
+        self.all_optimizers: weakref.WeakSet[Any] = weakref.WeakSet()
         self.finished, self.averages = False, True
         self.messages, self.bad_numbers = Messages(), BadNumbers()
         self.unsaved: dict[Any, Any] = {}
@@ -87,13 +89,13 @@ class Training(Clock):
         return None if param is None or optimizer is None else optimizer.state.get(param) or None
 
     def optimizers(self) -> list[Any]:
-        """Optimizers with Gaussian parameters."""
-        found = {id(o): o for m in self.members.values() if (o := m[0]()) is not None}
-        return list(found.values())
+        """Those that have not gone over to another training."""
+        return [each for each in self.all_optimizers if each.training is self]
 
     def clocks(self) -> list[int]:
-        """The next iteration of each optimizer whose steps are counted."""
-        counted = [o for o in self.optimizers() if o.has_means or not self.counts_means]
+        """The next iteration of each optimizer of Gaussians whose steps are counted."""
+        found = {id(o): o for m in self.members.values() if (o := m[0]()) is not None}
+        counted = [o for o in found.values() if o.has_means or not self.counts_means]
         return [each.next_iteration for each in counted]
 
     def numbers(self) -> dict[str, float | Tensor]:
@@ -108,15 +110,18 @@ class Training(Clock):
         for part in self.observers:
             part.observe(loss, self)
 
-    def drop_means(self) -> None:
-        """Have no means of iterates."""
+    def go_on(self) -> None:
+        """Have no end any more, and nothing that was kept for rows on the way to it."""
+        super().go_on()
         for optimizer in self.optimizers():
-            drop_means(optimizer.state.values())
+            for state in optimizer.state.values():
+                drop_kept(state)
 
     def end_averaging(self) -> None:
         """Go on without the mean of the last iterates, for which a device has no room."""
         self.averages = False
-        self.drop_means()
+        for optimizer in self.optimizers():
+            drop_means(optimizer.state.values())
         self.messages.warn_once(
             "memory",
             f"opt3dgs_optim: iteration {self.iteration}: the device has no room for the mean of "
@@ -126,10 +131,7 @@ class Training(Clock):
 
     def go_to(self, iteration: int) -> None:
         """Be at that iteration; now and then look for numbers that were not finite."""
-        fell = self.fall_step is not None
         super().go_to(iteration)
-        if fell and self.fall_step is None:
-            self.drop_means()
         if iteration >= self._look_at or iteration + 1 == self.total_steps:
             self._look_at = iteration + LOOK_INTERVAL
             self.look_at_numbers()
@@ -158,4 +160,5 @@ class Training(Clock):
     def __getstate__(self) -> dict[str, Any]:
         # A copy of an optimizer tells its training itself that it is a member.
         self.read_back()
-        return {**vars(self), "unsaved": {}, "members": {}}
+        others = {"unsaved": {}, "members": {}, "all_optimizers": weakref.WeakSet()}
+        return {**vars(self), **others}

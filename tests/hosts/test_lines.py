@@ -86,7 +86,7 @@ def test_the_lines_are_three_statements(name: str) -> None:
     [
         ("3dgs-mcmc", "phases = PhaseScheduler()"),
         ("gsplat", "phases = PhaseScheduler()"),
-        ("gsplat-2dgs", "phases = PhaseScheduler(parts=DEFAULTS[1:])"),
+        ("taming-3dgs", "phases = PhaseScheduler()"),
     ],
 )
 def test_the_lines_without_a_planned_end(
@@ -103,6 +103,7 @@ def test_the_lines_without_a_planned_end(
     ("words", "said"),
     [
         (["nerfstudio"], "nerfstudio plans its length"),
+        (["gsplat-2dgs"], "gsplat-2dgs plans its length"),
         (["train.py"], "need the name of a trainer"),
         (["inria", "--iterations", "300"], "give one of them"),
     ],

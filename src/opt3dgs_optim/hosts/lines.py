@@ -39,7 +39,7 @@ def text(name: str, iterations: int | None = None, open_end: bool = False) -> st
         raise ValueError(f"--open-end is for {known}; {name} plans its length")
     block = trainer.block
     if open_end:  # without the number
-        block = re.sub(r"(PhaseScheduler\()[^,()]+(, )?", r"\1", block)
+        block = re.sub(r"(PhaseScheduler\()[^,()]+", r"\1", block)
     notes = "\n".join(
         textwrap.fill(
             f"{topic}: {_plain(said)}", WIDTH, subsequent_indent="  ", break_on_hyphens=False

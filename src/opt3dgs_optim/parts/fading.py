@@ -45,8 +45,8 @@ class Fading(Part):
         events: how many over the run, but never less than 4 iterations apart. Where points are
             many, they are small, and so many events cost detail. So with N > 10,000 points only
             (10,000 / N)^(2/3) of the events happen, but at least a third of them.
-        start, stop: the stretch over which they are spread, as shares of the run; the last event
-            is at its end.
+        start, stop: the stretch over which they are spread, as shares of a planned run; the last
+            event is at its end.
         seed: of the choice of points.
         names: the Gaussian parameters, under gsplat's or INRIA's names.
 

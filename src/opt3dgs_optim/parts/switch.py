@@ -38,6 +38,5 @@ class FreshMoments(Part):
 
     def plan(self, step: Step, training: Training) -> None:
         """Begin anew in the parameter's first step after the switch."""
-        switch = training.switch_step
-        if switch is not None and step.stepped_in < switch <= step.iteration:
+        if step.stepped_in < training.switch_at <= step.iteration:
             step.fresh = True

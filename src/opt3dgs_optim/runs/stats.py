@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -178,7 +179,8 @@ def _gain(run: Run, reference: Run, metric: str) -> float | None:
 def gain_at_end(run: Run) -> tuple[float, float] | None:
     """Decibels that the loss gained in the last iterations, and their standard error.
 
-    None where the run's steps have no `loss` (or `energy`), or not that of every iteration.
+    None where the run's steps have no `loss` (or `energy`), not that of every iteration, or one
+    that is not above 0.
     """
     for name in ("loss", "energy"):
         iterations, _, losses = run.series(name, "step")
@@ -186,5 +188,6 @@ def gain_at_end(run: Run) -> tuple[float, float] | None:
         if len(last) == 2 * WINDOW and iterations[-1] - iterations[-2 * WINDOW] < 2 * WINDOW:
             means = last.reshape(-1, BLOCK).mean(1)
             before, now = np.split(means, 2)
-            return gain(before.tolist(), now.tolist())
+            found = gain(before.tolist(), now.tolist())
+            return None if math.isnan(found[0]) else found
     return None
