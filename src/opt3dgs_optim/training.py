@@ -94,9 +94,9 @@ class Training(Clock):
 
     def clocks(self) -> list[int]:
         """The next iteration of each optimizer of Gaussians whose steps are counted."""
-        found = {id(o): o for m in self.members.values() if (o := m[0]()) is not None}
-        counted = [o for o in found.values() if o.has_means or not self.counts_means]
-        return [each.next_iteration for each in counted]
+        found: dict[int, Any] = {id(o := m[0]()): o for m in self.members.values()}
+        held = [each for each in found.values() if each is not None]
+        return [o.next_iteration for o in held if o.has_means or not self.counts_means]
 
     def numbers(self) -> dict[str, float | Tensor]:
         """What the parts say of the present iteration."""

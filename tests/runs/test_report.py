@@ -360,7 +360,8 @@ def test_the_report_says_what_the_last_iterations_gained(
     """Of a log that has the loss of every iteration."""
     with RunLog(tmp_path / "log.jsonl", metadata={"arm": "mine"}) as log:
         for iteration in range(0, 4_100, every):
-            log.step(iteration, **{name: 0.1 if iteration < 2_100 else 0.05})
+            value: Any = 0.1 if iteration < 2_100 else 0.05
+            log.step(iteration, **{name: value})
         log.evaluation(4_100, psnr=25.0)
     written = report.write_report([read_run(tmp_path / "log.jsonl")], tmp_path / "out")
     said = "The last 2,000 iterations of mine gained 6.02 ± 0.00 dB in the loss"
