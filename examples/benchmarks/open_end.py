@@ -31,6 +31,7 @@ from tqdm import trange
 from benchmarks import evidence, train
 from opt3dgs_optim import PhaseScheduler
 
+SHORTEST = 60  # iterations
 FALL = 6  # the fall is a sixth of the training, a fifth of what is before it
 RATE = 0.03  # of the positions' first rate in a planned training
 REFINE_EVERY = 50
@@ -81,8 +82,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     torch.set_num_threads(1)
     ends, scene = args.ends, train.scene_of(args)
-    if sorted(set(ends)) != ends or ends[0] < FALL:
-        raise ValueError(f"ends {ends}: ascending numbers, {FALL} or more, are needed")
+    if sorted(set(ends)) != ends or ends[0] < SHORTEST:
+        raise ValueError(f"ends {ends}: ascending numbers, {SHORTEST} or more, are needed")
     options = replace(train.options_of(args), iterations=ends[-1])
     lpips = args.lpips and train.lpips_of(*args.lpips)
     name = f"{scene.name}-{args.size}-{args.seed}"

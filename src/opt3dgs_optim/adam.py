@@ -79,7 +79,7 @@ class StepAdam(Adam):
     def _name_groups(self) -> None:
         """Say in each group which Gaussian parameter it holds, by gsplat's name, or None."""
         members = self.training.members
-        self.training.all_optimizers.add(self)
+        self.training.all_optimizers[id(self)] = weakref.ref(self)
         self.has_means = False
         for slot in [slot for slot, each in members.items() if each[0]() is self]:
             del members[slot]

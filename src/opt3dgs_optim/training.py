@@ -31,7 +31,7 @@ class Training(Clock):
         changes_steps: whether the steps differ from torch's.
         members: by set and gsplat's name, the optimizer that holds this Gaussian parameter, and its
             group's index. References are weak: what a trainer replaces is freed at once.
-        all_optimizers: all that it steps, weakly.
+        all_optimizers: weak references to all that it steps, by id.
         finished: whether the training has been ended early.
         averages: whether there is room for the mean of the last iterates.
         messages: what has been said, each thing once.
@@ -51,7 +51,7 @@ class Training(Clock):
         self.moments = check_choice(type(self).__name__, "moments", moments, (32, 16))
         self.changes_steps = bool(self.parts) or moments != 32
         self.members: dict[tuple[str, str], tuple[weakref.ref[Optimizer], int]] = {}
-        self.all_optimizers: weakref.WeakSet[Any] = weakref.WeakSet()
+        self.all_optimizers: dict[int, weakref.ref[Any]] = {}
         self.finished, self.averages = False, True
         self.messages, self.bad_numbers = Messages(), BadNumbers()
         self.unsaved: dict[Any, Any] = {}
@@ -90,7 +90,8 @@ class Training(Clock):
 
     def optimizers(self) -> list[Any]:
         """Those that have not gone over to another training."""
-        return [each for each in self.all_optimizers if each.training is self]
+        found = [each() for each in self.all_optimizers.values()]
+        return [each for each in found if each is not None and each.training is self]
 
     def clocks(self) -> list[int]:
         """The next iteration of each optimizer of Gaussians whose steps are counted."""
@@ -160,5 +161,4 @@ class Training(Clock):
     def __getstate__(self) -> dict[str, Any]:
         # A copy of an optimizer tells its training itself that it is a member.
         self.read_back()
-        others = {"unsaved": {}, "members": {}, "all_optimizers": weakref.WeakSet()}
-        return {**vars(self), **others}
+        return {**vars(self), "unsaved": {}, "members": {}, "all_optimizers": {}}

@@ -66,7 +66,7 @@ def test_a_stopped_training_goes_on_and_becomes_a_line(
 def test_a_training_without_a_planned_end_is_ended_at_several_lengths(tmp_path: Path) -> None:
     """What comes after an end does not depend on it."""
     options = ["--scene", "embedded", "--points", "60"]
-    for ends in (["24", "90"], ["90"]):
+    for ends in (["60", "90"], ["90"]):
         out = tmp_path / str(len(ends))
         assert open_end.main([*ends, *options, "-o", str(out)]) == 0
         assert sorted(path.name for path in out.iterdir()) == [
@@ -80,12 +80,12 @@ def test_a_training_without_a_planned_end_is_ended_at_several_lengths(tmp_path: 
     line = evidence.line_of(json.loads((tmp_path / "2" / last).read_text()))
     assert (line["arm"], line["iterations"]) == ("open-end", 90)
     assert line["command"] == (
-        "python examples/benchmarks/open_end.py 24 90 --scene embedded --size images_4 "
+        "python examples/benchmarks/open_end.py 60 90 --scene embedded --size images_4 "
         "--points 60 --seed 0"
     )
 
 
-@pytest.mark.parametrize("ends", [["90", "24"], ["5"], ["24", "24"]])
+@pytest.mark.parametrize("ends", [["90", "60"], ["59"], ["60", "60"]])
 def test_ends_that_do_not_ascend_are_refused(ends: list[str], tmp_path: Path, capsys: Any) -> None:
     assert open_end.main([*ends, "--points", "60", "-o", str(tmp_path)]) == 2
     assert "ascending numbers" in capsys.readouterr().err
