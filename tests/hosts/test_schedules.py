@@ -136,8 +136,8 @@ def refinements(found: dict[str, Any]) -> int:
         (["drivestudio", "--iterations", "10000"], "the schedule of drivestudio was not read"),
         (["inria", "--iterations", "290"], "a multiple of 10 is needed, 300 or more"),
         (["inria", "--iterations", "1005"], "a multiple of 10 is needed"),
-        (["train.py", "--iterations", "1000"], "--iterations and --open-end need the name of a trainer"),
-        (["--iterations", "1000"], "--iterations and --open-end need the name of a trainer"),
+        (["train.py", "--iterations", "1000"], "--open-end need the name of a trainer"),
+        (["--iterations", "1000"], "--open-end need the name of a trainer"),
     ],
 )
 def test_what_is_refused(
