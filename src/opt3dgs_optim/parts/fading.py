@@ -100,7 +100,7 @@ class Fading(Part):
 
     def num_events(self, total_steps: int, num_points: int) -> int:
         """How many events a run of so many points has."""
-        events = self.events_before(total_steps, Clock(total_steps))
+        events = _events_before(total_steps, total_steps, self.start, self.stop, self.events)
         return int(events * share_of_events(num_points))
 
     def fade(self, event: int) -> Fade:
