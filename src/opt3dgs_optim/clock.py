@@ -78,21 +78,20 @@ class Clock:
         self._resumed, self._begun = False, iteration
         optimizer.next_iteration = iteration + 1
         if iteration > self.iteration:
-            self.advance(iteration)
+            if self.fall_step is not None and iteration >= (self.total_steps or 0):
+                self.go_on()
+            self.go_to(iteration)
+            self.advanced()
         return iteration
 
     def put_on(self, iteration: int) -> None:
         """Put the clock forward, to where the trainer's own count is."""
         if iteration > self.iteration:
+            if self.fall_step is not None and iteration >= (self.total_steps or 0):
+                self.go_on()
             self._resumed = False
-            self.advance(iteration)
-
-    def advance(self, iteration: int) -> None:
-        """Go on to an iteration; past the end of a fall the training has no end again."""
-        if self.fall_step is not None and iteration >= (self.total_steps or 0):
-            self.go_on()
-        self.go_to(iteration)
-        self.advanced()
+            self.go_to(iteration)
+            self.advanced()
 
     def resume(self, iteration: int) -> None:
         """Go on at an iteration, which is the next one that is made."""
@@ -109,11 +108,9 @@ class Clock:
                 self.progress = min(max(iteration / end, 0.0), 1.0)
             else:
                 self.fallen = min(max((iteration - start) / (end - start), 0.0), 1.0)
-        self.iteration, self.exploiting = iteration, self._exploits(iteration)
-        self.exploits_next = self._exploits(iteration + 1)
-
-    def _exploits(self, iteration: int) -> bool:
-        return self.switch_at <= iteration < self._switch_back
+        first, last = self.switch_at, self._switch_back
+        self.iteration, self.exploiting = iteration, first <= iteration < last
+        self.exploits_next = first <= iteration + 1 < last
 
     def plan_fall(self, start: int | None, end: int | None) -> None:
         """Have a training of no planned end fall from one iteration to another, or not at all."""
@@ -121,7 +118,7 @@ class Clock:
         if self.switch_step is None:
             self.switch_at = math.inf if start is None else start
             self._switch_back = math.inf if end is None else end
-        self.exploits_next = self._exploits(self.iteration + 1)
+        self.exploits_next = self.switch_at <= self.iteration + 1 < self._switch_back
 
     def go_on(self) -> None:
         """Have no end any more, after one."""

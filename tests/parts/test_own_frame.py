@@ -124,7 +124,7 @@ def test_the_rate_decays() -> None:
 def test_the_rate_where_no_end_is_planned() -> None:
     training, rates = Training([part := OwnFrame(rate=0.2, final=0.01)]), []
     for iteration in (0, 15_000, 15_001, 15_256, 16_024, 16_025):
-        training.advance(iteration)
+        training.put_on(iteration)
         rates.append(part.at(training))
         if iteration == 15_000:
             training.plan_fall(15_001, 16_025)

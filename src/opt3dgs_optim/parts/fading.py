@@ -79,8 +79,13 @@ class Fading(Part):
 
     def plan(self, step: Step, training: Training) -> None:
         """Fade by the newest event since this parameter's last step, if there was one."""
-        done = self.events_before(step.stepped_in + 1, training)
-        now = self.events_before(step.iteration + 1, training)
+        if training.open_end or training.total_steps is None:
+            done = self.events_before(step.stepped_in + 1, training)
+            now = self.events_before(step.iteration + 1, training)
+        else:  # every step asks
+            options = training.total_steps, self.start, self.stop, self.events
+            done = _events_before(step.stepped_in + 1, *options)
+            now = _events_before(step.iteration + 1, *options)
         # Several are due where the trainer has left steps out; they are one. Most steps have none,
         # and an empty `any` costs a third of this.
         if now > done and any(self.happens(e, len(step.param)) for e in range(done, now)):

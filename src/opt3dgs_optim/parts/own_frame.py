@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -148,6 +149,7 @@ def three_of(scales: Tensor) -> Tensor:
     return torch.nn.functional.pad(scales, (0, 1), value=-math.inf)
 
 
+@functools.lru_cache(maxsize=64)  # every step asks
 def min_aspect_of(iterations: int) -> float:
     """`min_aspect` where nothing is said, in a training of that length, or as long so far."""
     return min(max(3_000 / max(iterations, 1), 0.1), 0.25)
