@@ -20,8 +20,10 @@ from opt3dgs_optim.training import Training
 # that who takes nested states apart (torch.distributed.checkpoint) finds one leaf.
 STATE_KEY = "opt3dgs"
 FORMAT = 6
-COMMON = {"format", "iteration", "total_steps", "fall_step", "steps", "moments", "notes", "parts"}
-COMMON |= {"kept"}
+COMMON = {
+    *("format", "iteration", "total_steps", "fall_step", "steps", "moments", "kept"),
+    *("notes", "parts"),
+}
 OF_GROUP = {"last", "own_frame"}
 
 
