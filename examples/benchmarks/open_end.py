@@ -5,8 +5,8 @@
 
 At five sixths of each length the state is kept, and `finish_in` ends the training; from the kept
 state it goes on to the next. Each end is written as `train.py` writes a finished training, into the
-folder `--out`. The trainer plans no end either: it relocates every 50 iterations until then, and
-the rate of the positions, which sets the noise, is a constant.
+folder `--out`. The trainer plans no end either: it relocates every 25 iterations until then, and
+the rate of the positions, which sets the noise, falls as 1 / (1 + i / 200) in iteration i.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from splatting.arms import find_arm
 from splatting.density import MCMCDensityControl
 from splatting.fit import Fit
 from splatting.stopping import command
+from torch import Tensor
 from tqdm import trange
 
 from benchmarks import evidence, train
@@ -33,8 +34,8 @@ from opt3dgs_optim import PhaseScheduler
 
 SHORTEST = 60  # iterations
 FALL = 6  # the fall is a sixth of the training, a fifth of what is before it
-RATE = 0.03  # of the positions' first rate in a planned training
-REFINE_EVERY = 50
+HALVED = 200  # the iteration in which the positions' rate is half of its first value
+REFINE_START, REFINE_EVERY = 100, 25
 
 
 class OpenFit(Fit):
@@ -43,13 +44,19 @@ class OpenFit(Fit):
     phases: PhaseScheduler
 
     def _density_control(self) -> MCMCDensityControl:
-        self.optimizers["means"].param_groups[0]["lr"] *= RATE
         return MCMCDensityControl(
             self.options.points,
-            refine_stop=self.options.iterations,
-            refine_every=REFINE_EVERY,
+            REFINE_START,
+            self.options.iterations,
+            REFINE_EVERY,
             generator=self.draws["density"],
         )
+
+    def step(self) -> Tensor:
+        """One iteration, whose rate of the positions is by the iterations so far."""
+        group = self.optimizers["means"].param_groups[0]
+        group["lr"] = self.rates["means"] / (1 + self.iteration / HALVED)
+        return super().step()
 
     def end_at(self, iterations: int) -> None:
         """Begin the fall to the end."""
