@@ -154,8 +154,13 @@ def test_the_readme_says_what_was_measured() -> None:
         stock = report.of(("stock", 15_000), scene, gpu=True, **report.WHOLE)
         ours = report.of(("defaults", 7_500), scene, **report.WHOLE)
         assert report.gain(ours, stock)["psnr"] > -0.05
-    said = "7,500 iterations end where stock's 15,000 do (relocation, bonsai and lego, one seed)"
-    assert said in words
+    said = "7,500 iterations end where stock's 15,000 do (bonsai and lego, one seed)"
+    assert f"with relocation and 200,000 Gaussians, {said}" in words
+    plush, bonsai = (report.third(scene, "clone-and-split") for scene in ("plush", "bonsai"))
+    assert f"loses {-report.gain(plush[1], plush[0])['psnr']:.0f} dB on plush" in words
+    more = bonsai[1][0]["gaussians"] / bonsai[0][0]["gaussians"]
+    assert more == pytest.approx(1.5, abs=0.05)
+    assert "half as many Gaussians again on bonsai" in words
     shown = re.findall(r"\| ([+-][\d.]+) / [^|]+\|$", report.open_end(), re.M)
     less = [-float(each) for each in shown]
     assert len(less) > 10
