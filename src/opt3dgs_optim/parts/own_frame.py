@@ -17,7 +17,7 @@ from opt3dgs_optim.training import Training
 
 CALL = "OwnFrame"
 BETA1 = 0.9  # of one view an iteration
-STEADY, POWER = 1_000, 0.75  # where no end is planned: see `OwnFrame`
+SLOWED_OVER, POWER = 1_000, 0.75  # iterations; where no end is planned: see `OwnFrame`
 
 
 @dataclass(frozen=True, repr=False)
@@ -104,7 +104,7 @@ class OwnFrame(Part):
         """Standard deviations of a full step in the present iteration."""
         if not training.open_end:
             return self.rate * self.final**training.progress
-        slowed = (1 + max(training.iteration, 0) / STEADY) ** -POWER
+        slowed = (1 + max(training.iteration, 0) / SLOWED_OVER) ** -POWER
         return self.rate * slowed * (1 - (1 - self.final) * math.sqrt(training.fallen))
 
     def plan(self, step: Step, training: Training) -> None:
