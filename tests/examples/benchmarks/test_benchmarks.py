@@ -160,7 +160,10 @@ def test_the_readme_says_what_was_measured() -> None:
     assert f"loses {-report.gain(plush[1], plush[0])['psnr']:.0f} dB on plush" in words
     more = bonsai[1][0]["gaussians"] / bonsai[0][0]["gaussians"]
     assert more == pytest.approx(1.5, abs=0.05)
-    assert "half as many Gaussians again on bonsai" in words
+    assert "needs 50 % more Gaussians on bonsai" in words
+    whole = json.loads(report.GPU.read_text(encoding="utf-8"))["iterations"]["results"]
+    share = 100 * whole["1000000"]["defaults"]["ratio"]
+    assert f"a whole gsplat iteration {share:.0f} % of stock's (a million)" in words
     shown = re.findall(r"\| ([+-][\d.]+) / [^|]+\|$", report.open_end(), re.M)
     less = [-float(each) for each in shown]
     assert len(less) > 10
