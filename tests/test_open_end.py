@@ -246,6 +246,40 @@ def test_its_moments_begin_anew_and_its_loss_is_squared() -> None:
     assert counts == list(range(1, 13))
 
 
+def test_its_length_may_be_told_later() -> None:
+    """The last sixth is the fall, or what is left of it."""
+    phases, optimizers, params = begun()
+    assert phases.total_steps is None
+    steps(optimizers, params, 20)
+    for total, start in ((600, 500), (90, 75), (54, 44), (30, 20), (120, 100)):
+        phases.total_steps = total
+        assert (phases.fall_step, phases.total_steps) == (start, total)
+    told = copy.deepcopy((phases, optimizers, params))
+    for count in (60, 20, 20):
+        steps(*told[1:], count)
+    steps(optimizers, params, 60)
+    phases.finish_in(20)  # enough: an end that has not begun gives way
+    assert (phases.fall_step, phases.total_steps) == (80, 100)
+    phases.total_steps = 120
+    steps(optimizers, params, 20)
+    phases.finish_in(20)
+    steps(optimizers, params, 20)
+    assert phases.ended
+    assert told[0].end_line() is phases.end_line() is None
+    assert same_tensors(params, told[2])
+    steps(optimizers, params, 1)
+    assert phases.total_steps is None
+
+
+@pytest.mark.parametrize("total", [29, 0, 40.0, None])
+def test_a_length_that_is_over_or_no_number_is_refused(total: Any) -> None:
+    phases, optimizers, params = begun()
+    steps(optimizers, params, 20)
+    with pytest.raises(ValueError, match="total_steps=.* an integer at least 30"):
+        phases.total_steps = total
+    assert phases.total_steps is None
+
+
 @pytest.mark.parametrize("count", [9, 0, -1, 12.5, True, None])
 def test_what_is_no_number_of_iterations_is_refused(count: Any) -> None:
     phases, _, _ = begun()
@@ -257,10 +291,16 @@ def test_an_end_that_is_planned_or_begun_is_refused() -> None:
     phases, optimizers, params = begun()
     steps(optimizers, params, 3)
     phases.finish_in(15)
-    with pytest.raises(ValueError, match="the end has begun, from iteration 3 to 18"):
+    steps(optimizers, params, 1)
+    with pytest.raises(ValueError, match="finish_in: the end has begun, from iteration 3 to 18"):
         phases.finish_in(15)
+    with pytest.raises(ValueError, match="total_steps = 90: the end has begun, from iteration 3"):
+        phases.total_steps = 90
+    planned = PhaseScheduler(100)
     with pytest.raises(ValueError, match="total_steps=100 plans the end; "):
-        PhaseScheduler(100).finish_in(15)
+        planned.finish_in(15)
+    with pytest.raises(ValueError, match="total_steps = 90: total_steps=100 plans the end; "):
+        planned.total_steps = 90
 
 
 def test_a_jump_in_the_fall_is_refused() -> None:

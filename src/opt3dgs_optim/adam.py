@@ -245,7 +245,7 @@ class StepAdam(Adam):
 
         Parameters stepped after the end of the training stay as they are.
         """
-        found, end = 0, self.training.total_steps
+        found, end = 0, self.training.end_step
         for stepper in self.steppers():
             if end is not None and (stepper.stepped_in or 0) > end:  # one may count from 1
                 continue

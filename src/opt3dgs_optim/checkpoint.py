@@ -45,7 +45,7 @@ def numbers_of(training: Training, next_iteration: int, steps: int, kept: int) -
     return {
         "format": FORMAT,
         "iteration": max(next_iteration, training.iteration),  # it may have been put on
-        "total_steps": training.total_steps,
+        "total_steps": training.end_step,
         "fall_step": training.fall_step,
         "steps": steps,
         "moments": training.moments,
@@ -179,7 +179,7 @@ def drop_other_means(
             "optimizer has); they begin anew"
         )
     ends = None if saved is None else (saved["total_steps"], saved["fall_step"])
-    if ends != (training.total_steps, training.fall_step):
+    if ends != (training.end_step, training.fall_step):
         for state in states:
             drop_kept(state)
     if saved is not None and saved["moments"] != training.moments:

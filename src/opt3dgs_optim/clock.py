@@ -6,6 +6,11 @@ import enum
 import math
 from typing import Any
 
+from opt3dgs_optim.checks import check_count
+
+CALL = "PhaseScheduler"  # the clock that trainers have
+SHORTEST_FALL = 10  # iterations
+
 
 class Phase(enum.Enum):
     """What a training is doing."""
@@ -25,21 +30,24 @@ class Clock:
         iteration: the present one, from 0; -1 before the first step.
         exploiting: whether it is past the switch. exploits_next: whether the next one is.
         progress: the share of a planned training that is over, 0..1.
-        open_end: whether no end was planned. Then `total_steps` is None, but in a fall.
-        fall_step: the iteration with which the fall to the end begins; None: there is none.
+        open_end: whether no end was planned at first.
+        end_step: `total_steps`; parts of the package read it without a call.
+        fall_step: the iteration with which the fall to the end begins; None: none is planned.
         fallen: the share of the fall that is over, 0..1.
         switch_at: where exploitation starts: `switch_step`, or without it the present fall.
         counts_means: whether one of the optimizers holds positions: it alone counts.
+        finished: whether the training has been ended early.
     """
 
     def __init__(self, total_steps: int | None = None, switch_step: int | None = None) -> None:
-        self.total_steps, self.switch_step = total_steps, switch_step
+        self.end_step, self.switch_step = total_steps, switch_step
         self.switch_at = math.inf if switch_step is None else switch_step
         self._switch_back = math.inf
         self.iteration, self.exploiting, self.exploits_next = -1, False, self.switch_at <= 0
         self.progress, self.counts_means = 0.0, False
         self.open_end, self.fallen, self._ended = total_steps is None, 0.0, False
         self.fall_step: int | None = None
+        self.finished = False
         self._means_at = -1  # the iteration of the positions' last step
         self._means_open = False  # whether they were stepped first there
         self._begun = -1  # the iteration of the last step: `observe` puts the clock beyond it
@@ -54,6 +62,75 @@ class Clock:
     def ended(self) -> bool:
         """Whether the last iteration that was planned has been made."""
         return self._ended
+
+    @property
+    def total_steps(self) -> int | None:
+        """Iterations of the training; None: no end is planned.
+
+        Where none was planned at first, it may be set later. The last sixth of so many iterations,
+        or what is left of it, is then the fall of `finish_in`.
+        """
+        return self.end_step
+
+    @total_steps.setter
+    def total_steps(self, iterations: int) -> None:
+        call, done = f"{CALL}: total_steps = {iterations!r}", self.iteration + 1
+        self._check_open(call)
+        end = check_count(CALL, "total_steps", iterations, done + SHORTEST_FALL)
+        self._fall_between(max(done, end - max(end // 6, SHORTEST_FALL)), end)
+
+    def finish_in(self, iterations: int) -> None:
+        """End a training of no planned length after so many iterations more.
+
+        Over them the steps of the positions become small, nothing is faded, and the last fifth is
+        averaged. Have the trainer relocate and densify no more. After the end the training may go
+        on, with steps as long as before, and be ended again.
+
+        Args:
+            iterations: at least 10; a fifth of those so far is enough.
+
+        Raises:
+            ValueError: no count; the end was planned at first; or it has begun.
+
+        Examples:
+            >>> import torch
+            >>> from opt3dgs_optim import Averaging, PhaseScheduler
+            >>> means = torch.nn.Parameter(torch.ones(4, 3))
+            >>> optimizers = {"means": torch.optim.Adam([means], lr=0.01, eps=1e-15)}
+            >>> phases = PhaseScheduler(parts=[Averaging()])
+            >>> optimizers = phases.upgrade(optimizers)
+            >>> def train(iterations):
+            ...     for _ in range(iterations):
+            ...         (means**2).sum().backward()
+            ...         optimizers["means"].step()
+            ...         optimizers["means"].zero_grad()
+            >>> train(50)
+            >>> phases.finish_in(10)
+            >>> train(10)
+            >>> phases.iteration, phases.ended
+            (59, True)
+        """
+        call, done = f"{CALL}.finish_in", self.iteration + 1
+        iterations = check_count(call, "iterations", iterations, SHORTEST_FALL)
+        self._check_open(call)
+        self._fall_between(done, done + iterations)
+
+    def _check_open(self, call: str) -> None:
+        """Raise unless an end may be planned now."""
+        if not self.open_end:
+            raise ValueError(
+                f"{call}: total_steps={self.end_step} plans the end; PhaseScheduler() does not"
+            )
+        start = self.fall_step
+        if start is not None and start <= self.iteration and not (self._ended or self.finished):
+            raise ValueError(
+                f"{call}: the end has begun, from iteration {start} to {self.end_step}"
+            )
+
+    def _fall_between(self, start: int, end: int) -> None:
+        self.finished = False
+        self.go_on()
+        self.plan_fall(start, end)
 
     def begin(self, optimizer: Any) -> int:
         """The iteration of a step that an optimizer is about to make.
@@ -78,7 +155,7 @@ class Clock:
         self._resumed, self._begun = False, iteration
         optimizer.next_iteration = iteration + 1
         if iteration > self.iteration:
-            if self.fall_step is not None and iteration >= (self.total_steps or 0):
+            if self.fall_step is not None and iteration >= (self.end_step or 0):
                 self.go_on()
             self.go_to(iteration)
             self.advanced()
@@ -87,7 +164,7 @@ class Clock:
     def put_on(self, iteration: int) -> None:
         """Put the clock forward, to where the trainer's own count is."""
         if iteration > self.iteration:
-            if self.fall_step is not None and iteration >= (self.total_steps or 0):
+            if self.fall_step is not None and iteration >= (self.end_step or 0):
                 self.go_on()
             self._resumed = False
             self.go_to(iteration)
@@ -101,7 +178,7 @@ class Clock:
 
     def go_to(self, iteration: int) -> None:
         """Be at that iteration."""
-        start, end = self.fall_step, self.total_steps
+        start, end = self.fall_step, self.end_step
         if end is not None:
             self._ended = iteration + 1 >= end
             if start is None:
@@ -114,7 +191,7 @@ class Clock:
 
     def plan_fall(self, start: int | None, end: int | None) -> None:
         """Have a training of no planned end fall from one iteration to another, or not at all."""
-        self.fall_step, self.total_steps, self.fallen, self._ended = start, end, 0.0, False
+        self.fall_step, self.end_step, self.fallen, self._ended = start, end, 0.0, False
         if self.switch_step is None:
             self.switch_at = math.inf if start is None else start
             self._switch_back = math.inf if end is None else end

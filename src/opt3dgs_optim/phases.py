@@ -15,7 +15,7 @@ from torch.optim import Optimizer
 from opt3dgs_optim.adam import StepAdam, upgraded_class
 from opt3dgs_optim.checkpoint import check_groups, restore_parts
 from opt3dgs_optim.checks import check_count, check_energy, check_number
-from opt3dgs_optim.clock import Phase
+from opt3dgs_optim.clock import CALL, Phase
 from opt3dgs_optim.contract import (
     Slots,
     check_held_together,
@@ -39,7 +39,6 @@ from opt3dgs_optim.training import Training
 if TYPE_CHECKING:
     from opt3dgs_optim.runs import RunLog
 
-CALL = "PhaseScheduler"
 Optimizers = TypeVar(
     "Optimizers", bound="Optimizer | Mapping[str, Optimizer] | Sequence[Optimizer]"
 )
@@ -57,7 +56,7 @@ class PhaseScheduler(Training):
 
     Args:
         total_steps: iterations of the training, each with one step of the positions' optimizer;
-            None: it goes on until `finish_in` is called.
+            None: it goes on until `finish_in` is called, or `phases.total_steps` set.
         switch: where exploitation starts: a fraction of `total_steps` in (0, 1] if a float, an
             iteration if an int (`total_steps`: never). The paper: 29/30. Without `total_steps` a
             fraction is the fall to the end.
@@ -178,11 +177,11 @@ class PhaseScheduler(Training):
         """One line, so that a user sees that something has happened."""
         means, fading = self.param_of("", "means"), self.part(Fading)
         parts = [type(part).__name__ for part in self.parts]
-        if means is not None and fading is not None and self.total_steps is not None:
-            events = fading.num_events(self.total_steps, len(means))
+        if means is not None and fading is not None and self.end_step is not None:
+            events = fading.num_events(self.end_step, len(means))
             parts[self.parts.index(fading)] += f" ({events} times)"
         listed = ", ".join(parts) or "no parts"
-        length = "no planned end" if self.open_end else f"{self.total_steps} iterations"
+        length = "no planned end" if self.open_end else f"{self.end_step} iterations"
         say(f"opt3dgs_optim: {length}, {listed}, in the steps of {names}")
 
     def _upgrade(self, optimizer: Any, slots: Slots) -> None:
@@ -214,14 +213,14 @@ class PhaseScheduler(Training):
         """
         if iteration is not None:
             iteration = check_count(f"{CALL}.observe", "iteration", iteration, 0)
-            most = math.inf if self.total_steps is None else 2 * self.total_steps
+            most = math.inf if self.end_step is None else 2 * self.end_step
             cure = "make a new PhaseScheduler for another run"
             if self.fall_step is not None:  # a jump would leave out its end
                 most, cure = self.iteration + 1, "finish_in counts steps: leave out iteration="
             if not self.iteration <= iteration <= most:
                 raise ValueError(
                     f"{CALL}.observe: iteration={iteration}, but the clock stands at "
-                    f"{self.iteration} of {self.total_steps or 'no planned end'} and goes forward"
+                    f"{self.iteration} of {self.end_step or 'no planned end'} and goes forward"
                     f"{f', to {most} at most' * (most < math.inf)}; {cure}"
                 )
             self.put_on(iteration)
@@ -256,62 +255,18 @@ class PhaseScheduler(Training):
             return error.abs().mean()
         return part.pixel_loss(error)
 
-    def finish_in(self, iterations: int) -> None:
-        """End a training of no planned length after so many iterations more.
-
-        Over them the steps of the positions become small, nothing is faded, and the last fifth is
-        averaged. Have the trainer relocate and densify no more. After the end the training may go
-        on, with steps as long as before, and be ended again.
-
-        Args:
-            iterations: at least 10; a fifth of those so far is enough.
-
-        Raises:
-            ValueError: no count; `total_steps` was given; or the end has begun.
-
-        Examples:
-            >>> import torch
-            >>> from opt3dgs_optim import Averaging, PhaseScheduler
-            >>> means = torch.nn.Parameter(torch.ones(4, 3))
-            >>> optimizers = {"means": torch.optim.Adam([means], lr=0.01, eps=1e-15)}
-            >>> phases = PhaseScheduler(parts=[Averaging()])
-            >>> optimizers = phases.upgrade(optimizers)
-            >>> def train(iterations):
-            ...     for _ in range(iterations):
-            ...         (means**2).sum().backward()
-            ...         optimizers["means"].step()
-            ...         optimizers["means"].zero_grad()
-            >>> train(50)
-            >>> phases.finish_in(10)
-            >>> train(10)
-            >>> phases.iteration, phases.ended
-            (59, True)
-        """
-        call = f"{CALL}.finish_in"
-        iterations = check_count(call, "iterations", iterations, 10)
-        if not self.open_end:
-            raise ValueError(
-                f"{call}: total_steps={self.total_steps} plans the end; PhaseScheduler() does not"
-            )
-        if self.fall_step is not None and not (self.ended or self.finished):
-            raise ValueError(
-                f"{call}: the end has begun, from iteration {self.fall_step} to {self.total_steps}"
-            )
-        self.go_on()
-        self.plan_fall(self.iteration + 1, self.iteration + 1 + iterations)
-        self.finished = self._end.finished = False
-
     def plan_fall(self, start: int | None, end: int | None) -> None:
         """Have the training fall to its end, and know where its mean is."""
         super().plan_fall(start, end)
         self._plan_end()
 
     def _plan_end(self) -> None:
-        total, averaging = self.total_steps, self.part(Averaging)
+        total, averaging = self.end_step, self.part(Averaging)
         at = total if averaging is None else math.inf
         if averaging is not None and total is not None:
             at = averaging.put_from(total, self.fall_step)
         self._end.total_steps, self._end.mean_at = total, at
+        self._end.finished = self.finished
 
     @torch.no_grad()
     def finish(self) -> None:
@@ -322,7 +277,7 @@ class PhaseScheduler(Training):
         earlier `finish()`.
         """
         if not self.finished:
-            found, total = sum(each.put_means() for each in self.optimizers()), self.total_steps
+            found, total = sum(each.put_means() for each in self.optimizers()), self.end_step
             last = self._end.mean_at
             if not found and last is not None and self.iteration < last and last != total:
                 begins = "with the end that finish_in plans"
@@ -355,7 +310,7 @@ class PhaseScheduler(Training):
             if self._loss is not None:
                 numbers["loss"], self._loss = self._loss, None
             self.log.step(self.iteration, phase=self.phase.value, **numbers)
-        total, ends = self.total_steps, not self.averages or self.finished
+        total, ends = self.end_step, not self.averages or self.finished
         if self.iteration == self._end.mean_at != total and not ends:
             say(
                 f"opt3dgs_optim: iteration {self.iteration + 1} of {total}: from this step on the "
@@ -365,7 +320,7 @@ class PhaseScheduler(Training):
         if total is not None and self.iteration > total:
             self.messages.warn_once(
                 "overrun",
-                f"{CALL}: iteration {self.iteration} of total_steps={self.total_steps}: the "
+                f"{CALL}: iteration {self.iteration} of total_steps={self.end_step}: the "
                 "training is longer than that, so that all schedules ended early; pass its number "
                 "of iterations as total_steps",
             )
@@ -391,7 +346,7 @@ class PhaseScheduler(Training):
         return {**super().__getstate__(), "log": None, "_group": None}
 
     def __repr__(self) -> str:
-        end = "no planned end" if self.total_steps is None else self.total_steps
+        end = "no planned end" if self.end_step is None else self.end_step
         clock = f"iteration {self.iteration} of {end}"
         if any(part.during is not None for part in self.parts):
             clock += f", {self.phase.value}"

@@ -32,7 +32,6 @@ class Training(Clock):
         members: by set and gsplat's name, the optimizer that holds this Gaussian parameter, and its
             group's index. References are weak: what a trainer replaces is freed at once.
         all_optimizers: weak references to all that it steps, by id.
-        finished: whether the training has been ended early.
         averages: whether there is room for the mean of the last iterates.
         messages: what has been said, each thing once.
         bad_numbers: how many numbers of gradients were not finite.
@@ -52,7 +51,7 @@ class Training(Clock):
         self.changes_steps = bool(self.parts) or moments != 32
         self.members: dict[tuple[str, str], tuple[weakref.ref[Optimizer], int]] = {}
         self.all_optimizers: dict[int, weakref.ref[Any]] = {}
-        self.finished, self.averages = False, True
+        self.averages = True
         self.messages, self.bad_numbers = Messages(), BadNumbers()
         self.unsaved: dict[Any, Any] = {}
         self._notes: dict[str, dict[str, Any]] = {type(part).__name__: {} for part in self.parts}
@@ -133,7 +132,7 @@ class Training(Clock):
     def go_to(self, iteration: int) -> None:
         """Be at that iteration; now and then look for numbers that were not finite."""
         super().go_to(iteration)
-        if iteration >= self._look_at or iteration + 1 == self.total_steps:
+        if iteration >= self._look_at or iteration + 1 == self.end_step:
             self._look_at = iteration + LOOK_INTERVAL
             self.look_at_numbers()
 

@@ -61,12 +61,12 @@ class Averaging(Part):
 
     def begins(self, training: Training) -> int:
         """The first iteration that is averaged, where it is known beforehand."""
-        total = training.total_steps
+        total = training.end_step
         return 0 if training.open_end or total is None else self.start(total)
 
     def plan(self, step: Step, training: Training) -> None:
         """Take the iterate into the mean."""
-        total, now = training.total_steps, step.iteration
+        total, now = training.end_step, step.iteration
         if total is None or training.finished:
             return
         start, put, every = _window(total, training.fall_step)

@@ -79,11 +79,11 @@ class Fading(Part):
 
     def plan(self, step: Step, training: Training) -> None:
         """Fade by the newest event since this parameter's last step, if there was one."""
-        if training.open_end or training.total_steps is None:
+        if training.open_end or training.end_step is None:
             done = self.events_before(step.stepped_in + 1, training)
             now = self.events_before(step.iteration + 1, training)
         else:  # every step asks
-            options = training.total_steps, self.start, self.stop, self.events
+            options = training.end_step, self.start, self.stop, self.events
             done = _events_before(step.stepped_in + 1, *options)
             now = _events_before(step.iteration + 1, *options)
         # Several are due where the trainer has left steps out; they are one. Most steps have none,
@@ -93,7 +93,7 @@ class Fading(Part):
 
     def events_before(self, iteration: int, training: Clock) -> int:
         """Number of events before the step of this iteration (from 0)."""
-        total, fall = training.total_steps, training.fall_step
+        total, fall = training.end_step, training.fall_step
         if not training.open_end and total is not None:
             return _events_before(iteration, total, self.start, self.stop, self.events)
         return _open_events_before(iteration if fall is None else min(iteration, fall), self.events)

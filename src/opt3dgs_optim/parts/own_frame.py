@@ -133,7 +133,7 @@ class OwnFrame(Part):
             rate *= math.sqrt((1 - beta1) / (1 - BETA1))
         least = self.min_aspect
         if least is None:
-            least = min_aspect_of(training.total_steps or step.iteration)
+            least = min_aspect_of(training.end_step or step.iteration)
         step.frame = Frame(rate, least, quats, scales if scales.shape[1] == 3 else three_of(scales))
 
     def numbers(self, training: Training) -> Mapping[str, float]:
