@@ -271,13 +271,51 @@ def test_its_length_may_be_told_later() -> None:
     assert phases.total_steps is None
 
 
+def test_what_parts_keep_is_kept_until_the_end_begins() -> None:
+    phases, optimizers, params = begun([Curvature()], switch=5)
+    steps(optimizers, params, 20)
+    state = optimizers["means"].state[params["means"]]
+    phases.total_steps = 60
+    phases.finish_in(20)
+    assert "curvature.history" in state
+
+
+def test_a_jump_up_to_the_fall_is_none_in_it() -> None:
+    phases, optimizers, params = begun()
+    steps(optimizers, params, 1)
+    phases.total_steps = 600
+    phases.observe(iteration=500)
+    with pytest.raises(ValueError, match="to 501 at most"):
+        phases.observe(iteration=502)
+
+
+def test_a_checkpoint_from_before_finish_ends_again() -> None:
+    phases, optimizers, params = begun([Averaging()])
+    phases.finish_in(60)
+    steps(optimizers, params, 54)
+    saved = {name: copy.deepcopy(each.state_dict()) for name, each in optimizers.items()}
+    phases.finish()
+    for name, each in optimizers.items():
+        each.load_state_dict(saved[name])
+    steps(optimizers, params, 6)
+    for name, each in optimizers.items():
+        assert torch.equal(each.state[params[name]]["averaging.mean"], params[name]), name
+
+
+def test_a_length_before_the_first_step_is_refused() -> None:
+    phases, _, _ = begun()
+    with pytest.raises(ValueError, match=r"no step has been made yet; give it, PhaseScheduler\(9"):
+        phases.total_steps = 90
+
+
 @pytest.mark.parametrize("total", [29, 0, 40.0, None])
 def test_a_length_that_is_over_or_no_number_is_refused(total: Any) -> None:
     phases, optimizers, params = begun()
     steps(optimizers, params, 20)
+    phases.total_steps = 100
     with pytest.raises(ValueError, match="total_steps=.* an integer at least 30"):
         phases.total_steps = total
-    assert phases.total_steps is None
+    assert phases.total_steps == 100
 
 
 @pytest.mark.parametrize("count", [9, 0, -1, 12.5, True, None])
@@ -294,6 +332,7 @@ def test_an_end_that_is_planned_or_begun_is_refused() -> None:
     steps(optimizers, params, 1)
     with pytest.raises(ValueError, match="finish_in: the end has begun, from iteration 3 to 18"):
         phases.finish_in(15)
+    phases.total_steps = 18  # that is so already
     with pytest.raises(ValueError, match="total_steps = 90: the end has begun, from iteration 3"):
         phases.total_steps = 90
     planned = PhaseScheduler(100)
@@ -310,7 +349,7 @@ def test_a_jump_in_the_fall_is_refused() -> None:
     steps(optimizers, params, 1)
     phases.finish_in(20)
     phases.observe(iteration=401)
-    with pytest.raises(ValueError, match="to 402 at most; finish_in counts steps: leave out"):
+    with pytest.raises(ValueError, match="to 402 at most; the end counts steps: leave out"):
         phases.observe(iteration=404)
     with pytest.raises(ValueError, match="401 of 421 and goes forward"):
         phases.observe(iteration=3)

@@ -67,16 +67,24 @@ class Clock:
     def total_steps(self) -> int | None:
         """Iterations of the training; None: no end is planned.
 
-        Where none was planned at first, it may be set later. The last sixth of so many iterations,
-        or what is left of it, is then the fall of `finish_in`.
+        Where none was planned at first, it may be set after a step. The last sixth of so many
+        iterations, or what is left of it, is then the fall of `finish_in`.
+
+        Raises:
+            ValueError: no count; it is over; the end was planned at first, or has begun; or no step
+                has been made.
         """
         return self.end_step
 
     @total_steps.setter
     def total_steps(self, iterations: int) -> None:
+        if iterations == self.end_step:
+            return
         call, done = f"{CALL}: total_steps = {iterations!r}", self.iteration + 1
         self._check_open(call)
         end = check_count(CALL, "total_steps", iterations, done + SHORTEST_FALL)
+        if not done:  # a checkpoint that is loaded would bring its own end
+            raise ValueError(f"{call}: no step has been made yet; give it, PhaseScheduler({end})")
         self._fall_between(max(done, end - max(end // 6, SHORTEST_FALL)), end)
 
     def finish_in(self, iterations: int) -> None:
@@ -121,15 +129,19 @@ class Clock:
             raise ValueError(
                 f"{call}: total_steps={self.end_step} plans the end; PhaseScheduler() does not"
             )
-        start = self.fall_step
-        if start is not None and start <= self.iteration and not (self._ended or self.finished):
+        if self._falls() and not (self._ended or self.finished):
             raise ValueError(
-                f"{call}: the end has begun, from iteration {start} to {self.end_step}"
+                f"{call}: the end has begun, from iteration {self.fall_step} to {self.end_step}; "
+                "the training may go on after it"
             )
+
+    def _falls(self) -> bool:
+        return self.fall_step is not None and self.fall_step <= self.iteration
 
     def _fall_between(self, start: int, end: int) -> None:
         self.finished = False
-        self.go_on()
+        if self._falls():
+            self.go_on()
         self.plan_fall(start, end)
 
     def begin(self, optimizer: Any) -> int:
@@ -172,6 +184,7 @@ class Clock:
 
     def resume(self, iteration: int) -> None:
         """Go on at an iteration, which is the next one that is made."""
+        self.finished = False
         self.go_to(iteration - 1)
         self._means_at = self._begun = iteration - 1
         self._means_open, self._resumed = False, True

@@ -42,7 +42,7 @@ class Part:
     names: Any = GAUSSIAN  # tuple[str, ...] | None
 
     def begins(self, training: Training) -> int:
-        """The first iteration in which it acts."""
+        """The first iteration in which it acts; of a training of no planned end, 0."""
         return 0
 
     def plan(self, step: Step, training: Training) -> None:

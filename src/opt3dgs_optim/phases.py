@@ -216,7 +216,8 @@ class PhaseScheduler(Training):
             most = math.inf if self.end_step is None else 2 * self.end_step
             cure = "make a new PhaseScheduler for another run"
             if self.fall_step is not None:  # a jump would leave out its end
-                most, cure = self.iteration + 1, "finish_in counts steps: leave out iteration="
+                most = max(self.iteration + 1, self.fall_step)
+                cure = "the end counts steps: leave out iteration="
             if not self.iteration <= iteration <= most:
                 raise ValueError(
                     f"{CALL}.observe: iteration={iteration}, but the clock stands at "

@@ -10,7 +10,7 @@ import pytest
 
 from opt3dgs_optim.hosts import lines
 from opt3dgs_optim.hosts.diff import ANY
-from opt3dgs_optim.hosts.pages import section
+from opt3dgs_optim.hosts.pages import OPEN_END, section
 from opt3dgs_optim.hosts.trainers import TRAINERS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -34,13 +34,14 @@ def test_what_is_printed_stands_on_the_page(name: str, capsys: pytest.CaptureFix
     assert lines.main([name]) == 0
     printed = capsys.readouterr().out
     own = section(trainer.sections[-1])
-    (fenced,) = re.findall(r"^```(?:py|yaml|sh)\n(# .+?)```$", own, re.M | re.S)
+    fenced, *of_open_end = re.findall(r"^```(?:py|yaml|sh)\n(# .+?)```$", own, re.M | re.S)
     assert fenced in printed
+    assert len(of_open_end) == (OPEN_END in own)
     assert "](" not in printed
     pages = "".join(section(place) for place in trainer.sections)
     for topic in set(re.findall(r"^\*\*(.+?)\.\*\* ", pages, re.M)) | {"Density control"}:
-        assert len(re.findall(rf"^{topic}: ", printed, re.M)) == 1
-    for said in re.findall(r"^\*\*.+?\.\*\*(?: .+\n)+", own, re.M):
+        assert len(re.findall(rf"^{topic}: ", printed, re.M)) == (topic != OPEN_END)
+    for said in re.findall(rf"^\*\*(?!{OPEN_END}).+?\.\*\*(?: .+\n)+", own, re.M):
         wanted = set(re.findall("`.+?`", " ".join(said.split())))
         assert wanted <= set(re.findall("`.+?`", " ".join(printed.split())))
 
@@ -97,6 +98,7 @@ def test_the_lines_without_a_planned_end(
     assert printed.count("= PhaseScheduler(") == 1
     assert f"{line}\n" in printed
     assert "Open end: " in printed
+    assert printed.count("    if phases.ended:\n") + printed.count(" > opt.iterations:\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -105,6 +107,7 @@ def test_the_lines_without_a_planned_end(
         (["nerfstudio"], "nerfstudio plans its length"),
         (["gsplat-2dgs"], "gsplat-2dgs plans its length"),
         (["train.py"], "need the name of a trainer"),
+        ([], "need the name of a trainer"),
         (["inria", "--iterations", "300"], "give one of them"),
     ],
 )
@@ -122,6 +125,8 @@ def test_an_unknown_trainer(word: str, capsys: pytest.CaptureFixture[str]) -> No
     said = capsys.readouterr().err
     assert "did you mean" in said
     assert ANY in said
+    assert lines.main([word, "--open-end"]) == 2
+    assert capsys.readouterr().err == said
 
 
 @pytest.mark.parametrize("patch", sorted(PATCHES.glob("*.patch")), ids=lambda path: path.stem)

@@ -75,7 +75,7 @@ def test_trains_saves_the_mean_and_resumes(trial: Trial, scene: Path, tmp_path: 
         assert stock.psnr is not None
         assert math.isfinite(ours.psnr)
         assert ours.psnr > stock.psnr - trial.worse
-    ends_at_the_mean(trial, ours)
+    ends_at_the_mean(trial, ours, ours.saved())
     if trial.gsplat:
         return
     resumed = trial.train(
@@ -96,6 +96,25 @@ def test_ends_early_with_finish(scene: Path, tmp_path: Path) -> None:
     assert done.code == 0, done.output[-3000:]
     assert "no mean" not in done.output
     is_the_mean(done, done.out / f"point_cloud/iteration_{end}/point_cloud.ply")
+
+
+@pytest.mark.parametrize("name", ["gsplat-1.5.3 mcmc", "3dgs-mcmc --cap_max", "gaussian-splatting"])
+def test_ends_without_a_plan(name: str, scene: Path, tmp_path: Path) -> None:
+    """The trainer saves and evaluates where the mean is, and stops."""
+    trial = next(each for each in TRIALS if each.name.startswith(name))
+    if (why := missing(trial)) is not None:
+        pytest.skip(why)
+    enough = 60
+    last = enough + enough // 5
+    done = trial.train(scene, tmp_path, "open", ours=True, enough=enough)
+    assert done.code == 0, done.output[-3000:]
+    assert "opt3dgs_optim: no planned end" in done.output
+    assert "no mean" not in done.output
+    assert done.psnr is not None
+    saved = f"point_cloud/iteration_{last}/point_cloud.ply"
+    if trial.gsplat:
+        saved = f"ckpts/ckpt_{last - 1}_rank0.pt"
+    ends_at_the_mean(trial, done, done.out / saved)
 
 
 @pytest.mark.parametrize(
@@ -135,13 +154,13 @@ def test_nerfstudio_trains_and_saves_the_mean(
         assert torch.equal(saved[f"_model.gauss_params.{other}"], ends[name][1]), name
 
 
-def ends_at_the_mean(trial: Trial, done: Done) -> None:
+def ends_at_the_mean(trial: Trial, done: Done, path: Path) -> None:
     """The parameters are the mean at the end, and what is saved is a mean, too."""
     if not trial.gsplat:
-        is_the_mean(done, done.saved(), noise=trial.trainer == "3dgs-mcmc")
+        is_the_mean(done, path, noise=trial.trainer == "3dgs-mcmc")
         return
     ends = torch.load(done.out / "end.pt")
-    saved: Any = torch.load(done.saved(), weights_only=False)["splats"]
+    saved: Any = torch.load(path, weights_only=False)["splats"]
     for name, (param, mean) in ends.items():
         if name == "means" and "mcmc" in trial.options:
             continue  # its noise comes after the last step

@@ -14,6 +14,7 @@ from pathlib import Path
 from PIL import Image
 
 from opt3dgs_optim.hosts import diff
+from opt3dgs_optim.hosts.pages import places_in
 
 ON_CPU = Path(__file__).resolve().parent / "on_cpu.py"
 TRAINERS = Path(os.environ.get("OPT3DGS_TRAINERS", "/no/trainers"))
@@ -56,14 +57,24 @@ class Trial:
         return [*where, *often, *end, *saved, *options]
 
     def train(
-        self, scene: Path, work: Path, name: str, *more: str, ours: bool, end: int | None = None
+        self,
+        scene: Path,
+        work: Path,
+        name: str,
+        *more: str,
+        ours: bool,
+        end: int | None = None,
+        enough: int | None = None,
     ) -> Done:
-        """Train, stock or with our lines, in `work / name`; `end`: `finish()` there, and stop."""
+        """Train, stock or with our lines, in `work / name`.
+
+        `end`: `finish()` there, and stop. `enough`: no end is planned, until there.
+        """
         folder = TRAINERS / self.trainer
         if ours:
-            folder = work / f"edited {end}" / self.trainer
+            folder = work / f"edited {end} {enough}" / self.trainer
             if not folder.is_dir():
-                copy_edited(self, folder, end)
+                copy_edited(self, folder, end, enough)
         command = [*self.command(scene, work / name), *more]
         return run(folder / self.script, command, work / name)
 
@@ -122,12 +133,16 @@ def missing(trial: Trial) -> str | None:
     return f"{trial.trainer} needs {', '.join(lacking)}: pip install them" if lacking else None
 
 
-def copy_edited(trial: Trial, target: Path, end: int | None) -> None:
+def copy_edited(trial: Trial, target: Path, end: int | None, enough: int | None) -> None:
     """The trainer's Python files, with our lines in the script."""
     plain = shutil.ignore_patterns(".git", "*.png", "*.jpg", "*.gif", "*.mp4", "*.so")
     shutil.copytree(TRAINERS / trial.trainer, target, ignore=plain)
     script = target / trial.script
-    _, text = diff.edited(script.read_bytes().decode())
+    plain = script.read_bytes().decode()
+    known, text = diff.edited(plain)
+    if enough is not None:
+        lines = known.open_end.replace("10_000", str(enough))
+        text, _ = diff.inserted(plain, places_in(lines))
     if end is not None:  # the loop ends with that iteration, as by a limit of time
         text = ending(text, end)
     script.write_bytes(text.encode())

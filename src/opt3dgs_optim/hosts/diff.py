@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import ast
 import re
+from collections.abc import Iterable
 
-from opt3dgs_optim.hosts.pages import Trainer
+from opt3dgs_optim.hosts.pages import Place, Trainer
 from opt3dgs_optim.hosts.trainers import TRAINERS
 
 ANY = """\
@@ -52,23 +53,28 @@ def edited(text: str) -> tuple[Trainer, str]:
     fit = [each for each in TRAINERS.values() if each.signs and not misses(each, plain)]
     if len(fit) != 1:
         raise ValueError(_by_hand(plain))
-    trainer, lines = fit[0], text.split("\n")
-    inserted: dict[int, list[str]] = {}  # above that line, from 0
-    for place in trainer.places:
+    new_text, ours = inserted(text, fit[0].places)
+    if not _only_inserted(text, new_text, ours):
+        raise ValueError(f"the lines would not be statements of their own\n\n{_by_hand(plain)}")
+    return fit[0], new_text
+
+
+def inserted(text: str, places: Iterable[Place]) -> tuple[str, set[int]]:
+    """A text with lines at their places, and the numbers, from 1, that these have in it."""
+    plain = "\n".join(line.rstrip() for line in text.split("\n"))
+    lines, found = text.split("\n"), {}  # above that line, from 0
+    for place in places:
         for at in _starts(place.anchor, plain):
             end = "\r" if lines[at].endswith("\r") else ""
             new = [f"{place.indent}{line}{end}" for line in place.lines]
-            inserted.setdefault(at if place.above else at + 1, []).extend(new)
+            found.setdefault(at if place.above else at + 1, []).extend(new)
     whole: list[str] = []
-    ours: set[int] = set()  # numbers of our lines, from 1
+    ours: set[int] = set()
     for at, line in enumerate([*lines, ""]):
-        new = inserted.get(at, [])
+        new = found.get(at, [])
         ours.update(range(len(whole) + 1, len(whole) + 1 + len(new)))
         whole += [*new, line]
-    new_text = "\n".join(whole[:-1])
-    if not _only_inserted(text, new_text, ours):
-        raise ValueError(f"the lines would not be statements of their own\n\n{_by_hand(plain)}")
-    return trainer, new_text
+    return "\n".join(whole[:-1]), ours
 
 
 def _starts(lines: str, text: str) -> list[int]:

@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from opt3dgs_optim.hosts.diff import ANY, edited
-from opt3dgs_optim.hosts.pages import PAGES
+from opt3dgs_optim.hosts.pages import OPEN_END, PAGES
 from opt3dgs_optim.hosts.schedules import schedule, shortened
 from opt3dgs_optim.hosts.trainers import TRAINERS
 
 WIDTH = 100
-OPEN_END = "Open end"  # the topic of a page's note
+FEWER = "Fewer iterations"  # the topic of a note
 
 
 def text(name: str, iterations: int | None = None, open_end: bool = False) -> str:
@@ -34,17 +34,16 @@ def text(name: str, iterations: int | None = None, open_end: bool = False) -> st
             say how to train without a planned end.
     """
     trainer = TRAINERS[name]
-    if open_end and OPEN_END not in trainer.notes:
-        known = ", ".join(each for each, one in TRAINERS.items() if OPEN_END in one.notes)
+    if open_end and not trainer.open_end:
+        known = ", ".join(each for each, one in TRAINERS.items() if one.open_end)
         raise ValueError(f"--open-end is for {known}; {name} plans its length")
-    block = trainer.block
-    if open_end:  # without the number
-        block = re.sub(r"(PhaseScheduler\()[^,()]+", r"\1", block)
+    block = trainer.open_end if open_end else trainer.block
     notes = "\n".join(
         textwrap.fill(
             f"{topic}: {_plain(said)}", WIDTH, subsequent_indent="  ", break_on_hyphens=False
         )
         for topic, said in trainer.notes.items()
+        if topic != (FEWER if open_end else OPEN_END)
     )
     head = textwrap.fill(trainer.head, WIDTH, break_on_hyphens=False)
     if iterations is None:
@@ -120,7 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     is_file = word is not None and (Path(word).exists() or word.endswith(".py"))
     if options.write and (word in TRAINERS or not is_file):
         parser.error("--write needs the path of a trainer's script")
-    if (options.iterations is not None or options.open_end) and word not in TRAINERS:
+    if (options.iterations is not None or options.open_end) and (word is None or is_file):
         parser.error("--iterations and --open-end need the name of a trainer")
     if options.iterations is not None and options.open_end:
         parser.error("--iterations plans an end, --open-end does not; give one of them")

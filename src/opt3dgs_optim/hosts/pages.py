@@ -12,6 +12,7 @@ from pathlib import Path
 
 COPY = Path(__file__).with_name("pages")
 PAGES = COPY if COPY.is_dir() else Path(__file__).parents[3] / "docs" / "hosts"
+OPEN_END = "Open end"  # the topic of a note
 WHERE = re.compile(
     r"# (above|below) `(.+)`(?:, indented by (\d+) like it)?(?:, at each of its (\d+) places)?"
 )
@@ -42,6 +43,18 @@ class Place:
         return self.anchor[: len(self.anchor) - len(self.anchor.lstrip())]
 
 
+def places_in(block: str) -> tuple[Place, ...]:
+    """Those of a block of lines, each group below a comment that says where it goes."""
+    found = []
+    for group in block.split("\n\n"):
+        comment, *lines = group.split("\n")
+        if where := WHERE.fullmatch(comment):
+            anchor = " " * int(where[3] or 0) + where[2]
+            above, times = where[1] == "above", int(where[4] or 1)
+            found.append(Place(anchor, tuple(lines), above, times))
+    return tuple(found)
+
+
 @dataclass(frozen=True)
 class Trainer:
     """One trainer.
@@ -66,14 +79,21 @@ class Trainer:
     @property
     def places(self) -> tuple[Place, ...]:
         """The same, read; empty where no file of the trainer changes."""
-        found = []
-        for group in self.block.split("\n\n"):
-            comment, *lines = group.split("\n")
-            if where := WHERE.fullmatch(comment):
-                anchor = " " * int(where[3] or 0) + where[2]
-                above, times = where[1] == "above", int(where[4] or 1)
-                found.append(Place(anchor, tuple(lines), above, times))
-        return tuple(found)
+        return places_in(self.block)
+
+    @property
+    def open_end(self) -> str:
+        """Those of a training of no planned end; empty where its end is not known.
+
+        They have no number, and what stands below its note.
+        """
+        text = "".join(section(place) for place in self.sections)
+        found = re.findall(
+            rf"^\*\*{OPEN_END}\.\*\* (?:.+\n)+\n```py\n(# (?s:.+?))\n```$", text, re.M
+        )
+        if not found:
+            return ""
+        return "\n\n".join((re.sub(r"(PhaseScheduler\()[^,()]+", r"\1", self.block), found[-1]))
 
     @property
     def notes(self) -> dict[str, str]:

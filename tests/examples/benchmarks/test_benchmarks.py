@@ -154,20 +154,21 @@ def test_the_readme_says_what_was_measured() -> None:
         stock = report.of(("stock", 15_000), scene, gpu=True, **report.WHOLE)
         ours = report.of(("defaults", 7_500), scene, **report.WHOLE)
         assert report.gain(ours, stock)["psnr"] > -0.05
-    said = "7,500 iterations end where stock's 15,000 do (bonsai and lego, one seed)"
-    assert f"with relocation and 200,000 Gaussians, {said}" in words
+    assert "with relocation and 200,000 Gaussians, 7,500 iterations end where stock's" in words
     plush, bonsai = (report.third(scene, "clone-and-split") for scene in ("plush", "bonsai"))
-    assert f"loses {-report.gain(plush[1], plush[0])['psnr']:.0f} dB on plush" in words
+    loss = f"{-report.gain(plush[1], plush[0])['psnr']:.0f} dB"
+    assert f"and one loses {loss}. Your" in words
+    assert f"loses {loss} on plush" in words
     more = bonsai[1][0]["gaussians"] / bonsai[0][0]["gaussians"]
     assert more == pytest.approx(1.5, abs=0.05)
     assert "needs 50 % more Gaussians on bonsai" in words
     whole = json.loads(report.GPU.read_text(encoding="utf-8"))["iterations"]["results"]
     share = 100 * whole["1000000"]["defaults"]["ratio"]
-    assert f"a whole gsplat iteration {share:.0f} % of stock's (a million)" in words
+    assert f"A whole gsplat iteration takes {share:.0f} % of stock's (a million)" in words
     shown = re.findall(r"\| ([+-][\d.]+) / [^|]+\|$", report.open_end(), re.M)
     less = [-float(each) for each in shown]
     assert len(less) > 10
-    assert f"up to {max(less):.1f} dB below a planned end" in words
+    assert f"at worst {max(less):.1f} dB below a planned training" in words
 
 
 def test_the_picture_is_drawn(tmp_path: Path) -> None:
