@@ -313,7 +313,7 @@ def test_a_length_that_is_over_or_no_number_is_refused(total: Any) -> None:
     phases, optimizers, params = begun()
     steps(optimizers, params, 20)
     phases.total_steps = 100
-    with pytest.raises(ValueError, match="total_steps=.* an integer at least 30"):
+    with pytest.raises(ValueError, match=r"total_steps=.* an integer at least 30"):
         phases.total_steps = total
     assert phases.total_steps == 100
 

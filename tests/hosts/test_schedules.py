@@ -363,7 +363,7 @@ def test_what_is_printed_is_pasted_and_runs_to_its_end(
     if (why := missing(trial)) is not None:
         pytest.skip(why)
     folder, out = tmp_path / "edited" / trial.trainer, tmp_path / "out"
-    copy_edited(trial, folder, None)
+    copy_edited(trial, folder)
     path = folder / trial.script
     text = path.read_text(encoding="utf-8")
     for old, new in edits(name, SHORTEST):

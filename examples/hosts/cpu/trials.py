@@ -133,7 +133,9 @@ def missing(trial: Trial) -> str | None:
     return f"{trial.trainer} needs {', '.join(lacking)}: pip install them" if lacking else None
 
 
-def copy_edited(trial: Trial, target: Path, end: int | None, enough: int | None) -> None:
+def copy_edited(
+    trial: Trial, target: Path, end: int | None = None, enough: int | None = None
+) -> None:
     """The trainer's Python files, with our lines in the script."""
     plain = shutil.ignore_patterns(".git", "*.png", "*.jpg", "*.gif", "*.mp4", "*.so")
     shutil.copytree(TRAINERS / trial.trainer, target, ignore=plain)
