@@ -98,15 +98,18 @@ def default_step(
             own["exp_avg_sq"][out_of_view] = larger[out_of_view]
 
         # OwnFrame: a position is stepped by B z, with Adam's step z in the Gaussian's own frame, in
-        # standard deviations. A full step has 0.1 of them at the start and 0.003 at the end.
+        # standard deviations. A full step has 0.1 of them at the start and 0.003 at the end. Where
+        # a position has no gradient it stays, and so do its moments.
         if in_own_frame:
             # Thin axes count as a share of the longest, a larger one in short trainings.
             least = min(max(3_000 / total, 0.1), 0.25)
             frame = own_axes(params["quats"], params["scales"], least)
-            z = torch.zeros_like(param)
+            z, seen = torch.zeros_like(param), (grad != 0).any(1, keepdim=True)
             rate = 0.1 * 0.03**progress if rate else 0.0
+            before = {key: own[key].clone() for key in ("exp_avg", "exp_avg_sq")}
             adam_in_frame_(z, into_frame(frame, grad), own, rate)
-            param.sub_(out_of_frame(frame, z))
+            param.sub_(torch.where(seen, out_of_frame(frame, z), 0.0))
+            own |= {key: torch.where(seen, own[key], old) for key, old in before.items()}
         else:
             adam_(param, grad, own, rate)
 

@@ -10,7 +10,8 @@ A row is one Gaussian: dimension 0 of a parameter. In the order in which it is m
     gradient    numbers that are not finite count as zero
     fade        moments of random rows are shrunk
     decay       the trainer's weight decay: off the parameter (AdamW), or onto the gradient (Adam)
-    frame       the gradient is turned into each Gaussian's own axes, B^T g
+    frame       the gradient is turned into each Gaussian's own axes, B^T g; rows without one keep
+                their moments, and do not move
     hold        second moments of rows out of view are kept large
     Adam        m, v, and the step m / (sqrt(v) + eps), with bias correction
     frame       the step is turned back, B z
@@ -48,7 +49,10 @@ class Fade(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """Step the positions [N, 3] along each Gaussian's axes, in its standard deviations."""
+    """Step the positions [N, 3] along each Gaussian's axes, in its standard deviations.
+
+    A row without a gradient, as of a Gaussian out of view, stays as it is, moments and all.
+    """
 
     rate: float  # standard deviations of a full step
     min_aspect: float  # share of the longest axis that a shorter one counts as, at least
@@ -152,11 +156,12 @@ def take_step(step: Step) -> int:  # noqa: PLR0912  (all a step has)
             faded = like_rows(chosen[rows], param)
             exp_avg.copy_(torch.where(faded, exp_avg * fade.exp_avg, exp_avg))
             exp_avg_sq.copy_(torch.where(faded, exp_avg_sq * fade.exp_avg_sq, exp_avg_sq))
+        axes = None if step.frame is None else axes_of(step.frame, rows)
+        seen = None if axes is None else grad.any(1, keepdim=True)
         if step.shrink != 1.0:
             param.mul_(step.shrink)
         if step.decay:
             grad = grad.add(param, alpha=step.decay)
-        axes = None if step.frame is None else axes_of(step.frame, rows)
         if axes is not None:
             grad = into_frame(axes, grad)
         if step.hold is not None:
@@ -166,12 +171,11 @@ def take_step(step: Step) -> int:  # noqa: PLR0912  (all a step has)
         if step.plain:
             param.sub_(grad * (step.lr * step.factor))
         else:
-            exp_avg.lerp_(grad, 1 - step.beta1)
-            exp_avg_sq.mul_(step.beta2).addcmul_(grad, grad, value=1 - step.beta2)
-            root = exp_avg_sq.sqrt().div_(step.sqrt_correction2).add_(step.eps)
-            if step.frame is not None and axes is not None:
+            root = take_into_moments(step, exp_avg, exp_avg_sq, grad, seen)
+            if step.frame is not None and axes is not None and seen is not None:
                 rate = step.frame.rate * step.factor / step.correction1
-                param.sub_(out_of_frame(axes, (exp_avg / root).mul_(rate)))
+                moved = out_of_frame(axes, (exp_avg / root).mul_(rate))
+                param.sub_(torch.where(seen, moved, 0.0))
             elif isinstance(step.factor, Tensor):  # a device's number, which the host does not know
                 param.sub_((exp_avg / root).mul_(step.factor * (step.lr / step.correction1)))
             else:
@@ -181,6 +185,24 @@ def take_step(step: Step) -> int:  # noqa: PLR0912  (all a step has)
         if coded and not step.plain:
             encode(exp_avg, exp_avg_sq, *codes, chance)
     return bad
+
+
+def take_into_moments(
+    step: Step, exp_avg: Tensor, exp_avg_sq: Tensor, grad: Tensor, seen: Tensor | None
+) -> Tensor:
+    """Take a gradient into the moments, of all rows or of those that are seen, [n, 1] bool.
+
+    Returns:
+        What the first moment is divided by, for these rows.
+    """
+    kept = () if seen is None else (exp_avg.clone(), exp_avg_sq.clone())
+    exp_avg.lerp_(grad, 1 - step.beta1)
+    exp_avg_sq.mul_(step.beta2).addcmul_(grad, grad, value=1 - step.beta2)
+    root = exp_avg_sq.sqrt().div_(step.sqrt_correction2).add_(step.eps)
+    if seen is not None:
+        for moment, old in zip((exp_avg, exp_avg_sq), kept, strict=True):
+            moment.copy_(torch.where(seen, moment, old))
+    return root
 
 
 def finite(grad: Tensor, nonfinite: Tensor | None) -> tuple[Tensor, int]:

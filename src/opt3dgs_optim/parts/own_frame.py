@@ -38,6 +38,11 @@ class OwnFrame(Part):
     is `rate` standard deviations. It does not depend on the unit of the scene, nor on the
     positions' learning rate, except that a learning rate of 0 holds them.
 
+    A Gaussian is stepped in the iterations that see it: where its position has no gradient it
+    stays, and so do its moments, as with the Adam of Taming 3DGS (2024) for visible Gaussians.
+    Otherwise the momentum of one view carries those that few views see by most of a standard
+    deviation.
+
     Trained Gaussians are thin, often far thinner than a pixel. Steps in proportion to such an axis
     would pin the Gaussian across its own surface, so an axis counts as no thinner than `min_aspect`
     of the longest. The fewer steps a training has, the longer they must be: by default this share

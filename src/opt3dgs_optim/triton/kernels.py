@@ -241,13 +241,13 @@ def turned(w, x, y, z, a, b, c):
 
 
 @triton.jit
-def adam(grad, m, v, at, inside, size, beta2, ones1, ones2, eps, sqrt_correction2, round_key):
-    """Adam's step of one number, whose moments are written."""
-    exp_avg, exp_avg_sq = moments_of(m, v, at, inside)
+def adam(grad, m, v, at, seen, size, beta2, ones1, ones2, eps, sqrt_correction2, round_key):
+    """Adam's step of one number, 0 where it is not seen; elsewhere its moments are written."""
+    exp_avg, exp_avg_sq = moments_of(m, v, at, seen)
     exp_avg = exp_avg + (grad - exp_avg) * ones1
     exp_avg_sq = exp_avg_sq * beta2 + grad * grad * ones2
-    store_moments(m, v, at, inside, exp_avg, exp_avg_sq, round_key)
-    return size * exp_avg / (tl.sqrt(exp_avg_sq) / sqrt_correction2 + eps)
+    store_moments(m, v, at, seen, exp_avg, exp_avg_sq, round_key)
+    return tl.where(seen, size * exp_avg / (tl.sqrt(exp_avg_sq) / sqrt_correction2 + eps), 0.0)
 
 
 @triton.jit(do_not_specialize=PLAIN_INTS)
@@ -256,6 +256,8 @@ def step_in_own_frame(
     ones1, ones2, eps, sqrt_correction2, shrink, decay, round_key, number, put,
 ):  # fmt: skip
     """Step positions along each Gaussian's axes, mu <- mu - B Adam(B^T g), FRAME_BLOCK a program.
+
+    Rows whose gradient is zero keep their moments, and do not move.
 
     Args:
         p, g, m, v, scales, mean: [rows, 3] float32; scales are logarithms.
@@ -270,6 +272,7 @@ def step_in_own_frame(
     gx = finite(tl.load(g + i, inside), nonfinite, inside)
     gy = finite(tl.load(g + j, inside), nonfinite, inside)
     gz = finite(tl.load(g + k, inside), nonfinite, inside)
+    seen = ((gx != 0.0) | (gy != 0.0) | (gz != 0.0)) & inside
     px = tl.load(p + i, inside) * shrink
     py = tl.load(p + j, inside) * shrink
     pz = tl.load(p + k, inside) * shrink
@@ -295,9 +298,9 @@ def step_in_own_frame(
     gz = tl.where(tl.abs(gz) <= LARGEST, gz, 0.0)
     if factor is not None:
         size = size * tl.load(factor)
-    dx = sx * adam(gx, m, v, i, inside, size, beta2, ones1, ones2, eps, sqrt_correction2, round_key)
-    dy = sy * adam(gy, m, v, j, inside, size, beta2, ones1, ones2, eps, sqrt_correction2, round_key)
-    dz = sz * adam(gz, m, v, k, inside, size, beta2, ones1, ones2, eps, sqrt_correction2, round_key)
+    dx = sx * adam(gx, m, v, i, seen, size, beta2, ones1, ones2, eps, sqrt_correction2, round_key)
+    dy = sy * adam(gy, m, v, j, seen, size, beta2, ones1, ones2, eps, sqrt_correction2, round_key)
+    dz = sz * adam(gz, m, v, k, seen, size, beta2, ones1, ones2, eps, sqrt_correction2, round_key)
     dx, dy, dz = turned(w, x, y, z, dx, dy, dz)
     px = px - tl.where(tl.abs(dx) < INFINITY, dx, 0.0)
     py = py - tl.where(tl.abs(dy) < INFINITY, dy, 0.0)
