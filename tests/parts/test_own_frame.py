@@ -62,6 +62,31 @@ def test_the_first_step_is_against_the_gradient_in_the_frame() -> None:
     assert torch.allclose(moved.double(), expected, rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.parametrize("moments", [32, 16])
+def test_a_gaussian_out_of_view_stays_and_so_do_its_moments(moments: Any) -> None:
+    """Others are stepped as if it were not there."""
+    params, seen = parameters(ROWS, *NAMES), torch.arange(ROWS) % 3 != 0
+    alone = {name: Parameter(each.detach()[seen].clone()) for name, each in params.items()}
+    ours, theirs = (
+        PhaseScheduler(TOTAL, parts=[OwnFrame()], moments=moments).upgrade(adams_of(each))
+        for each in (params, alone)
+    )
+    stays: list[Tensor] = []
+    for i in range(4):
+        grad = draw(i, ROWS, 3)
+        if i:
+            grad[~seen] = 0.0
+        params["means"].grad, alone["means"].grad = grad, grad[seen]
+        ours["means"].step()
+        theirs["means"].step()
+        state = ours["means"].state[params["means"]]
+        tensors = [params["means"].detach(), state["exp_avg"], state["exp_avg_sq"]]
+        stays = stays or [each[~seen].clone() for each in tensors]
+        assert all(map(torch.equal, stays, (each[~seen] for each in tensors)))
+    if moments == 32:  # codes are rounded by a number's place
+        assert torch.equal(params["means"][seen], alone["means"])
+
+
 @settings(max_examples=20)
 @given(seed=SEEDS, unit=st.sampled_from([0.01, 100.0]), turn=SEEDS)
 def test_it_knows_no_unit_and_no_axes_of_the_world(seed: int, unit: float, turn: int) -> None:

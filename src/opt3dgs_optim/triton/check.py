@@ -57,6 +57,8 @@ def case(
     rows = shape[0]
     param, grad = draw(*shape), draw(*shape) * 10.0 ** (draw(*shape) * 2).clamp(-6, 6)
     exp_avg, exp_avg_sq = 0.1 * draw(*shape), draw(*shape).square()
+    if frame:
+        grad[1::5] = 0.0  # out of view
     grad.view(-1)[:bad] = torch.tensor([float("nan"), float("inf"), -float("inf")])[
         torch.arange(min(bad, grad.numel())) % 3
     ]
@@ -64,7 +66,7 @@ def case(
         codes = torch.zeros(2, *shape, dtype=CODES)
         encode(exp_avg, exp_avg_sq, codes[0], codes[1], NEAREST)
         exp_avg, exp_avg_sq = codes[0], codes[1]
-        exp_avg_sq[:1] = 0  # a row without history
+        exp_avg[:1] = exp_avg_sq[:1] = 0  # a row without history
     step = Step(param, grad, None, "", {}, {"exp_avg": exp_avg, "exp_avg_sq": exp_avg_sq}, 0, -1)
     step.factor, step.plain = factor, plain
     if fade:
