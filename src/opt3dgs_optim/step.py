@@ -129,7 +129,7 @@ class Step:
     rounding: int = 0
 
 
-def take_step(step: Step) -> int:  # noqa: PLR0912  (all a step has)
+def take_step(step: Step) -> int:  # noqa: PLR0912, PLR0915  (all a step has)
     """Make the step in plain torch; how many numbers of the gradient were not finite (CPU only).
 
     On other devices they are added to `step.nonfinite`, so that nothing waits.
@@ -171,11 +171,16 @@ def take_step(step: Step) -> int:  # noqa: PLR0912  (all a step has)
         if step.plain:
             param.sub_(grad * (step.lr * step.factor))
         else:
-            root = take_into_moments(step, exp_avg, exp_avg_sq, grad, seen)
+            kept = () if seen is None else (exp_avg.clone(), exp_avg_sq.clone())
+            exp_avg.lerp_(grad, 1 - step.beta1)
+            exp_avg_sq.mul_(step.beta2).addcmul_(grad, grad, value=1 - step.beta2)
+            root = exp_avg_sq.sqrt().div_(step.sqrt_correction2).add_(step.eps)
             if step.frame is not None and axes is not None and seen is not None:
                 rate = step.frame.rate * step.factor / step.correction1
                 moved = out_of_frame(axes, (exp_avg / root).mul_(rate))
                 param.sub_(torch.where(seen, moved, 0.0))
+                for moment, old in zip((exp_avg, exp_avg_sq), kept, strict=True):
+                    moment.copy_(torch.where(seen, moment, old))
             elif isinstance(step.factor, Tensor):  # a device's number, which the host does not know
                 param.sub_((exp_avg / root).mul_(step.factor * (step.lr / step.correction1)))
             else:
@@ -185,24 +190,6 @@ def take_step(step: Step) -> int:  # noqa: PLR0912  (all a step has)
         if coded and not step.plain:
             encode(exp_avg, exp_avg_sq, *codes, chance)
     return bad
-
-
-def take_into_moments(
-    step: Step, exp_avg: Tensor, exp_avg_sq: Tensor, grad: Tensor, seen: Tensor | None
-) -> Tensor:
-    """Take a gradient into the moments, of all rows or of those that are seen, [n, 1] bool.
-
-    Returns:
-        What the first moment is divided by, for these rows.
-    """
-    kept = () if seen is None else (exp_avg.clone(), exp_avg_sq.clone())
-    exp_avg.lerp_(grad, 1 - step.beta1)
-    exp_avg_sq.mul_(step.beta2).addcmul_(grad, grad, value=1 - step.beta2)
-    root = exp_avg_sq.sqrt().div_(step.sqrt_correction2).add_(step.eps)
-    if seen is not None:
-        for moment, old in zip((exp_avg, exp_avg_sq), kept, strict=True):
-            moment.copy_(torch.where(seen, moment, old))
-    return root
 
 
 def finite(grad: Tensor, nonfinite: Tensor | None) -> tuple[Tensor, int]:
