@@ -140,11 +140,11 @@ def copy_edited(
     plain = shutil.ignore_patterns(".git", "*.png", "*.jpg", "*.gif", "*.mp4", "*.so")
     shutil.copytree(TRAINERS / trial.trainer, target, ignore=plain)
     script = target / trial.script
-    plain = script.read_bytes().decode()
-    known, text = diff.edited(plain)
+    old = script.read_bytes().decode()
+    known, text = diff.edited(old)
     if enough is not None:
         lines = known.open_end.replace("10_000", str(enough))
-        text, _ = diff.inserted(plain, places_in(lines))
+        text, _ = diff.inserted(old, places_in(lines))
     if end is not None:  # the loop ends with that iteration, as by a limit of time
         text = ending(text, end)
     script.write_bytes(text.encode())

@@ -85,7 +85,7 @@ class Trainer:
     def open_end(self) -> str:
         """Those of a training of no planned end; empty where its end is not known.
 
-        They have no number, and what stands below its note.
+        They have no number, and what stands below its notes, the shared ones' first.
         """
         text = "".join(section(place) for place in self.sections)
         found = re.findall(
@@ -93,7 +93,7 @@ class Trainer:
         )
         if not found:
             return ""
-        return "\n\n".join((re.sub(r"(PhaseScheduler\()[^,()]+", r"\1", self.block), found[-1]))
+        return "\n\n".join((re.sub(r"(PhaseScheduler\()[^,()]+", r"\1", self.block), *found))
 
     @property
     def notes(self) -> dict[str, str]:
