@@ -101,9 +101,13 @@ def default_step(
         # standard deviations. A full step has 0.1 of them at the start and 0.003 at the end. Where
         # a position has no gradient it stays, and so do its moments.
         if in_own_frame:
-            # Thin axes count as a share of the longest, a larger one in short trainings.
+            # Thin axes count as a share of the longest, a larger one in short trainings; none as
+            # longer than 10 medians of the longest axes, found every 100 iterations.
             least = min(max(3_000 / total, 0.1), 0.25)
-            frame = own_axes(params["quats"], params["scales"], least)
+            if state.get("longest", (None,))[0] != iteration // 100:
+                median = params["scales"].amax(1).nanmedian()
+                state["longest"] = iteration // 100, median.exp() * 10
+            frame = own_axes(params["quats"], params["scales"], least, state["longest"][1])
             z, seen = torch.zeros_like(param), (grad != 0).any(1, keepdim=True)
             rate = 0.1 * 0.03**progress if rate else 0.0
             before = {key: own[key].clone() for key in ("exp_avg", "exp_avg_sq")}
@@ -170,14 +174,14 @@ def hashed(number: Tensor) -> Tensor:
     return number ^ (number >> 16)
 
 
-def own_axes(quats: Tensor, scales: Tensor, least: float) -> tuple[Tensor, Tensor]:
+def own_axes(quats: Tensor, scales: Tensor, least: float, most: Tensor) -> tuple[Tensor, Tensor]:
     """B = R diag(s) of every Gaussian: the unit quaternion [4, N] of R, and s [3, N].
 
-    An axis counts as no thinner than `least` of the longest.
+    An axis counts as no longer than `most`, and no thinner than `least` of the longest.
     """
     w, x, y, z = q = quats.T
     square = torch.addcmul(torch.addcmul(torch.addcmul(w * w, x, x), y, y), z, z)
-    deviations = scales.T.exp()
+    deviations = torch.minimum(scales.T.exp(), most)
     thinnest = deviations.amax(0) * least
     return q * square.sqrt().clamp(min=1e-12).reciprocal(), torch.maximum(deviations, thinnest)
 

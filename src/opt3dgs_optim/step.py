@@ -58,6 +58,7 @@ class Frame(NamedTuple):
     min_aspect: float  # share of the longest axis that a shorter one counts as, at least
     quats: Tensor  # [N, 4] wxyz, need not be normalised
     scales: Tensor  # [N, 3] log of the standard deviations
+    longest: Tensor | None = None  # [] a longer axis counts as of this standard deviation
 
 
 class Hold(NamedTuple):
@@ -239,10 +240,13 @@ def axes_of(frame: Frame, rows: Any = ...) -> Axes:
     square = torch.addcmul(torch.addcmul(torch.addcmul(w * w, x, x), y, y), z, z)
     inverse = square.sqrt_().clamp_(min=MIN_QUATERNION).reciprocal_()
     quaternion = w * inverse, x * inverse, y * inverse, z * inverse
-    a, b, c = frame.scales.detach()[rows].exp().unbind(1)
+    deviations = frame.scales.detach()[rows].exp()
+    if frame.longest is not None:
+        deviations = torch.minimum(deviations, frame.longest)
+    a, b, c = deviations.unbind(1)
     least = torch.maximum(torch.maximum(a, b), c).mul_(frame.min_aspect)
-    deviations = torch.maximum(a, least), torch.maximum(b, least), torch.maximum(c, least)
-    return Axes(quaternion, deviations)
+    thick = torch.maximum(a, least), torch.maximum(b, least), torch.maximum(c, least)
+    return Axes(quaternion, thick)
 
 
 def into_frame(axes: Axes, vectors: Tensor) -> Tensor:

@@ -123,6 +123,41 @@ def test_flat_and_round_gaussians_step_as_those_with_three_scales(width: int) ->
     assert torch.equal(*moved)
 
 
+def test_no_axis_counts_as_longer_than_ten_medians() -> None:
+    """Of the longest axes of all; a scale that is no number does not count among them."""
+    params, grad = parameters(ROWS, *NAMES), torch.ones(ROWS, 3)
+    params["quats"].data = torch.eye(4)[:1].repeat(ROWS, 1)
+    params["scales"].data.fill_(-3.0)
+    params["scales"].data[:3] = torch.tensor([5.0, -2.0, math.nan])[:, None]
+    moved = stepped(params, grad, OwnFrame(rate=0.1))
+    expected = -0.1 * torch.tensor([10 * math.exp(-3.0), math.exp(-2.0), 0.0, math.exp(-3.0)])
+    assert torch.allclose(moved[:4], expected[:, None], rtol=1e-5)
+
+
+def test_the_longest_axis_is_found_every_hundred_iterations_also_in_a_resumed_training() -> None:
+    """What was found is saved: the resumed steps are the same, though the scales have changed."""
+    params, grads = parameters(ROWS, *NAMES), [draw(i, ROWS, 3) for i in range(210)]
+    params["scales"].data[0] += 9.0
+
+    def step(each: dict[str, Any], optimizers: dict[str, Any], i: int) -> Tensor:
+        each["means"].grad = grads[i].clone()
+        optimizers["means"].step()
+        each["scales"].data += 0.02  # a fifth more in ten iterations
+        return each["means"].detach().clone()
+
+    ours = PhaseScheduler(TOTAL, parts=[OwnFrame()]).upgrade(adams_of(params))
+    for i in range(150):
+        step(params, ours, i)
+    theirs = {name: Parameter(each.detach().clone()) for name, each in params.items()}
+    resumed = PhaseScheduler(TOTAL, parts=[OwnFrame()]).upgrade(adams_of(theirs))
+    for name, optimizer in resumed.items():
+        optimizer.load_state_dict(copy.deepcopy(ours[name].state_dict()))
+    before = params["means"].detach().clone()
+    for i in range(150, 210):
+        assert torch.equal(step(params, ours, i), step(theirs, resumed, i))
+    assert not torch.equal(before, params["means"])
+
+
 def test_the_rate_follows_a_batch_by_its_beta() -> None:
     """gsplat has beta1 = 1 - 0.1 b for b views; a larger beta1 than 0.9 is no batch."""
     moved = {}

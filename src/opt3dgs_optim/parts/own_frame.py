@@ -6,6 +6,7 @@ import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,6 +19,7 @@ from opt3dgs_optim.training import Training
 CALL = "OwnFrame"
 BETA1 = 0.9  # of one view an iteration
 SLOWED_OVER, POWER = 1_000, 0.75  # iterations; where no end is planned: see `OwnFrame`
+MEDIANS, EVERY = 10, 100  # of the longest axes, found every so many iterations: see `OwnFrame`
 
 
 @dataclass(frozen=True, repr=False)
@@ -59,7 +61,7 @@ class OwnFrame(Part):
     the longest; or [N, 1] for round ones. gsplat's trainer for flat Gaussians has a third scale
     that nothing trains: leave the part out there. A Gaussian with non-finite axes is not moved.
 
-    It keeps nothing from step to step.
+    It keeps that median from step to step.
 
     Args:
         rate: a full step in the first iteration, in standard deviations; above 0.
@@ -139,11 +141,36 @@ class OwnFrame(Part):
         least = self.min_aspect
         if least is None:
             least = min_aspect_of(training.end_step or step.iteration)
-        step.frame = Frame(rate, least, quats, scales if scales.shape[1] == 3 else three_of(scales))
+        longest = longest_of(step, scales, training.unsaved, training.notes_of(self))
+        scales = scales if scales.shape[1] == 3 else three_of(scales)
+        step.frame = Frame(rate, least, quats, scales, longest)
+
+    def read_back(self, training: Training) -> None:
+        """Have the longest axes in the notes."""
+        notes = training.notes_of(self)
+        for place, kept in training.unsaved.items():
+            if place[0] is OwnFrame and math.isfinite(longest := kept[1].item()):
+                notes[f"longest {place[1]}"], notes[f"found at {place[1]}"] = longest, kept[0]
 
     def numbers(self, training: Training) -> Mapping[str, float]:
         """`own_frame_rate`: standard deviations of a full step."""
         return {"own_frame_rate": self.at(training)}
+
+
+def longest_of(
+    step: Step, scales: Tensor, unsaved: dict[Any, Any], notes: Mapping[str, Any]
+) -> Tensor | None:
+    """The standard deviation [] that a longer axis counts as; it stays on the device."""
+    at, place = step.iteration // EVERY, (OwnFrame, step.set)
+    if place not in unsaved and (known := notes.get(f"longest {step.set}")) is not None:
+        unsaved[place] = notes[f"found at {step.set}"], scales.new_tensor(known)
+    kept = unsaved.get(place)
+    if kept is None or kept[0] != at or kept[1].device != scales.device:
+        largest = scales.detach().amax(1)
+        if not len(largest):
+            return None
+        unsaved[place] = at, largest.nanmedian().exp() * MEDIANS
+    return unsaved[place][1]
 
 
 def three_of(scales: Tensor) -> Tensor:

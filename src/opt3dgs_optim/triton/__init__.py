@@ -216,8 +216,8 @@ def launch(step: Step) -> None:
     if frame is not None:
         _run(
             "step_in_own_frame", -(-param.shape[0] // FRAME_BLOCK),
-            (param, step.grad, exp_avg, exp_avg_sq, frame.quats, frame.scales, mean,
-             rest, began, on_device, step.nonfinite),
+            (param, step.grad, exp_avg, exp_avg_sq, frame.quats, frame.scales, frame.longest,
+             mean, rest, began, on_device, step.nonfinite),
             (param.shape[0], frame.min_aspect, size, *adam, number, put), coded,
         )  # fmt: skip
         return

@@ -72,7 +72,7 @@ def case(
     if fade:
         step.fade = Fade(0x9E3779B1, 0.3, 0.2, 0.04)
     if frame:
-        step.frame = Frame(0.1, 0.1, draw(rows, 4), draw(rows, 3) - 3)
+        step.frame = Frame(0.1, 0.1, draw(rows, 4), draw(rows, 3) - 3, draw().sub(3).exp())
     if hold:
         step.hold = Hold(draw(rows) < 0, 7.0)
     step.lr, step.shrink, step.decay = 1e-2, shrink, decay

@@ -44,6 +44,12 @@ def larger(a, b):
 
 
 @triton.jit
+def smaller(a, b):
+    """The smaller of two, or the one that is not a number."""
+    return tl.minimum(a, b, propagate_nan=tl.PropagateNan.ALL)
+
+
+@triton.jit
 def mixed(number, key):
     """`step.mixed` of a number and a key, 32 bits."""
     x = number.to(tl.uint32) ^ key.to(tl.uint32)
@@ -252,8 +258,8 @@ def adam(grad, m, v, at, seen, size, beta2, ones1, ones2, eps, sqrt_correction2,
 
 @triton.jit(do_not_specialize=PLAIN_INTS)
 def step_in_own_frame(
-    p, g, m, v, quats, scales, mean, rest, began, factor, nonfinite, rows, min_aspect, size, beta2,
-    ones1, ones2, eps, sqrt_correction2, shrink, decay, round_key, number, put,
+    p, g, m, v, quats, scales, longest, mean, rest, began, factor, nonfinite, rows, min_aspect,
+    size, beta2, ones1, ones2, eps, sqrt_correction2, shrink, decay, round_key, number, put,
 ):  # fmt: skip
     """Step positions along each Gaussian's axes, mu <- mu - B Adam(B^T g), FRAME_BLOCK a program.
 
@@ -262,6 +268,7 @@ def step_in_own_frame(
     Args:
         p, g, m, v, scales, mean: [rows, 3] float32; scales are logarithms.
         quats: [rows, 4] float32, wxyz.
+        longest: [] float32, the standard deviation that a longer axis counts as; or None.
         size: standard deviations of a full step, with the correction of the first moment in it.
         min_aspect: share of the longest axis that a shorter one counts as, at least.
         the others: as of `step_rows`.
@@ -288,6 +295,9 @@ def step_in_own_frame(
     sx = tl.exp(tl.load(scales + i, inside))
     sy = tl.exp(tl.load(scales + j, inside))
     sz = tl.exp(tl.load(scales + k, inside))
+    if longest is not None:
+        most = tl.load(longest)
+        sx, sy, sz = smaller(sx, most), smaller(sy, most), smaller(sz, most)
     least = larger(larger(sx, sy), sz) * min_aspect
     sx, sy, sz = larger(sx, least), larger(sy, least), larger(sz, least)
 
