@@ -242,7 +242,7 @@ def axes_of(frame: Frame, rows: Any = ...) -> Axes:
     quaternion = w * inverse, x * inverse, y * inverse, z * inverse
     deviations = frame.scales.detach()[rows].exp()
     if frame.longest is not None:
-        deviations = torch.minimum(deviations, frame.longest)
+        deviations.clamp_(max=frame.longest)
     a, b, c = deviations.unbind(1)
     least = torch.maximum(torch.maximum(a, b), c).mul_(frame.min_aspect)
     thick = torch.maximum(a, least), torch.maximum(b, least), torch.maximum(c, least)
