@@ -134,7 +134,10 @@ def test_no_axis_counts_as_longer_than_ten_medians() -> None:
     assert torch.allclose(moved[:4], expected[:, None], rtol=1e-5)
 
 
-def test_the_longest_axis_is_found_every_hundred_iterations_also_in_a_resumed_training() -> None:
+@pytest.mark.parametrize("at", [150, 200])
+def test_the_longest_axis_is_found_each_hundred_iterations_in_a_resumed_training_too(
+    at: int,
+) -> None:
     """What was found is saved: the resumed steps are the same, though the scales have changed."""
     params, grads = parameters(ROWS, *NAMES), [draw(i, ROWS, 3) for i in range(210)]
     params["scales"].data[0] += 9.0
@@ -146,14 +149,14 @@ def test_the_longest_axis_is_found_every_hundred_iterations_also_in_a_resumed_tr
         return each["means"].detach().clone()
 
     ours = PhaseScheduler(TOTAL, parts=[OwnFrame()]).upgrade(adams_of(params))
-    for i in range(150):
+    for i in range(at):
         step(params, ours, i)
     theirs = {name: Parameter(each.detach().clone()) for name, each in params.items()}
     resumed = PhaseScheduler(TOTAL, parts=[OwnFrame()]).upgrade(adams_of(theirs))
     for name, optimizer in resumed.items():
         optimizer.load_state_dict(copy.deepcopy(ours[name].state_dict()))
     before = params["means"].detach().clone()
-    for i in range(150, 210):
+    for i in range(at, 210):
         assert torch.equal(step(params, ours, i), step(theirs, resumed, i))
     assert not torch.equal(before, params["means"])
 

@@ -61,7 +61,7 @@ class OwnFrame(Part):
     the longest; or [N, 1] for round ones. gsplat's trainer for flat Gaussians has a third scale
     that nothing trains: leave the part out there. A Gaussian with non-finite axes is not moved.
 
-    It keeps that median from step to step.
+    It keeps that length from step to step, and it is saved.
 
     Args:
         rate: a full step in the first iteration, in standard deviations; above 0.
@@ -147,10 +147,9 @@ class OwnFrame(Part):
 
     def read_back(self, training: Training) -> None:
         """Have the longest axes in the notes."""
-        notes = training.notes_of(self)
         for place, kept in training.unsaved.items():
             if place[0] is OwnFrame and math.isfinite(longest := kept[1].item()):
-                notes[f"longest {place[1]}"], notes[f"found at {place[1]}"] = longest, kept[0]
+                training.notes_of(self)[f"longest {place[1]}".rstrip()] = longest
 
     def numbers(self, training: Training) -> Mapping[str, float]:
         """`own_frame_rate`: standard deviations of a full step."""
@@ -161,9 +160,9 @@ def longest_of(
     step: Step, scales: Tensor, unsaved: dict[Any, Any], notes: Mapping[str, Any]
 ) -> Tensor | None:
     """The standard deviation [] that a longer axis counts as; it stays on the device."""
-    at, place = step.iteration // EVERY, (OwnFrame, step.set)
-    if place not in unsaved and (known := notes.get(f"longest {step.set}")) is not None:
-        unsaved[place] = notes[f"found at {step.set}"], scales.new_tensor(known)
+    at, place, note = step.iteration // EVERY, (OwnFrame, step.set), f"longest {step.set}".rstrip()
+    if place not in unsaved and note in notes:  # of the iteration before, in a resumed training
+        unsaved[place] = (step.iteration - 1) // EVERY, scales.new_tensor(notes[note])
     kept = unsaved.get(place)
     if kept is None or kept[0] != at or kept[1].device != scales.device:
         largest = scales.detach().amax(1)
