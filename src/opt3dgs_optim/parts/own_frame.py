@@ -6,7 +6,6 @@ import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -141,9 +140,24 @@ class OwnFrame(Part):
         least = self.min_aspect
         if least is None:
             least = min_aspect_of(training.end_step or step.iteration)
-        longest = longest_of(step, scales, training.unsaved, training.notes_of(self))
+        kept = training.unsaved.get((OwnFrame, step.set))
+        if kept is None or kept[0] != step.iteration // EVERY or kept[1].device != scales.device:
+            kept = self.keep_longest(step, scales, training)
         scales = scales if scales.shape[1] == 3 else three_of(scales)
-        step.frame = Frame(rate, least, quats, scales, longest)
+        step.frame = Frame(rate, least, quats, scales, kept[1])
+
+    def keep_longest(self, step: Step, scales: Tensor, training: Training) -> tuple[int, Tensor]:
+        """Keep the standard deviation [] that a longer axis counts as, beside its hundred's number."""
+        place, now = (OwnFrame, step.set), step.iteration // EVERY
+        longest = training.notes_of(self).get(f"longest {step.set}".rstrip())
+        if place not in training.unsaved and longest and (step.iteration - 1) // EVERY == now:
+            found = scales.new_tensor(longest)  # in a resumed training
+        elif len(scales):
+            found = scales.detach().amax(1).nanmedian().exp() * MEDIANS
+        else:
+            found = scales.new_tensor(math.inf)
+        training.unsaved[place] = now, found
+        return now, found
 
     def read_back(self, training: Training) -> None:
         """Have the longest axes in the notes."""
@@ -154,22 +168,6 @@ class OwnFrame(Part):
     def numbers(self, training: Training) -> Mapping[str, float]:
         """`own_frame_rate`: standard deviations of a full step."""
         return {"own_frame_rate": self.at(training)}
-
-
-def longest_of(
-    step: Step, scales: Tensor, unsaved: dict[Any, Any], notes: Mapping[str, Any]
-) -> Tensor | None:
-    """The standard deviation [] that a longer axis counts as; it stays on the device."""
-    at, place, note = step.iteration // EVERY, (OwnFrame, step.set), f"longest {step.set}".rstrip()
-    if place not in unsaved and note in notes:  # of the iteration before, in a resumed training
-        unsaved[place] = (step.iteration - 1) // EVERY, scales.new_tensor(notes[note])
-    kept = unsaved.get(place)
-    if kept is None or kept[0] != at or kept[1].device != scales.device:
-        largest = scales.detach().amax(1)
-        if not len(largest):
-            return None
-        unsaved[place] = at, largest.nanmedian().exp() * MEDIANS
-    return unsaved[place][1]
 
 
 def three_of(scales: Tensor) -> Tensor:
