@@ -147,7 +147,7 @@ class OwnFrame(Part):
         step.frame = Frame(rate, least, quats, scales, kept[1])
 
     def keep_longest(self, step: Step, scales: Tensor, training: Training) -> tuple[int, Tensor]:
-        """Keep the standard deviation [] that a longer axis counts as, beside its hundred's number."""
+        """Keep the standard deviation [] that a longer axis counts as, of these 100 iterations."""
         place, now = (OwnFrame, step.set), step.iteration // EVERY
         longest = training.notes_of(self).get(f"longest {step.set}".rstrip())
         if place not in training.unsaved and longest and (step.iteration - 1) // EVERY == now:
