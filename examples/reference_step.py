@@ -102,11 +102,11 @@ def default_step(
         # a position has no gradient it stays, and so do its moments.
         if in_own_frame:
             # Thin axes count as a share of the longest, a larger one in short trainings; none as
-            # longer than 10 medians of the longest axes, found every 100 iterations.
+            # longer than 6 medians of the longest axes, found every 100 iterations.
             least = min(max(3_000 / total, 0.1), 0.25)
             if state.get("longest", (None,))[0] != iteration // 100:
                 median = params["scales"].amax(1).nanmedian()
-                state["longest"] = iteration // 100, median.exp() * 10
+                state["longest"] = iteration // 100, median.exp() * 6
             frame = own_axes(params["quats"], params["scales"], least, state["longest"][1])
             z, seen = torch.zeros_like(param), (grad != 0).any(1, keepdim=True)
             rate = 0.1 * 0.03**progress if rate else 0.0

@@ -18,7 +18,7 @@ from opt3dgs_optim.training import Training
 CALL = "OwnFrame"
 BETA1 = 0.9  # of one view an iteration
 SLOWED_OVER, POWER = 1_000, 0.75  # iterations; where no end is planned: see `OwnFrame`
-MEDIANS, EVERY = 10, 100  # of the longest axes, found every so many iterations: see `OwnFrame`
+MEDIANS, EVERY = 6, 100  # of the longest axes, found every so many iterations: see `OwnFrame`
 
 
 @dataclass(frozen=True, repr=False)
