@@ -78,7 +78,7 @@ class OwnFrame(Part):
         >>> from opt3dgs_optim import OwnFrame, PhaseScheduler
         >>> splats = {"means": torch.zeros(2, 3), "scales": torch.zeros(2, 3),
         ...           "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2)}
-        >>> splats["scales"][1] = -3.0  # the second Gaussian is twenty times smaller
+        >>> splats["scales"][1] = -1.5  # the second Gaussian is four times smaller
         >>> splats = {name: torch.nn.Parameter(value) for name, value in splats.items()}
         >>> adams = {name: torch.optim.Adam([param]) for name, param in splats.items()}
         >>> phases = PhaseScheduler(100, parts=[OwnFrame(rate=0.1)])
@@ -86,7 +86,7 @@ class OwnFrame(Part):
         >>> splats["means"].grad = torch.ones(2, 3)
         >>> adams["means"].step()
         >>> [round(x, 4) for x in splats["means"][:, 0].tolist()]
-        [-0.1, -0.005]
+        [-0.1, -0.0223]
     """
 
     rate: float = 0.1
