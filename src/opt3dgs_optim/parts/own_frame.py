@@ -49,6 +49,10 @@ class OwnFrame(Part):
     of the longest. The fewer steps a training has, the longer they must be: by default this share
     is 3,000 / total_steps, but between 0.1 (from 30,000 iterations on) and 0.25 (up to 12,000).
 
+    The largest Gaussians would be stepped farthest, and with density control that splits they fill
+    the space before the cameras. So an axis counts as no longer than 6 times the median of the
+    Gaussians' longest axes, which is found every 100 iterations.
+
     For b views in a batch, or b ranks, gsplat sets beta1 = 1 - 0.1 b and scales rates by sqrt(b).
     The rate here follows beta1: below beta1 = 0.9 it is scaled by sqrt((1 - beta1) / 0.1).
 
