@@ -64,7 +64,7 @@ class OwnFrame(Part):
     the longest; or [N, 1] for round ones. gsplat's trainer for flat Gaussians has a third scale
     that nothing trains: leave the part out there. A Gaussian with non-finite axes is not moved.
 
-    It keeps that length from step to step, and it is saved.
+    From step to step it keeps the length that the longest axes count as, which checkpoints save.
 
     Args:
         rate: a full step in the first iteration, in standard deviations; above 0.
