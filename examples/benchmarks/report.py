@@ -219,7 +219,7 @@ def adaptive() -> str:
                 trained = f"{fmean(x['train_psnr'] for x in found):.2f}"
                 count = f"{fmean(x['gaussians'] for x in found):,.0f}"
                 rows.append((scene * (run == STOCK), name(run), shown(found), trained, count))
-    heads = ("scene", "training", "PSNR / SSIM / LPIPS", "PSNR trained on", "Gaussians")
+    heads = ("scene", "training", "PSNR / SSIM / LPIPS", "training PSNR", "Gaussians")
     return table(heads, rows)
 
 

@@ -20,7 +20,7 @@ class Part:
     In `plan`, a part sets plain values that say *what* a parameter's step has; one function makes
     the step from them (`opt3dgs_optim.step`), on a GPU in one launch. A part with arithmetic of its
     own has `before`, which replaces the gradient after all plans, and `after`; both use torch
-    operations, at one launch each.
+    operations, each a launch.
 
     What a part learns of a training goes into `training.notes_of(self)`, a dict of plain numbers by
     name, which is saved with the optimizers; a part object whose state lives in itself sets

@@ -47,7 +47,7 @@ Optimizers = TypeVar(
 class PhaseScheduler(Training):
     """Put parts into the steps of a 3DGS trainer's optimizers, in two phases.
 
-    The default, `DEFAULTS`, suits relocation as in 3DGS-MCMC and clone, split and prune alike.
+    The default, `DEFAULTS`, suits both relocation (3DGS-MCMC) and clone, split and prune.
     `PhaseScheduler.paper` is Opt3DGS.
 
     The optimizers count their own steps, so nothing else need be called: the positions' optimizer
@@ -57,9 +57,9 @@ class PhaseScheduler(Training):
     Args:
         total_steps: iterations of the training, each with one step of the positions' optimizer;
             None: it goes on until `finish_in` is called, or `phases.total_steps` set.
-        switch: where exploitation starts: a fraction of `total_steps` in (0, 1] if a float, an
+        switch: where exploitation starts: a fraction of `total_steps` in [0, 1] if a float, an
             iteration if an int (`total_steps`: never). The paper: 29/30. Without `total_steps` a
-            fraction is the fall to the end.
+            fraction is where the fall to the end begins.
         parts: what the steps have, in order; None: `DEFAULTS`.
         moments: bits per number of each of Adam's two moments, and of the mean of the last
             thirtieth; 16 halves the memory, and is for the Gaussians alone (see
@@ -68,8 +68,8 @@ class PhaseScheduler(Training):
         process_group: a `torch.distributed` process group over whose ranks the loss is averaged,
             for parts that read it.
 
-    Memory: Adam's; in the last thirtieth `Averaging` keeps a copy of the parameters, too. With
-    `moments=16` each takes half.
+    Memory: Adam's; in the last thirtieth `Averaging` keeps a copy of the parameters, too.
+    `moments=16` halves Adam's, and that copy but for the positions'.
 
     Examples:
         >>> import torch
@@ -240,7 +240,7 @@ class PhaseScheduler(Training):
     def pixel_loss(self, render: Tensor, target: Tensor) -> Tensor:
         """The photometric term of two images in 0..1: mean |error|, unless a part says another.
 
-        It is for the iteration after the last step.
+        It is for the iteration of the next step.
 
         `SquaredLoss` has the paper's mean squared error while exploiting.
         """

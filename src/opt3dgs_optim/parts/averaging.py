@@ -23,22 +23,22 @@ class Averaging(Part):
 
     Every step follows one view, so the parameters wander around what fits all views, further with
     higher learning rates; their mean does not. Averaging covers the last thirtieth of the run, or
-    the last fifth of the fall where no end was planned: 250 of its iterates, or all if there are
-    fewer than 500. In the last tenth of it, at least the last two iterations, the mean takes the
+    the last fifth of the fall where no end was planned: 250 to 499 of its iterates, or all if there
+    are fewer. In the last tenth of it, at least the last two iterations, the mean takes the
     parameters' place, because trainers save before their last step. Until then nothing is changed.
 
     After an edit of rows the edited parameters' means begin anew: density control should end before
     the averaging. Iterates that are not finite are left out. In the last thirtieth it takes the
-    parameters' memory once more, plus four numbers a row. With moments of 16 bits the mean's
+    parameters' memory once more, plus nine numbers a Gaussian. With moments of 16 bits the mean's
     numbers have 16 bits, too, except positions. If a GPU has no room for it, there is a warning,
     and the training goes on without.
 
     Args:
         names: the Gaussian parameters, under gsplat's or INRIA's names; None: every parameter of
-            the upgraded optimizers, as cameras, exposures, anchors and networks.
+            the upgraded optimizers: cameras, exposures, anchors, networks.
 
     Raises:
-        ValueError: a name is no Gaussian parameter's.
+        ValueError: a name is not that of a Gaussian parameter.
     """
 
     names: tuple[str, ...] | None = GAUSSIAN

@@ -30,7 +30,7 @@ class Curvature(Part):
     into a pseudo-gradient. There is no line search: Adam takes the step. A point without a usable
     pair is stepped by plain Adam, bit for bit.
 
-    Memory: 32 K bytes per point beyond Adam's (K > 3, D = 3, float32), from the switch on.
+    Memory: 32 * K bytes per point beyond Adam's (K > 3, D = 3, float32), from the switch on.
 
     Args:
         history_size: K, number of pairs, 1 to 16 (the paper: 5).

@@ -33,10 +33,10 @@ class Fading(Part):
     recovered, which takes about a thousand iterations.
 
     The same points are faded in all of `names`. Which ones depends only on `seed`, the event and
-    the point's index: a resumed run repeats them, and every device chooses the same.
-    Where no end is planned, iteration i has `events` / (3 i) of them, until the fall to the end
-    begins. It costs no memory. Positions that `OwnFrame` steps are left alone: a faded step of them
-    would be half a standard deviation long.
+    the point's index: a resumed run repeats them, and every device chooses the same. Where no end
+    is planned, there are `events` / (3 i) events in iteration i, until the fall to the end begins.
+    It costs no memory. Positions that `OwnFrame` steps are left alone: a faded step of them would
+    be half a standard deviation long.
 
     Args:
         share: each point's chance to be faded in an event, in (0, 1].
@@ -51,7 +51,8 @@ class Fading(Part):
         names: the Gaussian parameters, under gsplat's or INRIA's names.
 
     Raises:
-        ValueError: an option is outside what is allowed, or a name is no Gaussian parameter's.
+        ValueError: an option is outside what is allowed, or a name is not one of a Gaussian
+            parameter.
     """
 
     share: float = 0.2

@@ -33,7 +33,7 @@ class EnergyHistogram(Part):
     By default the partitions follow the energy's recent mean and deviation: an energy two
     deviations from the mean gets |nu - 1| = 1 at all times, nu's mean is 1 and its deviation 1/2,
     whatever zeta and however far the energy falls. `MovingPartitions` has the formulas. With a
-    range and a temperature it is the paper's update, to the letter (`FixedPartitions`);
+    range and a temperature it is the paper's update, errata mended (`FixedPartitions`);
     `EnergyHistogram.paper()` has its numbers.
 
     The default is made for trainings. **To sample** a fixed energy, give `energy_range`, from the

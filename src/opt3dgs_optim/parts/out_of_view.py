@@ -32,8 +32,8 @@ class OutOfView(Part):
 
     3DGS-MCMC's regularisers pull on the scale and the opacity of every point in every iteration,
     and Adam takes a full step however small a gradient is. Relocation and `Fading` empty second
-    moments, so a point out of view then shrinks and fades until a view sees it again. Where each
-    view sees a tenth of the points, most points are dead by then.
+    moments, so a point out of view then shrinks and fades until a view sees it again. Where views
+    see a few percent of the points, most points are dead by then.
 
     This part keeps s, the mean share of the points that a view sees, over the last 100 views, of
     which it looks at one in four. While s is below a third, the second moment of a point out of
@@ -41,8 +41,8 @@ class OutOfView(Part):
     step. Above a third nothing is changed, bit for bit.
 
     A point is out of view where the gradient of its position is zero. Points whose position has
-    never had a gradient do not count in s: frozen positions are not out of view. The positions'
-    gradient must be there at the first step of an iteration, as in every known trainer.
+    never had a gradient, as frozen ones, do not count in s. The positions' gradient must be there
+    at the first step of an iteration, as in every known trainer.
     """
 
     names = ("means", "scales", "opacities")

@@ -41,8 +41,7 @@ class OwnFrame(Part):
 
     A Gaussian is stepped in the iterations that see it: where its position has no gradient it
     stays, and so do its moments, as with the Adam of Taming 3DGS (2024) for visible Gaussians.
-    Otherwise the momentum of one view carries those that few views see by most of a standard
-    deviation.
+    Otherwise one view's momentum carries those that few views see almost a standard deviation.
 
     Trained Gaussians are thin, often far thinner than a pixel. Steps in proportion to such an axis
     would pin the Gaussian across its own surface, so an axis counts as no thinner than `min_aspect`
@@ -50,7 +49,7 @@ class OwnFrame(Part):
     is 3,000 / total_steps, but between 0.1 (from 30,000 iterations on) and 0.25 (up to 12,000).
 
     The largest Gaussians would be stepped farthest, and with density control that splits they fill
-    the space before the cameras. So an axis counts as no longer than 6 times the median of the
+    the space in front of the cameras. So an axis counts as no longer than 6 times the median of the
     Gaussians' longest axes, which is found every 100 iterations.
 
     For b views in a batch, or b ranks, gsplat sets beta1 = 1 - 0.1 b and scales rates by sqrt(b).
@@ -64,7 +63,7 @@ class OwnFrame(Part):
     the longest; or [N, 1] for round ones. gsplat's trainer for flat Gaussians has a third scale
     that nothing trains: leave the part out there. A Gaussian with non-finite axes is not moved.
 
-    From step to step it keeps the length that the longest axes count as, which checkpoints save.
+    It keeps the bound on the longest axes from step to step; checkpoints save it.
 
     Args:
         rate: a full step in the first iteration, in standard deviations; above 0.

@@ -32,7 +32,7 @@ SMALLEST = 1e-30  # and as a number: zero over zero is none
 
 @dataclass(eq=False)
 class FixedPartitions:
-    """Eq. 7, 13, 14 and 16 as the paper has them. The state is Theta, [num_partitions].
+    """Eq. 7, 13, 14 and 16 of the paper, errata mended. The state is Theta, [num_partitions].
 
     Options as in `EnergyHistogram`.
     """
