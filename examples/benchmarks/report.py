@@ -213,12 +213,17 @@ def adaptive() -> str:
     rows = []
     for scene in PHOTOS:
         stock, ours = third(scene, "clone-and-split")
-        short = of(("stock", 10_000), scene, density="clone-and-split", **HALF)
-        for run, found in ((STOCK, stock), (("stock", 10_000), short), (THIRD, ours)):
-            if found:
-                trained = f"{fmean(x['train_psnr'] for x in found):.2f}"
-                count = f"{fmean(x['gaussians'] for x in found):,.0f}"
-                rows.append((scene * (run == STOCK), name(run), shown(found), trained, count))
+        those: dict[str, Any] = {"density": "clone-and-split", **HALF}
+        short = of(("stock", 10_000), scene, **those)
+        found = [(name(STOCK), stock), (name(("stock", 10_000)), short), (name(THIRD), ours)]
+        for factor in sorted({x.get("threshold", 1.0) for x in lines()} - {1.0}):
+            higher = of(THIRD, scene, threshold=factor, **those)
+            found.append((f"the same, threshold times {factor:g}", higher))
+        for label, each in found:
+            if each:
+                trained = f"{fmean(x['train_psnr'] for x in each):.2f}"
+                count = f"{fmean(x['gaussians'] for x in each):,.0f}"
+                rows.append((scene * (each is stock), label, shown(each), trained, count))
     heads = ("scene", "training", "PSNR / SSIM / LPIPS", "training PSNR", "Gaussians")
     return table(heads, rows)
 

@@ -11,7 +11,7 @@ A row is one Gaussian: dimension 0 of a parameter. In the order in which it is m
     fade        moments of random rows are shrunk
     decay       the trainer's weight decay: off the parameter (AdamW), or onto the gradient (Adam)
     frame       the gradient is turned into each Gaussian's own axes, B^T g; rows without one keep
-                their moments, and do not move
+                their moments, and move by decay alone
     hold        second moments of rows out of view are kept large
     Adam        m, v, and the step m / (sqrt(v) + eps), with bias correction
     frame       the step is turned back, B z

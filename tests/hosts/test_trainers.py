@@ -100,13 +100,14 @@ def test_ends_early_with_finish(scene: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["gsplat-1.5.3 mcmc", "3dgs-mcmc --cap_max", "gaussian-splatting"])
 def test_ends_without_a_plan(name: str, scene: Path, tmp_path: Path) -> None:
-    """The trainer saves and evaluates where the mean is, and stops."""
+    """The trainer saves and evaluates where the mean is, and stops; resumed in its fall, too."""
     trial = next(each for each in TRIALS if each.name.startswith(name))
     if (why := missing(trial)) is not None:
         pytest.skip(why)
-    enough = 60
+    enough = 56  # the end of an epoch, as HALF
     last = enough + enough // 5
-    done = trial.train(scene, tmp_path, "open", ours=True, enough=enough)
+    more = [] if trial.gsplat else ["--checkpoint_iterations", str(enough)]
+    done = trial.train(scene, tmp_path, "open", *more, ours=True, enough=enough)
     assert done.code == 0, done.output[-3000:]
     assert "opt3dgs_optim: no planned end" in done.output
     assert "no mean" not in done.output
@@ -115,6 +116,12 @@ def test_ends_without_a_plan(name: str, scene: Path, tmp_path: Path) -> None:
     if trial.gsplat:
         saved = f"ckpts/ckpt_{last - 1}_rank0.pt"
     ends_at_the_mean(trial, done, done.out / saved)
+    if trial.gsplat:
+        return
+    more = ["--start_checkpoint", str(done.out / f"chkpnt{enough}.pth")]
+    resumed = trial.train(scene, tmp_path, "resumed", *more, ours=True, enough=enough)
+    assert resumed.code == 0, resumed.output[-3000:]
+    assert (resumed.out / saved).read_bytes() == (done.out / saved).read_bytes()
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ class OwnFrame(Part):
     optimizers' groups; if not, there is one warning, and plain Adam steps the positions.
     Scales are [N, 3]; [N, 2] for flat Gaussians (2DGS), whose third axis counts as `min_aspect` of
     the longest; or [N, 1] for round ones. gsplat's trainer for flat Gaussians has a third scale
-    that nothing trains: leave the part out there. A Gaussian with non-finite axes is not moved.
+    that nothing trains: leave the part out there. A Gaussian whose scales or quaternion are NaN is not moved.
 
     It keeps the bound on the longest axes from step to step; checkpoints save it.
 
@@ -152,11 +152,11 @@ class OwnFrame(Part):
     def keep_longest(self, step: Step, scales: Tensor, training: Training) -> tuple[int, Tensor]:
         """Keep the standard deviation [] that a longer axis counts as, of these 100 iterations."""
         place, now = (OwnFrame, step.set), step.iteration // EVERY
-        longest = training.notes_of(self).get(f"longest {step.set}".rstrip())
-        if place not in training.unsaved and longest and (step.iteration - 1) // EVERY == now:
-            found = scales.new_tensor(longest)  # in a resumed training
+        notes = training.notes_of(self)
+        if place not in training.unsaved and notes.get(_note(step.set, "found in")) == now:
+            found = scales.new_tensor(notes[_note(step.set, "longest")])  # in a resumed training
         elif len(scales):
-            found = scales.detach().amax(1).nanmedian().exp() * MEDIANS
+            found = median_of(scales.detach().amax(1)).exp() * MEDIANS
         else:
             found = scales.new_tensor(math.inf)
         training.unsaved[place] = now, found
@@ -166,11 +166,28 @@ class OwnFrame(Part):
         """Have the longest axes in the notes."""
         for place, kept in training.unsaved.items():
             if place[0] is OwnFrame and math.isfinite(longest := kept[1].item()):
-                training.notes_of(self)[f"longest {place[1]}".rstrip()] = longest
+                notes = training.notes_of(self)
+                notes[_note(place[1], "longest")] = longest
+                notes[_note(place[1], "found in")] = kept[0]
 
     def numbers(self, training: Training) -> Mapping[str, float]:
         """`own_frame_rate`: standard deviations of a full step."""
         return {"own_frame_rate": self.at(training)}
+
+
+def _note(name: str, what: str) -> str:
+    """The key of a note on a set of Gaussians."""
+    return f"{what} {name}".rstrip()
+
+
+def median_of(numbers: Tensor) -> Tensor:
+    """The lower median [] of numbers [N], those that are none aside.
+
+    It is `nanmedian`, which waits for the device in PyTorch 2.4.
+    """
+    ordered = numbers.sort().values  # those that are none come last
+    middle = (numbers.numel() - numbers.isnan().sum() - 1) // 2
+    return ordered.gather(0, middle.clamp(min=0).view(1)).view(())
 
 
 def three_of(scales: Tensor) -> Tensor:
