@@ -61,7 +61,8 @@ class OwnFrame(Part):
     optimizers' groups; if not, there is one warning, and plain Adam steps the positions.
     Scales are [N, 3]; [N, 2] for flat Gaussians (2DGS), whose third axis counts as `min_aspect` of
     the longest; or [N, 1] for round ones. gsplat's trainer for flat Gaussians has a third scale
-    that nothing trains: leave the part out there. A Gaussian whose scales or quaternion are NaN is not moved.
+    that nothing trains: leave the part out there. A Gaussian whose scales or quaternion are NaN is
+    not moved.
 
     It keeps the bound on the longest axes from step to step; checkpoints save it.
 
