@@ -143,7 +143,8 @@ def test_the_readme_says_what_was_measured() -> None:
         short = report.of(("stock", 10_000), scene, **report.HALF)
         found = report.gain(short, report.of(report.STOCK, scene, **report.HALF))
         lost.append(f"{-found['psnr']:.1f}")
-    assert "Stock shortened to 10,000 loses {} dB on bonsai, {} on lego and {} on plush".format(*lost) in words
+    said = "loses {} dB on bonsai, {} on lego and {} on plush".format(*lost)
+    assert f"Stock shortened to 10,000 {said}" in words
     made = json.loads(report.GPU.read_text(encoding="utf-8"))["steps"]["results"]
     ratios = [made[count]["defaults"]["ratio"] for count in ("100000", "1000000", "5000000")]
     assert f"[{100 * min(ratios):.0f} to {100 * max(ratios):.0f} %]" in words
@@ -166,7 +167,8 @@ def test_the_readme_says_what_was_measured() -> None:
     assert "grows up to 40 % more Gaussians" in words
     assert "grows [40 % more Gaussians]" in words
     assert "on bonsai and 20 % on plush" in words
-    same = report.of(report.THIRD, "plush", density="clone-and-split", threshold=1.18, **report.HALF)
+    those = {"density": "clone-and-split", "threshold": 1.18, **report.HALF}
+    same = report.of(report.THIRD, "plush", **those)
     less = -report.gain(same, thirds["plush"][0])["psnr"]
     assert same[0]["gaussians"] == pytest.approx(thirds["plush"][0][0]["gaussians"], rel=0.05)
     assert f"at stock's number plush loses {less:.1f} dB" in words
