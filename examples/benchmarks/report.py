@@ -296,6 +296,7 @@ TABLES = {f.__name__: f for f in (
 
 DRAWN = {
     STOCK: "#555555",
+    ("stock", 10_000): "#e69f00",
     ("defaults", 15_000): "#7fc4ea",
     ("defaults", 10_000): "#0072b2",
     ("defaults", 7_500): "#08306b",
@@ -332,7 +333,7 @@ def draw(path: Path) -> None:
         axis.grid(color="#e4e4e4", lw=0.8)
     axes[0].set_ylabel("PSNR of held-out photos, dB", fontsize=12)
     entries, place = axes[0].get_legend_handles_labels(), "outside lower center"
-    figure.legend(*entries, loc=place, ncols=2, frameon=False, fontsize=11)
+    figure.legend(*entries, loc=place, ncols=3, frameon=False, fontsize=11)
     figure.savefig(path)
 
 
