@@ -15,7 +15,7 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, stdev
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -95,9 +95,15 @@ def shown(found: Sequence[Line]) -> str:
 
 
 def gained(ours: list[Line], control: list[Line]) -> str:
-    """The gain, and over how many seeds."""
-    found = gain(ours, control)
-    return f"{numbers(found, '+')} {seeds(paired(ours, control)[0])}" if found else "not trained"
+    """The gain, from three seeds on with the standard error of PSNR's, and over how many seeds."""
+    pairs = list(zip(*paired(ours, control), strict=True))
+    if not pairs:
+        return "not trained"
+    said = numbers(gain(ours, control), "+")
+    if len(pairs) > 2:
+        error = stdev(a["psnr"] - b["psnr"] for a, b in pairs) / len(pairs) ** 0.5
+        said = said.replace(" /", f" ± {error:.2f} /", 1)
+    return f"{said} {seeds(pairs)}"
 
 
 def beside(stock: Run, others: Iterable[Run], scene: str, **those: Any) -> list[str]:
