@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import ast
+import copy
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from gaussians import adams_of, parameters, steps
 
+from opt3dgs_optim import PhaseScheduler
 from opt3dgs_optim.hosts import lines
 from opt3dgs_optim.hosts.diff import ANY
-from opt3dgs_optim.hosts.pages import OPEN_END, section
+from opt3dgs_optim.hosts.pages import OPEN_END, places_in, section
 from opt3dgs_optim.hosts.trainers import TRAINERS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -99,6 +104,48 @@ def test_the_lines_without_a_planned_end(
     assert f"{line}\n" in printed
     assert "Open end: " in printed
     assert printed.count("    if phases.ended:\n") + printed.count(" > opt.iterations:\n") == 1
+
+
+def ending(name: str, first: int, kept: int, optimizers: dict[str, Any]) -> tuple[Any, ...]:
+    """What a loop with the lines of no planned end, enough at 50, leaves of the trainer's numbers.
+
+    It begins with `first`; `kept` is the iteration whose state it returns, too.
+    """
+    (place,) = (p for p in places_in(TRAINERS[name].open_end) if "for " in p.anchor and not p.above)
+    body = "\n".join(place.lines).replace("10_000", "50")
+    code = compile(f"ends = True\nfor _ in '1':\n{body}\nelse:\n    ends = False", name, "exec")
+    phases, state = PhaseScheduler(), {}
+    phases.upgrade(optimizers)
+    numbers: dict[str, Any] = {
+        "opt": SimpleNamespace(iterations=90, densify_until_iter=90),
+        "cfg": SimpleNamespace(strategy=SimpleNamespace(refine_stop_iter=90), eval_steps=[]),
+        "max_steps": 90, "saving_iterations": [], "testing_iterations": [],
+    }  # fmt: skip
+    params = {k: each.param_groups[0]["params"][0] for k, each in optimizers.items()}
+    for i in range(first, 90):
+        numbers |= {"phases": phases, "iteration": i, "step": i}
+        exec(code, numbers)
+        if numbers["ends"]:
+            break
+        if i < numbers["opt"].iterations:  # INRIA's makes no step in its last
+            steps(optimizers, params, 1)
+        if i == kept:
+            state = {k: copy.deepcopy(each.state_dict()) for k, each in optimizers.items()}
+    left = [numbers[key] for key in ("opt", "cfg", "max_steps", "saving_iterations", "iteration")]
+    return state, left
+
+
+@pytest.mark.parametrize("kept", [49, 50, 55])
+@pytest.mark.parametrize(("name", "first"), [("inria", 1), ("gsplat", 0)])
+def test_a_resumed_training_keeps_its_end(name: str, first: int, kept: int) -> None:
+    """Also where the checkpoint is of the iteration that was good enough, or of the fall."""
+    state, left = ending(name, first, kept, adams_of(parameters(4)))
+    resumed = adams_of(parameters(4))
+    for key, optimizer in resumed.items():
+        optimizer.load_state_dict(state[key])
+    _, again = ending(name, kept + 1, 0, resumed)
+    assert again == left
+    assert left[-1] < 65
 
 
 @pytest.mark.parametrize(
