@@ -194,11 +194,14 @@ def short() -> str:
 
 
 def open_end() -> str:
-    """One training without a planned end, ended at several lengths, less those planned for them."""
+    """One training without a planned end, ended at several lengths, less those planned for them.
+
+    Their arm is `planned`: the defaults that the one was trained with.
+    """
     rows = []
     for scene, those in (*((scene, QUARTER) for scene in MAIN), ("lego", HALF)):
         for count in (5_000, 7_500, 10_000, 15_000, 30_000):
-            found = (of((arm, count), scene, **those) for arm in ("open-end", "defaults"))
+            found = (of((arm, count), scene, **those) for arm in ("open-end", "planned"))
             ours, planned = paired(*found)
             if ours:
                 size = "half" if those is HALF else "quarter"
