@@ -186,7 +186,7 @@ def median_of(numbers: Tensor) -> Tensor:
 
     It is `nanmedian`, which waits for the device in PyTorch 2.4.
     """
-    ordered = numbers.sort().values  # those that are none come last
+    ordered, _ = numbers.sort()  # those that are none come last
     middle = (numbers.numel() - numbers.isnan().sum() - 1) // 2
     return ordered.gather(0, middle.clamp(min=0).view(1)).view(())
 
