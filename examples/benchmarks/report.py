@@ -225,9 +225,9 @@ def adaptive() -> str:
         those: dict[str, Any] = {"density": "clone-and-split", **HALF}
         short = of(("stock", 10_000), scene, **those)
         found = [(name(STOCK), stock), (name(("stock", 10_000)), short), (name(THIRD), ours)]
-        for factor in sorted({x.get("threshold", 1.0) for x in lines()} - {1.0}):
-            higher = of(THIRD, scene, threshold=factor, **those)
-            found.append((f"the same, threshold times {factor:g}", higher))
+        for factor in sorted({x["threshold"] for x in lines()} - {1.0}):
+            other = of(THIRD, scene, threshold=factor, **those)
+            found.append((f"the same, threshold times {factor:g}", other))
         for label, each in found:
             if each:
                 trained = f"{fmean(x['train_psnr'] for x in each):.2f}"

@@ -182,11 +182,11 @@ def _note(name: str, what: str) -> str:
 
 
 def median_of(numbers: Tensor) -> Tensor:
-    """The lower median [] of numbers [N], those that are none aside.
+    """The lower median [] of numbers [N], NaNs aside.
 
     It is `nanmedian`, which waits for the device in PyTorch 2.4.
     """
-    ordered, _ = numbers.sort()  # those that are none come last
+    ordered, _ = numbers.sort()  # NaNs come last
     middle = (numbers.numel() - numbers.isnan().sum() - 1) // 2
     return ordered.gather(0, middle.clamp(min=0).view(1)).view(())
 
