@@ -26,7 +26,7 @@ from splatting.scenes import Scene, View
 
 LR_DECAY = 0.01  # of the positions' learning rate over the run
 TRAIN_VIEWS_EVALUATED = 8
-SH_DEGREE_INTERVAL = 1000  # iterations until one degree more is used, as trainers do
+SH_DEGREE_INTERVALS = 30  # of a run; after each one degree more is used
 DRAWS = ("noise", "order", "density", "start")  # one random generator each, seeded in this order
 
 
@@ -165,8 +165,12 @@ class Fit:
 
     @property
     def active_sh_degree(self) -> int:
-        """The degree of spherical harmonics in use: one more every thousand iterations."""
-        return min(self.iteration // SH_DEGREE_INTERVAL, self.options.sh_degree)
+        """The degree of spherical harmonics in use: one more in each thirtieth of the run.
+
+        That is every 1,000 of 30,000 iterations, and what `opt3dgs lines` prints for fewer.
+        """
+        intervals = SH_DEGREE_INTERVALS * self.iteration // self.options.iterations
+        return min(intervals, self.options.sh_degree)
 
     def compile_kernels(self) -> None:
         """Have the rasterizer compiled, or loaded from its cache, before the run's clock starts."""
