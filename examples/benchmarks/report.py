@@ -29,12 +29,6 @@ GPU = evidence.FILE.with_name("gpu.json")
 PICTURE = evidence.FILE.with_name("iterations.png")
 MAIN = ("bonsai", "lego", "plush")
 FEW = ("banana", "brighton_beach", "lund_door")
-PHOTOS = {
-    "bonsai": "220 of 400x266",
-    "lego": "87 of 400x400",
-    "plush": "84 of 320x240",
-    "train": "263 of 489x271",
-}
 HALF: dict[str, Any] = {"size": "images_2", "points": 50_000, "sh_degree": 0}
 WHOLE: dict[str, Any] = {"size": "images", "points": 200_000, "sh_degree": 3}
 QUARTER: dict[str, Any] = {"size": "images_4", "sh_degree": 0}
@@ -43,11 +37,15 @@ COUNTS = ("10000", "100000", "1000000", "5000000")  # of Gaussians, as steps.jso
 NAMES = {
     "stock": "stock",
     "defaults": "the defaults",
-    "0.1.0": "version 0.1.0",
     "x2": "rates times 2",
     "x3": "rates times 3",
     "averaged": "stock, averaged",
     "learn2splat": "Learn2Splat's tuned Adam",
+}
+PHOTOS: dict[str, tuple[str, dict[str, Any]]] = {
+    "bonsai, 220 of 400x266": ("bonsai", HALF),
+    "lego, 87 of 400x400": ("lego", HALF),
+    "plush, 84 of 320x240": ("plush", HALF),
 }
 Run = tuple[str, int]  # an arm, and the iterations that it is planned for
 lines = cache(evidence.read)
@@ -132,25 +130,21 @@ def read(path: Path) -> dict[str, Any]:
 # -- the tables -----------------------------------------------------------------------------------
 
 STOCK, THIRD = ("stock", 30_000), ("defaults", 10_000)
-SHORTER = (
-    *(("defaults", count) for count in (15_000, 10_000, 7_500)),
-    *((arm, 10_000) for arm in ("stock", "x2", "x3", "averaged", "learn2splat")),
-)
+SHORTER = [(arm, 10_000) for arm in ("defaults", "stock", "x2", "x3", "averaged", "learn2splat")]
 
 
-def third(scene: str, density: str) -> list[list[Line]]:
+def third(scene: str, density: str, those: dict[str, Any] = HALF) -> list[list[Line]]:
     """Stock and a third of its iterations with the package, of the same seeds."""
-    return paired(*(of(run, scene, density=density, **HALF) for run in (STOCK, THIRD)))
+    return paired(*(of(run, scene, density=density, **those) for run in (STOCK, THIRD)))
 
 
 def front() -> str:
     """A third of stock's iterations against all of them."""
     ours, rows = "ours, 10,000", []
-    for scene, photos in PHOTOS.items():
-        found = third(scene, "relocation") + third(scene, "clone-and-split")
-        if any(found):
-            cells = (numbers(mean(each), digits=3) if each else "-" for each in found)
-            rows.append((f"{scene}, {photos}", *cells))
+    for photos, (scene, those) in PHOTOS.items():
+        found = third(scene, "relocation", those) + third(scene, "clone-and-split", those)
+        cells = (numbers(mean(each), digits=3) if each else "not trained" for each in found)
+        rows.append((photos, *cells))
     heads = ("photos", "relocation: stock, 30,000", ours, "clone and split: stock, 30,000", ours)
     return table(heads, rows)
 
@@ -171,26 +165,15 @@ def quarter() -> str:
 
 
 def equal() -> str:
-    """All of 30,000 iterations."""
-    runs = [(arm, 30_000) for arm in ("defaults", "0.1.0", "x2")]
-    rows = [
-        (scene, size, *beside(STOCK, runs, scene, **those))
-        for size, those in (("half", HALF), ("quarter", QUARTER))
-        for scene in MAIN
-    ]
-    return table(("scene", "size", "stock", *(NAMES[arm] for arm, _ in runs)), rows)
-
-
-def short() -> str:
-    """Both with schedules as short."""
+    """Both planned for as many iterations."""
     rows = []
-    for count in (15_000, 10_000, 7_500):
-        stock, ours = ("stock", count), ("defaults", count)
-        rows += [(f"{count:,}", s, *beside(stock, [ours], s, **HALF)) for s in MAIN]
-        gains = [gain(of(ours, s, **HALF), of(stock, s, **HALF)) for s in MAIN]
-        total = {m: fmean(each[m] for each in gains) for m in METRICS}
-        rows.append((f"{count:,}", "*mean*", "", numbers(total, "+")))
-    return table(("iterations", "scene", "stock", "the defaults gain"), rows, one_seed=True)
+    for size, those, count in (("half", HALF, 10_000), ("quarter", QUARTER, 30_000)):
+        runs = [(arm, count) for arm in ("defaults", "x2")]
+        rows += [
+            (size, f"{count:,}", scene, *beside(("stock", count), runs, scene, **those))
+            for scene in MAIN
+        ]
+    return table(("size", "iterations", "scene", "stock", "the defaults", NAMES["x2"]), rows)
 
 
 def open_end() -> str:
@@ -212,7 +195,7 @@ def open_end() -> str:
 
 def few() -> str:
     """Scenes with 10 to 15 photos; all beside stock at 30,000."""
-    runs = (("stock", 3_000), ("defaults", 3_000), ("0.1.0", 10_000), ("0.1.0", 30_000))
+    runs = (("stock", 3_000), ("defaults", 3_000), ("defaults", 30_000))
     rows = [(scene, *beside(STOCK, runs, scene, **QUARTER)) for scene in FEW]
     return table(("scene", *map(name, (STOCK, *runs))), rows)
 
@@ -220,7 +203,7 @@ def few() -> str:
 def adaptive() -> str:
     """Clone, split, prune and reset: held out, on the photos trained on, and Gaussians."""
     rows = []
-    for scene in PHOTOS:
+    for scene in MAIN:
         stock, ours = third(scene, "clone-and-split")
         those: dict[str, Any] = {"density": "clone-and-split", **HALF}
         short = of(("stock", 10_000), scene, **those)
@@ -297,7 +280,7 @@ def cost() -> str:
 
 
 TABLES = {f.__name__: f for f in (
-    front, iterations, quarter, equal, short, open_end, few, adaptive, whole, gpu_step,
+    front, iterations, quarter, equal, open_end, few, adaptive, whole, gpu_step,
     gpu_iteration, ratios, cost,
 )}  # fmt: skip
 
@@ -306,9 +289,7 @@ TABLES = {f.__name__: f for f in (
 DRAWN = {
     STOCK: "#555555",
     ("stock", 10_000): "#e69f00",
-    ("defaults", 15_000): "#7fc4ea",
     ("defaults", 10_000): "#0072b2",
-    ("defaults", 7_500): "#08306b",
 }
 
 
@@ -330,7 +311,7 @@ def draw(path: Path) -> None:
             # Some were evaluated twice as often as others.
             at = sorted(set.intersection(*map(set, curves)))
             curve = [fmean(one[n] for one in curves) for n in at]
-            label = "stock" if run == STOCK else f"{NAMES[run[0]]}, planned for {run[1]:,}"
+            label = f"{NAMES[run[0]]}, planned for {run[1]:,}"
             axis.plot([n / 1000 for n in at], curve, color=colour, lw=2, label=label)
             axis.plot(at[-1] / 1000, curve[-1], "o", color=colour, ms=6)
             if run == STOCK:
