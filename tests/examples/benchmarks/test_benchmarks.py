@@ -157,25 +157,24 @@ def test_the_readme_says_what_was_measured() -> None:
         stock = report.of(("stock", 15_000), scene, gpu=True, **report.WHOLE)
         ours = report.of(("defaults", 7_500), scene, **report.WHOLE)
         assert report.gain(ours, stock)["psnr"] > -0.05
-    said = "our 7,500 iterations (CPU) match stock's 15,000 (GPU)"
+    said = "7,500 iterations of an earlier form (CPU) match stock's 15,000 (GPU)"
     assert f"200,000 Gaussians (relocation, bonsai, lego, one seed), {said}" in words
     thirds = {scene: report.third(scene, "clone-and-split") for scene in report.MAIN}
     worst = max(-report.gain(ours, stock)["psnr"] for stock, ours in thirds.values())
     assert f"end at most {worst:.1f} dB below with [clone and split]" in words
     more = {s: ours[0]["gaussians"] / stock[0]["gaussians"] for s, (stock, ours) in thirds.items()}
-    assert more == pytest.approx({"bonsai": 1.4, "plush": 1.2, "lego": 0.9}, abs=0.05)
-    assert "grows up to 40 % more Gaussians" in words
-    assert "grows [40 % more Gaussians]" in words
-    assert "on bonsai and 20 % on plush" in words
+    assert max(more.values()) == more["bonsai"] < 1.4
+    assert f"makes [{100 * (more['bonsai'] - 1):.0f} % more Gaussians]" in words
     less = {}
     for scene, threshold in (("bonsai", 1.3), ("lego", 0.89), ("plush", 1.18)):
         those = {"density": "clone-and-split", "threshold": threshold, **report.HALF}
         same, stock = report.of(report.THIRD, scene, **those), thirds[scene][0]
         assert same[0]["gaussians"] == pytest.approx(stock[0]["gaussians"], rel=0.05)
         less[scene] = -report.gain(same, stock)["psnr"]
-    assert max(less["bonsai"], less["lego"]) < 0.05
-    said = f"at stock's number bonsai and lego match it, plush loses {less['plush']:.1f} dB"
-    assert said in words
+    assert max(less.values()) == less["plush"]
+    said = f"{less['plush']:.1f}"
+    assert f"with up to 40 % more Gaussians (with as many, {said} below)" in words
+    assert f"at stock's number plush loses {said} dB" in words
     whole = json.loads(report.GPU.read_text(encoding="utf-8"))["iterations"]["results"]
     share = 100 * whole["1000000"]["defaults"]["ratio"]
     assert f"A whole gsplat iteration takes {share:.0f} % of stock's (a million)" in words
