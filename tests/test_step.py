@@ -21,7 +21,7 @@ from opt3dgs_optim.step import (
     out_of_frame,
     take_step,
 )
-from opt3dgs_optim.triton.check import case, tensors
+from step_cases import case, tensors
 
 CPU = torch.device("cpu")
 NAN, INF = float("nan"), float("inf")

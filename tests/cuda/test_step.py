@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import pytest
@@ -9,8 +10,9 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim import PhaseScheduler, triton
+from opt3dgs_optim.mean import Mean
 from opt3dgs_optim.step import Step, chosen_rows, take_step
-from opt3dgs_optim.triton.check import case, combinations, tensors
+from step_cases import case, combinations, tensors
 
 pytestmark = [
     pytest.mark.cuda,
@@ -25,6 +27,8 @@ def moved(value: Any) -> Any:
     """Tensors on the GPU, within what a step has."""
     if isinstance(value, Tensor):
         return value.cuda()
+    if isinstance(value, Mean):
+        return Mean(*(moved(getattr(value, each.name)) for each in fields(value)))
     return type(value)(*map(moved, value)) if isinstance(value, tuple) else value
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from opt3dgs_optim import triton as package
-from opt3dgs_optim.triton.check import interprets
+from step_cases import interprets
 
 
 def fresh_kernels(environment: dict[str, str]) -> ModuleType:

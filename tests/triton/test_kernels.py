@@ -23,7 +23,7 @@ from opt3dgs_optim.step import (
     mixed,
     take_step,
 )
-from opt3dgs_optim.triton.check import both, case, difference, tensors
+from step_cases import both, case, difference, tensors
 
 ROWS = (0, 1, 255, 256, 257, 1000, 4096)
 WIDTHS: tuple[tuple[int, ...], ...] = ((), (3,), (4,), (15, 3))

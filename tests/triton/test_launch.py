@@ -15,7 +15,7 @@ from interpreted import fresh_kernels
 from opt3dgs_optim import triton
 from opt3dgs_optim.mean import Mean
 from opt3dgs_optim.triton import FRAME_BLOCK, ROWS_BLOCK
-from opt3dgs_optim.triton.check import case
+from step_cases import case
 
 pytest.importorskip("triton.language", reason="Triton is not installed")
 pytestmark = pytest.mark.compiles

@@ -10,9 +10,6 @@ import dataclasses
 import functools
 import importlib
 import itertools
-import os
-import subprocess
-import sys
 from typing import Any
 
 import torch
@@ -32,7 +29,6 @@ NO_FADE = (0, 0.0, 1.0, 1.0)
 NO_MEAN: Any = Mean(False, 0, None, None)  # pyright: ignore
 _COMPILED: dict[Any, Any] = {}  # what Triton has compiled, by what it depends on
 _PREPARED: set[Any] = set()  # for which parameters' steps it has
-CHECK = "opt3dgs_optim.triton.check"  # run as a program, with Triton's interpreter
 
 
 def missing() -> str | None:
@@ -273,26 +269,3 @@ def _run(
     compiled = kernel[programs,](*tensors, *numbers, **options)
     if compiled is not None:
         _COMPILED[key] = compiled
-
-
-def interpreted_difference(timeout: float = 120.0) -> float | None:
-    """How far the kernels, run on this CPU by Triton's interpreter, are from plain torch.
-
-    The largest difference of a parameter, a moment or a mean after thirty steps with all that a
-    step can have, as a share of its size (of 1 for smaller ones). It takes some seconds, in a
-    process of its own. None: Triton is not installed, or its interpreter is too old.
-
-    Raises:
-        RuntimeError: the kernels fail, with what they said.
-    """
-    try:
-        importlib.import_module("triton.language")
-    except ImportError:
-        return None
-    done = subprocess.run(
-        [sys.executable, "-m", CHECK], env={**os.environ, "TRITON_INTERPRET": "1"},
-        capture_output=True, text=True, timeout=timeout, check=False,
-    )  # fmt: skip
-    if done.returncode:
-        raise RuntimeError(f"Triton's interpreter has failed on the kernels: {done.stderr[-500:]}")
-    return float(done.stdout) if done.stdout else None

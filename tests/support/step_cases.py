@@ -1,7 +1,4 @@
-"""The kernels beside plain torch on a CPU, by Triton's interpreter.
-
-TRITON_INTERPRET=1 python -m opt3dgs_optim.triton.check
-"""
+"""Steps of a parameter with all that they can have, by plain torch and by the kernels."""
 
 from __future__ import annotations
 
@@ -166,13 +163,3 @@ def interprets() -> bool:
     # Anything: a kernel that leaves something out is a wrong one, not an old interpreter.
     return not all(map(torch.equal, before, tensors(step)))
 
-
-def main() -> None:
-    """Print the largest difference, or nothing where this Triton's interpreter does nothing."""
-    if not interprets():
-        return
-    print(max(difference(options, shape) for options, shape in combinations()))
-
-
-if __name__ == "__main__":
-    main()
