@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam, AdamW
 
-from opt3dgs_optim import DEFAULTS, Averaging, Fading, OwnFrame, Part, PhaseScheduler
+from opt3dgs_optim import DEFAULTS, Averaging, Fading, OutOfView, OwnFrame, Part, PhaseScheduler
 from opt3dgs_optim.step import Step
 
 TOTAL, ROWS = 90, 8
@@ -305,6 +305,20 @@ def test_a_group_that_was_taken_away_is_told() -> None:
         with pytest.raises(ValueError, match="5 parameter groups, but 6 when it was upgraded"):
             call()
     assert all(torch.equal(params[name], start[name]) for name in params)
+
+
+def test_other_rows_of_the_positions_are_named_where_another_steps_first() -> None:
+    """What looks at their moments, in the step of the scales, leaves them to be refused."""
+    params = parameters(ROWS, "scales", "means")
+    optimizers = PhaseScheduler(TOTAL, parts=[OutOfView()]).upgrade(adams_of(params))
+    steps(optimizers, params, 2)  # it looks in the third iteration
+    for param in params.values():
+        param.data, param.grad = torch.ones(2, ROWS + 3, 3)
+    state = optimizers["scales"].state[params["scales"]]
+    state["exp_avg"], state["exp_avg_sq"] = torch.zeros(2, ROWS + 3, 3)
+    optimizers["scales"].step()
+    with pytest.raises(ValueError, match=f"{ROWS} rows for {ROWS + 3}"):
+        optimizers["means"].step()
 
 
 @pytest.mark.parametrize("rows", [ROWS - 3, ROWS + 3])

@@ -13,7 +13,6 @@ from gaussians import adams_of, parameters, steps
 from torch.nn import Parameter
 from torch.optim import Adam
 
-import opt3dgs_optim
 from opt3dgs_optim import (
     DEFAULTS,
     Averaging,
@@ -157,7 +156,6 @@ SCHEDULERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         ValueError,
         "leave one of the two out",
     ),
-    "no log": (lambda: PhaseScheduler(9, log="run.jsonl"), TypeError, "a RunLog or None is needed"),  # pyright: ignore
 }
 
 
@@ -230,13 +228,6 @@ def test_several_ranks_without_a_process_group(
     told = "2 ranks train, but process_group=None"
     assert len(found) == (reads and not grouped)
     assert not found or (told in found[0] and "give process_group=torch.distributed" in found[0])
-
-
-def test_the_preset_of_version_0_1_is_the_defaults() -> None:
-    with pytest.warns(UserWarning, match="leave parts=DEFAULTS_ADC out"):
-        assert opt3dgs_optim.DEFAULTS_ADC is DEFAULTS  # pyright: ignore
-    with pytest.raises(AttributeError, match="no attribute 'DEFAULT'"):
-        _ = opt3dgs_optim.DEFAULT  # pyright: ignore
 
 
 def test_a_run_that_is_longer_than_it_was_said(recwarn: pytest.WarningsRecorder) -> None:
@@ -332,6 +323,10 @@ def test_finish_of_a_resumed_training_before_there_is_a_mean(
     phases.finish()
     said = "finish() at iteration 5: averaging begins at 580 of 600, and the parameters stay the"
     assert f"{said} last iterate" in caplog.text
+    optimizers = phases.upgrade(adams_of(params))
+    optimizers["means"].load_state_dict(trained["means"].state_dict())
+    steps(optimizers, params, 3)
+    assert "ended at iteration 8 of 600" in str(phases.end_line())
 
 
 @pytest.mark.processes

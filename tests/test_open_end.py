@@ -169,25 +169,6 @@ def test_pairs_of_one_fall_are_none_of_the_next() -> None:
     assert "curvature.history" not in state
 
 
-def test_an_end_that_is_planned_early_is_the_same_as_one_that_is_planned_late() -> None:
-    """Nothing but the fall itself depends on when it is told."""
-    ends = []
-    for early in (True, False):
-        phases, optimizers, params = begun()
-        steps(optimizers, params, 80)
-        if early:
-            steps(optimizers, params, 1, seed=1)
-            phases.finish_in(40)
-        else:
-            copied = copy.deepcopy((phases, optimizers, params))
-            phases, optimizers, params = copied
-            steps(optimizers, params, 1, seed=1)
-            phases.finish_in(40)
-        steps(optimizers, params, 40, seed=2)
-        ends.append({name: p.detach() for name, p in params.items()})
-    assert same_tensors(*ends)
-
-
 @pytest.mark.parametrize("saved_at", [50, 75, 98])
 def test_a_checkpoint_knows_of_the_fall(saved_at: int) -> None:
     phases, optimizers, params = begun()

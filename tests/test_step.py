@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from simulated_device import on_device, on_host
+from step_cases import case, tensors
 from torch import Tensor
 
 from opt3dgs_optim import step as module
@@ -21,7 +22,6 @@ from opt3dgs_optim.step import (
     out_of_frame,
     take_step,
 )
-from step_cases import case, tensors
 
 CPU = torch.device("cpu")
 NAN, INF = float("nan"), float("inf")

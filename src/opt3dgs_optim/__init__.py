@@ -15,7 +15,6 @@ from opt3dgs_optim.clock import Phase
 from opt3dgs_optim.lbfgs import history_from_pairs, two_loop
 from opt3dgs_optim.lbfgs.backend import backend_info
 from opt3dgs_optim.lqnadam import LQNAdam
-from opt3dgs_optim.messages import warn_user
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.parts.averaging import Averaging
 from opt3dgs_optim.parts.curvature import Curvature
@@ -30,17 +29,6 @@ from opt3dgs_optim.presets import DEFAULTS, paper_parts
 from opt3dgs_optim.runs import RunLog
 from opt3dgs_optim.training import Training
 from opt3dgs_optim.version import __version__
-
-
-def __getattr__(name: str) -> object:
-    if name == "DEFAULTS_ADC":  # of version 0.1.0
-        warn_user(
-            "opt3dgs_optim.DEFAULTS_ADC is DEFAULTS now, for every kind of density control; leave "
-            "parts=DEFAULTS_ADC out"
-        )
-        return DEFAULTS
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
 
 __all__ = [
     "AWSGLD",

@@ -305,7 +305,7 @@ class StepAdam(Adam):
                 restore_parts(self.training, [saved])
 
         def go_on(_: Any) -> None:
-            self.coded = False  # unless the training's numbers say so
+            self.coded = False  # what is loaded is numbers
             complete_groups(self.training, self.param_groups, own)
             self._count_on_host()
             self.resume()

@@ -19,7 +19,7 @@ class Reading:
     def ask(self) -> None:
         """Have a copy of the present numbers made."""
         source = self.source
-        if source.is_cuda and torch.cuda.is_available():
+        if source.is_cuda:
             self._host = torch.empty(
                 source.shape, dtype=source.dtype, device="cpu", pin_memory=True
             ).copy_(source, non_blocking=True)
@@ -80,8 +80,6 @@ def num_ranks() -> int:
 
 def mean_over_ranks(number: Tensor, group: Any) -> Tensor:
     """The mean of a number of every process of a `torch.distributed` group, 0-d float32."""
-    from torch import distributed  # many builds of torch and most trainings are without it
-
     total = number.detach().to(torch.float32, copy=True)
-    distributed.all_reduce(total, group=group)
-    return total / distributed.get_world_size(group)
+    torch.distributed.all_reduce(total, group=group)
+    return total / torch.distributed.get_world_size(group)

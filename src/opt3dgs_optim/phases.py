@@ -6,7 +6,7 @@ import math
 import weakref
 from collections.abc import Mapping, Sequence
 from numbers import Integral
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor
@@ -36,9 +36,6 @@ from opt3dgs_optim.plateau import Plateau
 from opt3dgs_optim.presets import DEFAULTS, PAPER_STEPS, PAPER_SWITCH, paper_parts
 from opt3dgs_optim.training import Training
 
-if TYPE_CHECKING:
-    from opt3dgs_optim.runs import RunLog
-
 Optimizers = TypeVar(
     "Optimizers", bound="Optimizer | Mapping[str, Optimizer] | Sequence[Optimizer]"
 )
@@ -64,7 +61,6 @@ class PhaseScheduler(Training):
         moments: bits per number of each of Adam's two moments, and of the mean of the last
             thirtieth; 16 halves the memory, and is for the Gaussians alone (see
             docs/performance.md).
-        log: a `RunLog` that gets one line per iteration, with what the parts report.
         process_group: a `torch.distributed` process group over whose ranks the loss is averaged,
             for parts that read it.
 
@@ -95,7 +91,6 @@ class PhaseScheduler(Training):
         parts: Sequence[Part] | None = None,
         *,
         moments: Literal[32, 16] = 32,
-        log: RunLog | None = None,
         process_group: Any = None,
     ) -> None:
         if total_steps is not None:
@@ -111,9 +106,6 @@ class PhaseScheduler(Training):
             switch_step = None if total_steps is None else round(share * total_steps)
         parts = DEFAULTS if parts is None else check_parts(CALL, parts)
         super().__init__(parts, total_steps, switch_step, moments)
-        if log is not None and not hasattr(log, "step"):
-            raise TypeError(f"{CALL}: log={log!r}, but a RunLog or None is needed")
-        self.log, self._loss = log, None
         self._group = process_group
         own = (part for part in self.parts if part.overrides("pixel_loss"))
         self._pixel: Part | None = next(own, None)
@@ -227,7 +219,7 @@ class PhaseScheduler(Training):
             self.put_on(iteration)
         if loss is None:
             return
-        self._loss = energy = check_energy(f"{CALL}.observe", "loss", loss)
+        energy = check_energy(f"{CALL}.observe", "loss", loss)
         if self.open_end and self.fall_step is None:
             line = self._plateau.line(energy, self.iteration)
             if line is not None:
@@ -295,10 +287,10 @@ class PhaseScheduler(Training):
     def resume(self, iteration: int) -> None:
         """Go on from a checkpoint, which may have been loaded to be looked at alone."""
         super().resume(iteration)
-        self._end.upgraded, self._end.done = False, 0
+        self._end.upgraded, self._end.done, self._end.finished = False, 0, False
 
     def advanced(self) -> None:
-        """Say what is wrong with the training as it goes; write a line of the log."""
+        """Say what is wrong with the training as it goes."""
         if self.members and not self.counts_means and self.part(OwnFrame) is not None:
             self.messages.warn_once(
                 "positions",
@@ -306,11 +298,6 @@ class PhaseScheduler(Training):
                 "group, or its key in the dict, 'means' (other trainers' names are known, too)",
             )
         self._end.done = self.iteration + 1
-        if self.log is not None:
-            numbers = self.numbers()
-            if self._loss is not None:
-                numbers["loss"], self._loss = self._loss, None
-            self.log.step(self.iteration, phase=self.phase.value, **numbers)
         total, ends = self.end_step, not self.averages or self.finished
         if self.iteration == self._end.mean_at != total and not ends:
             say(
@@ -343,8 +330,8 @@ class PhaseScheduler(Training):
         return self._end.line()
 
     def __getstate__(self) -> dict[str, Any]:
-        # Two would write into one file; another process has groups of its own.
-        return {**super().__getstate__(), "log": None, "_group": None}
+        # Another process has groups of its own.
+        return {**super().__getstate__(), "_group": None}
 
     def __repr__(self) -> str:
         end = "no planned end" if self.end_step is None else self.end_step

@@ -35,7 +35,7 @@ class Training(Clock):
         averages: whether there is room for the mean of the last iterates.
         messages: what has been said, each thing once.
         bad_numbers: how many numbers of gradients were not finite.
-        unsaved: what parts keep from step to step, and never save.
+        unsaved: what parts keep from step to step; `Part.read_back` puts what is saved into notes.
     """
 
     def __init__(

@@ -61,7 +61,7 @@ def test_free_running_in_float64(rows: int, size: int) -> None:
 def test_single_step_in_float32(rows: int) -> None:
     options = {**OPTIONS, "min_cosine": 0.1}
     x, grad = Problem(rows).start.float(), Problem(rows, 1).start.float()
-    history = new_history(x, 5, contiguous=True)
+    history = new_history(x, 5)
     for k in range(4):
         lqn_direction(x + 0.1 * k * grad, grad * (1 + k), history, 5, **options)  # pyright: ignore
     twin = history.cuda()
@@ -106,7 +106,7 @@ def test_the_recursion_does_not_synchronise_and_can_be_captured() -> None:
 @QUIET
 def test_side_stream_and_no_synchronisation() -> None:
     x, grad = torch.randn(5000, 3, device="cuda"), torch.randn(5000, 3, device="cuda")
-    history = new_history(x, 5, contiguous=True)
+    history = new_history(x, 5)
     lqn_direction(x, grad, history, 5, **KERNEL)  # pyright: ignore
     expected, _, _ = lqn_direction(x + 1, 2 * grad, history.clone(), 5, **KERNEL)  # pyright: ignore
     stream = torch.cuda.Stream()
@@ -138,7 +138,7 @@ def test_a_launch_costs_little_of_python() -> None:
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="one GPU only")
 def test_second_device() -> None:
     x, grad = torch.randn(300, 3, device="cuda:1"), torch.randn(300, 3, device="cuda:1")
-    history = new_history(x, 5, contiguous=True)
+    history = new_history(x, 5)
     result, _, _ = lqn_direction(x, grad, history, 5, **KERNEL)  # pyright: ignore
     assert torch.equal(result, grad)
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 import torch
+from step_cases import case, combinations, tensors
 from torch import Tensor
 
 from opt3dgs_optim import PhaseScheduler, triton
 from opt3dgs_optim.mean import Mean
 from opt3dgs_optim.step import Step, chosen_rows, take_step
-from step_cases import case, combinations, tensors
 
 pytestmark = [
     pytest.mark.cuda,

@@ -13,10 +13,9 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from opt3dgs_optim import cuda
-from opt3dgs_optim.lbfgs import history_from_pairs, lqn_direction, new_history, two_loop
+from opt3dgs_optim.lbfgs import lqn_direction, new_history, two_loop
 from opt3dgs_optim.lbfgs import pairs as columns_of
 from opt3dgs_optim.lbfgs.backend import obstacle
-from opt3dgs_optim.lbfgs.history import laid_out
 
 # inductor imports parts of torch that torch itself has deprecated
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
@@ -40,19 +39,16 @@ def test_pure_torch_compiles_with_inductor() -> None:
     torch.testing.assert_close(compiled, two_loop(grad, history, 5), rtol=1e-5, atol=1e-6)
 
 
-def test_layouts_and_chunks_make_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_make_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """Directions, pairs and the history, which is written where it lies."""
     x, grad, history = points(40)
     outcomes = []
-    for contiguous, chunk in ((False, 40), (True, 40), (False, 7), (True, 7)):
+    for chunk in (40, 7):
         monkeypatch.setattr(columns_of, "CHUNK", chunk)
-        copy = laid_out(history.clone(), contiguous=contiguous)
-        assert copy.is_contiguous() == contiguous
-        assert laid_out(copy, contiguous=contiguous) is copy
+        copy = history.clone()
         outcomes.append([*lqn_direction(x, grad, copy, 5, **OPTIONS), copy])
-    assert all(map(torch.equal, outcomes[0], outcomes[1]))
-    for each in outcomes[2:]:  # other SIMD lanes: equal to rounding
-        torch.testing.assert_close(each, outcomes[0], rtol=1e-5, atol=1e-6)
+    # other SIMD lanes: equal to rounding
+    torch.testing.assert_close(outcomes[1], outcomes[0], rtol=1e-5, atol=1e-6)
     assert not torch.equal(outcomes[0][-1], history)
 
 
@@ -92,16 +88,14 @@ class Operators(TorchDispatchMode):
         return found
 
 
-@pytest.mark.parametrize("contiguous", [False, True])
 @pytest.mark.parametrize("dim", [1, 3, 4])
 def test_memory_is_that_of_the_results_and_one_chunk(
-    dim: int, contiguous: bool, monkeypatch: pytest.MonkeyPatch
+    dim: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """10^7 points: 14 bytes each beside history, position and gradient, whatever D is."""
     n, chunk = 20_000, 500
     monkeypatch.setattr(columns_of, "CHUNK", chunk)
     x, grad, history = points(n, dim)
-    history = laid_out(history, contiguous=contiguous)
     with Operators() as memory:
         lqn_direction(x, grad, history, 5, **OPTIONS, backend="torch")
     results = n * (4 * dim + 2)
@@ -114,7 +108,7 @@ def test_operators_of_a_chunk() -> None:
     x, grad, history = points(100)
     with Operators() as of_a_step:
         lqn_direction(x, grad, history, 5, **OPTIONS)
-    assert of_a_step.count <= 84
+    assert of_a_step.count <= 86
     chunks = columns_of.row_chunks(torch.empty(2_500_000, 3, device="meta"))
     assert [c.stop for c in chunks] == [1 << 20, 2 << 20, 2_500_000]
 
@@ -175,15 +169,3 @@ def test_points_on_a_gpu_are_one_launch(name: str, monkeypatch: pytest.MonkeyPat
     assert called(grad, backend="cuda") == "launched"
     monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
     assert name != "two_loop" or called(grad.as_subclass(There)) != "launched"
-
-
-@pytest.mark.parametrize("kernel", [False, True])
-def test_a_history_is_laid_out_for_what_reads_it(
-    kernel: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    module = sys.modules["opt3dgs_optim.lbfgs.history"]
-    monkeypatch.setattr(module, "obstacle", lambda *_: None if kernel else "no")
-    s = torch.randn(5, 9, 3)
-    history = history_from_pairs(s.as_subclass(There), s.as_subclass(There))
-    assert history.is_contiguous() == kernel
-    assert torch.equal(history, history_from_pairs(s, s))

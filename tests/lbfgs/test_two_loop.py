@@ -91,9 +91,8 @@ class Point:
 
 
 @pytest.mark.parametrize("graft", [True, False])
-@pytest.mark.parametrize("contiguous", [False, True])
 @pytest.mark.parametrize(("size", "dim"), [(1, 1), (1, 3), (2, 2), (3, 3), (4, 3), (5, 3), (6, 4)])
-def test_every_point_is_its_own_history(size: int, dim: int, contiguous: bool, graft: bool) -> None:
+def test_every_point_is_its_own_history(size: int, dim: int, graft: bool) -> None:
     """Of functions with some negative curvature; a fifth of the gradients is zero or not finite."""
     rows, steps, generator = 15, 3 * size + 6, torch.Generator().manual_seed(10 * size + dim)
     hessian = torch.randn(rows, dim, dim, generator=generator, dtype=F64)
@@ -104,7 +103,7 @@ def test_every_point_is_its_own_history(size: int, dim: int, contiguous: bool, g
     g[unseen < 0.2] = 0.0
     g[..., -1][unseen < 0.1] = math.nan
     g[..., 0][unseen < 0.05] = -math.inf
-    history = new_history(x[0], size, contiguous=contiguous)
+    history = new_history(x[0], size)
     points, rejected = [Point(size, 0.05) for _ in range(rows)], 0
     for k in range(steps):
         found = lqn_direction(x[k], g[k], history, size, min_cosine=0.05, graft=graft)
@@ -195,9 +194,6 @@ def test_the_result_has_the_gradients_dtype_and_no_graph(dtype: torch.dtype) -> 
     for each in (found, history):
         assert (each.dtype, each.requires_grad) == (dtype, False)
     assert torch.equal(history, before)
-
-
-# -- where it lies ---------------------------------------------------------------------------------
 
 
 # -- what is refused -------------------------------------------------------------------------------

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from step_cases import interprets
 
 from opt3dgs_optim import triton as package
-from step_cases import interprets
 
 
 def fresh_kernels(environment: dict[str, str]) -> ModuleType:

@@ -188,7 +188,7 @@ def free_run(
 ) -> list[Tensor]:
     """Positions, directions, flags and history of a run on its own state."""
     x = problem.start.clone()
-    history = new_history(x, size, contiguous=True)
+    history = new_history(x, size)
     problem.generator.manual_seed(1)
     seen = []
     for noise, kind, reset in problem.views(steps):

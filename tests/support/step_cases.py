@@ -162,4 +162,3 @@ def interprets() -> bool:
     triton.launch(step)
     # Anything: a kernel that leaves something out is a wrong one, not an old interpreter.
     return not all(map(torch.equal, before, tensors(step)))
-

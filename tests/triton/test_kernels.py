@@ -10,6 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from interpreted import interpreted_kernels
+from step_cases import both, case, difference, tensors
 
 from opt3dgs_optim import triton
 from opt3dgs_optim.moments import MOMENTS
@@ -23,7 +24,6 @@ from opt3dgs_optim.step import (
     mixed,
     take_step,
 )
-from step_cases import both, case, difference, tensors
 
 ROWS = (0, 1, 255, 256, 257, 1000, 4096)
 WIDTHS: tuple[tuple[int, ...], ...] = ((), (3,), (4,), (15, 3))

@@ -11,11 +11,11 @@ import pytest
 import torch
 from fake_driver import FakeDriver, fake_driver
 from interpreted import fresh_kernels
+from step_cases import case
 
 from opt3dgs_optim import triton
 from opt3dgs_optim.mean import Mean
 from opt3dgs_optim.triton import FRAME_BLOCK, ROWS_BLOCK
-from step_cases import case
 
 pytest.importorskip("triton.language", reason="Triton is not installed")
 pytestmark = pytest.mark.compiles

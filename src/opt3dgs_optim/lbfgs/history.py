@@ -12,8 +12,8 @@ position and gradient, and the number of its visible steps. With K > D it fits i
 of slots 0 .. D (slots = K: 160 bytes per point in float32 for K = 5, D = 3); otherwise it gets a
 slot of its own (slots = K + 1).
 
-A new pair moves the older ones down: readers of a ring would have to gather. A history that torch
-computes on has the strides of [slots, lanes, N], its cells; one of the CUDA kernel is contiguous.
+A new pair moves the older ones down: readers of a ring would have to gather. Torch computes on a
+copy of some rows, [slots, lanes, n], their cells; the CUDA kernel on the history itself.
 """
 
 from typing import Any
@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 
 from opt3dgs_optim.checks import check_count
-from opt3dgs_optim.lbfgs.backend import obstacle
 from opt3dgs_optim.lbfgs.pairs import BITS, bits_of, columns, normalised, overwrite
 
 MAX_HISTORY = 16
@@ -34,20 +33,10 @@ def history_shape(points: Tensor, history_size: int) -> tuple[int, int, int]:
     return rows, history_size + (history_size <= dim), 2 * (dim + 1)
 
 
-def new_history(points: Tensor, history_size: int, *, contiguous: bool = False) -> Tensor:
-    """An empty history for `points` [N, D], in their dtype; see `laid_out`."""
-    rows, *cells = history_shape(points, history_size)
-    shape = (rows, *cells) if contiguous else (*cells, rows)
-    zeros = torch.zeros(shape, dtype=points.dtype, device=points.device)
-    return zeros if contiguous else zeros.movedim(-1, 0)
-
-
-def laid_out(history: Tensor, *, contiguous: bool) -> Tensor:
-    """`history` itself, or a copy if it is not laid out for the kernel (contiguous), or torch."""
-    if contiguous:
-        return history.contiguous()
-    cells = history.movedim(0, -1)
-    return history if cells.is_contiguous() else cells.contiguous().movedim(-1, 0)
+def new_history(points: Tensor, history_size: int) -> Tensor:
+    """An empty history for `points` [N, D], in their dtype."""
+    shape = history_shape(points, history_size)
+    return torch.zeros(shape, dtype=points.dtype, device=points.device)
 
 
 def check_points(call: str, name: str, points: Any, dims: int) -> None:
@@ -126,9 +115,8 @@ class Cells:
 
 
 def cells_of(history: Tensor, rows: slice = slice(None)) -> Tensor:
-    """The rows [slots, 2 (D + 1), n] of `history`: a view, or a copy where N is not innermost."""
-    cells = history.movedim(0, -1)[..., rows]
-    return cells if cells.stride(2) == 1 else cells.contiguous()
+    """The rows of `history` as [slots, 2 (D + 1), n], a copy."""
+    return history.movedim(0, -1)[..., rows].contiguous()
 
 
 def push(cells: Cells, vectors: Tensor, accepted: Tensor) -> None:
@@ -180,8 +168,6 @@ def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:
     Returns:
         The history [N, slots, 2 (D + 1)], of K or K + 1 slots, in the dtype of the pairs.
         `two_loop(grad, history, K)` reads it, with K the number of pairs that there is room for.
-        It is laid out for the CUDA kernel where that can run, and for torch elsewhere; `two_loop`
-        takes both.
 
     Raises:
         TypeError: s is no tensor of float32 or float64.
@@ -205,10 +191,9 @@ def history_from_pairs(s: Tensor, y: Tensor) -> Tensor:
     check_points(call, "s", s, 3)
     check_alike(call, "y", y, s, s.shape)
     s, y, size = s.detach(), y.detach(), s.shape[0]
-    kernel = s.is_cuda and obstacle("auto", s.device, s.dtype, s.shape[2], size) is None
-    history = new_history(s[0], size)
-    cells = Cells(cells_of(history), size)
+    memory = cells_of(new_history(s[0], size))
+    cells = Cells(memory, size)
     for k in range(size):
         pair = normalised(columns(s[k], y[k]))
         push(cells, pair.vectors, pair.cosine > 0)  # false where it is not finite
-    return laid_out(history, contiguous=kernel)
+    return memory.movedim(-1, 0).contiguous()

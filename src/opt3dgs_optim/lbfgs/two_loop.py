@@ -171,8 +171,7 @@ def lqn_direction(
             cells = Cells(chunk, history_size)
             take_pairs(cells, seen, visible, min_cosine, accepted[rows], candidates[rows])
             put(fed[rows], direction(g, size, cells, graft))
-            if history.stride(0) != 1:  # the cells were copied
-                history[rows] = chunk.movedim(-1, 0)
+            history[rows] = chunk.movedim(-1, 0)
     return fed, accepted, candidates
 
 

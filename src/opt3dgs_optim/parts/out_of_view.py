@@ -111,6 +111,8 @@ class _Seen:
         if holds:
             self.rows = self._rows(grad)
         second = None if state is None else state["exp_avg_sq"]
+        if second is not None and (second.shape != grad.shape or not second.is_contiguous()):
+            second = None  # of other rows, which the step refuses
         look = triton.look if triton.looks(grad) else look_at_positions
         look(grad, second, self.rows, counter)
         if counter is not None:

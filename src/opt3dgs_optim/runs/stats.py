@@ -179,15 +179,13 @@ def _gain(run: Run, reference: Run, metric: str) -> float | None:
 def gain_at_end(run: Run) -> tuple[float, float] | None:
     """Decibels that the loss gained in the last iterations, and their standard error.
 
-    None where the run's steps have no `loss` (or `energy`), not that of every iteration, or one
+    None where the run's steps have no `loss`, not that of every iteration, or one
     that is not above 0.
     """
-    for name in ("loss", "energy"):
-        iterations, _, losses = run.series(name, "step")
-        last = losses[-2 * WINDOW :]
-        if len(last) == 2 * WINDOW and iterations[-1] - iterations[-2 * WINDOW] < 2 * WINDOW:
-            means = last.reshape(-1, BLOCK).mean(1)
-            before, now = np.split(means, 2)
-            found = gain(before.tolist(), now.tolist())
-            return None if math.isnan(found[0]) else found
-    return None
+    iterations, _, losses = run.series("loss", "step")
+    last = losses[-2 * WINDOW :]
+    if len(last) < 2 * WINDOW or iterations[-1] - iterations[-2 * WINDOW] >= 2 * WINDOW:
+        return None
+    before, now = np.split(last.reshape(-1, BLOCK).mean(1), 2)
+    found = gain(before.tolist(), now.tolist())
+    return None if math.isnan(found[0]) else found

@@ -99,9 +99,6 @@ def assert_close(actual: dict[str, Tensor], expected: dict[str, Tensor], toleran
         assert difference <= tolerance * expected[name].abs().max().clamp(min=1e-3), name
 
 
-# Projection
-
-
 # Known answers
 
 
