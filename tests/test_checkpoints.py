@@ -223,14 +223,6 @@ def test_the_state_is_plain_and_of_the_moment() -> None:
     assert equal(saved, through_a_file(saved))
 
 
-def test_a_stock_adam_loads_ours_and_goes_on() -> None:
-    _, optimizer, params = trained()
-    stock = adam_of(params)
-    stock.load_state_dict(through_a_file(optimizer.state_dict()))
-    steps({"all": stock}, params, 3)
-    assert all(int(state["step"]) == 62 for state in stock.state.values())
-
-
 def test_a_stock_adam_that_goes_on_with_a_checkpoint_of_ours_is_noticed() -> None:
     """Its own steps say how far it has come, and its moments are no own frame's."""
     params = parameters(ROWS, "means", "scales", "quats")
