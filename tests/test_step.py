@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from typing import Any
 
 import pytest
 import torch
 from simulated_device import on_device, on_host
-from step_cases import case, tensors
+from step_cases import case, moved, tensors
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 
 from opt3dgs_optim import step as module
 from opt3dgs_optim.mean import Mean, places_of, take_into_mean
@@ -36,14 +38,9 @@ each_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 def stepped(device: bool = False, rows: int = 50, seed: int = 0, **options: Any) -> list[Tensor]:
     """What a step leaves, on the CPU, and how many numbers were not finite."""
     step = case((rows, 3), torch.Generator().manual_seed(seed), **options)
-    assert step.nonfinite is not None
     if device:
-        step.param, step.grad = on_device(step.param), on_device(step.grad)
-        step.nonfinite = on_device(step.nonfinite)
-        step.state = {key: on_device(moment) for key, moment in step.state.items()}
-        if (mean := step.mean) is not None:
-            mean.tensor, mean.began = on_device(mean.tensor), on_device(mean.began)
-            mean.rest = None if mean.rest is None else on_device(mean.rest)
+        step = moved(step, on_device)
+    assert step.nonfinite is not None
     bad = take_step(step)
     assert bad == 0 or not device  # nobody waits
     return [on_host(each) for each in (*tensors(step), step.nonfinite + bad)]
@@ -189,3 +186,13 @@ def test_a_step_to_no_finite_place_is_none() -> None:
     world = Axes((one, zero, zero, zero), (one, one, one))
     vectors = torch.tensor([[largest, 0.0, 0.0], [0.0, 1.0, INF]])
     assert out_of_frame(world, vectors).tolist() == [[largest, 0.0, 0.0], [0.0, 0.0, 0.0]]
+
+
+@pytest.mark.parametrize("kind", [*KINDS.values(), {"coded": True}], ids=[*KINDS, "16 bits"])
+def test_the_cases_of_a_gpu_lie_on_it(kind: dict[str, Any]) -> None:
+    """In whole: the kernels of a GPU would read what is left on the host as its own."""
+    step = case((9, 3), torch.Generator().manual_seed(0), mean=True, **kind)
+    there = moved(step, lambda tensor: tensor.to("meta"))
+    found = [x for x in tree_leaves(asdict(there)) if isinstance(x, Tensor)]
+    assert {each.device.type for each in found} == {"meta"}
+    assert len(found) >= 7  # of the parameter, the mean and the counter

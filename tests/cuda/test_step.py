@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-from typing import Any
-
 import pytest
 import torch
-from step_cases import case, combinations, tensors
+from step_cases import case, combinations, moved, tensors
 from torch import Tensor
 
 from opt3dgs_optim import PhaseScheduler, triton
-from opt3dgs_optim.mean import Mean
-from opt3dgs_optim.step import Step, chosen_rows, take_step
+from opt3dgs_optim.step import chosen_rows, take_step
 
 pytestmark = [
     pytest.mark.cuda,
@@ -21,22 +17,6 @@ pytestmark = [
 CASES = list(combinations())
 # exp, sqrt and division of a GPU are right to some units in the last place, thrice in a row.
 TOLERANCE = 2e-5
-
-
-def moved(value: Any) -> Any:
-    """Tensors on the GPU, within what a step has."""
-    if isinstance(value, Tensor):
-        return value.cuda()
-    if isinstance(value, Mean):
-        return Mean(*(moved(getattr(value, each.name)) for each in fields(value)))
-    return type(value)(*map(moved, value)) if isinstance(value, tuple) else value
-
-
-def on_gpu(step: Step) -> None:
-    """Move what a step has."""
-    for name in step.__slots__:
-        setattr(step, name, moved(getattr(step, name)))
-    step.state = {key: moved(moment) for key, moment in step.state.items()}
 
 
 def test_triton_launches_here() -> None:
@@ -50,7 +30,7 @@ def test_a_step_is_that_of_a_cpu(at: int) -> None:
     for gpu in (False, True):
         step = case(shape, torch.Generator().manual_seed(0), **options)
         if gpu:
-            on_gpu(step)
+            step = moved(step, Tensor.cuda)
             assert triton.takes(step)
             triton.take_step(step)
         else:
@@ -68,7 +48,7 @@ def test_a_step_is_that_of_a_cpu(at: int) -> None:
 def test_the_same_rows_fade() -> None:
     step = case((4099, 3), torch.Generator().manual_seed(0), fade=True)
     step.state["exp_avg"].fill_(1.0)
-    on_gpu(step)
+    step = moved(step, Tensor.cuda)
     step.grad.zero_()
     triton.take_step(step)
     assert step.fade is not None

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -21,6 +22,7 @@ from opt3dgs_optim.step import (
     take_step,
 )
 
+PARTS = (Fade, Frame, Hold)
 SHAPES = ((257, 3), (31, 4), (1000,), (19, 15, 3))
 
 
@@ -85,6 +87,18 @@ def case(
         rest = 1e-8 * draw(*shape) if sums else None
         step.mean = Mean(put, steps, kept, began, grid, rest)
     return step
+
+
+def moved(value: Any, place: Callable[[Tensor], Tensor]) -> Any:
+    """A step, or what it has, with all tensors where `place` puts them."""
+    if isinstance(value, Tensor):
+        return place(value)
+    if isinstance(value, dict):
+        return {key: moved(each, place) for key, each in value.items()}
+    if is_dataclass(value):
+        each = {field.name: getattr(value, field.name) for field in fields(value)}
+        return replace(cast(Any, value), **moved(each, place))
+    return type(value)(*(moved(each, place) for each in value)) if type(value) in PARTS else value
 
 
 def tensors(step: Step) -> list[Tensor]:
