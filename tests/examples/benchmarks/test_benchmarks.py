@@ -175,6 +175,8 @@ def test_the_readme_says_what_was_measured() -> None:
     said = f"{less['plush']:.1f}"
     assert f"with up to 40 % more Gaussians (with as many, {said} below)" in words
     assert f"at stock's number plush loses {said} dB" in words
+    few = [re.findall(r"\| ([+-][\d.]+) / ", row)[-1] for row in report.few().splitlines()[2:]]
+    assert f"iterations lose up to {-min(map(float, few)):.1f} dB (one seed)" in words
     whole = json.loads(report.GPU.read_text(encoding="utf-8"))["iterations"]["results"]
     share = 100 * whole["1000000"]["defaults"]["ratio"]
     assert f"A whole gsplat iteration takes {share:.0f} % of stock's (a million)" in words
