@@ -215,6 +215,7 @@ class StepAdam(Adam):
                 if check:
                     stepper.check_rows(param, state)
                 made.append(stepper)
+        self._on_gpu = any(p.is_cuda for group in self.param_groups for p in group["params"])
         self._steppers = made
         # Positions first: they step in frames of the shapes that the gradient is of.
         self._in_order = sorted(made, key=lambda stepper: stepper.name != "means")

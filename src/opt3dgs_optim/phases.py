@@ -227,7 +227,8 @@ class PhaseScheduler(Training):
         if self.observers:
             if self._group is not None:
                 energy = mean_over_ranks(energy, self._group)
-            super().observe(energy)
+            with torch.autocast(energy.device.type, enabled=False):  # Lightning's is around it
+                super().observe(energy)
 
     def pixel_loss(self, render: Tensor, target: Tensor) -> Tensor:
         """The photometric term of two images in 0..1: mean |error|, unless a part says another.

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import torch
 from torch import Tensor
 
 WINDOW = 2_000  # iterations whose losses are compared with those of as many before
@@ -67,7 +68,7 @@ class Plateau:
         self._sum, self._count = 0.0, 0
         if len(self._means) < WINDOW // BLOCK:
             return None
-        before, self._before = self._before, [float(mean) for mean in self._means]
+        before, self._before = self._before, torch.stack(self._means).tolist()
         self._means = []
         if not before:
             return None

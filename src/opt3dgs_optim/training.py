@@ -16,6 +16,7 @@ from opt3dgs_optim.mean import drop_kept, drop_means
 from opt3dgs_optim.messages import Messages
 
 LOOK_INTERVAL = 100  # iterations between two looks at the numbers that were not finite
+LAG = 3  # iterations after which a device has nearly always done what it was asked for
 AnyPart = TypeVar("AnyPart")
 
 
@@ -132,7 +133,8 @@ class Training(Clock):
     def go_to(self, iteration: int) -> None:
         """Be at that iteration; now and then look for numbers that were not finite."""
         super().go_to(iteration)
-        if iteration >= self._look_at or iteration + 1 == self.end_step:
+        left = 0 if self.end_step is None else self.end_step - iteration
+        if iteration >= self._look_at or left in (LAG + 1, 1):  # a look tells of the one before
             self._look_at = iteration + LOOK_INTERVAL
             self.look_at_numbers()
 

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from interpreted import interpreted_kernels
-from step_cases import both, case, difference, tensors
+from step_cases import both, case, difference, moved, tensors
 
 from opt3dgs_optim import triton
 from opt3dgs_optim.moments import MOMENTS
@@ -19,6 +19,7 @@ from opt3dgs_optim.step import (
     LARGEST,
     Fade,
     Frame,
+    Hold,
     Step,
     chosen_rows,
     mixed,
@@ -284,6 +285,40 @@ def test_what_it_takes() -> None:
     step.mean.tensor = step.mean.tensor.t().contiguous().t()
     assert not triton.fits(step)
     assert not triton.takes(case((8, 3), draw))  # of a CPU
+
+
+class There(torch.Tensor):
+    """On the second GPU."""
+
+    def get_device(self) -> int:
+        return 1
+
+
+def elsewhere(tensor: torch.Tensor) -> torch.Tensor:
+    """Another GPU's tensor."""
+    return tensor.as_subclass(There)
+
+
+def test_what_lies_elsewhere_or_is_of_other_rows_is_left_to_torch() -> None:
+    """Which says what is wrong; a kernel would read what is not there."""
+    draw = torch.Generator().manual_seed(0)
+    for name in ("grad", "state", "mean", "hold", "factor"):
+        step = case((8, 3), draw, mean=True, hold=True, factor=torch.ones(()))
+        assert triton.fits(step)
+        setattr(step, name, moved(getattr(step, name), elsewhere))
+        assert not triton.fits(step), name
+    step = case((8, 3), draw, hold=True)
+    for rows in (torch.ones(3, dtype=torch.bool), torch.ones(8)):
+        step.hold = Hold(rows, 1.0)
+        assert not triton.fits(step)
+    step = case((8, 3), draw, frame=True)
+    assert step.frame is not None
+    for other in ({"quats": torch.ones(2, 4)}, {"scales": torch.ones(8, 2)}):
+        step.frame, whole = step.frame._replace(**other), step.frame
+        assert not triton.fits(step)
+        step.frame = whole
+    step.frame = moved(step.frame, elsewhere)
+    assert not triton.fits(step)
 
 
 @pytest.mark.parametrize("rows", [1, 8, 1025])

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from fake_driver import FakeDriver, fake_driver
@@ -15,6 +16,7 @@ from step_cases import case
 
 from opt3dgs_optim import triton
 from opt3dgs_optim.mean import Mean
+from opt3dgs_optim.step import Step
 from opt3dgs_optim.triton import FRAME_BLOCK, ROWS_BLOCK
 
 pytest.importorskip("triton.language", reason="Triton is not installed")
@@ -128,6 +130,55 @@ def test_tensors_that_begin_anywhere_have_a_kernel_of_their_own(driver: FakeDriv
     assert len(driver.loaded) == 2
 
 
+@pytest.mark.parametrize("frame", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16], ids=str)
+def test_kernels_are_of_the_steps_dtypes(
+    driver: FakeDriver, monkeypatch: pytest.MonkeyPatch, dtype: torch.dtype, frame: bool
+) -> None:
+    """Whatever a trainer makes torch's default, and those that later steps need, too."""
+    monkeypatch.setattr(triton, "_PREPARED", set())
+    step = case((9, 3), torch.Generator().manual_seed(0), frame=frame)
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        triton.take_step(step, ("factor", "mean") if frame else ("factor", "hold", "mean"))
+    finally:
+        torch.set_default_dtype(before)
+    assert driver.loaded
+    assert {kind for kinds in signatures() for kind in kinds if "*" in kind} <= {
+        "*fp32", "*i32", "*u8", "*i8",  # the counter, rows that are held, and what is None
+    }  # fmt: skip
+
+
+def signatures() -> list[tuple[str, ...]]:
+    """The types of the arguments of all kernels that were compiled."""
+    return [tuple(made.src.signature.values()) for made in triton._COMPILED.values()]
+
+
+def test_numbers_of_any_type_are_floats_in_a_kernel(driver: FakeDriver) -> None:
+    """What a part sets: a 1 would be compiled as a constant, which other steps then have, too."""
+    plain = case((9, 3), torch.Generator().manual_seed(0), fade=True, hold=True)
+    odd = case((9, 3), torch.Generator().manual_seed(0), fade=True, hold=True)
+    assert odd.fade is not None
+    assert odd.hold is not None
+    odd.factor = np.float32(0.5)
+    odd.fade, odd.hold = odd.fade._replace(share=1, exp_avg=0), odd.hold._replace(weight=1)
+    for step in (odd, plain):
+        triton._COMPILED.clear()
+        triton.launch(step)
+        ((kinds),) = signatures()
+        assert kinds.count("fp32") == 15
+    assert len(driver.loaded) == 1
+
+
+def test_large_tensors_have_a_kernel_of_their_own(driver: FakeDriver) -> None:
+    """Triton compiles for ROCm anew from 2^31 bytes on."""
+    for rows in (100, 12_000_000):
+        p, g, m, v = (torch.empty(rows, 15, 3) for _ in range(4))  # nobody touches them
+        triton.launch(Step(p, g, None, "", {}, {"exp_avg": m, "exp_avg_sq": v}, 0, -1))
+    assert len(triton._COMPILED) == 2
+
+
 COMPILED = {
     "step": {},
     "fading": {"fade": True},
@@ -158,7 +209,8 @@ def test_rows_are_read_four_numbers_at_a_time(
     assert ptx.count("ld.global.v4") == reads * (2 + moments + means)
     assert ptx.count("st.global.v4") == reads * (1 + moments + means)
     assert ".local" not in ptx  # all in registers
-    assert key[3] == (long is not None)
+    assert "sqrt.approx" not in ptx  # it takes small numbers for 0
+    assert key[3] == (27 if long is None else 32)
     assert ".s64" in ptx or not long
 
 

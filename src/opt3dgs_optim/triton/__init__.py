@@ -44,7 +44,7 @@ def missing_on(device: torch.device) -> str | None:
     if (error := _import_error()) is not None:
         return error
     try:
-        p, g, m, v = torch.zeros(4, 1, device=device)
+        p, g, m, v = torch.zeros(4, 1, device=device, dtype=torch.float32)
         step = Step(p, g, None, "", {}, {"exp_avg": m, "exp_avg_sq": v}, 0, -1)
         for _ in range(2):  # by Triton's launcher, and as in all later steps
             launch(step)
@@ -84,31 +84,44 @@ def takes(step: Step) -> bool:
 
 def fits(step: Step) -> bool:  # noqa: PLR0911
     """`takes`, wherever the tensors lie."""
-    frame, hold, mean, state = step.frame, step.hold, step.mean, step.state
-    for tensor in (step.param, step.grad, state["exp_avg"], state["exp_avg_sq"]):
-        if tensor.dtype not in DTYPES or not tensor.is_contiguous():
+    frame, hold, mean, state, param = step.frame, step.hold, step.mean, step.state, step.param
+    device, numbers = param.get_device(), param.numel()
+    if numbers and not param.data_ptr():  # of a subclass without memory of its own, a DTensor
+        return False
+    for tensor in (param, step.grad, state["exp_avg"], state["exp_avg_sq"]):
+        if tensor.dtype not in DTYPES or not _lies_on(device, tensor):
             return False
     if mean is not None:
         for tensor in (mean.tensor, mean.began, mean.rest):
-            if tensor is not None and not tensor.is_contiguous():
+            if tensor is not None and not _lies_on(device, tensor):
                 return False
-    if hold is not None and not hold.rows.is_contiguous():
-        return False
-    factor = step.factor
-    if isinstance(factor, Tensor) and not (_plain(factor) and factor.device == step.param.device):
+    if isinstance(step.factor, Tensor) and not _plain_on(device, step.factor):
         return False
     if frame is None:
-        numbers = step.param.numel()
-        if numbers > MAX_WIDTH and numbers > MAX_WIDTH * step.param.shape[0]:
+        if numbers > MAX_WIDTH and numbers > MAX_WIDTH * param.shape[0]:
             return False
-        return not step.plain or (step.fade is None and hold is None)
+        if step.plain:
+            return step.fade is None and hold is None
+        return hold is None or (
+            hold.rows.dtype is torch.bool
+            and len(hold.rows) == len(param)
+            and _lies_on(device, hold.rows)
+        )
     if step.plain or step.fade is not None or hold is not None:
         return False  # none of our parts says so of positions in their own frames
-    return _plain(frame.quats) and _plain(frame.scales) and 4 * step.param.shape[0] < 2**31
+    rows = param.shape[0]
+    if frame.quats.numel() != 4 * rows or frame.scales.numel() != 3 * rows or 4 * rows >= 2**31:
+        return False
+    longest = frame.longest is None or _plain_on(device, frame.longest)
+    return longest and _plain_on(device, frame.quats) and _plain_on(device, frame.scales)
 
 
-def _plain(tensor: Tensor) -> bool:
-    return tensor.dtype is torch.float32 and tensor.is_contiguous()
+def _lies_on(device: int, tensor: Tensor) -> bool:
+    return tensor.is_contiguous() and tensor.get_device() == device
+
+
+def _plain_on(device: int, tensor: Tensor) -> bool:
+    return tensor.dtype is torch.float32 and _lies_on(device, tensor)
 
 
 def take_step(step: Step, later: tuple[str, ...] = ()) -> None:
@@ -137,7 +150,8 @@ def _subsets(later: tuple[str, ...]) -> list[tuple[str, ...]]:
 def _stand_in(step: Step, forms: tuple[str, ...]) -> Step:
     """A step of one row that changes nothing of the training, and compiles what others need."""
     param = step.param
-    one: Any = torch.zeros((1, *param.shape[1:]) if param.dim() else (), device=param.device)
+    shape = (1, *param.shape[1:]) if param.dim() else ()
+    one: Any = torch.zeros(shape, dtype=param.dtype, device=param.device)
     state = {key: torch.zeros_like(one, dtype=step.state[key].dtype) for key in MOMENTS}
     made = dataclasses.replace(
         step, param=one, grad=torch.zeros_like(one), state=state, fade=None, hold=None, mean=None
@@ -146,7 +160,7 @@ def _stand_in(step: Step, forms: tuple[str, ...]) -> Step:
         quats, scales = one.new_zeros(1, 4), one.new_zeros(1, 3)
         made.frame = step.frame._replace(quats=quats, scales=scales)
     if "factor" in forms:
-        made.factor = torch.ones((), device=one.device)
+        made.factor = one.new_ones(())
     if "hold" in forms:
         made.hold = Hold(torch.zeros(1, dtype=torch.bool, device=one.device), 1.0)
     if "mean" in forms:
@@ -156,7 +170,9 @@ def _stand_in(step: Step, forms: tuple[str, ...]) -> Step:
 
 def looks(grad: Tensor) -> bool:
     """Whether `look` takes the positions' gradient."""
-    return grad.is_cuda and _runs(grad.device) and _plain(grad) and 4 * len(grad) < 2**31
+    if not (grad.is_cuda and _runs(grad.device)):
+        return False
+    return _plain_on(grad.get_device(), grad) and 4 * len(grad) < 2**31
 
 
 def look(
@@ -193,12 +209,13 @@ def launch(step: Step) -> None:
     if not numbers:
         return
     frame, fade, hold, factor = step.frame, step.fade, step.hold, step.factor
-    size = step.lr if frame is None else frame.rate
+    # Triton would compile an integer, or a number of numpy, as another kind of argument.
+    size = float(step.lr if frame is None else frame.rate)
     on_device = None
     if isinstance(factor, Tensor):
         on_device = factor
     else:
-        size *= factor
+        size *= float(factor)
     if not step.plain:
         size /= step.correction1
     kept = NO_MEAN if step.mean is None else step.mean
@@ -214,11 +231,13 @@ def launch(step: Step) -> None:
             "step_in_own_frame", -(-param.shape[0] // FRAME_BLOCK),
             (param, step.grad, exp_avg, exp_avg_sq, frame.quats, frame.scales, frame.longest,
              mean, rest, began, on_device, step.nonfinite),
-            (param.shape[0], frame.min_aspect, size, *adam, number, put), coded,
+            (param.shape[0], float(frame.min_aspect), size, *adam, number, put), coded,
         )  # fmt: skip
         return
-    key, share, fade_m, fade_v = NO_FADE if fade is None else fade
-    held, weight = (None, 0.0) if hold is None else (hold.rows.view(torch.uint8), hold.weight)
+    key, *fades = NO_FADE if fade is None else fade
+    share, fade_m, fade_v = map(float, fades)
+    held = None if hold is None else hold.rows.view(torch.uint8)
+    weight = 0.0 if hold is None else float(hold.weight)
     m, v = (None, None) if step.plain else (exp_avg, exp_avg_sq)
     _run(
         "step_rows", -(-numbers // ROWS_BLOCK),
@@ -242,7 +261,8 @@ def _run(
 
     `coded` says whether moments, and whether the mean, are codes: each has a kernel of its own.
     Triton's launcher looks at every argument, which takes 30 us. What it finds depends only on
-    which tensors are None, on whether each begins at a multiple of 16 bytes, and on the device.
+    which tensors are None, on whether each begins at a multiple of 16 bytes, on the device, and on
+    the size: of 2^31 numbers, and of 2^31 bytes for ROCm.
     """
     pointers = [None if tensor is None else tensor.data_ptr() for tensor in tensors]
     first = tensors[0]
@@ -252,7 +272,8 @@ def _run(
         with torch.cuda.device(device):
             _run(name, programs, tensors, numbers, coded)
         return
-    key = name, coded, device, numbers[0] >= 2**31, *[p and p & 15 for p in pointers]
+    size = max(27, int(numbers[0]).bit_length())  # a row of quaternions has 16 bytes
+    key = name, coded, device, size, *[p and p & 15 for p in pointers]
     compiled = _COMPILED.get(key)
     if compiled is not None:
         # The public `torch.cuda.current_stream` makes an object of it, at the cost of this launch.

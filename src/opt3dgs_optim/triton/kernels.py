@@ -185,7 +185,7 @@ def _step_rows(
             exp_avg_sq = larger(exp_avg_sq, least)
         exp_avg = exp_avg + (grad - exp_avg) * ones1
         exp_avg_sq = exp_avg_sq * beta2 + grad * grad * ones2
-        value = value - size * exp_avg / (tl.sqrt(exp_avg_sq) / sqrt_correction2 + eps)
+        value = value - size * exp_avg / (tl.sqrt_rn(exp_avg_sq) / sqrt_correction2 + eps)
         store_moments(m, v, at, inside, exp_avg, exp_avg_sq, round_key)
     if mean is not None:
         if mean.dtype.element_ty == tl.int16:
@@ -253,7 +253,7 @@ def adam(grad, m, v, at, seen, size, beta2, ones1, ones2, eps, sqrt_correction2,
     exp_avg = exp_avg + (grad - exp_avg) * ones1
     exp_avg_sq = exp_avg_sq * beta2 + grad * grad * ones2
     store_moments(m, v, at, seen, exp_avg, exp_avg_sq, round_key)
-    return tl.where(seen, size * exp_avg / (tl.sqrt(exp_avg_sq) / sqrt_correction2 + eps), 0.0)
+    return tl.where(seen, size * exp_avg / (tl.sqrt_rn(exp_avg_sq) / sqrt_correction2 + eps), 0.0)
 
 
 @triton.jit(do_not_specialize=PLAIN_INTS)
