@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from step_cases import case, combinations, moved, tensors
+from step_cases import both, case, combinations, moved, tensors
 from torch import Tensor
 
 from opt3dgs_optim import PhaseScheduler, triton
-from opt3dgs_optim.step import chosen_rows, take_step
+from opt3dgs_optim.step import Step, chosen_rows
 
 pytestmark = [
     pytest.mark.cuda,
@@ -23,21 +23,18 @@ def test_triton_launches_here() -> None:
     assert triton.missing() is None
 
 
+def on_gpu(step: Step) -> Step:
+    """The step, made on the GPU."""
+    step = moved(step, Tensor.cuda)
+    assert triton.takes(step)
+    triton.take_step(step)
+    return step
+
+
 @pytest.mark.parametrize("at", range(len(CASES)))
 def test_a_step_is_that_of_a_cpu(at: int) -> None:
     options, shape = CASES[at]
-    made = []
-    for gpu in (False, True):
-        step = case(shape, torch.Generator().manual_seed(0), **options)
-        if gpu:
-            step = moved(step, Tensor.cuda)
-            assert triton.takes(step)
-            triton.take_step(step)
-        else:
-            bad = take_step(step)
-            assert step.nonfinite is not None
-            step.nonfinite += bad
-        made.append(step)
+    made = both(options, shape, by=on_gpu)
     assert torch.equal(made[0].nonfinite, made[1].nonfinite.cpu())
     for ours, theirs in zip(tensors(made[0]), tensors(made[1]), strict=True):
         size = ours.abs()

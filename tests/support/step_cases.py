@@ -116,20 +116,25 @@ def tensors(step: Step) -> list[Tensor]:
     return [*found, mean, *rest, step.mean.began]
 
 
-def both(options: dict[str, Any], shape: tuple[int, ...], seed: int = 0) -> tuple[Any, Any]:
+def launched(step: Step) -> Step:
+    """The step, made by the kernels where it lies."""
+    assert triton.fits(step), step
+    triton.launch(step)
+    return step
+
+
+def both(
+    options: dict[str, Any],
+    shape: tuple[int, ...],
+    seed: int = 0,
+    by: Callable[[Step], Step] = launched,
+) -> tuple[Any, Any]:
     """The same case, stepped by plain torch, and by the kernels."""
-    made = []
-    for kernels in (False, True):
-        step = case(shape, torch.Generator().manual_seed(seed), **options)
-        if kernels:
-            assert triton.fits(step), options
-            triton.launch(step)
-        else:
-            bad = take_step(step)
-            assert step.nonfinite is not None
-            step.nonfinite += bad
-        made.append(step)
-    return made[0], made[1]
+    ours, theirs = (case(shape, torch.Generator().manual_seed(seed), **options) for _ in range(2))
+    bad = take_step(ours)
+    assert ours.nonfinite is not None
+    ours.nonfinite += bad
+    return ours, by(theirs)
 
 
 def difference(options: dict[str, Any], shape: tuple[int, ...], seed: int = 0) -> float:
