@@ -214,20 +214,17 @@ def test_a_part_that_gets_no_loss_says_so_once() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:EnergyHistogram. no energy")
-@pytest.mark.parametrize(("grouped", "reads"), [(False, True), (True, True), (False, False)])
-def test_several_ranks_without_a_process_group(
-    monkeypatch: pytest.MonkeyPatch, grouped: bool, reads: bool, recwarn: pytest.WarningsRecorder
+@pytest.mark.parametrize("reads", [True, False])
+def test_several_ranks_are_told_where_a_part_reads_the_loss(
+    monkeypatch: pytest.MonkeyPatch, reads: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """It matters to a part that reads the loss."""
     monkeypatch.setattr(module, "num_ranks", lambda: 2)
-    params, group = parameters(ROWS, "means"), "all" if grouped else None
+    caplog.set_level("INFO", logger="opt3dgs_optim")
+    params = parameters(ROWS, "means")
     parts: list[Part] = [EnergyHistogram() if reads else Averaging()]
-    phases = PhaseScheduler(100, parts=parts, process_group=group)
-    steps(phases.upgrade(adams_of(params)), params, 3)
-    found = [str(each.message) for each in recwarn if "ranks" in str(each.message)]
-    told = "2 ranks train, but process_group=None"
-    assert len(found) == (reads and not grouped)
-    assert not found or (told in found[0] and "give process_group=torch.distributed" in found[0])
+    steps(PhaseScheduler(100, parts=parts).upgrade(adams_of(params)), params, 3)
+    told = "2 ranks train: EnergyHistogram needs the same loss in all; give observe() its mean"
+    assert caplog.text.count(told) == reads
 
 
 def test_a_run_that_is_longer_than_it_was_said(recwarn: pytest.WarningsRecorder) -> None:

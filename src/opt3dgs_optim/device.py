@@ -76,10 +76,3 @@ def num_ranks() -> int:
     distributed = torch.distributed
     ready = distributed.is_available() and distributed.is_initialized()
     return distributed.get_world_size() if ready else 1
-
-
-def mean_over_ranks(number: Tensor, group: Any) -> Tensor:
-    """The mean of a number of every process of a `torch.distributed` group, 0-d float32."""
-    total = number.detach().to(torch.float32, copy=True)
-    torch.distributed.all_reduce(total, group=group)
-    return total / torch.distributed.get_world_size(group)

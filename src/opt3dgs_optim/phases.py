@@ -26,7 +26,7 @@ from opt3dgs_optim.contract import (
     named,
     slots_of,
 )
-from opt3dgs_optim.device import mean_over_ranks, num_ranks
+from opt3dgs_optim.device import num_ranks
 from opt3dgs_optim.messages import LOGGER, End, say
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.parts.averaging import Averaging
@@ -61,8 +61,6 @@ class PhaseScheduler(Training):
         moments: bits per number of each of Adam's two moments, and of the mean of the last
             thirtieth; 16 halves the memory, and is for the Gaussians alone (see
             docs/performance.md).
-        process_group: a `torch.distributed` process group over whose ranks the loss is averaged,
-            for parts that read it.
 
     Memory: Adam's; in the last thirtieth `Averaging` keeps a copy of the parameters, too.
     `moments=16` halves Adam's, and that copy but for the positions'.
@@ -91,7 +89,6 @@ class PhaseScheduler(Training):
         parts: Sequence[Part] | None = None,
         *,
         moments: Literal[32, 16] = 32,
-        process_group: Any = None,
     ) -> None:
         if total_steps is not None:
             total_steps = check_count(CALL, "total_steps", total_steps, 1)
@@ -106,7 +103,6 @@ class PhaseScheduler(Training):
             switch_step = None if total_steps is None else round(share * total_steps)
         parts = DEFAULTS if parts is None else check_parts(CALL, parts)
         super().__init__(parts, total_steps, switch_step, moments)
-        self._group = process_group
         own = (part for part in self.parts if part.overrides("pixel_loss"))
         self._pixel: Part | None = next(own, None)
         self._end, self._plateau = End(self.open_end), Plateau()
@@ -196,7 +192,8 @@ class PhaseScheduler(Training):
         """Give the loss to parts that read it, or put the clock where the trainer's count is.
 
         Args:
-            loss: this iteration's, 0-d, before its steps. No part in `DEFAULTS` reads it.
+            loss: this iteration's, 0-d, before its steps; with several ranks its mean over them. No
+                part in `DEFAULTS` reads it.
             iteration: from 0; for trainers whose count differs from the number of their steps.
 
         Raises:
@@ -225,8 +222,6 @@ class PhaseScheduler(Training):
             if line is not None:
                 self.messages.say_once(line)
         if self.observers:
-            if self._group is not None:
-                energy = mean_over_ranks(energy, self._group)
             with torch.autocast(energy.device.type, enabled=False):  # Lightning's is around it
                 super().observe(energy)
 
@@ -319,20 +314,16 @@ class PhaseScheduler(Training):
                 f"{CALL}: iteration {self.iteration} comes after finish(): the parameters are no "
                 "mean any more; call it after the last step",
             )
-        if self.iteration == 0 and self.observers and self._group is None and num_ranks() > 1:
-            self.messages.warn_once(
-                "ranks",
-                f"{CALL}: {num_ranks()} ranks train, but process_group=None: parts that read the "
-                "loss would differ between them; give process_group=torch.distributed.group.WORLD",
+        if self.iteration == 0 and self.observers and num_ranks() > 1:
+            reader = type(self.observers[0]).__name__
+            self.messages.say_once(
+                f"opt3dgs_optim: {num_ranks()} ranks train: {reader} needs the same loss in all; "
+                "give observe() its mean (torch.distributed.all_reduce)"
             )
 
     def end_line(self) -> str | None:
         """The warning if the training stops now, before its end; None if there is none."""
         return self._end.line()
-
-    def __getstate__(self) -> dict[str, Any]:
-        # Another process has groups of its own.
-        return {**super().__getstate__(), "_group": None}
 
     def __repr__(self) -> str:
         end = "no planned end" if self.end_step is None else self.end_step
