@@ -8,7 +8,6 @@ import pytest
 import torch
 from gaussians import RATES, adam_of, adams_of, parameters, same_tensors, steps
 from masked_adams import MaskedAdam, SelectiveAdam, SparseGaussianAdam, masked
-from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam, AdamW
 
@@ -240,8 +239,8 @@ class Signs(Part):
 
     names = ("scales",)
 
-    def before(self, step: Step, training: Any) -> Tensor:
-        return step.grad.sign()
+    def plan(self, step: Step, training: Any) -> None:
+        step.grad = step.grad.sign()
 
     def after(self, step: Step, training: Any) -> None:
         step.param.clamp_(-1.0, 1.0)
@@ -277,13 +276,13 @@ def test_a_strangers_part_has_hooks_and_notes() -> None:
 @pytest.mark.parametrize("found", [None, torch.ones(2, 2), 1.0])
 def test_a_gradient_of_another_shape_is_refused(found: Any) -> None:
     class Wrong(Part):
-        def before(self, step: Step, training: Any) -> Tensor:
-            return found
+        def plan(self, step: Step, training: Any) -> None:
+            step.grad = found
 
     params = parameters(ROWS, "sh0")
     optimizers = PhaseScheduler(TOTAL, parts=[Wrong()]).upgrade(adams_of(params))
     with pytest.raises(
-        ValueError, match=r"Wrong.before: returned .*a tensor of \(8, 1, 3\) is needed"
+        ValueError, match=r"Adam.step: a part has put .*a tensor of \(8, 1, 3\) is needed"
     ):
         steps(optimizers, params, 1)
 

@@ -61,9 +61,7 @@ class SignAgreement(Part):
 
     def plan(self, step: Step, training: Training) -> None:
         step.factor *= 2.0
-
-    def before(self, step: Step, training: Training) -> Tensor:
-        return torch.where(step.grad * step.state["exp_avg"] < 0, 0.0, step.grad)
+        step.grad = torch.where(step.grad * step.state["exp_avg"] < 0, 0.0, step.grad)
 
 
 parts: list[Part] = [*DEFAULTS, SignAgreement()]

@@ -19,8 +19,8 @@ class Part:
 
     In `plan`, a part sets plain values that say *what* a parameter's step has; one function makes
     the step from them (`opt3dgs_optim.step`), on a GPU in one launch. A part with arithmetic of its
-    own has `before`, which replaces the gradient after all plans, and `after`; both use torch
-    operations, each a launch.
+    own puts another gradient into `step.grad`, or has `after`; both use torch operations, each a
+    launch.
 
     What a part learns of a training goes into `training.notes_of(self)`, a dict of plain numbers by
     name, which is saved with the optimizers; a part object whose state lives in itself sets
@@ -47,10 +47,6 @@ class Part:
 
     def plan(self, step: Step, training: Training) -> None:
         """Say what the step has, before it is made, by setting attributes of `step`."""
-
-    def before(self, step: Step, training: Training) -> Tensor:
-        """The gradient [N, ...] that Adam is fed in the place of `step.grad`."""
-        return step.grad
 
     def after(self, step: Step, training: Training) -> None:
         """Change `step.param` [N, ...] in place, after the step."""

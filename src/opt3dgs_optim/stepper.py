@@ -31,7 +31,7 @@ class ParamStepper:
     Attributes:
         param: the Parameter, a weak reference: an old one lives no longer than the trainer wants.
         name, set: which Gaussian parameter it is, and of which set of Gaussians.
-        acting: by `Training.exploiting`: the parts with a `plan`, with a `before`, with an `after`.
+        acting: by `Training.exploiting`: the parts with a `plan`, and with an `after`.
         later: what later steps may have and the first has not, see `Part.later`.
         counter: where its device counts numbers that are not finite; None on a CPU.
         stepped_in: the iteration of its last step; -1: none; None: it is not known, and counts as
@@ -67,7 +67,7 @@ class ParamStepper:
         self.acting = tuple(
             tuple(
                 [p for p in begun if p.overrides(hook) and p.during in (None, phase)]
-                for hook in ("plan", "before", "after")
+                for hook in ("plan", "after")
             )
             for phase in (Phase.EXPLORATION, Phase.EXPLOITATION)
         )
@@ -105,7 +105,7 @@ class ParamStepper:
             triton.take_step(step, self.later)
         elif bad := take_step(step):
             training.bad_numbers.add(bad)
-        for part in self.acting[training.exploiting][2]:
+        for part in self.acting[training.exploiting][1]:
             part.after(step, training)
 
     def after(self, step: Step, count: int) -> None:
@@ -113,7 +113,7 @@ class ParamStepper:
         mean = None if step.put is None else self.mean(step, count)
         if mean is not None:
             take_into_mean(mean, step.param)
-        for part in self.acting[self.training.exploiting][2]:
+        for part in self.acting[self.training.exploiting][1]:
             part.after(step, self.training)
 
     def plan(self, param: Tensor, state: dict[str, Any], iteration: int) -> Step:
@@ -138,11 +138,13 @@ class ParamStepper:
         )
         if iteration >= self._arranged_until:
             self._arrange(iteration)
-        plans, befores, _ = self.acting[training.exploiting]
-        for part in plans:
+        for part in self.acting[training.exploiting][0]:
             part.plan(step, training)
-        for part in befores:
-            step.grad = checked_gradient(part, part.before(step, training), grad)
+        if step.grad is not grad and (got := getattr(step.grad, "shape", step.grad)) != grad.shape:
+            raise ValueError(
+                f"{self.call}.step: a part has put {got} in the place of the gradient of "
+                f"{self.name or 'a parameter'}, but a tensor of {tuple(grad.shape)} is needed"
+            )
         if step.plain:
             step.frame = None  # the rate of a plain step is the trainer's
         framed = step.frame is not None
@@ -231,14 +233,3 @@ def begin_moments_anew(state: dict[str, Any]) -> None:
     for key in MOMENTS:
         state[key].zero_()
     drop_means([state])
-
-
-def checked_gradient(part: Any, found: Any, grad: Tensor) -> Tensor:
-    """What a part returned as the gradient; ValueError unless it has the gradient's shape."""
-    if not isinstance(found, Tensor) or found.shape != grad.shape:
-        got = tuple(found.shape) if isinstance(found, Tensor) else repr(found)
-        raise ValueError(
-            f"{type(part).__name__}.before: returned {got}, but a tensor of {tuple(grad.shape)} is "
-            "needed, as the gradient has"
-        )
-    return found
