@@ -43,6 +43,12 @@ _INRIA_STEP = (
     "            if iteration < opt.iterations:\n"
     "                gaussians.exposure_optimizer.step()"
 )
+_PGSR_STEP = (
+    "            if iteration < opt.iterations:\n"
+    "                gaussians.optimizer.step()\n"
+    "                app_model.optimizer.step()\n"
+    "                gaussians.optimizer.zero_grad(set_to_none = True)"
+)
 _TAMING_STEP = (
     "            if iteration < opt.iterations:\n"
     '                if opt.optimizer_type == "default":\n'
@@ -82,8 +88,11 @@ TRAINERS: dict[str, Trainer] = {
     ),
     "inria": _inria(
         "gaussian-splatting",
-        step=(_INRIA_STEP, _STEP),
-        counts={"gaussians.optimizer.step(": (1, 2), "total_loss.backward()": 0},
+        step=(_INRIA_STEP, _STEP, _PGSR_STEP),
+        counts={
+            **{"gaussians.optimizer.step(": (1, 2), "total_loss.backward()": 0},
+            "break": (0, 1),  # some have no viewer
+        },
     ),
     "3dgs-mcmc": _inria("3dgs-mcmc", counts={"break": 0, "relocate_gs(": 1}),
     "2dgs": _inria("2d-gaussian-splatting", counts={"total_loss.backward()": 1}),
