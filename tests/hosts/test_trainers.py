@@ -31,7 +31,8 @@ PLACES = {  # the folder of each trainer's sources; the others' is their name
 }  # fmt: skip
 OLDER = [("gsplat", "gsplat-1.5.3"), ("gsplat", "gsplat-1.4.0"), ("gsplat-2dgs", "gsplat-1.5.3"),
          ("gsplat-2dgs", "gsplat-1.4.0"), ("inria", "gaussian-splatting-2024-04")]  # fmt: skip
-FORKS = ("mip-splatting", "gaussian-opacity-fields", "RaDe-GS", "PGSR", "DashGaussian")
+FORKS = ("mip-splatting", "gaussian-opacity-fields", "RaDe-GS", "PGSR", "DashGaussian",
+         "AbsGS", "Pixel-GS", "StopThePop")  # fmt: skip
 EACH = [(name, PLACES.get(name, name)) for name, each in TABLE.items() if each.signs]
 
 PATCHES = Path(__file__).resolve().parents[2] / "examples" / "hosts"
@@ -39,9 +40,7 @@ PATCHES = Path(__file__).resolve().parents[2] / "examples" / "hosts"
 pytestmark = pytest.mark.hosts
 
 
-@pytest.mark.parametrize(
-    ("name", "folder"), [*EACH, *OLDER, *(("inria", each) for each in FORKS)]
-)
+@pytest.mark.parametrize(("name", "folder"), [*EACH, *OLDER, *(("inria", each) for each in FORKS)])
 def test_the_real_file_gets_its_lines(name: str, folder: str, tmp_path: Path) -> None:
     """And no linter finds a name in it that is not defined."""
     path = TRAINERS / folder / TABLE[name].file
