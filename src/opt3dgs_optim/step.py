@@ -1,8 +1,8 @@
 """The step of one parameter: what it has (`Step`), and how it is made (`take_step`).
 
 Parts of a training fill in a `Step` with plain values, and may put another gradient in the place of
-the parameter's. The arithmetic is here, in plain torch, which runs on every device;
-`opt3dgs_optim.triton` makes the same step in one launch on a GPU. Without any of the parts it is
+the parameter's. The arithmetic is here, in plain torch, which runs on every device; on a GPU
+`opt3dgs_optim.triton` makes the same step in one launch. Without any of the parts it is
 `torch.optim.Adam`, bit for bit on a CPU.
 
 A row is one Gaussian: dimension 0 of a parameter. In the order in which it is made:
@@ -73,8 +73,8 @@ class Step:
     """What the step of one parameter has in one iteration. Parts set what they want of it.
 
     Attributes:
-        param, grad: [N, ...] float32 or float64, and the gradient that Adam is fed: another tensor
-            of its shape may take its place, and must not be written into.
+        param, grad: [N, ...] float32 or float64, and the gradient that Adam is fed. A part may put
+            another tensor of that shape in its place, but not write into it.
         name: gsplat's name of the Gaussian parameter, or None.
         set: the set of Gaussians that it belongs to, "" where there is one.
         group, state: torch's parameter group and the optimizer's state of the parameter.
