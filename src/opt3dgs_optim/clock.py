@@ -166,11 +166,15 @@ class Clock:
             iteration = max(present + begins, 0)
         self._resumed, self._begun = False, iteration
         optimizer.next_iteration = iteration + 1
-        self.put_on(iteration)
+        if iteration > self.iteration:
+            if self.fall_step is not None and iteration >= (self.end_step or 0):
+                self.go_on()
+            self.go_to(iteration)
+            self.advanced()
         return iteration
 
     def put_on(self, iteration: int) -> None:
-        """Put the clock forward, to a step's iteration or to where the trainer's own count is."""
+        """Put the clock forward, to where the trainer's own count is."""
         if iteration > self.iteration:
             if self.fall_step is not None and iteration >= (self.end_step or 0):
                 self.go_on()
