@@ -52,12 +52,12 @@ Run = tuple[str, int]  # an arm, and the iterations that it is planned for
 lines = cache(evidence.read)
 
 
-def of(run: Run, scene: str, *, gpu: bool = False, **those: Any) -> list[Line]:
+def of(run: Run, scene: str, **those: Any) -> list[Line]:
     """The lines of a run; what is not said is as usual. One a seed, in order."""
     wanted = evidence.USUAL | {"density": "relocation"} | those
     wanted |= {"arm": run[0], "iterations": run[1], "scene": scene}
     found = [x for x in lines() if all(x.get(k) == v for k, v in wanted.items())]
-    return sorted((x for x in found if ("NVIDIA" in x["device"]) is gpu), key=lambda x: x["seed"])
+    return sorted(found, key=lambda x: x["seed"])
 
 
 def paired(*runs: list[Line]) -> list[list[Line]]:
