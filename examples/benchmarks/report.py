@@ -172,6 +172,11 @@ def whole() -> str:
     return less_stock(["bonsai"], [THIRD, ("defaults", 15_000)], **WHOLE)
 
 
+def outdoors() -> str:
+    """A third of stock's iterations against all of them, outdoors, at half size."""
+    return less_stock(["train"], [THIRD], **HALF)
+
+
 def quarter() -> str:
     """A quarter of stock's iterations against all of them, at quarter size."""
     return less_stock(MAIN, [("defaults", 7_500)], **QUARTER)
@@ -277,7 +282,7 @@ def cost() -> str:
 
 
 TABLES = {f.__name__: f for f in (
-    front, iterations, quarter, equal, open_end, few, adaptive, whole, gpu_step,
+    front, iterations, quarter, equal, open_end, few, adaptive, whole, outdoors, gpu_step,
     gpu_iteration, ratios, cost,
 )}  # fmt: skip
 
