@@ -101,13 +101,16 @@ def default_step(
         # standard deviations. A full step has 0.1 of them at the start and 0.003 at the end. Where
         # a position has no gradient it stays, and so do its moments.
         if in_own_frame:
-            # Thin axes count as a share of the longest, a larger one in short trainings; none as
-            # longer than 6 medians of the longest axes, found every 100 iterations.
+            # Thin axes count as a share of the longest, a larger one in short trainings. Where the
+            # last edit has changed the number of points, none counts as longer than 6 medians of
+            # the longest axes, as they were then.
             least = min(max(3_000 / total, 0.1), 0.25)
-            if state.get("longest", (None,))[0] != iteration // 100:
-                median = params["scales"].amax(1).nanmedian()
-                state["longest"] = iteration // 100, median.exp() * 6
-            frame = own_axes(params["quats"], params["scales"], least, state["longest"][1])
+            edited, most = state.get("edited", (param, torch.tensor(torch.inf)))
+            if edited is not param:
+                median = params["scales"].amax(1).nanmedian().exp()
+                most = 6 * median if len(edited) != num_points else torch.tensor(torch.inf)
+            state["edited"] = param, most
+            frame = own_axes(params["quats"], params["scales"], least, most)
             z, seen = torch.zeros_like(param), (grad != 0).any(1, keepdim=True)
             rate = 0.1 * 0.03**progress if rate else 0.0
             before = {key: own[key].clone() for key in ("exp_avg", "exp_avg_sq")}

@@ -123,43 +123,81 @@ def test_flat_and_round_gaussians_step_as_those_with_three_scales(width: int) ->
     assert torch.equal(*moved)
 
 
-def test_no_axis_counts_as_longer_than_six_medians() -> None:
-    """Of the longest axes of all; a scale that is no number does not count among them."""
-    params, grad = parameters(ROWS, *NAMES), torch.ones(ROWS, 3)
+def edit(params: dict[str, Any], optimizers: dict[str, Any], rows: list[int]) -> None:
+    """Have new Parameters of these rows, as density control does."""
+    for name, optimizer in optimizers.items():
+        param = params[name]
+        new = params[name] = Parameter(param.detach()[rows])
+        state = optimizer.state.pop(param, {})
+        for key in ("exp_avg", "exp_avg_sq"):
+            if key in state:
+                state[key] = state[key][rows]
+        if state:
+            optimizer.state[new] = state
+        optimizer.param_groups[0]["params"] = [new]
+
+
+def moved_by_a_step(params: dict[str, Any], optimizers: dict[str, Any]) -> Tensor:
+    """The displacement of each Gaussian by its own first step, in x."""
+    for optimizer in optimizers.values():
+        optimizer.state.clear()
+    params["means"].grad, before = (
+        torch.ones_like(params["means"]),
+        params["means"].detach().clone(),
+    )
+    optimizers["means"].step()
+    return (params["means"].detach() - before)[:, 0]
+
+
+def test_no_axis_counts_as_longer_than_six_medians_once_an_edit_changes_the_number() -> None:
+    """As clone and split does; relocation, which leaves it, has no bound. A NaN does not count."""
+    params = parameters(ROWS, *NAMES)
     params["quats"].data = torch.eye(4)[:1].repeat(ROWS, 1)
     params["scales"].data.fill_(-3.0)
     params["scales"].data[:3] = torch.tensor([5.0, -2.0, math.nan])[:, None]
-    moved = stepped(params, grad, OwnFrame(rate=0.1))
-    expected = -0.1 * torch.tensor([6 * math.exp(-3.0), math.exp(-2.0), 0.0, math.exp(-3.0)])
-    assert torch.allclose(moved[:4], expected[:, None], rtol=1e-5)
+    optimizers = PhaseScheduler(TOTAL, parts=[OwnFrame(final=1.0)]).upgrade(adams_of(params))
+    every = list(range(ROWS))
+    for rows, longest in (
+        (every, math.exp(5.0)),
+        ([*every, ROWS - 1], 6 * math.exp(-3.0)),  # one is cloned
+        (None, 6 * math.exp(-3.0)),  # no edit
+        ([*every, ROWS - 1], math.exp(5.0)),  # they are relocated
+        (every[:-1], 6 * math.exp(-3.0)),  # two are pruned
+    ):
+        if rows is not None:
+            edit(params, optimizers, rows)
+        moved = moved_by_a_step(params, optimizers)
+        expected = -0.1 * torch.tensor([longest, math.exp(-2.0), 0.0, math.exp(-3.0)])
+        assert torch.allclose(moved[:4], expected, rtol=1e-5, atol=1e-5)  # of positions up to 30
 
 
-@pytest.mark.parametrize("at", [150, 200, 201])
-def test_the_longest_axis_is_found_each_hundred_iterations_in_a_resumed_training_too(
-    at: int,
-) -> None:
-    """What was found is saved: the resumed steps are the same, though the scales have changed."""
-    params, grads = parameters(ROWS, *NAMES), [draw(i, ROWS, 3) for i in range(210)]
+@pytest.mark.parametrize("edits", ["before", "between", "relocated", "none"])
+def test_a_resumed_training_has_the_bound_that_it_had(edits: str) -> None:
+    """Also where the edit came after the last step before the checkpoint."""
+    params, grads = parameters(ROWS, *NAMES), [draw(i, ROWS, 3) for i in range(30)]
     params["scales"].data[0] += 9.0
 
     def step(each: dict[str, Any], optimizers: dict[str, Any], i: int) -> Tensor:
-        # Density control before the step leaves a new Parameter, without a gradient.
-        each["means"].grad = None if i == 200 else grads[i].clone()
+        each["means"].grad = grads[i][: len(each["means"])].clone()
         optimizers["means"].step()
-        each["scales"].data += 0.02  # a fifth more in ten iterations
+        each["scales"].data += 0.02
         return each["means"].detach().clone()
 
     ours = PhaseScheduler(TOTAL, parts=[OwnFrame()]).upgrade(adams_of(params))
-    for i in range(at):
+    for i in range(20):
+        if i == 10 and edits in ("before", "relocated"):
+            edit(params, ours, list(range(ROWS - 1)))
         step(params, ours, i)
+    if edits in ("between", "relocated"):
+        edit(params, ours, list(range(ROWS - 1)))
     theirs = {name: Parameter(each.detach().clone()) for name, each in params.items()}
     resumed = PhaseScheduler(TOTAL, parts=[OwnFrame()]).upgrade(adams_of(theirs))
     for name, optimizer in resumed.items():
         optimizer.load_state_dict(copy.deepcopy(ours[name].state_dict()))
-    before = params["means"].detach().clone()
-    for i in range(at, 210):
+    note = resumed["means"].training.notes_of(OwnFrame()).get("longest")
+    assert (note is None) == (edits in ("relocated", "none"))
+    for i in range(20, 30):
         assert torch.equal(step(params, ours, i), step(theirs, resumed, i))
-    assert not torch.equal(before, params["means"])
 
 
 def test_the_rate_follows_a_batch_by_its_beta() -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import functools
 import math
+import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,7 +20,7 @@ from opt3dgs_optim.training import Training
 CALL = "OwnFrame"
 BETA1 = 0.9  # of one view an iteration
 SLOWED_OVER, POWER = 1_000, 0.75  # iterations; where no end is planned: see `OwnFrame`
-MEDIANS, EVERY = 6, 100  # of the longest axes, found every so many iterations: see `OwnFrame`
+MEDIANS = 6  # of the longest axes: see `OwnFrame`
 
 
 @dataclass(frozen=True, repr=False)
@@ -48,9 +50,10 @@ class OwnFrame(Part):
     of the longest. The fewer steps a training has, the longer they must be: by default this share
     is 3,000 / total_steps, but between 0.1 (from 30,000 iterations on) and 0.25 (up to 12,000).
 
-    The largest Gaussians would be stepped farthest, and with density control that splits they fill
-    the space in front of the cameras. So an axis counts as no longer than 6 times the median of the
-    Gaussians' longest axes, which is found every 100 iterations.
+    The largest Gaussians would be stepped farthest, and with density control that clones and splits
+    they fill the space in front of the cameras. So there an axis counts as no longer than 6 times
+    the median of the Gaussians' longest axes. The bound is found when an edit changes the number of
+    Gaussians; an edit that leaves it, as relocation's, lifts it.
 
     For b views in a batch, or b ranks, gsplat sets beta1 = 1 - 0.1 b and scales rates by sqrt(b).
     The rate here follows beta1: below beta1 = 0.9 it is scaled by sqrt((1 - beta1) / 0.1).
@@ -144,41 +147,60 @@ class OwnFrame(Part):
         least = self.min_aspect
         if least is None:
             least = min_aspect_of(training.end_step or step.iteration)
-        kept = training.unsaved.get((OwnFrame, step.set))
-        if kept is None or kept[0] != step.iteration // EVERY or kept[1].device != scales.device:
-            kept = self.keep_longest(step, scales, training)
+        kept: _Bound | None = training.unsaved.get((OwnFrame, step.set))
+        if kept is None or kept.means() is not step.param:
+            kept = self.keep_bound(step.set, step.param, scales, training)
         scales = scales if scales.shape[1] == 3 else three_of(scales)
-        step.frame = Frame(rate, least, quats, scales, kept[1])
+        step.frame = Frame(rate, least, quats, scales, kept.longest)
 
-    def keep_longest(self, step: Step, scales: Tensor, training: Training) -> tuple[int, Tensor]:
-        """Keep the standard deviation [] that a longer axis counts as, of these 100 iterations."""
-        place, now = (OwnFrame, step.set), step.iteration // EVERY
-        notes = training.notes_of(self)
-        if place not in training.unsaved and notes.get(_note(step.set, "found in")) == now:
-            found = scales.new_tensor(notes[_note(step.set, "longest")])  # in a resumed training
-        elif len(scales):
-            found = median_of(scales.detach().amax(1)).exp() * MEDIANS
+    def keep_bound(self, of_set: str, means: Tensor, scales: Tensor, training: Training) -> _Bound:
+        """Keep what a longer axis counts as, until the next edit of the rows."""
+        last: _Bound | None = training.unsaved.get((OwnFrame, of_set))
+        if last is None:  # in the first step, or in that of a resumed training
+            found = training.notes_of(self).get(_note(of_set), math.inf)
+            longest = scales.new_tensor(found)
+        elif last.rows == len(means) or not len(means):
+            longest = scales.new_tensor(math.inf)
         else:
-            found = scales.new_tensor(math.inf)
-        training.unsaved[place] = now, found
-        return now, found
+            longest = median_of(scales.detach().amax(1)).exp() * MEDIANS
+        kept = _Bound(weakref.ref(means), len(means), longest)
+        training.unsaved[OwnFrame, of_set] = kept
+        return kept
 
     def read_back(self, training: Training) -> None:
-        """Have the longest axes in the notes."""
-        for place, kept in training.unsaved.items():
-            if place[0] is OwnFrame and math.isfinite(longest := kept[1].item()):
-                notes = training.notes_of(self)
-                notes[_note(place[1], "longest")] = longest
-                notes[_note(place[1], "found in")] = kept[0]
+        """Have the bounds in the notes, as the next step would find them."""
+        notes = training.notes_of(self)
+        for of_set in [place[1] for place in training.unsaved if place[0] is OwnFrame]:
+            kept: _Bound = training.unsaved[OwnFrame, of_set]
+            means, scales = (training.param_of(of_set, name) for name in ("means", "scales"))
+            if means is not None and scales is not None and kept.means() is not means:
+                kept = self.keep_bound(of_set, means, scales, training)
+            notes.pop(_note(of_set), None)
+            if math.isfinite(longest := kept.longest.item()):
+                notes[_note(of_set)] = longest
 
     def numbers(self, training: Training) -> Mapping[str, float]:
         """`own_frame_rate`: standard deviations of a full step."""
         return {"own_frame_rate": self.at(training)}
 
 
-def _note(name: str, what: str) -> str:
-    """The key of a note on a set of Gaussians."""
-    return f"{what} {name}".rstrip()
+class _Bound(NamedTuple):
+    """What is kept of a set of Gaussians between two edits of them.
+
+    Attributes:
+        means: the Parameter that the trainer has, a weak reference.
+        rows: their number N.
+        longest: [] the standard deviation that a longer axis counts as; infinite: none does.
+    """
+
+    means: weakref.ref[Tensor]
+    rows: int
+    longest: Tensor
+
+
+def _note(of_set: str) -> str:
+    """The key of the note on a set of Gaussians."""
+    return f"longest {of_set}".rstrip()
 
 
 def median_of(numbers: Tensor) -> Tensor:
