@@ -62,6 +62,8 @@ class WholeLife(RuleBasedStateMachine):
         self.options = {stock: True} if stock else {}
         self.params: dict[str, Any] = parameters(num_points, *NAMES)
         self.theirs = {name: make_gaussians(num_points)[name] for name in NAMES}
+        self.params["scales"].data[0] += 4.0  # longer than the bound, once rows are edited
+        self.theirs["scales"][0] += 4.0
         self.state: dict[str, Any] = {}
         self.iteration, self.finished, self.rates = 0, False, dict(RATES)
         self.upgrade(self.new_optimizers())
@@ -252,8 +254,8 @@ class WholeLife(RuleBasedStateMachine):
                     del own[key]
         self.load(states, upgraded_first)
         self.drop(*OF_THE_END)
-        self.state.pop("share", None)
-        self.state.pop("look", None)
+        for key in ("share", "look", "edited"):
+            self.state.pop(key, None)
         # The positions' optimizer is the clock; one of all has the steps of all.
         made = [self.state.get(name, {}).get("step", 0) for name in NAMES]
         self.iteration = max(made) if self.inria else made[NAMES.index("means")] or max(made)
@@ -344,7 +346,7 @@ def test_whole_life() -> None:
     run_state_machine_as_test(
         WholeLife,
         settings=settings(
-            max_examples=30,
+            max_examples=100,
             stateful_step_count=25,
             deadline=None,
             suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],

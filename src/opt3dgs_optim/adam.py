@@ -196,6 +196,7 @@ class StepAdam(Adam):
         """Know whose rows the state is of, so that an edit before the first step shows."""
         if self.state and len(self._slots) == len(self.param_groups):
             self._new_steppers(check=False)
+            self.training.read_back()
 
     def _new_steppers(self, check: bool = True) -> list[ParamStepper]:
         old, made, call = self._steppers, [], type(self).__name__
@@ -356,9 +357,8 @@ class StepAdam(Adam):
 
     def own_frame(self) -> frozenset[str]:
         """The sets whose positions have moments in the own frame."""
-        if not self._steppers:
-            return self._own_frame
-        return frozenset(each.set for each in self._steppers if each.framed)
+        framed = frozenset(each.set for each in self._steppers if each.framed)
+        return framed if self._steppers else self._own_frame
 
     def __getstate__(self) -> dict[str, Any]:
         self.notice_edits()

@@ -55,7 +55,7 @@ class Part:
         """Take the loss of this iteration, 0-d; called by `observe(loss)`."""
 
     def read_back(self, training: Training) -> None:
-        """Take what is still on its way from a device into the notes; called before a save."""
+        """Take what is on its way from a device into the notes: before a save, after a load."""
 
     def pixel_loss(self, error: Tensor) -> Tensor:
         """The photometric term of an error [...] of pixels, 0-d."""

@@ -157,23 +157,25 @@ class OwnFrame(Part):
         """Keep what a longer axis counts as, until the next edit of the rows."""
         last: _Bound | None = training.unsaved.get((OwnFrame, of_set))
         if last is None:  # in the first step, or in that of a resumed training
-            found = training.notes_of(self).get(_note(of_set), math.inf)
-            longest = scales.new_tensor(found)
-        elif last.rows == len(means) or not len(means):
-            longest = scales.new_tensor(math.inf)
-        else:
+            noted = training.notes_of(self).get(_note(of_set), math.inf)
+            longest = scales.new_full((), noted)
+        elif last.rows != len(means) and len(means):
             longest = median_of(scales.detach().amax(1)).exp() * MEDIANS
+        else:
+            longest = scales.new_full((), math.inf)
         kept = _Bound(weakref.ref(means), len(means), longest)
         training.unsaved[OwnFrame, of_set] = kept
         return kept
 
     def read_back(self, training: Training) -> None:
-        """Have the bounds in the notes, as the next step would find them."""
+        """Have the bounds in the notes, and know the rows that they are of."""
         notes = training.notes_of(self)
-        for of_set in [place[1] for place in training.unsaved if place[0] is OwnFrame]:
-            kept: _Bound = training.unsaved[OwnFrame, of_set]
+        for of_set in [of_set for of_set, name in training.members if name == "means"]:
             means, scales = (training.param_of(of_set, name) for name in ("means", "scales"))
-            if means is not None and scales is not None and kept.means() is not means:
+            if means is None or scales is None:
+                continue
+            kept: _Bound | None = training.unsaved.get((OwnFrame, of_set))
+            if kept is None or kept.means() is not means:
                 kept = self.keep_bound(of_set, means, scales, training)
             notes.pop(_note(of_set), None)
             if math.isfinite(longest := kept.longest.item()):
