@@ -254,7 +254,7 @@ class WholeLife(RuleBasedStateMachine):
                     del own[key]
         self.load(states, upgraded_first)
         self.drop(*OF_THE_END)
-        for key in ("share", "look", "edited"):
+        for key in ("share", "look", "bound"):
             self.state.pop(key, None)
         # The positions' optimizer is the clock; one of all has the steps of all.
         made = [self.state.get(name, {}).get("step", 0) for name in NAMES]

@@ -149,20 +149,20 @@ def moved_by_a_step(params: dict[str, Any], optimizers: dict[str, Any]) -> Tenso
     return (params["means"].detach() - before)[:, 0]
 
 
-def test_no_axis_counts_as_longer_than_six_medians_once_an_edit_changes_the_number() -> None:
-    """As clone and split does; relocation, which leaves it, has no bound. A NaN does not count."""
+def test_no_axis_counts_as_longer_than_six_medians_unless_rows_are_relocated() -> None:
+    """An edit that leaves their number lifts it, until one changes it. A NaN does not count."""
     params = parameters(ROWS, *NAMES)
     params["quats"].data = torch.eye(4)[:1].repeat(ROWS, 1)
     params["scales"].data.fill_(-3.0)
     params["scales"].data[:3] = torch.tensor([5.0, -2.0, math.nan])[:, None]
     optimizers = PhaseScheduler(TOTAL, parts=[OwnFrame(final=1.0)]).upgrade(adams_of(params))
-    every = list(range(ROWS))
+    every, bound, own = list(range(ROWS)), 6 * math.exp(-3.0), math.exp(5.0)
     for rows, longest in (
-        (every, math.exp(5.0)),
-        ([*every, ROWS - 1], 6 * math.exp(-3.0)),  # one is cloned
-        (None, 6 * math.exp(-3.0)),  # no edit
-        ([*every, ROWS - 1], math.exp(5.0)),  # they are relocated
-        (every[:-1], 6 * math.exp(-3.0)),  # two are pruned
+        (None, bound),
+        ([*every, ROWS - 1], bound),  # one is cloned
+        ([*every, ROWS - 2], own),  # one is relocated
+        (None, own),
+        (every[:-1], bound),  # two are pruned
     ):
         if rows is not None:
             edit(params, optimizers, rows)
@@ -171,8 +171,39 @@ def test_no_axis_counts_as_longer_than_six_medians_once_an_edit_changes_the_numb
         assert torch.allclose(moved[:4], expected, rtol=1e-5, atol=1e-5)  # of positions up to 30
 
 
-@pytest.mark.parametrize("edits", ["before", "between", "relocated", "none"])
-def test_a_resumed_training_has_the_bound_that_it_had(edits: str) -> None:
+@pytest.mark.parametrize("at", [150, 200, 201])
+def test_the_longest_axis_is_found_each_hundred_iterations_in_a_resumed_training_too(
+    at: int,
+) -> None:
+    """What was found is saved: the resumed steps are the same, though the scales have changed."""
+    params, grads = parameters(ROWS, *NAMES), [draw(i, ROWS, 3) for i in range(210)]
+    params["scales"].data[0] += 9.0
+
+    def step(each: dict[str, Any], optimizers: dict[str, Any], i: int) -> Tensor:
+        # Density control before the step leaves a new Parameter, without a gradient.
+        each["means"].grad = None if i == 200 else grads[i].clone()
+        optimizers["means"].step()
+        each["scales"].data += 0.02  # a fifth more in ten iterations
+        return each["means"].detach().clone()
+
+    ours = PhaseScheduler(TOTAL, parts=[OwnFrame()]).upgrade(adams_of(params))
+    for i in range(at):
+        step(params, ours, i)
+    theirs = {name: Parameter(each.detach().clone()) for name, each in params.items()}
+    resumed = PhaseScheduler(TOTAL, parts=[OwnFrame()]).upgrade(adams_of(theirs))
+    for name, optimizer in resumed.items():
+        optimizer.load_state_dict(copy.deepcopy(ours[name].state_dict()))
+    before = params["means"].detach().clone()
+    for i in range(at, 210):
+        assert torch.equal(step(params, ours, i), step(theirs, resumed, i))
+    assert not torch.equal(before, params["means"])
+
+
+@pytest.mark.parametrize(
+    "edits",  # by iteration, the number of Gaussians after it
+    [{10: ROWS}, {10: ROWS - 1}, {20: ROWS}, {20: ROWS - 1}, {10: ROWS, 20: ROWS - 1}],
+)
+def test_a_resumed_training_has_the_bound_that_it_had(edits: dict[int, int]) -> None:
     """Also where the edit came after the last step before the checkpoint."""
     params, grads = parameters(ROWS, *NAMES), [draw(i, ROWS, 3) for i in range(30)]
     params["scales"].data[0] += 9.0
@@ -184,18 +215,17 @@ def test_a_resumed_training_has_the_bound_that_it_had(edits: str) -> None:
         return each["means"].detach().clone()
 
     ours = PhaseScheduler(TOTAL, parts=[OwnFrame()]).upgrade(adams_of(params))
-    for i in range(20):
-        if i == 10 and edits in ("before", "relocated"):
-            edit(params, ours, list(range(ROWS - 1)))
-        step(params, ours, i)
-    if edits in ("between", "relocated"):
-        edit(params, ours, list(range(ROWS - 1)))
+    for i in range(21):
+        if i in edits:
+            edit(params, ours, list(range(edits[i])))
+        if i < 20:
+            step(params, ours, i)
     theirs = {name: Parameter(each.detach().clone()) for name, each in params.items()}
     resumed = PhaseScheduler(TOTAL, parts=[OwnFrame()]).upgrade(adams_of(theirs))
     for name, optimizer in resumed.items():
         optimizer.load_state_dict(copy.deepcopy(ours[name].state_dict()))
-    note = resumed["means"].training.notes_of(OwnFrame()).get("longest")
-    assert (note is None) == (edits in ("relocated", "none"))
+    bound = resumed["means"].training.notes_of(OwnFrame()).get("longest")
+    assert (bound is None) == (len(params["means"]) == ROWS)
     for i in range(20, 30):
         assert torch.equal(step(params, ours, i), step(theirs, resumed, i))
 

@@ -7,7 +7,7 @@ import math
 import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -20,7 +20,8 @@ from opt3dgs_optim.training import Training
 CALL = "OwnFrame"
 BETA1 = 0.9  # of one view an iteration
 SLOWED_OVER, POWER = 1_000, 0.75  # iterations; where no end is planned: see `OwnFrame`
-MEDIANS = 6  # of the longest axes: see `OwnFrame`
+MEDIANS, EVERY = 6, 100  # of the longest axes, found every so many iterations: see `OwnFrame`
+LIFTED = -1  # in the place of the hundred of iterations that a bound was found in
 
 
 @dataclass(frozen=True, repr=False)
@@ -51,9 +52,10 @@ class OwnFrame(Part):
     is 3,000 / total_steps, but between 0.1 (from 30,000 iterations on) and 0.25 (up to 12,000).
 
     The largest Gaussians would be stepped farthest, and with density control that clones and splits
-    they fill the space in front of the cameras. So there an axis counts as no longer than 6 times
-    the median of the Gaussians' longest axes. The bound is found when an edit changes the number of
-    Gaussians; an edit that leaves it, as relocation's, lifts it.
+    they fill the space in front of the cameras. So an axis counts as no longer than 6 times the
+    median of the Gaussians' longest axes, which is found every 100 iterations. Relocation does not
+    need this bound, and it slows far Gaussians down. So an edit that leaves the number of Gaussians
+    lifts it, until one changes their number.
 
     For b views in a batch, or b ranks, gsplat sets beta1 = 1 - 0.1 b and scales rates by sqrt(b).
     The rate here follows beta1: below beta1 = 0.9 it is scaled by sqrt((1 - beta1) / 0.1).
@@ -147,25 +149,41 @@ class OwnFrame(Part):
         least = self.min_aspect
         if least is None:
             least = min_aspect_of(training.end_step or step.iteration)
-        kept: _Bound | None = training.unsaved.get((OwnFrame, step.set))
-        if kept is None or kept.means() is not step.param:
-            kept = self.keep_bound(step.set, step.param, scales, training)
+        now, kept = step.iteration // EVERY, training.unsaved.get((OwnFrame, step.set))
+        if kept is None or kept.means() is not step.param or kept.found_in not in (now, LIFTED):
+            kept = self.keep_bound(step.set, step.param, scales, now, training)
         scales = scales if scales.shape[1] == 3 else three_of(scales)
         step.frame = Frame(rate, least, quats, scales, kept.longest)
 
-    def keep_bound(self, of_set: str, means: Tensor, scales: Tensor, training: Training) -> _Bound:
-        """Keep what a longer axis counts as, until the next edit of the rows."""
-        last: _Bound | None = training.unsaved.get((OwnFrame, of_set))
-        if last is None:  # in the first step, or in that of a resumed training
-            noted = training.notes_of(self).get(_note(of_set), math.inf)
-            longest = scales.new_full((), noted)
-        elif last.rows != len(means) and len(means):
-            longest = median_of(scales.detach().amax(1)).exp() * MEDIANS
+    def keep_bound(
+        self, of_set: str, means: Tensor, scales: Tensor, now: int, training: Training
+    ) -> _Bound:
+        """Keep what a longer axis counts as, of these 100 iterations or until the next edit."""
+        last = self.bound(of_set, means, training)
+        if last is None:
+            lifted = False
+        elif last.means() is means:
+            lifted = last.found_in == LIFTED
         else:
+            lifted = last.rows == len(means)
+        if lifted or not len(means):
             longest = scales.new_full((), math.inf)
-        kept = _Bound(weakref.ref(means), len(means), longest)
+        elif last is not None and last.found_in == now:
+            longest = last.longest
+        else:
+            longest = median_of(scales.detach().amax(1)).exp() * MEDIANS
+        kept = _Bound(weakref.ref(means), len(means), LIFTED if lifted else now, longest)
         training.unsaved[OwnFrame, of_set] = kept
         return kept
+
+    def bound(self, of_set: str, means: Tensor, training: Training) -> _Bound | None:
+        """What is kept, in a resumed training what is noted; None: nothing yet."""
+        place, notes = (OwnFrame, of_set), training.notes_of(self)
+        found_in = notes.get(_note(of_set, "found in"))
+        if place not in training.unsaved and found_in is not None:
+            longest = means.new_full((), notes.get(_note(of_set, "longest"), math.inf))
+            training.unsaved[place] = _Bound(weakref.ref(means), len(means), found_in, longest)
+        return cast("_Bound | None", training.unsaved.get(place))
 
     def read_back(self, training: Training) -> None:
         """Have the bounds in the notes, and know the rows that they are of."""
@@ -174,12 +192,15 @@ class OwnFrame(Part):
             means, scales = (training.param_of(of_set, name) for name in ("means", "scales"))
             if means is None or scales is None:
                 continue
-            kept: _Bound | None = training.unsaved.get((OwnFrame, of_set))
-            if kept is None or kept.means() is not means:
-                kept = self.keep_bound(of_set, means, scales, training)
-            notes.pop(_note(of_set), None)
+            if (kept := self.bound(of_set, means, training)) is None:
+                continue
+            if kept.means() is not means:
+                now = training.iteration // EVERY
+                kept = self.keep_bound(of_set, means, scales, now, training)
+            notes[_note(of_set, "found in")] = kept.found_in
+            notes.pop(_note(of_set, "longest"), None)
             if math.isfinite(longest := kept.longest.item()):
-                notes[_note(of_set)] = longest
+                notes[_note(of_set, "longest")] = longest
 
     def numbers(self, training: Training) -> Mapping[str, float]:
         """`own_frame_rate`: standard deviations of a full step."""
@@ -187,22 +208,24 @@ class OwnFrame(Part):
 
 
 class _Bound(NamedTuple):
-    """What is kept of a set of Gaussians between two edits of them.
+    """What is kept of a set of Gaussians from step to step.
 
     Attributes:
-        means: the Parameter that the trainer has, a weak reference.
+        means: the Parameter that the trainer had in the last step, a weak reference.
         rows: their number N.
-        longest: [] the standard deviation that a longer axis counts as; infinite: none does.
+        found_in: which hundred of iterations; `LIFTED`: there is no bound.
+        longest: [] the standard deviation that a longer axis counts as.
     """
 
     means: weakref.ref[Tensor]
     rows: int
+    found_in: int
     longest: Tensor
 
 
-def _note(of_set: str) -> str:
-    """The key of the note on a set of Gaussians."""
-    return f"longest {of_set}".rstrip()
+def _note(of_set: str, what: str) -> str:
+    """The key of a note on a set of Gaussians."""
+    return f"{what} {of_set}".rstrip()
 
 
 def median_of(numbers: Tensor) -> Tensor:
