@@ -102,17 +102,17 @@ def default_step(
         # a position has no gradient it stays, and so do its moments.
         if in_own_frame:
             # Thin axes count as a share of the longest, a larger one in short trainings; none as
-            # longer than 6 medians of the longest axes, found every 100 iterations, unless the
-            # last edit has left the number of points as it was.
+            # longer than 6 medians of the longest axes, found every 100 iterations, unless two
+            # edits in a row have left the number of points as it was.
             least, now = min(max(3_000 / total, 0.1), 0.25), iteration // 100
-            known, lifted, found_in, most = state.get("bound", (param, False, None, None))
+            known, steady, found_in, most = state.get("bound", (param, 0, None, None))
             if known is not param:
-                lifted = len(known) == num_points
-            if lifted:
+                steady = steady + 1 if len(known) == num_points else 0
+            if steady > 1:
                 found_in, most = None, torch.tensor(torch.inf)
             elif found_in != now:
                 found_in, most = now, params["scales"].amax(1).nanmedian().exp() * 6
-            state["bound"] = param, lifted, found_in, most
+            state["bound"] = param, steady, found_in, most
             frame = own_axes(params["quats"], params["scales"], least, most)
             z, seen = torch.zeros_like(param), (grad != 0).any(1, keepdim=True)
             rate = 0.1 * 0.03**progress if rate else 0.0

@@ -150,7 +150,7 @@ def moved_by_a_step(params: dict[str, Any], optimizers: dict[str, Any]) -> Tenso
 
 
 def test_no_axis_counts_as_longer_than_six_medians_unless_rows_are_relocated() -> None:
-    """An edit that leaves their number lifts it, until one changes it. A NaN does not count."""
+    """Two edits that leave their number lift it, until one changes it. A NaN does not count."""
     params = parameters(ROWS, *NAMES)
     params["quats"].data = torch.eye(4)[:1].repeat(ROWS, 1)
     params["scales"].data.fill_(-3.0)
@@ -160,6 +160,8 @@ def test_no_axis_counts_as_longer_than_six_medians_unless_rows_are_relocated() -
     for rows, longest in (
         (None, bound),
         ([*every, ROWS - 1], bound),  # one is cloned
+        ([*every, ROWS - 2], bound),  # as many are cloned as pruned, or one is relocated
+        (None, bound),
         ([*every, ROWS - 2], own),  # one is relocated
         (None, own),
         (every[:-1], bound),  # two are pruned
@@ -200,10 +202,17 @@ def test_the_longest_axis_is_found_each_hundred_iterations_in_a_resumed_training
 
 
 @pytest.mark.parametrize(
-    "edits",  # by iteration, the number of Gaussians after it
-    [{10: ROWS}, {10: ROWS - 1}, {20: ROWS}, {20: ROWS - 1}, {10: ROWS, 20: ROWS - 1}],
+    ("edits", "bounded"),  # by iteration, the number of Gaussians after it
+    [
+        ({10: ROWS}, True),
+        ({10: ROWS - 1}, True),
+        ({20: ROWS - 1}, True),
+        ({9: ROWS, 10: ROWS}, False),
+        ({10: ROWS, 20: ROWS}, False),
+        ({9: ROWS, 10: ROWS, 20: ROWS - 1}, True),
+    ],
 )
-def test_a_resumed_training_has_the_bound_that_it_had(edits: dict[int, int]) -> None:
+def test_a_resumed_training_has_the_bound_that_it_had(edits: dict[int, int], bounded: bool) -> None:
     """Also where the edit came after the last step before the checkpoint."""
     params, grads = parameters(ROWS, *NAMES), [draw(i, ROWS, 3) for i in range(30)]
     params["scales"].data[0] += 9.0
@@ -224,8 +233,7 @@ def test_a_resumed_training_has_the_bound_that_it_had(edits: dict[int, int]) -> 
     resumed = PhaseScheduler(TOTAL, parts=[OwnFrame()]).upgrade(adams_of(theirs))
     for name, optimizer in resumed.items():
         optimizer.load_state_dict(copy.deepcopy(ours[name].state_dict()))
-    bound = resumed["means"].training.notes_of(OwnFrame()).get("longest")
-    assert (bound is None) == (len(params["means"]) == ROWS)
+    assert bool(resumed["means"].training.notes_of(OwnFrame())["longest"]) == bounded
     for i in range(20, 30):
         assert torch.equal(step(params, ours, i), step(theirs, resumed, i))
 

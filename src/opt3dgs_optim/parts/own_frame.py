@@ -21,7 +21,7 @@ CALL = "OwnFrame"
 BETA1 = 0.9  # of one view an iteration
 SLOWED_OVER, POWER = 1_000, 0.75  # iterations; where no end is planned: see `OwnFrame`
 MEDIANS, EVERY = 6, 100  # of the longest axes, found every so many iterations: see `OwnFrame`
-LIFTED = -1  # in the place of the hundred of iterations that a bound was found in
+STEADY = 2  # edits in a row that leave the number of Gaussians are relocation's
 
 
 @dataclass(frozen=True, repr=False)
@@ -54,8 +54,8 @@ class OwnFrame(Part):
     The largest Gaussians would be stepped farthest, and with density control that clones and splits
     they fill the space in front of the cameras. So an axis counts as no longer than 6 times the
     median of the Gaussians' longest axes, which is found every 100 iterations. Relocation does not
-    need this bound, and it slows far Gaussians down. So an edit that leaves the number of Gaussians
-    lifts it, until one changes their number.
+    need this bound, which slows far Gaussians down. So two edits in a row that leave the number of
+    Gaussians lift it, until one changes their number.
 
     For b views in a batch, or b ranks, gsplat sets beta1 = 1 - 0.1 b and scales rates by sqrt(b).
     The rate here follows beta1: below beta1 = 0.9 it is scaled by sqrt((1 - beta1) / 0.1).
@@ -150,7 +150,10 @@ class OwnFrame(Part):
         if least is None:
             least = min_aspect_of(training.end_step or step.iteration)
         now, kept = step.iteration // EVERY, training.unsaved.get((OwnFrame, step.set))
-        if kept is None or kept.means() is not step.param or kept.found_in not in (now, LIFTED):
+        if (
+            kept is None or kept.means() is not step.param
+            or (kept.found_in != now and kept.steady < STEADY)
+        ):  # fmt: skip
             kept = self.keep_bound(step.set, step.param, scales, now, training)
         scales = scales if scales.shape[1] == 3 else three_of(scales)
         step.frame = Frame(rate, least, quats, scales, kept.longest)
@@ -159,35 +162,33 @@ class OwnFrame(Part):
         self, of_set: str, means: Tensor, scales: Tensor, now: int, training: Training
     ) -> _Bound:
         """Keep what a longer axis counts as, of these 100 iterations or until the next edit."""
-        last = self.bound(of_set, means, training)
-        if last is None:
-            lifted = False
-        elif last.means() is means:
-            lifted = last.found_in == LIFTED
-        else:
-            lifted = last.rows == len(means)
-        if lifted or not len(means):
+        last, steady = self.bound(of_set, means, training), 0
+        if last is not None:
+            steady = last.steady
+            if last.means() is not means:
+                steady = steady + 1 if last.rows == len(means) else 0
+        if steady >= STEADY or not len(means):
             longest = scales.new_full((), math.inf)
-        elif last is not None and last.found_in == now:
+        elif last is not None and last.found_in == now and last.steady < STEADY:
             longest = last.longest
         else:
             longest = median_of(scales.detach().amax(1)).exp() * MEDIANS
-        kept = _Bound(weakref.ref(means), len(means), LIFTED if lifted else now, longest)
+        kept = _Bound(weakref.ref(means), len(means), steady, now, longest)
         training.unsaved[OwnFrame, of_set] = kept
         return kept
 
     def bound(self, of_set: str, means: Tensor, training: Training) -> _Bound | None:
         """What is kept, in a resumed training what is noted; None: nothing yet."""
         place, notes = (OwnFrame, of_set), training.notes_of(self)
-        found_in = notes.get(_note(of_set, "found in"))
-        if place not in training.unsaved and found_in is not None:
-            longest = means.new_full((), notes.get(_note(of_set, "longest"), math.inf))
-            training.unsaved[place] = _Bound(weakref.ref(means), len(means), found_in, longest)
+        steady, found_in, longest = (notes.get(note) for note in _notes(of_set))
+        if place not in training.unsaved and steady is not None:
+            longest = means.new_full((), longest or math.inf)
+            kept = _Bound(weakref.ref(means), len(means), steady, found_in, longest)
+            training.unsaved[place] = kept
         return cast("_Bound | None", training.unsaved.get(place))
 
     def read_back(self, training: Training) -> None:
         """Have the bounds in the notes, and know the rows that they are of."""
-        notes = training.notes_of(self)
         for of_set in [of_set for of_set, name in training.members if name == "means"]:
             means, scales = (training.param_of(of_set, name) for name in ("means", "scales"))
             if means is None or scales is None:
@@ -197,10 +198,9 @@ class OwnFrame(Part):
             if kept.means() is not means:
                 now = training.iteration // EVERY
                 kept = self.keep_bound(of_set, means, scales, now, training)
-            notes[_note(of_set, "found in")] = kept.found_in
-            notes.pop(_note(of_set, "longest"), None)
-            if math.isfinite(longest := kept.longest.item()):
-                notes[_note(of_set, "longest")] = longest
+            number = kept.longest.item()
+            found = kept.steady, kept.found_in, number if math.isfinite(number) else 0.0
+            training.notes_of(self).update(zip(_notes(of_set), found, strict=True))
 
     def numbers(self, training: Training) -> Mapping[str, float]:
         """`own_frame_rate`: standard deviations of a full step."""
@@ -213,19 +213,21 @@ class _Bound(NamedTuple):
     Attributes:
         means: the Parameter that the trainer had in the last step, a weak reference.
         rows: their number N.
-        found_in: which hundred of iterations; `LIFTED`: there is no bound.
-        longest: [] the standard deviation that a longer axis counts as.
+        steady: how many edits in a row have left their number.
+        found_in: the hundred of iterations.
+        longest: [] the standard deviation that a longer axis counts as; infinite: none does.
     """
 
     means: weakref.ref[Tensor]
     rows: int
+    steady: int
     found_in: int
     longest: Tensor
 
 
-def _note(of_set: str, what: str) -> str:
-    """The key of a note on a set of Gaussians."""
-    return f"{what} {of_set}".rstrip()
+def _notes(of_set: str) -> tuple[str, ...]:
+    """The keys of the notes on a set of Gaussians; the third is 0 where no axis is bounded."""
+    return tuple(f"{what} {of_set}".rstrip() for what in ("steady", "found in", "longest"))
 
 
 def median_of(numbers: Tensor) -> Tensor:
