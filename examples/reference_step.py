@@ -103,11 +103,11 @@ def default_step(
         if in_own_frame:
             # Thin axes count as a share of the longest, a larger one in short trainings; none as
             # longer than 6 medians of the longest axes, found every 100 iterations, unless two
-            # edits in a row have left the number of points as it was.
+            # edits in a row have left the points where they are in memory.
             least, now = min(max(3_000 / total, 0.1), 0.25), iteration // 100
             known, steady, found_in, most = state.get("bound", (param, 0, None, None))
             if known is not param:
-                steady = steady + 1 if len(known) == num_points else 0
+                steady = steady + 1 if known.data_ptr() == param.data_ptr() else 0
             if steady > 1:
                 found_in, most = None, torch.tensor(torch.inf)
             elif found_in != now:

@@ -162,7 +162,7 @@ class WholeLife(RuleBasedStateMachine):
         edits = {
             "added": [row_edits.added(few)],
             "removed": [row_edits.removed(few)] if count > len(few) else [],
-            "both": [row_edits.added(few), row_edits.removed(few)],
+            "both": [row_edits.added(few), row_edits.removed(few[1:])],
             "relocated": [row_edits.relocated(few, order.flip(0)[: len(few)])],
             "forgotten": [row_edits.forgotten()],
         }[kind]

@@ -43,9 +43,8 @@ def relocated(dead: Tensor, alive: Tensor) -> Edit:
     """Dead rows become copies of others, whose state is zeroed in place, as 3DGS-MCMC does it."""
 
     def moved(param: Tensor) -> Tensor:
-        result = param.clone()
-        result[dead] = param[alive]
-        return result
+        param[dead] = param[alive]
+        return param[:]
 
     def zeroed(tensor: Tensor) -> Tensor:
         tensor[alive] = 0

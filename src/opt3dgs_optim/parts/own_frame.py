@@ -7,7 +7,7 @@ import math
 import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ CALL = "OwnFrame"
 BETA1 = 0.9  # of one view an iteration
 SLOWED_OVER, POWER = 1_000, 0.75  # iterations; where no end is planned: see `OwnFrame`
 MEDIANS, EVERY = 6, 100  # of the longest axes, found every so many iterations: see `OwnFrame`
-STEADY = 2  # edits in a row that leave the number of Gaussians are relocation's
+STEADY = 2  # edits in a row that leave the rows in their place are relocation's
 
 
 @dataclass(frozen=True, repr=False)
@@ -54,8 +54,9 @@ class OwnFrame(Part):
     The largest Gaussians would be stepped farthest, and with density control that clones and splits
     they fill the space in front of the cameras. So an axis counts as no longer than 6 times the
     median of the Gaussians' longest axes, which is found every 100 iterations. Relocation does not
-    need this bound, which slows far Gaussians down. So two edits in a row that leave the number of
-    Gaussians lift it, until one changes their number.
+    need this bound, which slows far Gaussians down. It makes a new Parameter of the same memory,
+    and clone, split and prune make one of other memory. So two edits in a row of the first kind
+    lift the bound, until one of the second.
 
     For b views in a batch, or b ranks, gsplat sets beta1 = 1 - 0.1 b and scales rates by sqrt(b).
     The rate here follows beta1: below beta1 = 0.9 it is scaled by sqrt((1 - beta1) / 0.1).
@@ -162,45 +163,44 @@ class OwnFrame(Part):
         self, of_set: str, means: Tensor, scales: Tensor, now: int, training: Training
     ) -> _Bound:
         """Keep what a longer axis counts as, of these 100 iterations or until the next edit."""
-        last, steady = self.bound(of_set, means, training), 0
-        if last is not None:
-            steady = last.steady
-            if last.means() is not means:
-                steady = steady + 1 if last.rows == len(means) else 0
-        if steady >= STEADY or not len(means):
+        kept = self.bound(of_set, means, training)
+        if kept is None or (kept.found_in != now and kept.steady < STEADY):
             longest = scales.new_full((), math.inf)
-        elif last is not None and last.found_in == now and last.steady < STEADY:
-            longest = last.longest
-        else:
-            longest = median_of(scales.detach().amax(1)).exp() * MEDIANS
-        kept = _Bound(weakref.ref(means), len(means), steady, now, longest)
+            if len(means):
+                longest = median_of(scales.detach().amax(1)).exp() * MEDIANS
+            kept = _Bound(
+                weakref.ref(means), rows_of(means), kept.steady if kept else 0, now, longest
+            )
         training.unsaved[OwnFrame, of_set] = kept
         return kept
 
     def bound(self, of_set: str, means: Tensor, training: Training) -> _Bound | None:
-        """What is kept, in a resumed training what is noted; None: nothing yet."""
-        place, notes = (OwnFrame, of_set), training.notes_of(self)
-        steady, found_in, longest = (notes.get(note) for note in _notes(of_set))
-        if place not in training.unsaved and steady is not None:
+        """What holds for these rows: as kept or, after a load, as noted; None: it is not known."""
+        kept: _Bound | None = training.unsaved.get((OwnFrame, of_set))
+        rows = rows_of(means)
+        if kept is None:
+            steady, found_in, longest = map(training.notes_of(self).get, _notes(of_set))
+            if steady is None:
+                return None
             longest = means.new_full((), longest or math.inf)
-            kept = _Bound(weakref.ref(means), len(means), steady, found_in, longest)
-            training.unsaved[place] = kept
-        return cast("_Bound | None", training.unsaved.get(place))
+        elif kept.means() is means:
+            return kept
+        else:
+            steady = kept.steady + 1 if kept.rows == rows else 0
+            found_in = kept.found_in if kept.steady < STEADY else -1  # it is to be found
+            longest = kept.longest if steady < STEADY else means.new_full((), math.inf)
+        return _Bound(weakref.ref(means), rows, steady, found_in, longest)
 
     def read_back(self, training: Training) -> None:
-        """Have the bounds in the notes, and know the rows that they are of."""
+        """Have the bounds in the notes; after a load, know the rows that they are of."""
         for of_set in [of_set for of_set, name in training.members if name == "means"]:
-            means, scales = (training.param_of(of_set, name) for name in ("means", "scales"))
-            if means is None or scales is None:
-                continue
-            if (kept := self.bound(of_set, means, training)) is None:
-                continue
-            if kept.means() is not means:
-                now = training.iteration // EVERY
-                kept = self.keep_bound(of_set, means, scales, now, training)
-            number = kept.longest.item()
-            found = kept.steady, kept.found_in, number if math.isfinite(number) else 0.0
-            training.notes_of(self).update(zip(_notes(of_set), found, strict=True))
+            means = training.param_of(of_set, "means")
+            kept = None if means is None else self.bound(of_set, means, training)
+            if kept is not None:
+                training.unsaved.setdefault((OwnFrame, of_set), kept)
+                number = kept.longest.item()
+                found = kept.steady, kept.found_in, number if math.isfinite(number) else 0.0
+                training.notes_of(self).update(zip(_notes(of_set), found, strict=True))
 
     def numbers(self, training: Training) -> Mapping[str, float]:
         """`own_frame_rate`: standard deviations of a full step."""
@@ -212,17 +212,22 @@ class _Bound(NamedTuple):
 
     Attributes:
         means: the Parameter that the trainer had in the last step, a weak reference.
-        rows: their number N.
-        steady: how many edits in a row have left their number.
-        found_in: the hundred of iterations.
+        rows: how many, and where they lie, see `rows_of`.
+        steady: how many edits in a row have left that.
+        found_in: the hundred of iterations; -1: it is to be found.
         longest: [] the standard deviation that a longer axis counts as; infinite: none does.
     """
 
     means: weakref.ref[Tensor]
-    rows: int
+    rows: tuple[int, int]
     steady: int
     found_in: int
     longest: Tensor
+
+
+def rows_of(means: Tensor) -> tuple[int, int]:
+    """How many rows there are, and their address: relocation makes a Parameter of the same."""
+    return len(means), means.data_ptr()
 
 
 def _notes(of_set: str) -> tuple[str, ...]:
