@@ -12,7 +12,8 @@ import torch
 from gaussians import RATES, same_tensors
 from gsplat_host import ORDERS, POINTS, TOTAL, VERSIONS, Trainer
 
-from opt3dgs_optim import PhaseScheduler
+from opt3dgs_optim import OwnFrame, PhaseScheduler
+from opt3dgs_optim.parts.own_frame import STEADY
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "hosts" / "gsplat.md"
 KINDS = ("mcmc", "default")
@@ -67,6 +68,26 @@ def test_a_training_ends_at_the_mean(version: str, kind: str, order: str) -> Non
     assert all(bool(torch.isfinite(p).all()) for p in trainer.splats.values())
     assert phases.end_line() is None
     assert at_the_mean(trainer, phases)
+
+
+@each_kind
+@each_version
+def test_relocation_lifts_the_bound_on_long_axes_and_clone_and_split_does_not(
+    version: str, kind: str
+) -> None:
+    trainer = Trainer(version, kind)
+    phases = trainer.upgrade()
+    if trainer.is_mcmc:
+        trainer.strategy.cap_max = POINTS
+    edited, lifted = 0, False
+    for step in range(TOTAL // 2):
+        before = trainer.splats["means"]
+        trainer.splats["opacities"].data[::6] = -9.0
+        trainer.run(step, step + 1)
+        lifted = lifted or phases.unsaved[OwnFrame, ""].steady >= STEADY
+        edited += trainer.splats["means"] is not before
+    assert edited >= 4
+    assert lifted == trainer.is_mcmc
 
 
 def test_finish_ends_early_at_the_mean() -> None:
