@@ -44,6 +44,7 @@ NAMES = {
 }
 PHOTOS = (
     ("bonsai", "220 of 800x532", WHOLE),
+    ("lego", "87 of 800x800", WHOLE),
     ("bonsai", "220 of 400x266", HALF),
     ("lego", "87 of 400x400", HALF),
     ("plush", "84 of 320x240", HALF),
@@ -169,7 +170,7 @@ def less_stock(scenes: Iterable[str], runs: Sequence[Run], **those: Any) -> str:
 
 def whole() -> str:
     """A third and a half of stock's iterations against all of them, at whole size."""
-    return less_stock(["bonsai"], [THIRD, ("defaults", 15_000)], **WHOLE)
+    return less_stock(["bonsai", "lego"], [THIRD, ("defaults", 15_000)], **WHOLE)
 
 
 def outdoors() -> str:
