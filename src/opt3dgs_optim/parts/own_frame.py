@@ -179,9 +179,10 @@ class OwnFrame(Part):
         kept: _Bound | None = training.unsaved.get((OwnFrame, of_set))
         rows = rows_of(means)
         if kept is None:
-            steady, found_in, longest = map(training.notes_of(self).get, _notes(of_set))
-            if steady is None:
+            notes = training.notes_of(self)
+            if not set(_notes(of_set)) <= set(notes):
                 return None
+            steady, found_in, longest = (notes[note] for note in _notes(of_set))
             longest = means.new_full((), longest or math.inf)
         elif kept.means() is means:
             return kept
