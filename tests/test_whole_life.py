@@ -62,7 +62,7 @@ class WholeLife(RuleBasedStateMachine):
         self.options = {stock: True} if stock else {}
         self.params: dict[str, Any] = parameters(num_points, *NAMES)
         self.theirs = {name: make_gaussians(num_points)[name] for name in NAMES}
-        self.params["scales"].data[0] += 4.0  # longer than the bound, once rows are edited
+        self.params["scales"].data[0] += 4.0  # longer than the bound
         self.theirs["scales"][0] += 4.0
         self.state: dict[str, Any] = {}
         self.iteration, self.finished, self.rates = 0, False, dict(RATES)

@@ -136,10 +136,8 @@ def moved_by_a_step(params: dict[str, Any], optimizers: dict[str, Any]) -> Tenso
     """The displacement of each Gaussian by its own first step, in x."""
     for optimizer in optimizers.values():
         optimizer.state.clear()
-    params["means"].grad, before = (
-        torch.ones_like(params["means"]),
-        params["means"].detach().clone(),
-    )
+    before = params["means"].detach().clone()
+    params["means"].grad = torch.ones_like(before)
     optimizers["means"].step()
     return (params["means"].detach() - before)[:, 0]
 
