@@ -118,10 +118,9 @@ def name(run: Run) -> str:
     return f"{NAMES[run[0]]}, {run[1]:,}"
 
 
-def table(heads: Sequence[str], rows: Iterable[Sequence[str]], *, one_seed: bool = False) -> str:
-    """Markdown; `one_seed`: the page says that all have one."""
-    made = "\n".join(f"| {' | '.join(row)} |" for row in (heads, ["---"] * len(heads), *rows))
-    return made.replace(" (1 seed)", "") if one_seed else made
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Markdown."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in (heads, ["---"] * len(heads), *rows))
 
 
 def read(path: Path) -> dict[str, Any]:
