@@ -93,7 +93,7 @@ def default_step(
 
         # Harmonics: in short trainings the higher ones make longer steps.
         if name in parts.get("harmonics", ()):
-            rate *= min(max(30_000 / total, 1.0), 4.0)
+            rate *= max(1.0, min(30_000 / total, total / 3_000))
 
         # OutOfView: where views see less than a third of the points, regularisers make no full
         # steps of a point out of view, but about 3 share of one: its second moment is kept large.

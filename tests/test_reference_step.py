@@ -30,7 +30,6 @@ from opt3dgs_optim import (
     EnergyHistogram,
     Fading,
     FreshMoments,
-    Harmonics,
     OutOfView,
     OwnFrame,
     Part,
@@ -189,7 +188,6 @@ def test_more_points_than_a_cpu_takes_at_a_time() -> None:
 ALONE: list[tuple[Part, dict]] = [
     (OwnFrame(), {"own_frame": ("means",)}),
     (Fading(names=("means", "sh0")), {"fading": ("means", "sh0")}),
-    (Harmonics(), {"harmonics": ("shN",)}),
     (OutOfView(), {"out_of_view": ("scales", "opacities")}),
     (Averaging(), {"averaging": tuple(SHAPES)}),
 ]

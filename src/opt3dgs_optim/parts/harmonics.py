@@ -8,8 +8,7 @@ from opt3dgs_optim.part import Part
 from opt3dgs_optim.step import Step
 from opt3dgs_optim.training import Training
 
-PUBLISHED = 30_000  # iterations, for which 3DGS's rates are
-MOST = 4.0
+SHORTEST, PUBLISHED = 3_000, 30_000  # iterations
 
 
 @dataclass(frozen=True, repr=False)
@@ -17,9 +16,11 @@ class Harmonics(Part):
     """Lengthen the steps of the spherical harmonics of degree 1 and more in short trainings.
 
     3DGS trainers step them at a twentieth of the rate of degree 0, and for 30,000 iterations. After
-    fewer they have not grown to their size. So the rate is scaled by 30,000 / total_steps, by no
-    less than 1 and no more than 4; where no end is planned, by 30,000 / iteration. Colours of
-    degree 0, and trainings of 30,000 iterations or more, are unchanged.
+    fewer they have not grown to their size. So in T iterations the rate is scaled by 30,000 / T:
+    by 3 in 10,000. Trainings of few photos are shorter still, and longer steps make their colours
+    fit those photos alone. So the rate is scaled by no more than T / 3,000, and up to 3,000
+    iterations and from 30,000 on it is the trainer's. Where no end is planned, T is the present
+    iteration. Colours of degree 0 are unchanged.
     """
 
     names = ("shN",)
@@ -27,4 +28,4 @@ class Harmonics(Part):
     def plan(self, step: Step, training: Training) -> None:
         """Scale the rate."""
         length = training.end_step or step.iteration or 1
-        step.factor *= min(max(PUBLISHED / length, 1.0), MOST)
+        step.factor *= max(1.0, min(PUBLISHED / length, length / SHORTEST))
