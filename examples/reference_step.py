@@ -29,7 +29,6 @@ COLORS = ("sh0", "shN")
 DEFAULTS = {
     "own_frame": ("means",),
     "fading": ("scales", "quats", "opacities", *COLORS),
-    "harmonics": ("shN",),
     "out_of_view": ("scales", "opacities"),
     "averaging": ("means", "scales", "quats", "opacities", *COLORS),
 }
@@ -66,7 +65,7 @@ def default_step(
     total: int,
     parts: dict = DEFAULTS,
 ) -> None:
-    """OwnFrame, Fading, Harmonics, OutOfView and Averaging around Adam, as `parts` has them.
+    """OwnFrame, Fading, OutOfView and Averaging around Adam, as far as `parts` has them.
 
     parts: by part, the tensors that it acts on.
     """
@@ -90,10 +89,6 @@ def default_step(
             chosen = chosen_points(due[-1], num_points)
             own["exp_avg"][chosen] *= 0.2
             own["exp_avg_sq"][chosen] *= 0.04
-
-        # Harmonics: in short trainings the higher ones make longer steps.
-        if name in parts.get("harmonics", ()):
-            rate *= max(1.0, min(30_000 / total, total / 3_000))
 
         # OutOfView: where views see less than a third of the points, regularisers make no full
         # steps of a point out of view, but about 3 share of one: its second moment is kept large.

@@ -97,7 +97,7 @@ def test_phase_progress_and_what_is_shown() -> None:
     assert shown == [*first, (90, exploit, 0.9), (99, exploit, 0.99)]
     assert "iteration 99 of 100\n" in repr(phases)  # no part acts in one phase alone
     assert "iteration -1 of 100, exploration\n" in repr(PhaseScheduler.paper(100))
-    assert phases.part(Averaging) is DEFAULTS[-1]
+    assert phases.part(Averaging) is DEFAULTS[3]
     assert phases.numbers()["own_frame_rate"] == pytest.approx(0.1 * 0.03**0.99)
 
 

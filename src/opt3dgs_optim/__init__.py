@@ -5,8 +5,8 @@ this was written): the optimizers AWSGLD and LQNAdam, and the PhaseScheduler tha
 two phases into an existing trainer.
 
 What is on by default is this package's own, and not the paper's: positions are stepped in each
-Gaussian's own frame, Adam's moments of the others are faded, higher harmonics make longer steps,
-points out of view are held, and the training ends at the mean of its last iterates.
+Gaussian's own frame, Adam's moments of the others are faded, points out of view are held, and the
+training ends at the mean of its last iterates.
 """
 
 from opt3dgs_optim.adam import StepAdam
@@ -19,7 +19,6 @@ from opt3dgs_optim.part import Part
 from opt3dgs_optim.parts.averaging import Averaging
 from opt3dgs_optim.parts.curvature import Curvature
 from opt3dgs_optim.parts.fading import Fading
-from opt3dgs_optim.parts.harmonics import Harmonics
 from opt3dgs_optim.parts.histogram import EnergyHistogram
 from opt3dgs_optim.parts.noise import IsotropicNoise, PositionNoise
 from opt3dgs_optim.parts.out_of_view import OutOfView
@@ -39,7 +38,6 @@ __all__ = [
     "EnergyHistogram",
     "Fading",
     "FreshMoments",
-    "Harmonics",
     "IsotropicNoise",
     "LQNAdam",
     "OutOfView",

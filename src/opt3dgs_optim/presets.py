@@ -7,7 +7,6 @@ from opt3dgs_optim.part import Part
 from opt3dgs_optim.parts.averaging import Averaging
 from opt3dgs_optim.parts.curvature import Curvature
 from opt3dgs_optim.parts.fading import Fading
-from opt3dgs_optim.parts.harmonics import Harmonics
 from opt3dgs_optim.parts.histogram import EnergyHistogram
 from opt3dgs_optim.parts.out_of_view import OutOfView
 from opt3dgs_optim.parts.own_frame import OwnFrame
@@ -22,7 +21,6 @@ PAPER_WARMUP = 2_500 / PAPER_STEPS
 DEFAULTS: tuple[Part, ...] = (
     OwnFrame(),
     Fading(names=("scales", "quats", "opacities", "sh0", "shN")),
-    Harmonics(),
     OutOfView(),
     Averaging(),
 )
