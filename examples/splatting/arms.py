@@ -12,6 +12,7 @@ from typing import Literal
 from opt3dgs_optim import (
     DEFAULTS,
     Averaging,
+    Harmonics,
     Part,
     PhaseScheduler,
     paper_parts,
@@ -40,7 +41,6 @@ class Arm:
     what: str
     parts: Callable[[int], Sequence[Part]] | None = None  # of the iterations; None: torch's Adam
     rates: float = 1.0  # factor on all of the trainer's learning rates
-    harmonics: float = 1.0  # factor on that of the higher harmonics
     beta1: float = 0.9
     decays: bool = True  # the positions' rate, to a hundredth
     moments: Literal[32, 16] = 32  # bits of Adam's moments
@@ -64,8 +64,8 @@ _ARMS = (
     Arm(BASELINE, "the trainer as its authors publish it: the baseline"),
     Arm("defaults", "the package's defaults", of(*DEFAULTS)),
     Arm("defaults-16", "as defaults, Adam's moments in 16 bits", of(*DEFAULTS), moments=16),
-    Arm("harmonics-x3", "the defaults, higher harmonics' rate times 3", of(*DEFAULTS), harmonics=3),
-    Arm("stock-harmonics-x3", "the baseline, higher harmonics' rate times 3", harmonics=3),
+    Arm("harmonics", "the defaults and `Harmonics`", of(*DEFAULTS, Harmonics())),
+    Arm("stock-harmonics", "the baseline and `Harmonics`", of(Harmonics())),
     Arm(
         "open-end",
         "the defaults without a planned end, for `benchmarks/open_end.py`",

@@ -81,7 +81,6 @@ class Fit:
         self.gaussians = self._initial_gaussians()
         factor = options.rates * arm.rates
         self.rates = {k: lr * factor for k, lr in stock_learning_rates(scene.extent).items()}
-        self.rates["shN"] *= arm.harmonics
         self.optimizers = {
             name: torch.optim.Adam(
                 [{"params": param, "lr": self.rates[name], "name": name}],

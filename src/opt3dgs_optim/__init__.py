@@ -19,6 +19,7 @@ from opt3dgs_optim.part import Part
 from opt3dgs_optim.parts.averaging import Averaging
 from opt3dgs_optim.parts.curvature import Curvature
 from opt3dgs_optim.parts.fading import Fading
+from opt3dgs_optim.parts.harmonics import Harmonics
 from opt3dgs_optim.parts.histogram import EnergyHistogram
 from opt3dgs_optim.parts.noise import IsotropicNoise, PositionNoise
 from opt3dgs_optim.parts.out_of_view import OutOfView
@@ -38,6 +39,7 @@ __all__ = [
     "EnergyHistogram",
     "Fading",
     "FreshMoments",
+    "Harmonics",
     "IsotropicNoise",
     "LQNAdam",
     "OutOfView",
