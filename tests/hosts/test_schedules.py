@@ -98,6 +98,7 @@ if iteration % 334 == 0:
 """  # noqa: E501
         in printed
     )
+    assert "`parts=[*DEFAULTS, Harmonics()]`" in printed
 
 
 @pytest.mark.parametrize("name", STOCK)

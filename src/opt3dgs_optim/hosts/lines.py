@@ -13,11 +13,16 @@ from pathlib import Path
 
 from opt3dgs_optim.hosts.diff import ANY, edited
 from opt3dgs_optim.hosts.pages import OPEN_END, PAGES
-from opt3dgs_optim.hosts.schedules import schedule, shortened
+from opt3dgs_optim.hosts.schedules import STOCK, schedule, shortened
 from opt3dgs_optim.hosts.trainers import TRAINERS
 
 WIDTH = 100
 FEWER = "Fewer iterations"  # the topic of a note
+MANY = (
+    "Many photos: where Gaussians are relocated, and sixty photos or more are trained on, give the "
+    "scheduler `parts=[*{}, Harmonics()]`, and import DEFAULTS and Harmonics. Twenty or fewer lose "
+    "by it."
+)
 
 
 def text(name: str, iterations: int | None = None, open_end: bool = False) -> str:
@@ -51,6 +56,9 @@ def text(name: str, iterations: int | None = None, open_end: bool = False) -> st
     if (stock := schedule(trainer)) is None:
         known = ", ".join(each for each, one in TRAINERS.items() if schedule(one))
         raise ValueError(f"--iterations is for {known}; the schedule of {name} was not read")
+    if "PhaseScheduler(" in block and iterations < STOCK:
+        parts = "DEFAULTS[1:]" if "DEFAULTS[1:]" in block else "DEFAULTS"
+        notes += f"\n{textwrap.fill(MANY.format(parts), WIDTH, subsequent_indent='  ')}"
     return "\n\n".join([head, block, shortened(stock, iterations), notes])
 
 
