@@ -142,11 +142,13 @@ def readme() -> str:
 def test_the_readme_says_where_a_third_of_the_iterations_is_enough() -> None:
     whole = [(scene, report.WHOLE, report.MANY) for scene in ("bonsai", "lego")]
     half = [(scene, report.HALF, report.THIRD) for scene in (*report.MAIN, "train")]
-    for scene, those, run in whole + half:
+    for scene, those, run in (*whole, *half):
         stock, ours = report.third(scene, "relocation", those, run)
         assert report.gain(ours, stock)["psnr"] > 0, scene
     said = "10,000 reach stock's 30,000 on both scenes of photos 800 pixels wide (one seed, with"
-    assert f"With 3DGS-MCMC, {said} [`Harmonics`](#plan-a-shorter-training)), and on all" in readme()
+    assert (
+        f"With 3DGS-MCMC, {said} [`Harmonics`](#plan-a-shorter-training)), and on all" in readme()
+    )
     without = report.mean(report.of(report.THIRD, "bonsai", **report.WHOLE))
     assert f"with `Harmonics` (bonsai without: {without['psnr']:.2f})" in readme()
 
