@@ -18,10 +18,10 @@ from opt3dgs_optim.hosts.trainers import TRAINERS
 
 WIDTH = 100
 FEWER = "Fewer iterations"  # the topic of a note
-MANY = (
-    "Many photos: where Gaussians are relocated, and sixty photos or more are trained on, give the "
-    "scheduler `parts=[*{}, Harmonics()]`, and import DEFAULTS and Harmonics. Twenty or fewer lose "
-    "by it."
+MANY = (  # the same for every trainer that relocates
+    "Many photos: with relocation and sixty photos or more, the higher harmonics should make longer "
+    "steps: `PhaseScheduler({}, parts=[*DEFAULTS, Harmonics()])`; import DEFAULTS and Harmonics, "
+    "too. Twenty photos or fewer lose by it."
 )
 
 
@@ -56,9 +56,9 @@ def text(name: str, iterations: int | None = None, open_end: bool = False) -> st
     if (stock := schedule(trainer)) is None:
         known = ", ".join(each for each, one in TRAINERS.items() if schedule(one))
         raise ValueError(f"--iterations is for {known}; the schedule of {name} was not read")
-    if "PhaseScheduler(" in block and iterations < STOCK:
-        parts = "DEFAULTS[1:]" if "DEFAULTS[1:]" in block else "DEFAULTS"
-        notes += f"\n{textwrap.fill(MANY.format(parts), WIDTH, subsequent_indent='  ')}"
+    length = re.search(r"PhaseScheduler\((.+)\)$", block, re.M)
+    if length and iterations < STOCK and "mcmc" in stock + trainer.title:
+        notes += f"\n{textwrap.fill(MANY.format(length[1]), WIDTH, subsequent_indent='  ')}"
     return "\n\n".join([head, block, shortened(stock, iterations), notes])
 
 
