@@ -19,7 +19,7 @@ from opt3dgs_optim.hosts.trainers import TRAINERS
 WIDTH = 100
 FEWER = "Fewer iterations"  # the topic of a note
 MANY = (  # the same for every trainer that relocates
-    "Many photos: with relocation and sixty photos or more, the higher harmonics should make longer "
+    "Many photos: with relocation and sixty photos or more, have the higher harmonics make longer "
     "steps: `PhaseScheduler({}, parts=[*DEFAULTS, Harmonics()])`; import DEFAULTS and Harmonics, "
     "too. Twenty photos or fewer lose by it."
 )
