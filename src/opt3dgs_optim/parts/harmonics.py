@@ -21,9 +21,9 @@ class Harmonics(Part):
     4 at most: by 3 in 10,000 iterations. Trainings of 30,000 iterations or more, or of no planned
     end, and colours of degree 0 are unchanged.
 
-    It is for sixty photos or more with relocation, as in 3DGS-MCMC. An optimizer cannot see how
-    many photos there are, so it is none of the defaults: with twenty or fewer, colours then fit the
-    photos trained on, and no others.
+    It is for sixty photos or more with relocation, as in 3DGS-MCMC. With clone and split one scene
+    gains by it, and one loses. An optimizer cannot see how many photos there are, so it is none of
+    the defaults: with twenty or fewer, colours then fit the photos trained on, and no others.
 
     Examples:
         >>> from opt3dgs_optim import DEFAULTS, Harmonics, PhaseScheduler
