@@ -15,7 +15,7 @@ NAMES = ("means", "sh0", "shN")
 
 def moved(phases: PhaseScheduler | None) -> dict[str, Any]:
     """What the first step adds to each parameter; of torch's Adam, without a scheduler."""
-    params, adams = parameters(5, *NAMES), None
+    params = parameters(5, *NAMES)
     adams = adams_of(params) if phases is None else phases.upgrade(adams_of(params))
     steps(adams, params, 1)
     return {name: (params[name] - at).detach() for name, at in parameters(5, *NAMES).items()}
