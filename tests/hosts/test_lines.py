@@ -87,6 +87,16 @@ def test_the_lines_are_three_statements(name: str) -> None:
     ) - (name == "mini-splatting")  # one of its lines goes to two places
 
 
+@pytest.mark.parametrize("name", PYTHON)
+def test_a_trainer_that_relocates_is_told_of_the_harmonics(name: str) -> None:
+    """With the number of iterations of its own lines."""
+    trainer = TRAINERS[name]
+    notes = " ".join(trainer.notes.values())
+    told = re.findall(r"PhaseScheduler\((.+?), parts=.+?Harmonics", notes)
+    own = re.findall(r"PhaseScheduler\(([^,()]+)", trainer.block)
+    assert told == (own if "relocates" in trainer.notes["Density control"] else [])
+
+
 @pytest.mark.parametrize(
     ("name", "line"),
     [

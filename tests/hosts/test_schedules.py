@@ -100,23 +100,6 @@ if iteration % 334 == 0:
     )
 
 
-@pytest.mark.parametrize(
-    ("name", "line"),
-    [
-        ("3dgs-mcmc", "`PhaseScheduler(opt.iterations - 1, parts=[*DEFAULTS, Harmonics()])`"),
-        ("gsplat", "`PhaseScheduler(max_steps, parts=[*DEFAULTS, Harmonics()])`"),
-        ("inria", None),
-        ("gsplat-2dgs", None),
-        ("nerfstudio", None),
-    ],
-)
-def test_many_photos(name: str, line: str | None) -> None:
-    """A part for them is named where the trainer relocates, and has lines of its own."""
-    printed = " ".join(lines.text(name, 10_000).split())
-    assert (line in printed) if line else ("Harmonics()" not in printed)
-    assert "Harmonics()" not in lines.text(name, 30_000)
-
-
 @pytest.mark.parametrize("name", STOCK)
 def test_no_refinement_and_no_reset_is_added(name: str) -> None:
     """INRIA's form of it, and gsplat's, which rounds down by itself."""

@@ -13,16 +13,11 @@ from pathlib import Path
 
 from opt3dgs_optim.hosts.diff import ANY, edited
 from opt3dgs_optim.hosts.pages import OPEN_END, PAGES
-from opt3dgs_optim.hosts.schedules import STOCK, schedule, shortened
+from opt3dgs_optim.hosts.schedules import schedule, shortened
 from opt3dgs_optim.hosts.trainers import TRAINERS
 
 WIDTH = 100
 FEWER = "Fewer iterations"  # the topic of a note
-MANY = (  # the same for every trainer that relocates
-    "Many photos: with relocation and sixty photos or more, have the higher harmonics make longer "
-    "steps: `PhaseScheduler({}, parts=[*DEFAULTS, Harmonics()])`; import DEFAULTS and Harmonics, "
-    "too. Twenty photos or fewer lose by it."
-)
 
 
 def text(name: str, iterations: int | None = None, open_end: bool = False) -> str:
@@ -56,9 +51,6 @@ def text(name: str, iterations: int | None = None, open_end: bool = False) -> st
     if (stock := schedule(trainer)) is None:
         known = ", ".join(each for each, one in TRAINERS.items() if schedule(one))
         raise ValueError(f"--iterations is for {known}; the schedule of {name} was not read")
-    length = re.search(r"PhaseScheduler\((.+)\)$", block, re.M)
-    if length and iterations < STOCK and "mcmc" in stock + trainer.title:
-        notes += f"\n{textwrap.fill(MANY.format(length[1]), WIDTH, subsequent_indent='  ')}"
     return "\n\n".join([head, block, shortened(stock, iterations), notes])
 
 
