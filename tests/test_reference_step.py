@@ -185,6 +185,24 @@ def test_more_points_than_a_cpu_takes_at_a_time() -> None:
     assert state["share"] != 1
 
 
+def test_a_long_run_averages_every_second_iterate() -> None:
+    """From 500 iterates on; in the last tenth of them all."""
+    total, has = 15_000, {"averaging": tuple(SHAPES)}
+    ours = {name: Parameter(each) for name, each in make_gaussians(9).items()}
+    theirs, state = make_gaussians(9), {}
+    phases = PhaseScheduler(total, parts=[Averaging()])
+    optimizers = phases.upgrade(adams_of(ours))
+    for iteration in range(14_490, total):
+        phases.observe(iteration=iteration)
+        for param in ours.values():
+            param.grad = torch.randn_like(param)
+        for optimizer in optimizers.values():
+            optimizer.step()
+        grads: Any = {name: param.grad for name, param in ours.items()}
+        default_step(theirs, grads, state, RATES, iteration, total, has)
+        assert same_tensors(ours, theirs), iteration
+
+
 ALONE: list[tuple[Part, dict]] = [
     (OwnFrame(), {"own_frame": ("means",)}),
     (Fading(names=("means", "sh0")), {"fading": ("means", "sh0")}),
