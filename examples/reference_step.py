@@ -123,17 +123,9 @@ def default_step(
         else:
             adam_(param, grad, own, rate)
 
-        # Averaging: the mean of the iterates of the last thirtieth of the training, which takes the
-        # parameter's place in the last tenth of that. Until then it takes every second iterate if
-        # there are 500 or more, every third if 750, and so on.
-        window = int(1 / 30 * total)
-        if name in parts.get("averaging", ()) and total - window <= iteration < total:
-            put, every = iteration >= total - int(max(2, window / 10)), max(1, window // 250)
-            if put or own["step"] % every == 0:
-                far = name == "means"  # from the origin, for the digits of float32
-                take_into_mean(param, own, own["step"] / every, far)
-            if put:
-                put_mean(param, own)
+        # Averaging: a mean of the last iterates takes the parameter's place at the end.
+        if name in parts.get("averaging", ()):
+            average(param, own, name == "means", iteration, total)
 
 
 def views(grad: Tensor | None, state: dict, iteration: int) -> tuple[Tensor | None, float]:
@@ -224,6 +216,20 @@ def adam_in_frame_(z: Tensor, grad: Tensor, own: dict, rate: float) -> None:
     """Adam's step z, in standard deviations, of a gradient in the own frame."""
     adam_(z, grad, own, 0.0)  # the moments
     z.copy_(own["exp_avg"] / root_of(own) * (rate / (1 - BETA1 ** own["step"])))
+
+
+def average(param: Tensor, own: dict, far: bool, iteration: int, total: int) -> None:
+    """Take iterates of the last thirtieth into their mean, and put it in the last tenth of that.
+
+    Until it is put it takes every second iterate if there are 500 or more, every third if 750, ...
+    far: from the origin, for the digits of float32.
+    """
+    window = int(1 / 30 * total)
+    put, every = iteration >= total - int(max(2, window / 10)), max(1, window // 250)
+    if total - window <= iteration < total and (put or own["step"] % every == 0):
+        take_into_mean(param, own, own["step"] / every, far)
+        if put:
+            put_mean(param, own)
 
 
 def take_into_mean(param: Tensor, own: dict, number: float, far: bool) -> None:
