@@ -20,6 +20,8 @@ from opt3dgs_optim import (
 )
 from opt3dgs_optim.clock import Phase
 from opt3dgs_optim.parts.averaging import SHARE_OF_FALL
+from opt3dgs_optim.step import Step
+from opt3dgs_optim.training import Training
 
 ROWS = 6
 
@@ -253,12 +255,18 @@ def test_its_length_may_be_told_later() -> None:
 
 
 def test_what_parts_keep_is_kept_until_the_end_begins() -> None:
-    phases, optimizers, params = begun([Curvature()], switch=5)
+    class Sum(Part):
+        names = ("means",)
+
+        def plan(self, step: Step, training: Training) -> None:
+            step.keep(step.state, "sum.of", step.param.shape).add_(1)
+
+    phases, optimizers, params = begun([Sum()])
     steps(optimizers, params, 20)
     state = optimizers["means"].state[params["means"]]
     phases.total_steps = 60
     phases.finish_in(20)
-    assert "curvature.history" in state
+    assert "sum.of" in state
 
 
 def test_a_jump_up_to_the_fall_is_none_in_it() -> None:

@@ -47,6 +47,16 @@ def test_where_nothing_can_be_said(loss: float) -> None:
     assert not lines(torch.full((3 * WINDOW,), loss))
 
 
+def test_views_that_differ_take_longer() -> None:
+    """Three hundred views, whose losses differ by a half, in an order anew for each epoch."""
+    draw = torch.Generator().manual_seed(0)
+    views = 0.05 * torch.exp(0.47 * torch.randn(300, generator=draw))
+    epochs = [views[torch.randperm(300, generator=draw)] for _ in range(100)]
+    ((at, said),) = lines(torch.cat(epochs))
+    assert 5 * WINDOW < at < 12 * WINDOW
+    assert f"the {at // 5:,} iterations up to {at:,} gained" in said
+
+
 def test_a_loss_whose_views_differ_too_much_says_nothing() -> None:
     draw = torch.Generator().manual_seed(0)
     assert not lines(0.05 * torch.randn(4 * WINDOW, generator=draw).exp().pow(2))

@@ -256,7 +256,9 @@ def test_a_scalar_beside_the_rows_resumes(kind: Any) -> None:
             return LQNAdam([param], 1e-2)
         group = {"params": [param], "name": "exposure"}
         means = {"params": [Parameter(torch.zeros(4, 3))], "name": "means"}
-        return PhaseScheduler(TOTAL, 0, [Curvature(names=None)]).upgrade(Adam([group, means]))
+        return PhaseScheduler(TOTAL, parts=[Curvature(names=None)], switch=0).upgrade(
+            Adam([group, means])
+        )
 
     param = Parameter(torch.tensor(0.3))
     ours = made(param)

@@ -65,16 +65,16 @@ class SignAgreement(Part):
 
 
 parts: list[Part] = [*DEFAULTS, SignAgreement()]
-phases = PhaseScheduler(30_000, 0.9, parts)
-phases = PhaseScheduler(30_000, 29_000, [OwnFrame(0.2), Fading(seed=3)])
+phases = PhaseScheduler(30_000, parts=parts, switch=0.9)
+phases = PhaseScheduler(30_000, parts=[OwnFrame(0.2), Fading(seed=3)])
 phases = PhaseScheduler(300, parts=[FreshMoments(), SquaredLoss(), Curvature(history_size=3)])
 phases = PhaseScheduler.paper(total_steps=3_000)
 phase: Phase = phases.phase
 loss: Tensor = phases.pixel_loss(torch.ones(3), torch.ones(3))
 phases.observe(loss)
 points = Parameter(torch.ones(4, 3))
-phases = PhaseScheduler(30, parts=[PositionNoise({"scales": points}, scale=5e5), Averaging()])
-a = AWSGLD([points], lr=0.1, histogram=EnergyHistogram(), noise=IsotropicNoise(std=0.1))
+phases = PhaseScheduler(30, parts=[PositionNoise(scale=5e5), Averaging()])
+a = AWSGLD([points], lr=0.1, histogram=EnergyHistogram(), noise=IsotropicNoise(0.1))
 b = LQNAdam([points], lr=0.1, betas=(0.9, 0.99), history_size=5)
 b.step()
 a.step(lambda: torch.ones(()))

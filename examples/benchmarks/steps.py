@@ -91,7 +91,7 @@ def stepped(
         losses = [x * torch.ones((), device=device) for x in (0.1, 0.12, 0.09, 0.11)]
         phases = None
         if parts is not None:
-            phases = PhaseScheduler(TOTAL, switch, [*parts()], moments=moments)
+            phases = PhaseScheduler(TOTAL, parts=[*parts()], switch=switch, moments=moments)
             optimizers = phases.upgrade(optimizers)
             phases.observe(iteration=round(at * TOTAL))
         count = 0

@@ -34,7 +34,7 @@ class AWSGLD(StepAdam):
         params, lr, betas, eps, weight_decay: as in `torch.optim.Adam`.
         histogram: where nu comes from, one that serves this optimizer alone. None: nu is off.
         noise: `IsotropicNoise` for any parameters, `PositionNoise` for the positions of Gaussians
-            (the group named `means` or `xyz`, or the only group), or None.
+            (its groups named as a trainer's), or None.
         preconditioner: `"adam"`, or `"none"` for the plain SGLD drift `lr * nu * grad`, which
             samples exp(-energy / temperature) together with `IsotropicNoise(temperature=...)`.
         moments: bits per number of each of Adam's two moments; 16 halves Adam's memory.
@@ -105,8 +105,6 @@ class AWSGLD(StepAdam):
             )
         super().__init__(params, lr, betas, eps, weight_decay)
         slots: Slots = [split_name(group.get("name")) for group in self.param_groups]
-        if len(slots) == 1 and slots[0][1] is None and isinstance(noise, PositionNoise):
-            slots = [("", "means")]  # the only group
         check_supported(self, slots, moments)
         parts: list[Part] = [part for part in (histogram, noise) if part is not None]
         if preconditioner == "none":

@@ -11,10 +11,22 @@ from torch import Tensor
 
 from opt3dgs_optim.checks import as_float, check_choice, check_count, check_number
 from opt3dgs_optim.contract import REFUSED, Slots
-from opt3dgs_optim.mean import BEGAN, MEAN, RESIDUE, REST, drop_kept, drop_means, kept_in
+from opt3dgs_optim.mean import (
+    BEGAN,
+    MEAN,
+    OF_MEAN,
+    RESIDUE,
+    REST,
+    drop_kept,
+    drop_means,
+    kept_in,
+)
 from opt3dgs_optim.moments import CODES, MOMENTS, recode
-from opt3dgs_optim.stepper import KEPT, begin_moments_anew
+from opt3dgs_optim.parts.curvature import HISTORY
+from opt3dgs_optim.stepper import begin_moments_anew
 from opt3dgs_optim.training import Training
+
+KEPT = (*OF_MEAN, HISTORY)  # for rows, beside moments
 
 # In each group of a checkpoint, as a line of JSON, so that a group may be moved or dropped, and
 # that who takes nested states apart (torch.distributed.checkpoint) finds one leaf.
@@ -293,9 +305,11 @@ def check_numbers(call: str, saved: Any, count: int) -> None:
 def check_notes(call: str, notes: Mapping[str, Mapping[str, Any]]) -> None:
     """ValueError unless what parts have noted is finite numbers, as a checkpoint holds them."""
     for name, found in notes.items():
-        if not all(type(v) is bool or math.isfinite(as_float(v)) for v in found.values()):
+        others = [v for v in found.values() if type(v) is not bool]
+        if not all(type(v) in (int, float) and math.isfinite(as_float(v)) for v in others):
             raise ValueError(
-                f"{call}: notes of {name} are {dict(found)!r}, but finite numbers are needed"
+                f"{call}: notes of {name} are {dict(found)!r}, but finite numbers of Python "
+                "are needed"
             )
 
 

@@ -61,7 +61,7 @@ class Clock:
     @property
     def ended(self) -> bool:
         """Whether the last iteration that was planned has been made."""
-        return self._ended
+        return self._ended and self._begun >= self.iteration
 
     @property
     def total_steps(self) -> int | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Mapping, Sequence
-from numbers import Integral
 from typing import Any, Literal, TypeVar
 
 import torch
@@ -54,10 +53,10 @@ class PhaseScheduler(Training):
     Args:
         total_steps: iterations of the training, each with one step of the positions' optimizer;
             None: it goes on until `finish_in` is called, or `phases.total_steps` set.
-        switch: where exploitation starts: a fraction of `total_steps` in [0, 1] if a float, an
-            iteration if an int (`total_steps`: never). The paper: 29/30. Without `total_steps` a
-            fraction is where the fall to the end begins.
         parts: what the steps have, in order; None: `DEFAULTS`.
+        switch: where exploitation starts, which only the paper's parts read: a share of
+            `total_steps` in [0, 1] (1: never). The paper: 29/30. Without `total_steps` it starts
+            where the fall to the end begins.
         moments: bits per number of each of Adam's two moments, and of the mean of the last
             thirtieth; 16 halves the memory, and is for the Gaussians alone (see
             docs/performance.md).
@@ -85,22 +84,15 @@ class PhaseScheduler(Training):
     def __init__(
         self,
         total_steps: int | None = None,
-        switch: float | int = PAPER_SWITCH,
-        parts: Sequence[Part] | None = None,
         *,
+        parts: Sequence[Part] | None = None,
+        switch: float = PAPER_SWITCH,
         moments: Literal[32, 16] = 32,
     ) -> None:
         if total_steps is not None:
             total_steps = check_count(CALL, "total_steps", total_steps, 1)
-        if isinstance(switch, (list, tuple)):
-            raise TypeError(
-                f"{CALL}: parts in the second place, where `switch` is; write parts=..."
-            )
-        if isinstance(switch, Integral) and not isinstance(switch, bool):
-            switch_step = check_count(CALL, "switch", switch, 0, total_steps)
-        else:
-            share = check_number(CALL, "switch", switch, 0.0, 1.0)
-            switch_step = None if total_steps is None else round(share * total_steps)
+        share = check_number(CALL, "switch", switch, 0.0, 1.0)
+        switch_step = None if total_steps is None else round(share * total_steps)
         parts = DEFAULTS if parts is None else check_parts(CALL, parts)
         super().__init__(parts, total_steps, switch_step, moments)
         own = (part for part in self.parts if part.overrides("pixel_loss"))

@@ -9,9 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-WINDOW = 2_000  # iterations whose losses are compared with those of as many before
+WINDOW = 2_000  # iterations, at least, whose losses are compared with those of as many before
+SHARE = 1 / 5  # of the iterations so far; fewer know too little where views differ much
 BLOCK = 100  # iterations whose mean loss is one number
-LITTLE = 0.05  # decibels that are not worth as many iterations again
+LITTLE = 0.05  # decibels that are not worth as many iterations as WINDOW
 
 
 def gain(before: Sequence[float], now: Sequence[float]) -> tuple[float, float]:
@@ -47,7 +48,7 @@ class Plateau:
         self._sum: Any = 0.0
         self._count = 0  # losses in the sum
         self._means: list[Any] = []  # of blocks, on the loss's device until a window is full
-        self._before: list[float] = []
+        self._blocks: list[float] = []  # all that were read
         self._said = False
 
     def line(self, loss: Tensor, iteration: int) -> str | None:
@@ -59,7 +60,7 @@ class Plateau:
         if self._said or iteration == self._last:
             return None
         if iteration != self._last + 1:
-            self._sum, self._count, self._means, self._before = 0.0, 0, [], []
+            self._sum, self._count, self._means, self._blocks = 0.0, 0, [], []
         self._last = iteration
         self._sum, self._count = self._sum + loss, self._count + 1
         if self._count < BLOCK:
@@ -68,16 +69,18 @@ class Plateau:
         self._sum, self._count = 0.0, 0
         if len(self._means) < WINDOW // BLOCK:
             return None
-        before, self._before = self._before, torch.stack(self._means).tolist()
+        self._blocks += torch.stack(self._means).tolist()
         self._means = []
-        if not before:
+        size = max(int(SHARE * len(self._blocks)), WINDOW // BLOCK)
+        if len(self._blocks) < 2 * size:
             return None
-        gained, error = gain(before, self._before)
-        self._said = abs(gained) + error < LITTLE  # where it rises, the loss has become another
+        gained, error = gain(self._blocks[-2 * size : -size], self._blocks[-size:])
+        # Where it rises, the loss has become another.
+        self._said = abs(gained) + error < LITTLE * size * BLOCK / WINDOW
         if not self._said:
             return None
         return (
-            f"opt3dgs_optim: the {WINDOW:,} iterations up to {iteration + 1:,} gained "
+            f"opt3dgs_optim: the {size * BLOCK:,} iterations up to {iteration + 1:,} gained "
             f"{gained:.2f} dB in the loss; phases.finish_in({(iteration + 1) // 5}) ends the "
             "training"
         )

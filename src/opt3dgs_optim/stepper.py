@@ -11,13 +11,12 @@ from torch import Tensor
 
 from opt3dgs_optim import triton
 from opt3dgs_optim.clock import Phase
-from opt3dgs_optim.mean import OF_MEAN, Mean, drop_kept, drop_means, mean_of, take_into_mean
+from opt3dgs_optim.mean import Mean, drop_kept, drop_means, mean_of, take_into_mean
 from opt3dgs_optim.messages import LOGGER
 from opt3dgs_optim.moments import CODES, MOMENTS, as_codes
 from opt3dgs_optim.step import Step, mixed, take_step
 from opt3dgs_optim.training import Training
 
-KEPT = (*OF_MEAN, "curvature.history")  # what a checkpoint may hold for rows beside moments
 FRAME_EPS = 1e-15  # of 3DGS; torch's 1e-8 is large beside a gradient times a standard deviation
 
 

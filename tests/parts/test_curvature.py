@@ -32,7 +32,7 @@ def test_it_acts_on_its_parameters_from_the_switch_on(names: Any) -> None:
     splats = {name: Parameter(torch.ones(5, *shape)) for name, shape in SHAPES.items()}
     adams = {name: torch.optim.Adam([param], lr=0.1) for name, param in splats.items()}
     curvature = Curvature(3, names=names)
-    phases = PhaseScheduler(8, 4, parts=[curvature])
+    phases = PhaseScheduler(8, parts=[curvature], switch=0.5)
     phases.upgrade(adams)
     for i in range(8):
         for name, param in splats.items():
@@ -50,7 +50,7 @@ def test_the_share_is_over_all_parameters_of_a_step() -> None:
     assert curvature.numbers(Training([])) == {}
     x, y = Parameter(torch.zeros(3, 3)), Parameter(torch.zeros(5, 3))
     groups = [{"params": [x], "name": "xyz"}, {"params": [y], "name": "scaling"}]
-    phases = PhaseScheduler(10, 0, parts=[curvature])
+    phases = PhaseScheduler(10, parts=[curvature], switch=0)
     optimizer = phases.upgrade(torch.optim.Adam(groups, lr=0.1))
     for slope, expected in ((-1.0, 0.0), (-1.0, 3 / 8), (1.0, 1.0), (-9.0, 3 / 8)):
         x.grad = torch.ones(3, 3) + x.detach()  # convex: accepted

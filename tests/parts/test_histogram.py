@@ -272,7 +272,7 @@ def test_moments_of_nu_before_there_are_any() -> None:
 
 def test_after_the_switch_it_looks_no_more_and_tells_no_nu() -> None:
     x = torch.nn.Parameter(torch.zeros(4, 3))
-    phases = PhaseScheduler(30, 20, parts=[histogram := EnergyHistogram(warmup=4)])
+    phases = PhaseScheduler(30, parts=[histogram := EnergyHistogram(warmup=4)], switch=2 / 3)
     adam, learnt = phases.upgrade(torch.optim.Adam([{"params": [x], "name": "means"}])), []
     for step, energy in enumerate(stream(30), 1):
         phases.observe(torch.tensor(energy))

@@ -19,7 +19,7 @@ TOTAL, SWITCH = 12, 8
 def test_moments_begin_anew_once_in_a_parameters_first_step_after_the_switch() -> None:
     """Which may come later, and an edit of the rows is no other parameter."""
     params: Any = {"means": Parameter(torch.ones(4, 3))}
-    phases = PhaseScheduler(TOTAL, SWITCH, parts=[FreshMoments()])
+    phases = PhaseScheduler(TOTAL, parts=[FreshMoments()], switch=SWITCH / TOTAL)
     adam = phases.upgrade(torch.optim.Adam([{"params": [params["means"]], "name": "means"}]))
     for iteration, count in ((SWITCH - 2, 1), (SWITCH - 1, 2), (SWITCH + 2, 1), (SWITCH + 3, 2)):
         phases.observe(iteration=iteration)
@@ -40,7 +40,7 @@ class Fourth(Part):
 def test_a_compiled_loss_changes_its_kind_at_the_switch(part: Any, late: float) -> None:
     """It is compiled once for each kind, and not for each iteration."""
     x = Parameter(torch.ones(4, 3))
-    phases = PhaseScheduler(TOTAL, SWITCH, parts=[part or FreshMoments()])
+    phases = PhaseScheduler(TOTAL, parts=[part or FreshMoments()], switch=SWITCH / TOTAL)
     optimizer = phases.upgrade(torch.optim.Adam([{"params": [x], "name": "means"}]))
     compiled: list[Any] = []
 

@@ -94,15 +94,13 @@ class Cells:
     Each view is an operator; they are made once a chunk.
 
     Attributes:
-        dim, history_size: D and K.
         pairs: [K, 2, D, N], the newest first; of each s and y.
         last: position and gradient of the last visible step, [2, D, N].
         steps: [N], in which a point was visible; as floats they stop at 2^24.
     """
 
     def __init__(self, cells: Tensor, history_size: int) -> None:
-        dim = self.dim = cells.shape[1] // 2 - 1
-        self.history_size = history_size
+        dim = cells.shape[1] // 2 - 1
         halves = cells.unflatten(1, (2, dim + 1))
         pairs = halves[:, :, :dim]
         if history_size > dim:

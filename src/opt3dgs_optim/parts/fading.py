@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -117,12 +116,6 @@ class Fading(Part):
     def chosen(self, event: int, num_points: int, device: torch.device) -> Tensor:
         """Which points an event fades, [num_points] bool: the same in every parameter."""
         return chosen_rows(self.fade(event), num_points, device)
-
-    def numbers(self, training: Training) -> Mapping[str, float]:
-        """`faded`: the share of up to 10,000 points that the present iteration's event fades."""
-        now = training.iteration
-        happened = self.events_before(now + 1, training) > self.events_before(now, training)
-        return {"faded": self.share * happened}
 
 
 def share_of_events(num_points: int) -> float:
