@@ -9,7 +9,6 @@ Gaussian's own frame, Adam's moments of the others are faded, points out of view
 training ends at the mean of its last iterates.
 """
 
-from opt3dgs_optim.adam import StepAdam
 from opt3dgs_optim.awsgld import AWSGLD
 from opt3dgs_optim.clock import Phase
 from opt3dgs_optim.lbfgs import history_from_pairs, two_loop
@@ -50,7 +49,6 @@ __all__ = [
     "PositionNoise",
     "RunLog",
     "SquaredLoss",
-    "StepAdam",
     "Training",
     "__version__",
     "backend_info",

@@ -51,7 +51,7 @@ class StepAdam(Adam):
 
     training: Training
     next_iteration = 0  # the one that it steps next
-    has_means = False  # whether it holds positions, whose steps count
+    has_positions = False  # whether it holds positions, whose steps count
     coded = False  # whether its moments are codes of 16 bits, see `moments`
     _base: type[Adam] = Adam  # the class whose optimizer it was
     _steppers: list[ParamStepper] = []  # noqa: RUF012  (made anew, never changed)
@@ -80,7 +80,7 @@ class StepAdam(Adam):
         """Say in each group which Gaussian parameter it holds, by gsplat's name, or None."""
         members = self.training.members
         self.training.all_optimizers[id(self)] = weakref.ref(self)
-        self.has_means = False
+        self.has_positions = False
         for slot in [slot for slot, each in members.items() if each[0]() is self]:
             del members[slot]
         for at, (which, name) in enumerate(self._slots):
@@ -90,7 +90,7 @@ class StepAdam(Adam):
             if name is not None:
                 members[which, name] = weakref.ref(self), at
             if name == "means":
-                self.has_means = self.training.counts_means = True
+                self.has_positions = self.training.counts_positions = True
 
     def _count_on_host(self) -> None:
         """Keep Adam's count of steps on the host, which reads it in every step of ours."""
@@ -104,15 +104,15 @@ class StepAdam(Adam):
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """As torch's; refuses what `upgrade` would, with nothing changed."""
-        ours = "training" in vars(self)
+        ours, call = "training" in vars(self), f"{type(self).__name__}.add_param_group"
         if ours:
-            check_slots(f"{type(self).__name__}.add_param_group", self.param_groups, self._slots)
+            check_slots(call, self.param_groups, self._slots)
         super().add_param_group(param_group)
         if not ours:
             return
         slots = [*self._slots, split_name(self.param_groups[-1].get("name"))]
         try:
-            check_supported(self, slots, self.training.moments)
+            check_supported(call, self, slots, self.training.moments)
         except ValueError:
             self.param_groups.pop()
             raise
@@ -341,7 +341,7 @@ class StepAdam(Adam):
         drop_other_means(self.state.values(), ours, training)
         self._steppers, self._in_order, self.next_iteration = [], [], iteration
         clocks = training.clocks()
-        if saved is not None or (counts and (self.has_means or not any(clocks))):
+        if saved is not None or (counts and (self.has_positions or not any(clocks))):
             training.resume(max([iteration, *clocks]))  # one that steps now and then lags
         recode_all(self.state, self.coded, saved, training)
         self.coded = training.moments == 16
@@ -362,8 +362,8 @@ class StepAdam(Adam):
 
     def __getstate__(self) -> dict[str, Any]:
         self.notice_edits()
-        kept = ("training", "next_iteration", "has_means", "_slots", "_masked", "coded", "_on_gpu")
-        own = {key: getattr(self, key) for key in kept}
+        kept = ("training", "next_iteration", "has_positions", "_slots", "_masked", "coded")
+        own = {key: getattr(self, key) for key in (*kept, "_on_gpu")}
         own |= {"_steppers": [], "_last": self.last_steps(), "_own_frame": self.own_frame()}
         return {**super().__getstate__(), **own}
 

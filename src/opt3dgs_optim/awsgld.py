@@ -105,7 +105,7 @@ class AWSGLD(StepAdam):
             )
         super().__init__(params, lr, betas, eps, weight_decay)
         slots: Slots = [split_name(group.get("name")) for group in self.param_groups]
-        check_supported(self, slots, moments)
+        check_supported("AWSGLD", self, slots, moments)
         parts: list[Part] = [part for part in (histogram, noise) if part is not None]
         if preconditioner == "none":
             parts.append(PlainDrift())

@@ -35,7 +35,7 @@ class Clock:
         fall_step: the iteration with which the fall to the end begins; None: none is planned.
         fallen: the share of the fall that is over, 0..1.
         switch_at: where exploitation starts: `switch_step`, or without it the present fall.
-        counts_means: whether one of the optimizers holds positions: it alone counts.
+        counts_positions: whether one of the optimizers holds positions: it alone counts.
         finished: whether the training has been ended early.
     """
 
@@ -44,12 +44,12 @@ class Clock:
         self.switch_at = math.inf if switch_step is None else switch_step
         self._switch_back = math.inf
         self.iteration, self.exploiting, self.exploits_next = -1, False, self.switch_at <= 0
-        self.progress, self.counts_means = 0.0, False
+        self.progress, self.counts_positions = 0.0, False
         self.open_end, self.fallen, self._ended = total_steps is None, 0.0, False
         self.fall_step: int | None = None
         self.finished = False
-        self._means_at = -1  # the iteration of the positions' last step
-        self._means_open = False  # whether they were stepped first there
+        self._positions_at = -1  # the iteration of the positions' last step
+        self._positions_open = False  # whether they were stepped first there
         self._begun = -1  # the iteration of the last step: `observe` puts the clock beyond it
         self._resumed = False  # whether the present iteration is over, for all optimizers
 
@@ -153,16 +153,16 @@ class Clock:
 
         Args:
             optimizer: has `next_iteration`, the one that it steps next, which is put forward, and
-                `has_means`, whether it holds positions.
+                `has_positions`, whether it holds positions.
         """
         present = self.iteration + self._resumed
         iteration = max(optimizer.next_iteration, present, 0)
-        if optimizer.has_means:
-            if iteration > self._means_at:  # of two sets' optimizers the first
-                self._means_open = iteration > self._begun
-            self._means_at = iteration
-        elif self.counts_means and iteration > present:  # it has stepped in the present one
-            begins = self._means_at >= present and not self._means_open
+        if optimizer.has_positions:
+            if iteration > self._positions_at:  # of two sets' optimizers the first
+                self._positions_open = iteration > self._begun
+            self._positions_at = iteration
+        elif self.counts_positions and iteration > present:  # it has stepped in the present one
+            begins = self._positions_at >= present and not self._positions_open
             iteration = max(present + begins, 0)
         self._resumed, self._begun = False, iteration
         optimizer.next_iteration = iteration + 1
@@ -186,8 +186,8 @@ class Clock:
         """Go on at an iteration, which is the next one that is made."""
         self.finished = False
         self.go_to(iteration - 1)
-        self._means_at = self._begun = iteration - 1
-        self._means_open, self._resumed = False, True
+        self._positions_at = self._begun = iteration - 1
+        self._positions_open, self._resumed = False, True
 
     def go_to(self, iteration: int) -> None:
         """Be at that iteration."""

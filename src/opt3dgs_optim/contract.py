@@ -38,10 +38,11 @@ def bare(step: Any) -> Any:
     return step.__wrapped__ if getattr(step, "hooked", False) else step
 
 
-def check_supported(optimizer: Any, slots: Slots, moments: int = 32) -> None:
+def check_supported(call: str, optimizer: Any, slots: Slots, moments: int) -> None:
     """Refuse an optimizer that is outside of the contract, before anything has been changed.
 
     Args:
+        call: what the user called.
         optimizer: what is to be upgraded.
         slots: by group, the set of Gaussians and which of its parameters it holds, or None.
         moments: bits of each of Adam's moments of a number.
@@ -53,10 +54,10 @@ def check_supported(optimizer: Any, slots: Slots, moments: int = 32) -> None:
     kind = type(optimizer)
     if not isinstance(optimizer, Optimizer):
         raise TypeError(
-            f"upgrade: {kind.__name__} is no optimizer; pass the trainer's own, or a dict or list "
+            f"{call}: {kind.__name__} is no optimizer; pass the trainer's own, or a dict or list "
             "of them"
         )
-    _check_bare(optimizer)
+    _check_bare(call, optimizer)
     owner = (
         own_step(kind._base if hasattr(kind, "_base") else kind)
         if isinstance(optimizer, Adam)
@@ -64,43 +65,43 @@ def check_supported(optimizer: Any, slots: Slots, moments: int = 32) -> None:
     )
     if owner is not None and owner.__name__ not in OWN_STEPS:
         raise TypeError(
-            f"upgrade: {kind.__name__} has a step of its own; have the trainer make a "
+            f"{call}: {kind.__name__} has a step of its own; have the trainer make a "
             "torch.optim.Adam (or, from torch 2.7 on, AdamW) with the same groups, or gsplat's "
             "SelectiveAdam"
         )
-    _check_bits(optimizer, owner, slots, moments)
+    _check_bits(call, optimizer, owner, slots, moments)
     held = [slot for slot in slots if slot[1] is not None]
     if len(set(held)) < len(held):
         raise ValueError(
-            f"upgrade: two groups hold the same of {sorted({str(n) for _, n in held})}; for two "
+            f"{call}: two groups hold the same of {sorted({str(n) for _, n in held})}; for two "
             "sets of Gaussians name the groups 'first#means', 'second#means'"
         )
     for group, (_, name) in zip(optimizer.param_groups, slots, strict=True):
         shown = group.get("name") or name or "a group"
         for option in REFUSED:
             if group.get(option):
-                raise ValueError(f"upgrade: {shown} has {option}=True; make the Adam without it")
+                raise ValueError(f"{call}: {shown} has {option}=True; make the Adam without it")
         if isinstance(group["lr"], Tensor):
-            raise ValueError(f"upgrade: {shown} has a tensor as lr; give a float")
+            raise ValueError(f"{call}: {shown} has a tensor as lr; give a float")
         if name is not None and len(group["params"]) != 1:
             raise ValueError(
-                f"upgrade: {shown} holds {len(group['params'])} tensors; give each Gaussian "
+                f"{call}: {shown} holds {len(group['params'])} tensors; give each Gaussian "
                 "parameter one group with one tensor"
             )
         for param in group["params"]:
             if param.dtype not in (torch.float32, torch.float64) or param.layout != torch.strided:
                 raise ValueError(
-                    f"upgrade: {shown} is {param.dtype}, {param.layout}; dense float32 is needed "
+                    f"{call}: {shown} is {param.dtype}, {param.layout}; dense float32 is needed "
                     "(or float64, which is stepped in plain torch)"
                 )
             if (name and not param.dim()) or (name == "means" and param.shape[1:] != (3,)):
                 raise ValueError(
-                    f"upgrade: {shown} is {tuple(param.shape)}; Gaussian parameters have a row for "
+                    f"{call}: {shown} is {tuple(param.shape)}; Gaussian parameters have a row for "
                     "each Gaussian, and positions are [N, 3]"
                 )
     devices = {str(p.device) for g in optimizer.param_groups for p in g["params"]}
     if len(devices) > 1:
-        raise ValueError(f"upgrade: its parameters lie on {sorted(devices)}; one device is needed")
+        raise ValueError(f"{call}: its parameters lie on {sorted(devices)}; one device is needed")
 
 
 def check_held(call: str, optimizer: Optimizer, param: Tensor) -> None:
@@ -121,20 +122,20 @@ def check_slots(call: str, groups: list[dict[str, Any]], slots: Slots) -> None:
         )
 
 
-def _check_bare(optimizer: Any) -> None:
+def _check_bare(call: str, optimizer: Any) -> None:
     """Refuse a wrapper around an optimizer, and a function over its step."""
     kind = type(optimizer)
     within = getattr(optimizer, "optimizer", None) or getattr(optimizer, "_optimizer", None)
     if isinstance(within, Optimizer):
         raise TypeError(
-            f"upgrade: {kind.__name__} is a wrapper around a {type(within).__name__}, whose own "
+            f"{call}: {kind.__name__} is a wrapper around a {type(within).__name__}, whose own "
             "step would be left out; give what is within, `.optimizer`, or upgrade it before the "
             "trainer prepares (Lightning, Fabric, Accelerate) its optimizers"
         )
     wrapped = vars(optimizer).get("step")
     if wrapped is not None and not hasattr(kind, "_base") and not of_scheduler(wrapped, kind):
         raise ValueError(
-            f"upgrade: a function has been put over this {kind.__name__}'s step, and it calls "
+            f"{call}: a function has been put over this {kind.__name__}'s step, and it calls "
             "torch's; upgrade the optimizer first, and wrap its step then"
         )
 
@@ -149,25 +150,25 @@ def of_scheduler(step: Any, kind: type) -> bool:
     return bare(within) is bare(getattr(kind, "step", None))
 
 
-def _check_bits(optimizer: Any, owner: type | None, slots: Slots, moments: int) -> None:
+def _check_bits(call: str, optimizer: Any, owner: type | None, slots: Slots, moments: int) -> None:
     """ValueError where moments of 16 bits are not for an optimizer."""
     if moments == 32:
         return
     if owner is not None:
         raise ValueError(
-            f"upgrade: moments=16, but {type(optimizer).__name__} makes its own step, on moments "
+            f"{call}: moments=16, but {type(optimizer).__name__} makes its own step, on moments "
             "of 32 bits; take torch.optim.Adam, or moments=32"
         )
     others = [at for at, (_, name) in enumerate(slots) if name is None]
     if 0 < len(others) < len(slots):
         shown = optimizer.param_groups[others[0]].get("name")
         raise ValueError(
-            f"upgrade: moments=16, but the group {shown!r} beside the Gaussians is "
+            f"{call}: moments=16, but the group {shown!r} beside the Gaussians is "
             "none of theirs; give it an optimizer of its own, or take moments=32"
         )
     dtypes = {param.dtype for group in optimizer.param_groups for param in group["params"]}
     if dtypes - {torch.float32}:
-        raise ValueError(f"upgrade: moments=16 with {sorted(map(str, dtypes))}; use float32")
+        raise ValueError(f"{call}: moments=16 with {sorted(map(str, dtypes))}; use float32")
 
 
 # -- parts, and the names of groups ----------------------------------------------------------------

@@ -90,7 +90,7 @@ class LQNAdam(StepAdam):
         )
         super().__init__(params, lr, betas, eps, weight_decay)
         slots = [split_name(group.get("name")) for group in self.param_groups]
-        check_supported(self, slots, moments)
+        check_supported("LQNAdam", self, slots, moments)
         self.follow(Training([curvature], switch_step=0, moments=moments), slots)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:

@@ -54,8 +54,7 @@ class End:
     Attributes:
         total_steps: of the training; None: its end is not planned yet.
         mean_at: the first iteration after which the mean is in the parameters' place; infinity: it
-            is not planned yet; `total_steps`: there is none, without `Averaging`, or in so short a
-            training.
+            is not planned yet; None: there is none, without `Averaging` or in so short a training.
     """
 
     def __init__(self, open_end: bool) -> None:
@@ -75,9 +74,7 @@ class End:
                 "opt3dgs_optim: the optimizers that were upgraded have made no step; upgrade those "
                 "that the training steps, after they have been made"
             )
-        if self.mean_at is None or self.mean_at == self.total_steps or not self.done:
-            return None
-        if self.done > self.mean_at:
+        if self.mean_at is None or not self.done or self.done > self.mean_at:
             return None
         if self.open_end:
             return (

@@ -132,7 +132,7 @@ class PhaseScheduler(Training):
                     "torch.optim.Adam, with parts=[...] for what its steps are to have"
                 )
             try:
-                check_supported(optimizer, its, self.moments)
+                check_supported(f"{CALL}.upgrade", optimizer, its, self.moments)
             except (TypeError, ValueError) as error:
                 if key is None or any(name for _, name in its):
                     raise
@@ -243,9 +243,10 @@ class PhaseScheduler(Training):
 
     def _plan_end(self) -> None:
         total, averaging = self.end_step, self.part(Averaging)
-        at = total if averaging is None else math.inf
+        at = None if averaging is None else math.inf
         if averaging is not None and total is not None:
-            at = averaging.put_from(total, self.fall_step)
+            put = averaging.put_from(total, self.fall_step)
+            at = put if put < total else None
         self._end.total_steps, self._end.mean_at = total, at
         self._end.finished = self.finished
 
@@ -260,7 +261,7 @@ class PhaseScheduler(Training):
         if not self.finished:
             found, total = sum(each.put_means() for each in self.optimizers()), self.end_step
             last = self._end.mean_at
-            if not found and last is not None and self.iteration < last and last != total:
+            if not found and last is not None and self.iteration < last:
                 begins = "with the end that finish_in plans"
                 if total is not None:
                     begins = f"at {Averaging.start(total, self.fall_step)} of {total}"
@@ -279,7 +280,7 @@ class PhaseScheduler(Training):
 
     def advanced(self) -> None:
         """Say what is wrong with the training as it goes."""
-        if self.members and not self.counts_means and self.part(OwnFrame) is not None:
+        if self.members and not self.counts_positions and self.part(OwnFrame) is not None:
             self.messages.warn_once(
                 "positions",
                 f"{CALL}: no optimizer holds positions, so that OwnFrame does nothing; name their "
@@ -287,7 +288,7 @@ class PhaseScheduler(Training):
             )
         self._end.done = self.iteration + 1
         total, ends = self.end_step, not self.averages or self.finished
-        if self.iteration == self._end.mean_at != total and not ends:
+        if self.iteration == self._end.mean_at and not ends:
             say(
                 f"opt3dgs_optim: iteration {self.iteration + 1} of {total}: from this step on the "
                 "parameters are the mean of the last iterates"

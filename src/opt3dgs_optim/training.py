@@ -97,7 +97,7 @@ class Training(Clock):
         """The next iteration of each optimizer of Gaussians whose steps are counted."""
         found: dict[int, Any] = {id(o := m[0]()): o for m in self.members.values()}
         held = [each for each in found.values() if each is not None]
-        return [o.next_iteration for o in held if o.has_means or not self.counts_means]
+        return [o.next_iteration for o in held if o.has_positions or not self.counts_positions]
 
     def numbers(self) -> dict[str, float | Tensor]:
         """What the parts say of the present iteration."""

@@ -46,7 +46,7 @@ def strict_lines(path):
 def write_sample(path):
     with RunLog(path, metadata={"arm": "stock", "seed": 0}) as log:
         for i in range(1, 5):
-            log.step(i, phase="exploration", energy=0.1 * i, nu=float("nan"))
+            log.step(i, energy=0.1 * i, nu=float("nan"))
         log.evaluation(4, psnr=20.5)
         log.evaluation(4, ssim=0.5)
 
@@ -58,7 +58,7 @@ def test_steps_round_trip_exactly(tmp_path, rows):
     path.unlink(missing_ok=True)
     with RunLog(path) as log:
         for i, row in enumerate(rows):
-            log.step(i, phase="exploration", **row)
+            log.step(i, **row)
     strict_lines(path)
     run = read_run(path)
     assert run.steps["iteration"].tolist() == list(range(len(rows)))
@@ -87,7 +87,7 @@ def test_cut_at_every_byte_every_complete_line_comes_back_and_the_log_goes_on(tm
         complete = data[:offset].count(b"\n")
         assert len(read_run(cut).records) == complete
         with RunLog(cut, resume=4) as log:
-            log.step(9, phase="exploitation", energy=1.0)
+            log.step(9, energy=1.0)
         assert len(read_run(cut).records) == complete + 2  # a start and the step
         assert read_run(cut).steps["energy"][-1] == 1.0
 
@@ -166,13 +166,13 @@ def test_resume_supersedes_and_continues_the_clock(tmp_path):
     with RunLog(path, metadata={"arm": "a"}, clock=lambda: now[0]) as log:
         for i in range(1, 11):
             now[0] += 1
-            log.step(i, phase="exploration", energy=float(i))
+            log.step(i, energy=float(i))
         log.evaluation(10, psnr=1.0)
     now[0] += 1000
     with RunLog(path, resume=6, metadata={"machine": "b"}, clock=lambda: now[0]) as log:
         assert log.seconds == 6
         now[0] += 2
-        log.step(7, phase="exploration", energy=70.0)
+        log.step(7, energy=70.0)
     run = read_run(path)
     assert run.steps["iteration"].tolist() == [1, 2, 3, 4, 5, 6, 7]
     assert run.steps["energy"].tolist() == [1, 2, 3, 4, 5, 6, 70]
@@ -209,7 +209,7 @@ def test_no_autograd_graph_is_kept(tmp_path):
     with RunLog(tmp_path / "run.jsonl") as log:
         loss = torch.ones(3, requires_grad=True).sum()
         alive = weakref.ref(loss)
-        log.step(1, phase="exploration", loss=loss)
+        log.step(1, loss=loss)
         log.evaluation(1, loss=loss)
         del loss
         gc.collect()
@@ -244,19 +244,19 @@ def gpu(monkeypatch):
 def test_lines_wait_for_the_gpu_in_order_without_waiting_for_it(tmp_path, gpu):
     path, scalar = tmp_path / "run.jsonl", torch.tensor(0.0)
     with RunLog(path) as log:
-        log.step(1, phase="exploration", energy=scalar)
-        log.step(2, phase="exploration", energy=scalar, nu=2.0)
-        log.step(3, phase="exploration", energy=3.0)
+        log.step(1, energy=scalar)
+        log.step(2, energy=scalar, nu=2.0)
+        log.step(3, energy=3.0)
         assert len(strict_lines(path)) == 1
         gpu[1].done = True  # not the first: order is kept
-        log.step(4, phase="exploration", energy=scalar)
+        log.step(4, energy=scalar)
         assert len(strict_lines(path)) == 1
         gpu[0].done = True
-        log.step(5, phase="exploration", energy=scalar)
+        log.step(5, energy=scalar)
         assert len(strict_lines(path)) == 4
         log.evaluation(5, psnr=20.0)
         assert len(strict_lines(path)) == 7
-        log.step(6, phase="exploration", energy=scalar)
+        log.step(6, energy=scalar)
     assert read_run(path).steps["energy"].tolist() == [1, 2, 3, 3, 4, 5]
     assert read_run(path).steps["iteration"].tolist() == [1, 2, 3, 4, 5, 6]
 
@@ -268,12 +268,12 @@ def test_cuda_steps_do_not_synchronize(tmp_path):
     with RunLog(tmp_path / "run.jsonl") as log:
         energy = torch.zeros((), device="cuda", requires_grad=True)
         count = torch.zeros((), device="cuda", dtype=torch.int64)
-        log.step(0, phase="exploration", energy=energy, count=count)  # first pinned allocation
+        log.step(0, energy=energy, count=count)  # first pinned allocation
         torch.cuda.set_sync_debug_mode("error")
         try:
             for i in range(1, 100):
                 count += 1
-                log.step(i, phase="exploration", energy=energy, count=count, nu=1.0)
+                log.step(i, energy=energy, count=count, nu=1.0)
         finally:
             torch.cuda.set_sync_debug_mode("default")
         log.evaluation(99, psnr=energy)
@@ -287,7 +287,7 @@ def test_a_log_names_the_gpu_and_a_pause_waits_for_it(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "a GPU")
     monkeypatch.setattr(torch.cuda, "synchronize", lambda: waited.append(True))
     with RunLog(tmp_path / "log.jsonl") as log:
-        log.step(0, phase="exploration", loss=0.5)
+        log.step(0, loss=0.5)
         with log.paused():
             log.evaluation(1, psnr=20.0)
     assert ', a GPU"' in (tmp_path / "log.jsonl").read_text()

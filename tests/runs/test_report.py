@@ -19,7 +19,7 @@ ABSENT = object()
 
 
 def write_run(path, arm, seed, points, *, steps=(), metric="psnr", **metadata):
-    """A log with evaluations at (iteration, seconds, value) and steps at (iteration, nu, phase)."""
+    """A log with evaluations at (iteration, seconds, value) and steps at (iteration, nu)."""
     lines = [
         {
             "kind": "start",
@@ -30,8 +30,8 @@ def write_run(path, arm, seed, points, *, steps=(), metric="psnr", **metadata):
             "metadata": {"arm": arm, **({} if seed is ABSENT else {"seed": seed}), **metadata},
         }
     ]
-    for i, nu, phase in steps:
-        line = {"kind": "step", "iteration": i, "seconds": float(i), "phase": phase, "nu": nu}
+    for i, nu in steps:
+        line = {"kind": "step", "iteration": i, "seconds": float(i), "nu": nu}
         lines.append(line | {"accepted": 0.25})
     for i, seconds, value in points:
         line = {"kind": "evaluation", "iteration": i, "seconds": seconds, metric: value}
@@ -234,7 +234,7 @@ def picture(path):
 def test_picture_opens_and_shows_curves_without_touching_matplotlib(tmp_path):
     matplotlib = pytest.importorskip("matplotlib", reason="needs matplotlib")
     before = dict(matplotlib.rcParams)
-    steps = [(i, 1.0, "exploration" if i < 8 else "exploitation") for i in range(10)]
+    steps = [(i, 1.0) for i in range(10)]
     runs = two_arms(tmp_path)
     runs += [write_run(tmp_path / "$_|.jsonl", "_$x^{", 0, [(9, 9.0, 21.0)], steps=steps)]
     assert report.write_report(runs, tmp_path / "out")[-1].name == "report.png"

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-NO_NUMBERS = ("kind", "phase")
 Columns = dict[str, np.ndarray]
 
 
@@ -23,8 +22,7 @@ class Run:
         steps: columns of equal length over the step lines: `iteration` (int64), `seconds` and
             every logged number as float64, NaN where a line lacks it.
         evaluations: the same over the evaluation lines.
-        records: all lines kept, in order, as dictionaries, with `phase`; tells "logged as NaN" from
-            "absent".
+        records: all lines kept, in order, as dictionaries; they tell "logged as NaN" from "absent".
     """
 
     name: str
@@ -81,7 +79,7 @@ def _parse(raw: bytes) -> dict[str, Any]:
     if kind not in ("start", "step", "evaluation") or iteration != int(iteration) or seconds < 0:
         raise ValueError("kind, iteration or seconds")
     if kind != "start":
-        for name in line.keys() - {*NO_NUMBERS, "iteration"}:
+        for name in line.keys() - {"kind", "iteration"}:
             line[name] = float(line[name])  # of "nan", "inf" and "-inf", too
     return line
 
@@ -91,6 +89,6 @@ def _columns(lines: list[dict[str, Any]]) -> Columns:
     columns = {
         name: np.array([line.get(name, np.nan) for line in lines], float)
         for name in names
-        if name not in NO_NUMBERS
+        if name != "kind"
     }
     return columns | {"iteration": columns["iteration"].astype(np.int64)}

@@ -119,7 +119,7 @@ class RunLog(AbstractContextManager["RunLog"]):
         """Run seconds so far by the log's clock, without pauses, of all sessions of this run."""
         return self._base + (0.0 if self._since is None else self._clock() - self._since)
 
-    def step(self, iteration: int, *, phase: str | None = None, **columns: Number) -> None:
+    def step(self, iteration: int, **columns: Number) -> None:
         """Log one optimization step: `log.step(iteration, loss=loss, lr=1e-3)`.
 
         `columns` are Python or numpy numbers, or tensors of one element on any device, under names
@@ -130,10 +130,7 @@ class RunLog(AbstractContextManager["RunLog"]):
             ValueError: a negative iteration, a name of the log's own, what is not one number, or
                 the log is closed.
         """
-        line = self._line("step", iteration)
-        if phase is not None:
-            line["phase"] = phase
-        self._add(line, columns, wait=False)
+        self._add(self._line("step", iteration), columns, wait=False)
 
     def evaluation(self, iteration: int, **metrics: Number) -> None:
         """Log metrics of a number each: `log.evaluation(7_000, psnr=27.1, ssim=0.83)`.

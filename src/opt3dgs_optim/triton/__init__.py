@@ -44,8 +44,10 @@ def missing_on(device: torch.device) -> str | None:
     if (error := _import_error()) is not None:
         return error
     try:
-        p, g, m, v = torch.zeros(4, 1, device=device, dtype=torch.float32)
+        # Aligned, and with a counter, as parameters of trainers: its kernel is compiled for them.
+        p, g, m, v = torch.zeros(4, 4, device=device, dtype=torch.float32)
         step = Step(p, g, None, "", {}, {"exp_avg": m, "exp_avg_sq": v}, 0, -1)
+        step.nonfinite = torch.zeros(1, device=device, dtype=torch.int32)
         for _ in range(2):  # by Triton's launcher, and as in all later steps
             launch(step)
     except Exception as error:  # no C compiler, a GPU that is too old, a folder that is read-only
