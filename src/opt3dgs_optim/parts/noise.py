@@ -43,19 +43,20 @@ class PositionNoise(Part):
 
     def after(self, step: Step, training: Training) -> None:
         """Add the noise to the positions [N, 3] in place."""
-        means, found = step.param, {}
+        means, others = step.param, list[Tensor]()
         for name, numbers in (("scales", 3), ("quats", 4), ("opacities", 1)):
-            tensor = found[name] = training.param_of(step.set, name)
+            tensor = training.param_of(step.set, name)
             if tensor is None or tensor.numel() != numbers * len(means):
                 has = "missing" if tensor is None else list(tensor.shape)
                 raise ValueError(
                     f"PositionNoise: {name} is {has}, but [{len(means)}, {numbers}] is needed for "
                     f"{len(means)} means, in an optimizer that is upgraded with theirs"
                 )
+            others.append(tensor)
         eta = torch.randn(
             means.shape, dtype=means.dtype, device=means.device, generator=self.generator
         )
-        noise = covariance_noise(found["scales"], found["quats"], found["opacities"], eta)
+        noise = covariance_noise(*others, eta)
         means.data.add_(noise, alpha=step.group["lr"] * self.scale)
 
 
