@@ -81,8 +81,8 @@ def train(number: int) -> str:
         optimizers = make(params, kind, **options)
         phases = package.PhaseScheduler(
             total,
-            draw.choice([0.5, 29 / 30]),
-            copy.deepcopy(parts),
+            switch=draw.choice([0.5, 29 / 30]),
+            parts=copy.deepcopy(parts),
             moments=moments,  # pyright: ignore
         )
         phases.upgrade(optimizers)

@@ -43,7 +43,7 @@ class PositionNoise(Part):
 
     def after(self, step: Step, training: Training) -> None:
         """Add the noise to the positions [N, 3] in place."""
-        means, others = step.param, list[Tensor]()
+        means, others = step.param, []
         for name, numbers in (("scales", 3), ("quats", 4), ("opacities", 1)):
             tensor = training.param_of(step.set, name)
             if tensor is None or tensor.numel() != numbers * len(means):
@@ -56,7 +56,8 @@ class PositionNoise(Part):
         eta = torch.randn(
             means.shape, dtype=means.dtype, device=means.device, generator=self.generator
         )
-        noise = covariance_noise(*others, eta)
+        scales, quats, opacities = others
+        noise = covariance_noise(scales, quats, opacities, eta)
         means.data.add_(noise, alpha=step.group["lr"] * self.scale)
 
 
