@@ -191,7 +191,8 @@ def quarter() -> str:
 def equal() -> str:
     """Both planned for as many iterations."""
     rows = []
-    for size, those, count in (("half", HALF, 10_000), ("quarter", QUARTER, 30_000)):
+    sizes = (("half", HALF, 10_000), ("half", HALF, 30_000), ("quarter", QUARTER, 30_000))
+    for size, those, count in sizes:
         runs = [(arm, count) for arm in ("defaults", "x2")]
         rows += [
             (size, f"{count:,}", scene, *beside(("stock", count), runs, scene, **those))
@@ -246,22 +247,16 @@ def gpu_step() -> str:
 
 def gpu_iteration() -> str:
     """What a whole iteration of gsplat's training costs on a GPU."""
-    made, rows = read(GPU), []
-    found, before = made["iterations"]["results"], made["before"]["iterations"]
-    names = {  # of the step before: its defaults had no own frame
-        "defaults": "the same with OwnFrame",
-        "defaults, last thirtieth": "the same in the last thirtieth",
-    }
+    found = read(GPU)["iterations"]["results"]
+    rows = []
     for subject in found["1000000"]:
         cells = []
-        for points, results in found.items():
-            row, old = results[subject], before[points].get(names.get(subject, ""))
+        for results in found.values():
+            row = results[subject]
             spread = "" if subject == "stock" else f" ({row['low']:.2f} to {row['high']:.2f})"
             cells.append(f"{row['ms']:.1f} ms, x{row['ratio']:.2f}{spread}")
-            cells.append("" if old is None else f"x{old:.2f}")
         rows.append((subject, *cells))
-    heads = [h for n in found for h in (f"{int(n):,} Gaussians", "the step before")]
-    return table(("", *heads), rows)
+    return table(("", *(f"{int(n):,} Gaussians" for n in found)), rows)
 
 
 def ratios() -> str:
