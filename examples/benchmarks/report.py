@@ -293,6 +293,7 @@ DRAWN = {
     STOCK: "#555555",
     SHORT: "#e69f00",
     THIRD: "#0072b2",
+    ("defaults", 30_000): "#56b4e9",
 }
 
 
@@ -314,8 +315,7 @@ def draw(path: Path) -> None:
             # Some were evaluated twice as often as others.
             at = sorted(set.intersection(*map(set, curves)))
             curve = [fmean(one[n] for one in curves) for n in at]
-            label = f"{NAMES[run[0]]}, planned for {run[1]:,}"
-            axis.plot([n / 1000 for n in at], curve, color=colour, lw=2, label=label)
+            axis.plot([n / 1000 for n in at], curve, color=colour, lw=2, label=name(run))
             axis.plot(at[-1] / 1000, curve[-1], "o", color=colour, ms=6)
             if run == STOCK:
                 axis.axhline(curve[-1], color=colour, lw=1, ls="--", zorder=0)
@@ -326,7 +326,7 @@ def draw(path: Path) -> None:
         axis.grid(color="#e4e4e4", lw=0.8)
     axes[0].set_ylabel("PSNR of held-out photos, dB", fontsize=12)
     entries, place = axes[0].get_legend_handles_labels(), "outside lower center"
-    figure.legend(*entries, loc=place, ncols=3, frameon=False, fontsize=11)
+    figure.legend(*entries, loc=place, ncols=4, frameon=False, fontsize=11)
     figure.savefig(path)
 
 
