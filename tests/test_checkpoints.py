@@ -242,7 +242,9 @@ def test_a_stock_adam_that_goes_on_with_a_checkpoint_of_ours_is_noticed() -> Non
     assert again.state[params["scales"]]["step"] == 51
 
 
-@pytest.mark.parametrize("noted", [[1.0, 2.0], math.nan, np.float32(1), "text", None])
+@pytest.mark.parametrize(
+    "noted", [[1.0, 2.0], math.nan, torch.ones(()), np.float32(1), "text", None]
+)
 def test_notes_that_no_checkpoint_holds_are_refused_at_the_first_save(noted: Any) -> None:
     """And not when the run is to go on from it."""
     params = parameters(5, "means")

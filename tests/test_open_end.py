@@ -269,6 +269,18 @@ def test_what_parts_keep_is_kept_until_the_end_begins() -> None:
     assert "sum.of" in state
 
 
+def test_it_has_ended_after_its_last_step() -> None:
+    """And not where a trainer puts the clock there, before the step."""
+    phases, optimizers, params = begun()
+    steps(optimizers, params, 20)
+    phases.finish_in(10)
+    steps(optimizers, params, 9)
+    phases.observe(iteration=29)
+    assert not phases.ended
+    steps(optimizers, params, 1)
+    assert (phases.iteration, phases.ended) == (29, True)
+
+
 def test_a_jump_up_to_the_fall_is_none_in_it() -> None:
     phases, optimizers, params = begun()
     steps(optimizers, params, 1)

@@ -20,6 +20,7 @@ from opt3dgs_optim.hosts.trainers import TRAINERS
 
 ROOT = Path(__file__).resolve().parents[2]
 PATCHES = ROOT / "examples" / "hosts"
+DOCS = ROOT / "docs" / "hosts"
 PYTHON = [name for name, trainer in TRAINERS.items() if trainer.places]
 FLAT = ("gsplat-2dgs",)  # flat Gaussians, with a third scale that nothing trains
 
@@ -156,6 +157,14 @@ def test_a_resumed_training_keeps_its_end(name: str, first: int, kept: int) -> N
     _, again = ending(name, kept + 1, 0, resumed)
     assert again == left
     assert left[-1] < 65
+
+
+def test_the_page_names_those_with_an_open_end() -> None:
+    page = " ".join((DOCS / "index.md").read_text(encoding="utf-8").split())
+    named = re.findall(r"`--open-end` is for (.+?)\.", page)[0]
+    assert re.findall("`(.+?)`", named) == [
+        name for name, each in TRAINERS.items() if each.open_end
+    ]
 
 
 @pytest.mark.parametrize(
