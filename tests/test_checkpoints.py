@@ -242,6 +242,26 @@ def test_a_stock_adam_that_goes_on_with_a_checkpoint_of_ours_is_noticed() -> Non
     assert again.state[params["scales"]]["step"] == 51
 
 
+@pytest.mark.parametrize("ours", [False, True])
+def test_it_is_told_where_a_stock_checkpoint_goes_on(
+    ours: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A trainer that leaves out steps is further than Adam has counted."""
+    caplog.set_level("INFO")
+    params = parameters(5, "means", "scales")
+    optimizers = adams_of(params)
+    if ours:
+        PhaseScheduler(100, parts=[Averaging()]).upgrade(optimizers)
+    steps(optimizers, params, 30)
+    saved = {name: optimizer.state_dict() for name, optimizer in optimizers.items()}
+    made = adams_of(params)
+    for name, optimizer in made.items():
+        optimizer.load_state_dict(saved[name])
+    PhaseScheduler(100, parts=[Averaging()]).upgrade(made)
+    said = "goes on at iteration 30, by Adam's count of steps; where the trainer has left out steps"
+    assert caplog.text.count(said) == (not ours)
+
+
 @pytest.mark.parametrize(
     "noted", [[1.0, 2.0], math.nan, torch.ones(()), np.float32(1), "text", None]
 )

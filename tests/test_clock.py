@@ -88,6 +88,7 @@ def test_another_scheduler_goes_on_where_the_first_was() -> None:
 
 def test_phase_progress_and_what_is_shown() -> None:
     phases = PhaseScheduler(100, switch=0.9)
+    phases.upgrade(adam_of(parameters(5, "means")))
     shown = [(phases.iteration, phases.phase, phases.progress)]
     for iteration in (0, 89, 90, 99):
         phases.observe(iteration=iteration)

@@ -24,6 +24,7 @@ from opt3dgs_optim import (
     PhaseScheduler,
 )
 from opt3dgs_optim import phases as module
+from opt3dgs_optim.messages import End
 
 ROWS = 4
 
@@ -63,6 +64,16 @@ OPTIMIZERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     ),
     "a foreign step": (lambda: Foreign(one().param_groups), TypeError, "Foreign has a step of its"),
     "no optimizer": (lambda: torch.ones(3), TypeError, "Tensor is no optimizer; pass the trainer"),
+    "a model": (
+        lambda: torch.nn.ParameterDict({"means": torch.ones(ROWS, 3)}),
+        TypeError,
+        r"ParameterDict is no optimizer; pass the trainer's own \(gaussians.optimizer, say\)",
+    ),
+    "others, in a list": (
+        lambda: [one(), torch.optim.SGD([Parameter(torch.ones(3))], lr=0.1)],
+        TypeError,
+        "SGD has a step of its own.*; or leave it out, which holds no Gaussians",
+    ),
     "half precision": (
         lambda: one(torch.ones(ROWS, 3, dtype=torch.bfloat16)),
         ValueError,
@@ -144,6 +155,11 @@ SCHEDULERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         TypeError,
         r"write parts=\[Averaging\(\)\]",
     ),
+    "no star": (
+        lambda: PhaseScheduler(100, parts=[DEFAULTS, Averaging()]),  # pyright: ignore
+        TypeError,
+        r"no Part object; write a star before it, parts=\[\*DEFAULTS, ",
+    ),
     "one part": (
         lambda: PhaseScheduler(100, parts=Averaging()),  # pyright: ignore
         TypeError,
@@ -189,10 +205,21 @@ def test_a_part_that_learns_serves_one_training() -> None:
 )
 def test_the_clock_goes_forward_within_the_run(iteration: Any, said: str) -> None:
     phases = PhaseScheduler(100)
+    phases.upgrade(one())
     phases.observe(iteration=7)
     with pytest.raises(ValueError, match=said):
         phases.observe(iteration=iteration)
     assert phases.iteration == 7
+
+
+def test_a_count_is_no_loss_and_comes_after_upgrade() -> None:
+    phases = PhaseScheduler(100)
+    with pytest.raises(ValueError, match=r"iteration=7 before upgrade.*; call it below"):
+        phases.observe(iteration=7)
+    phases.upgrade(one())
+    with pytest.raises(ValueError, match=r"loss=7, an integer.* write observe\(iteration=7\)"):
+        phases.observe(7)
+    assert phases.iteration == -1
 
 
 @pytest.mark.parametrize(
@@ -236,7 +263,7 @@ def test_a_run_that_is_longer_than_it_was_said(recwarn: pytest.WarningsRecorder)
     found = [str(each.message) for each in recwarn]
     assert len(found) == 1
     assert "iteration 11 of total_steps=10" in found[0]
-    assert "pass its number of iterations as total_steps" in found[0]
+    assert "pass the number of steps that it makes as total_steps" in found[0]
 
 
 def test_numbers_that_are_not_finite_are_told_once(recwarn: pytest.WarningsRecorder) -> None:
@@ -264,8 +291,9 @@ def test_numbers_that_are_not_finite_are_told_at_the_end() -> None:
 
 def test_positions_of_a_name_that_is_not_known() -> None:
     params = parameters(ROWS, "scales", "quats")
+    given = adams_of(params) | {"mu": Adam([Parameter(torch.ones(ROWS, 3))], lr=0.01)}
     with pytest.warns(UserWarning, match=r"the groups \['mu'\] have a row for each Gaussian"):
-        optimizers = PhaseScheduler(80).upgrade(adams_of(params) | {"mu": one(name="mu")})
+        optimizers = PhaseScheduler(80).upgrade(given)
     with pytest.warns(UserWarning, match="no optimizer holds positions.*name their group"):
         steps(optimizers, params, 3)
 
@@ -291,14 +319,19 @@ def test_a_training_that_ends_early(total: int, done: int, finished: bool, said:
     assert line is None or (f"iteration {done} of 600" in line and "phases.finish()" in line)
 
 
-def test_optimizers_that_make_no_step() -> None:
+def test_optimizers_that_make_no_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """As where the trainer makes its optimizers after `upgrade`."""
+    told: list[Any] = []
+    monkeypatch.setattr(End, "say", lambda end: told.append(end.line()))
     params = parameters(ROWS, "means")
     phases = PhaseScheduler(600)
-    assert phases.end_line() is None
-    phases.upgrade(adams_of(params))
+    assert "its upgrade(optimizers) was not called" in str(phases.end_line())
+    upgraded = phases.upgrade(adams_of(params))
     steps(adams_of(params), params, 3)
     assert "have made no step; upgrade those that the training steps" in str(phases.end_line())
+    assert not told
+    del upgraded  # as where a trainer makes others to load a checkpoint
+    assert told == [phases.end_line()]
 
 
 def test_a_schedule_that_another_takes_over_says_no_more() -> None:
@@ -330,17 +363,21 @@ def test_finish_of_a_resumed_training_before_there_is_a_mean(
 
 
 @pytest.mark.processes
-def test_the_early_end_is_said_at_exit() -> None:
-    code = """
+@pytest.mark.parametrize("error", ["", "raise MemoryError"])
+def test_the_early_end_is_said_at_exit(error: str) -> None:
+    """And not where an error is what ended it."""
+    code = f"""
 import torch
 from opt3dgs_optim import PhaseScheduler
 p = torch.nn.Parameter(torch.zeros(5, 3))
 phases = PhaseScheduler(600, parts=None)
-adam = phases.upgrade({"opacities": torch.optim.Adam([p])})["opacities"]
+adam = phases.upgrade({{"opacities": torch.optim.Adam([p])}})["opacities"]
 for _ in range(585):
     p.grad = torch.ones(5, 3)
     adam.step()
+{error}
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "the training ended at iteration 585 of 600" in done.stderr
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ("the training ended at iteration 585 of 600" in done.stderr) is not bool(error)
+    assert done.returncode == bool(error)
     assert done.stdout == ""

@@ -50,7 +50,8 @@ def test_it_ends_at_the_mean_of_the_last_fifth_of_its_fall(moments: Any) -> None
     assert phases.end_line() is None
 
 
-def test_steps_fall_to_the_end_and_are_as_long_as_before_after_it() -> None:
+def test_steps_fall_to_the_end_and_are_as_long_as_before_after_it(caplog: Any) -> None:
+    caplog.set_level("INFO")
     phases, optimizers, params = begun()
     rates = []
     for count in (200, 50, 20):
@@ -64,7 +65,9 @@ def test_steps_fall_to_the_end_and_are_as_long_as_before_after_it() -> None:
     assert fall[-1] < 0.1 * fall[0]
     assert rates[250] > 0.9 * rates[199]
     assert phases.total_steps is None
-    assert "of no planned end" in (phases.end_line() or "")
+    said = "after the end that was planned at 250, so that the parameters are the last iterate"
+    assert said in str(phases.end_line())
+    assert caplog.text.count("the end that was planned, at iteration 250, is over; the") == 1
     phases.finish_in(10)
     steps(optimizers, params, 10)
     assert phases.total_steps == 280

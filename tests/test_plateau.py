@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from gaussians import adams_of, parameters
 
 from opt3dgs_optim import PhaseScheduler
 from opt3dgs_optim.plateau import WINDOW, Plateau, gain
@@ -66,6 +67,7 @@ def test_a_loss_whose_views_differ_too_much_says_nothing() -> None:
 def test_it_is_said_where_no_end_is_planned(total: Any, said: bool, caplog: Any) -> None:
     caplog.set_level("INFO")
     phases = PhaseScheduler(total)
+    phases.upgrade(adams_of(parameters(5, "means")))
     for iteration in range(2 * WINDOW):
         phases.observe(0.1, iteration=iteration)
     assert ("dB in the loss" in caplog.text) is said

@@ -23,7 +23,7 @@ from opt3dgs_optim.checkpoint import (
     complete_groups,
     drop_other_means,
     forget_own_frames,
-    iteration_by_counts,
+    next_by_counts,
     note_in_groups,
     numbers_of,
     recode_all,
@@ -337,7 +337,7 @@ class StepAdam(Adam):
             restore_training(training, saved)
             iteration = saved["iteration"] + missed
         else:
-            iteration = iteration_by_counts(type(self).__name__, counts, training)
+            iteration = next_by_counts(type(self).__name__, counts, training, self.has_positions)
         drop_other_means(self.state.values(), ours, training)
         self._steppers, self._in_order, self.next_iteration = [], [], iteration
         clocks = training.clocks()

@@ -127,12 +127,14 @@ class Clock:
         """Raise unless an end may be planned now."""
         if not self.open_end:
             raise ValueError(
-                f"{call}: total_steps={self.end_step} plans the end; PhaseScheduler() does not"
+                f"{call}: total_steps={self.end_step} plans the end; for another length make a new "
+                "PhaseScheduler and upgrade the same optimizers, which goes on; for none, "
+                "PhaseScheduler()"
             )
         if self._falls() and not (self._ended or self.finished):
             raise ValueError(
                 f"{call}: the end has begun, from iteration {self.fall_step} to {self.end_step}; "
-                "the training may go on after it"
+                "plan it once; the training may go on after it"
             )
 
     def _falls(self) -> bool:

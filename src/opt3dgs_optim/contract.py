@@ -54,8 +54,8 @@ def check_supported(call: str, optimizer: Any, slots: Slots, moments: int) -> No
     kind = type(optimizer)
     if not isinstance(optimizer, Optimizer):
         raise TypeError(
-            f"{call}: {kind.__name__} is no optimizer; pass the trainer's own, or a dict or list "
-            "of them"
+            f"{call}: {kind.__name__} is no optimizer; pass the trainer's own "
+            "(gaussians.optimizer, say), when it is made, or a dict or list of them"
         )
     _check_bare(call, optimizer)
     owner = (
@@ -183,6 +183,8 @@ def check_parts(call: str, parts: Any) -> Sequence[Part]:
     for part in parts:
         if not isinstance(part, Part):
             cure = f"; write parts=[{part.__name__}()]" if isinstance(part, type) else ""
+            if isinstance(part, (list, tuple)):
+                cure = "; write a star before it, parts=[*DEFAULTS, Harmonics()]"
             raise TypeError(f"{call}: {part!r} in parts is no Part object{cure}")
     kinds = [type(part) for part in parts]
     if OwnFrame in kinds and Curvature in kinds:
@@ -247,15 +249,15 @@ def line_of_unknown_groups(
 ) -> str | None:
     """What to say of groups that have a row for each Gaussian, under names that are not known."""
     groups = [
-        (group, name)
-        for (_, optimizer), its in zip(given, slots, strict=True)
+        (group["params"], group.get("name") or key, name)
+        for (key, optimizer), its in zip(given, slots, strict=True)
         for group, (_, name) in zip(optimizer.param_groups, its, strict=True)
     ]
-    rows = {len(group["params"][0]) for group, name in groups if name and group["params"]}
+    rows = {len(params[0]) for params, _, name in groups if name and params}
     found = [
-        str(group.get("name"))
-        for group, name in groups
-        if name is None and any(p.dim() and len(p) > 1 and len(p) in rows for p in group["params"])
+        str(shown)
+        for params, shown, name in groups
+        if name is None and any(p.dim() and len(p) > 1 and len(p) in rows for p in params)
     ]
     if not found:
         return None

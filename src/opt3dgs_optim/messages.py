@@ -6,6 +6,8 @@ import logging
 import os
 import sys
 import warnings
+import weakref
+from typing import Any
 
 import torch
 
@@ -55,41 +57,66 @@ class End:
         total_steps: of the training; None: its end is not planned yet.
         mean_at: the first iteration after which the mean is in the parameters' place; infinity: it
             is not planned yet; None: there is none, without `Averaging` or in so short a training.
+        passed: the end after which a training of no planned end has gone on.
+        upgraded: whether optimizers were; None: never; False: but resumed, as a checkpoint may be
+            loaded to be looked at.
+        held: how many of them there are still.
+        done: iterations, if any was made here.
     """
 
     def __init__(self, open_end: bool) -> None:
         self.open_end = open_end
         self.total_steps: int | None = None
         self.mean_at: float | None = None
-        self.upgraded = False  # and not resumed: a checkpoint may be loaded to be looked at
-        self.done = 0  # iterations, if any was made here
-        self.finished = False
+        self.passed: int | None = None
+        self.upgraded: bool | None = None
+        self.held = self.done = 0
+        self.finished = self._said = False
 
     def line(self) -> str | None:
         """The warning; None: nothing is wrong."""
         if self.finished:
             return None
+        if self.upgraded is None:
+            return (
+                "opt3dgs_optim: a PhaseScheduler was made, but its upgrade(optimizers) was not "
+                "called, so that it has done nothing"
+            )
         if self.upgraded and not self.done:
             return (
                 "opt3dgs_optim: the optimizers that were upgraded have made no step; upgrade those "
-                "that the training steps, after they have been made"
+                "that the training steps, below the lines that make them or load a checkpoint"
             )
         if self.mean_at is None or not self.done or self.done > self.mean_at:
             return None
-        if self.open_end:
-            return (
-                f"opt3dgs_optim: the training ended at iteration {self.done} of "
-                f"{self.total_steps or 'no planned end'}, so that the parameters are the last "
-                "iterate and no mean; call phases.finish_in(n) n iterations before it ends"
-            )
+        where = f" of {self.total_steps or 'no planned end'}"
+        cure = (
+            "make total_steps the number of steps, upgrade optimizers that are made anew, and call "
+            "phases.finish() where a training ends early"
+        )
+        if self.passed is not None and self.total_steps is None:
+            where = f", after the end that was planned at {self.passed}"
+            cure = "have the loop save and stop where phases.ended is true"
+        elif self.open_end:
+            cure = "call phases.finish_in(n) n iterations before it ends"
         return (
-            f"opt3dgs_optim: the training ended at iteration {self.done} of {self.total_steps}, so "
-            "that the parameters are the last iterate and no mean; make total_steps the number of "
-            "steps, upgrade optimizers that are made anew, and call phases.finish() where a "
-            "training ends early"
+            f"opt3dgs_optim: the training ended at iteration {self.done}{where}, so that the "
+            f"parameters are the last iterate and no mean; {cure}"
         )
 
     def say(self) -> None:
-        """Log the line, if there is one."""
-        if (line := self.line()) is not None:
+        """Log the line, if there is one; not where an error has ended the program."""
+        line = None if self._said or hasattr(sys, "last_value") else self.line()
+        if line is not None:
+            self._said = True
             LOGGER.warning(line)
+
+    def hold(self, optimizer: Any) -> None:
+        """Have one more, and say at once if all of them are gone before their first step."""
+        self.held += 1
+        weakref.finalize(optimizer, self._let_go).atexit = False
+
+    def _let_go(self) -> None:
+        self.held -= 1
+        if not self.held and self.upgraded and not self.done:
+            self.say()

@@ -126,7 +126,8 @@ class PhaseScheduler(Training):
         slots = [slots_of(key, optimizer) for key, optimizer in given]
         saved: list[Any] = []
         for (key, optimizer), its in zip(given, slots, strict=True):
-            if not isinstance(getattr(optimizer, "training", self), PhaseScheduler):
+            ours = isinstance(optimizer, StepAdam)
+            if ours and not isinstance(optimizer.training, PhaseScheduler):
                 raise TypeError(
                     f"{CALL}.upgrade: {type(optimizer).__name__} has parts of its own; upgrade a "
                     "torch.optim.Adam, with parts=[...] for what its steps are to have"
@@ -134,12 +135,13 @@ class PhaseScheduler(Training):
             try:
                 check_supported(f"{CALL}.upgrade", optimizer, its, self.moments)
             except (TypeError, ValueError) as error:
-                if key is None or any(name for _, name in its):
+                if (key is None and not its) or any(name for _, name in its):
                     raise
+                which = "it" if key is None else repr(key)
                 raise type(error)(
-                    f"{error}; or leave {key!r} out, which holds no Gaussians"
+                    f"{error}; or leave {which} out, which holds no Gaussians"
                 ) from None
-            if isinstance(optimizer, StepAdam) and optimizer.training is not self:
+            if ours and optimizer.training is not self:
                 check_slots(f"{CALL}.upgrade", optimizer.param_groups, optimizer._slots)
             saved.append(check_groups(f"{CALL}.upgrade", optimizer.param_groups))
         check_held_together(f"{CALL}.upgrade", given, slots, self.moments)
@@ -174,6 +176,7 @@ class PhaseScheduler(Training):
         else:
             vars(optimizer).pop("step", None)  # as learning-rate schedulers of old have wrapped it
             optimizer.__class__ = upgraded_class(type(optimizer))
+        self._end.hold(optimizer)
         optimizer.follow(self, slots)
         optimizer.resume()
 
@@ -189,10 +192,20 @@ class PhaseScheduler(Training):
             iteration: from 0; for trainers whose count differs from the number of their steps.
 
         Raises:
-            ValueError: the loss is not a single number; or the clock would go back, or beyond
-                2 * `total_steps`.
+            ValueError: the loss is not a single number, or an int, which is hardly one; or the
+                clock would go back, or beyond 2 * `total_steps`, or has no optimizers yet.
         """
+        if type(loss) is int:
+            raise ValueError(
+                f"{CALL}.observe: loss={loss}, an integer; for the trainer's count write "
+                f"observe(iteration={loss})"
+            )
         if iteration is not None:
+            if not self.all_optimizers:
+                raise ValueError(
+                    f"{CALL}.observe: iteration={iteration} before upgrade(optimizers), which "
+                    "would set the clock anew; call it below"
+                )
             iteration = check_count(f"{CALL}.observe", "iteration", iteration, 0)
             most = math.inf if self.end_step is None else 2 * self.end_step
             cure = "make a new PhaseScheduler for another run"
@@ -240,6 +253,15 @@ class PhaseScheduler(Training):
         """Have the training fall to its end, and know where its mean is."""
         super().plan_fall(start, end)
         self._plan_end()
+
+    def go_on(self) -> None:
+        """Have no end any more, after one."""
+        self._end.passed = self.end_step
+        super().go_on()
+        self.messages.say_once(
+            f"opt3dgs_optim: the end that was planned, at iteration {self._end.passed}, is over; "
+            "the training goes on, and the parameters are no mean any more"
+        )
 
     def _plan_end(self) -> None:
         total, averaging = self.end_step, self.part(Averaging)
@@ -298,8 +320,8 @@ class PhaseScheduler(Training):
             self.messages.warn_once(
                 "overrun",
                 f"{CALL}: iteration {self.iteration} of total_steps={self.end_step}: the "
-                "training is longer than that, so that all schedules ended early; pass its number "
-                "of iterations as total_steps",
+                "training is longer than that, so that all schedules ended early; pass the number "
+                "of steps that it makes as total_steps",
             )
         if self.finished:
             self.messages.warn_once(

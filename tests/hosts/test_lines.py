@@ -185,6 +185,22 @@ def test_where_there_is_no_open_end(
     assert said in capsys.readouterr().err
 
 
+def test_a_name_is_no_folder_that_bears_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As in a folder of clones, and in gsplat's own, which holds its package."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "gsplat").mkdir()
+    assert lines.main(["gsplat", "--iterations", "10000"]) == 0
+    assert "# 10,000 iterations" in capsys.readouterr().out
+
+
+def test_a_repository_s_name_is_known(capsys: pytest.CaptureFixture[str]) -> None:
+    for word, name in (("gaussian-splatting", "inria"), ("3DGS-MCMC", "3dgs-mcmc")):
+        assert lines.main([word]) == 2
+        assert re.search(rf"did you mean .*\b{name}\b", capsys.readouterr().err)
+
+
 @pytest.mark.parametrize("word", ["gsplt", "gsplat-mcmc", "3dgs_mcmc"])
 def test_an_unknown_trainer(word: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert lines.main([word]) == 2

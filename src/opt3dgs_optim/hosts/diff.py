@@ -47,9 +47,12 @@ def edited(text: str) -> tuple[Trainer, str]:
         ValueError: the file is not known, or has been edited; the message has what to do by hand.
     """
     plain = "\n".join(line.rstrip() for line in text.split("\n"))
-    if word := re.search(r"\b(opt3dgs_optim|PhaseScheduler|phases)\b", plain):
-        line = plain.count("\n", 0, word.start()) + 1
-        raise ValueError(f"line {line} has `{word[0]}` already, so that nothing is inserted")
+    word = re.search(r"\b(opt3dgs_optim|PhaseScheduler)\b", plain)
+    own = re.search(r"\bphases\b", plain)
+    if (found := word or own) is not None:
+        line = plain.count("\n", 0, found.start()) + 1
+        cure = "" if word else f"; write them by hand, under another name:\n\n{ANY}"
+        raise ValueError(f"line {line} has `{found[0]}` already, so that nothing is inserted{cure}")
     fit = [each for each in TRAINERS.values() if each.signs and not misses(each, plain)]
     if len(fit) != 1:
         raise ValueError(_by_hand(plain))

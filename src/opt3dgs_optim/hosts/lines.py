@@ -117,7 +117,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     word = options.trainer
     is_file = word is not None and (Path(word).exists() or word.endswith(".py"))
-    if options.write and (word in TRAINERS or not is_file):
+    is_file &= word not in TRAINERS  # a clone's folder may bear the name
+    if options.write and not is_file:
         parser.error("--write needs the path of a trainer's script")
     if (options.iterations is not None or options.open_end) and (word is None or is_file):
         parser.error("--iterations and --open-end need the name of a trainer")
@@ -140,7 +141,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(changes)
         print(f"\n{done}", file=sys.stderr)
     else:
-        near = difflib.get_close_matches(word, TRAINERS, cutoff=0.4)
+        titles = {each.title.partition(":")[0].lower(): name for name, each in TRAINERS.items()}
+        known = titles | {name: name for name in TRAINERS}
+        near = difflib.get_close_matches(word.lower(), known, cutoff=0.4)
+        near = list(dict.fromkeys(known[each] for each in near))
         meant = f"did you mean {' or '.join(near)}?" if near else "any trainer has these lines:"
         print(f"opt3dgs lines: no trainer and no file {word!r}; {meant}\n\n{ANY}", file=sys.stderr)
         return 2
