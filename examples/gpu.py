@@ -137,11 +137,20 @@ def report(made: dict[str, Any]) -> str:
     for name in ("doctor", "tests"):
         text = made[name]["output"][-8_000:].rstrip()
         lines += ["", f"## {name}: exit status {made[name]['code']}", "", "```text", text, "```"]
-    lines += ["", "## A step", "", steps.table(made["steps"]), ""]
-    lines += ["On a GPU the six Adams are PyTorch's fused ones.", "", counts(made["steps"])]
-    lines += ["", bandwidth(made["steps"]), "", made["two_loop"]]
+    lines += ["", "## A step", "", made["two_loop"]]
+    if made["steps"]:
+        lines += ["", steps.table(made["steps"]), ""]
+        lines += ["On a GPU the six Adams are PyTorch's fused ones.", "", counts(made["steps"])]
+        lines += ["", bandwidth(made["steps"])]
+    lines += [f"\n{points:,} Gaussians: the device has no room." for points in made["no_room"]]
     said = json.dumps(made["training"], indent=1)
     return "\n".join([*lines, "", "## gsplat's own trainer", "", "```json", said, "```", ""])
+
+
+def write(made: dict[str, Any], out: Path) -> None:
+    """The page, and what it is made of."""
+    (out / "report.json").write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
+    (out / "report.md").write_text(report(made), encoding="utf-8")
 
 
 @command("gpu")
@@ -166,7 +175,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     device, out = torch.device(args.device), args.out.resolve()
     torch.set_num_threads(1)
     about = {"machine": steps.machine(device), "date": time.strftime("%Y-%m-%d", time.gmtime())}
-    made: dict[str, Any] = {"about": {**about, **versions(device)}, "steps": {}, "training": {}}
+    made: dict[str, Any] = {"about": {**about, **versions(device)}, "steps": {}, "no_room": []}
+    made["training"] = {}
     for name, words in (
         ("doctor", (*PACKAGE, "doctor", "--device", args.device)),
         ("tests", TESTS),
@@ -175,14 +185,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         made[name] = {"code": code, "seconds": seconds, "output": said}
     # On a GPU all of PyTorch's Adams are the fused ones.
     names = [n for n in steps.SUBJECTS if args.device == "cpu" or "fused" not in n]
-    for points in tqdm(args.points or POINTS[args.device], desc="steps", unit="size"):
-        made["steps"][points] = steps.measure(points, device, names, args.rounds)
     made["two_loop"] = recursion(device, args.rounds)
+    for points in tqdm(args.points or POINTS[args.device], desc="steps", unit="size"):
+        try:
+            made["steps"][points] = steps.measure(points, device, names, args.rounds)
+        except torch.cuda.OutOfMemoryError:
+            made["no_room"].append(points)
+        write(made, out)  # what is measured is kept, whatever comes
     if args.gsplat is not None:
         found = trainings(args.gsplat.resolve(), args.scene.resolve(), out, args.iterations)
         made["training"] = found
-    (out / "report.json").write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
-    (out / "report.md").write_text(report(made), encoding="utf-8")
+    write(made, out)
     print(out / "report.md")
     failed = any("failed" in found for found in (made["training"], *made["training"].values()))
     return int(made["doctor"]["code"] != 0 or made["tests"]["code"] not in (0, 5) or failed)

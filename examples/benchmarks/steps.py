@@ -120,6 +120,7 @@ SUBJECTS: dict[str, Callable[[int, torch.device], Subject]] = {
     "defaults, a tenth in view": stepped(lambda: DEFAULTS, in_view=0.1),
     "defaults, last thirtieth": stepped(lambda: DEFAULTS, at=0.975),
     "defaults, moments of 16 bits": stepped(lambda: DEFAULTS, moments=16),
+    "the same, last thirtieth": stepped(lambda: DEFAULTS, at=0.975, moments=16),
     "defaults without OwnFrame": stepped(lambda: [Fading(), OutOfView(), Averaging()]),
     "OwnFrame alone": stepped(lambda: [OwnFrame()]),
     "the paper's exploration": stepped(lambda: [EnergyHistogram.paper(warmup=4)]),

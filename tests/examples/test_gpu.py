@@ -43,9 +43,27 @@ def test_all_of_it_runs_on_a_cpu(said: dict[str, tuple[int, str]], tmp_path: Pat
     page = (tmp_path / "report.md").read_text(encoding="utf-8")
     assert "## doctor: exit status 0\n\n```text\nall is well\n" in page
     assert "| defaults | - | - | " in page
+    assert "no room" not in page
     said["pytest"] = 1, "2 failed"
     assert gpu.main(small(tmp_path)) == 1
     assert "2 failed" in (tmp_path / "report.md").read_text(encoding="utf-8")
+
+
+def test_a_size_that_has_no_room_loses_no_other(
+    said: dict[str, tuple[int, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measure = steps.measure
+
+    def measured(points: int, *others: Any) -> Any:
+        if points > 64:
+            raise torch.cuda.OutOfMemoryError
+        return measure(points, *others)
+
+    monkeypatch.setattr(steps, "measure", measured)
+    assert gpu.main([*small(tmp_path), "--points", "64", "5000000"]) == 0
+    page = (tmp_path / "report.md").read_text(encoding="utf-8")
+    assert "| defaults | - | - | " in page
+    assert "5,000,000 Gaussians: the device has no room." in page
 
 
 def test_gsplats_script_is_trained_as_it_is_and_as_an_edited_copy(

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from opt3dgs_optim import triton
 from opt3dgs_optim.mean import Mean, like_rows, mean_of_residue
-from opt3dgs_optim.moments import CODES, NEAREST, decoded, encode
+from opt3dgs_optim.moments import CODES, MOMENTS, NEAREST, decoded, encode
 from opt3dgs_optim.step import (
     Fade,
     Frame,
@@ -172,6 +172,35 @@ def combinations() -> Iterator[tuple[dict[str, Any], tuple[int, ...]]]:
         options = {"mean": mean, "put": mean, "decay": decay, "bad": 2}
         yield {"frame": True, **options}, (257, 3)
         yield {"plain": True, "factor": torch.tensor(0.7), **options}, (257, 4)
+
+
+def coded_combinations() -> Iterator[tuple[dict[str, Any], tuple[int, ...]]]:
+    """Steps on codes of 16 bits, and means of them, with what can meet in one."""
+    for shape, kind in (
+        ((257, 3), {}),
+        ((19, 15, 3), {"hold": True, "fade": True, "bad": 5}),
+        ((257, 3), {"frame": True, "bad": 2}),
+    ):
+        for mean, put in ((False, False), (True, False), (True, True)):
+            yield {"coded": True, "mean": mean, "put": put, **kind}, shape
+
+
+def codes_apart(ours: Step, theirs: Step) -> Iterator[Tensor]:
+    """By how many codes, or places of a mean of 16 bits, each number of two steps is apart."""
+    for one, other in zip(*(numbers_and_codes(step)[1] for step in (ours, theirs)), strict=True):
+        away = (one.to(torch.int32) - other.to(torch.int32)).abs()
+        yield torch.minimum(away, 2**16 - away)  # the codes of second moments have no sign
+
+
+def numbers_and_codes(step: Step) -> tuple[list[Tensor], list[Tensor]]:
+    """What a step on codes changes."""
+    mean = step.mean
+    kept = [] if mean is None else [mean.tensor, mean.began]
+    if mean is not None and mean.rest is not None:
+        kept.append(mean.rest)
+    changed = [step.param, *(step.state[key] for key in MOMENTS), *kept]
+    codes = [each for each in changed if each.dtype == CODES]
+    return [each for each in changed if each.dtype != CODES], codes
 
 
 def interprets() -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -207,6 +208,8 @@ def test_rows_are_read_four_numbers_at_a_time(
     moments, means = (0 if "plain" in options else 2), (1 if "mean" in options else 0)
     reads = ROWS_BLOCK // (4 * 32 * triton.WARPS["step_rows"])  # of four numbers, by its threads
     assert ptx.count("ld.global.v4") == reads * (2 + moments + means)
+    together = ptx[ptx.index("ld.global.v4") : ptx.rindex("ld.global.v4")]
+    assert re.search(r"\b(st\.\w+|red|atom|bar)\b", together) is None  # nothing waits between them
     assert ptx.count("st.global.v4") == reads * (1 + moments + means)
     assert ".local" not in ptx  # all in registers
     assert "sqrt.approx" not in ptx  # it takes small numbers for 0
@@ -235,6 +238,7 @@ def test_own_frames_are_in_registers(driver: FakeDriver, options: Any) -> None:
     launched(driver, (64, 3), frame=True, **options)
     ((_, made),) = triton._COMPILED.items()
     assert ".local" not in made.asm["ptx"]
+    assert "bar.sync" not in made.asm["ptx"]  # nothing passes from thread to thread
 
 
 @pytest.mark.parametrize("options", [{}, {"frame": True}], ids=str)

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+MOST_PAIRS = 5  # of curvature, that fit into a thread's registers
 BLOCK = 128  # threads; the .cu files promise it to the compiler
 HEADER = "two_loop.cuh"
 KERNELS = {"lqn_direction": "lqn.cu", "two_loop": "two_loop.cu"}  # the kernel: its file
@@ -178,4 +179,8 @@ def missing() -> str | None:
         return f"cuda.core cannot be imported: {type(error).__name__}: {error}"
     if not torch.cuda.is_available():
         return "torch sees no CUDA device: no NVIDIA driver, or a build of torch without CUDA"
+    try:  # the one of the defaults: NVRTC, and a driver, may not know each other or the GPU
+        _kernel("lqn_direction", torch.cuda.current_device(), torch.float32, MOST_PAIRS)
+    except Exception as error:
+        return f"cuda.core cannot compile for this GPU: {type(error).__name__}: {error}"
     return None

@@ -10,7 +10,6 @@ from opt3dgs_optim.checks import check_choice
 
 Backend = Literal["auto", "cuda", "torch"]
 BACKENDS = ("auto", "cuda", "torch")
-KERNEL_HISTORY = 5  # curvature pairs that fit into a thread's registers
 
 
 @dataclass(frozen=True)
@@ -36,8 +35,8 @@ def backend_info(
         backend: `"auto"` takes the CUDA kernels where they can run; the others insist.
 
     The two give the same numbers, up to rounding. The kernels are for points of three coordinates
-    with at most five curvature pairs; others are stepped by pure torch. A kernel that fails to
-    compile or to launch raises: nothing is replaced after an error.
+    with at most five curvature pairs; others are stepped by pure torch, and so are all where the
+    default one does not compile. What fails later raises: nothing is replaced after an error.
 
     Raises:
         ValueError: `backend` is none of these.
@@ -63,10 +62,10 @@ def obstacle(
     """
     if backend == "torch":
         return "backend='torch' was asked for"
-    if dim != 3 or history_size > KERNEL_HISTORY:
+    if dim != 3 or history_size > cuda.MOST_PAIRS:
         found = (
             f"there is no kernel for {history_size} pairs of points of {dim} coordinates, "
-            f"only for at most {KERNEL_HISTORY} of 3"
+            f"only for at most {cuda.MOST_PAIRS} of 3"
         )
     elif device.type != "cuda":
         found = "the kernels need a CUDA device"

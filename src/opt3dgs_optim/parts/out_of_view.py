@@ -111,8 +111,10 @@ class _Seen:
         if holds:
             self.rows = self._rows(grad)
         second = None if state is None else state["exp_avg_sq"]
-        if second is not None and (second.shape != grad.shape or not second.is_contiguous()):
-            second = None  # of other rows, which the step refuses
+        if second is not None and (
+            second.shape != grad.shape or second.device != grad.device or not second.is_contiguous()
+        ):
+            second = None  # of other rows, or elsewhere, which the step refuses
         look = triton.look if triton.looks(grad) else look_at_positions
         look(grad, second, self.rows, counter)
         if counter is not None:

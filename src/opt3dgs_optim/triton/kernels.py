@@ -3,7 +3,8 @@
 Every number is read once and written once; nothing lies between. A thread has four numbers of
 `step_rows`, or two Gaussians of `step_in_own_frame`. What changes from step to step is an argument
 that compiles nothing anew; what is not there is None, and compiles to nothing.
-What a load gives outside of its mask is never stored.
+What a load gives outside of its mask is never stored. Loads stand above the first atomic and the
+first store, which a compiler moves no load past: so they wait for the memory together.
 
 No argument is a constexpr, so that a compiled kernel takes the same arguments in every version of
 Triton. Nothing of Triton's standard library is used, so that Triton's interpreter can run this file
@@ -26,15 +27,11 @@ PLAIN_INTS = ["numbers", "width", "key", "round_key", "rows"]
 
 
 @triton.jit
-def finite(grad, nonfinite, inside):
-    """The gradient with zeros for numbers that are not finite, which are counted."""
-    known = tl.abs(grad) < INFINITY
-    if nonfinite is not None:
-        bad = known == 0
-        if inside is not None:
-            bad = bad & inside
-        tl.atomic_add(nonfinite + tl.where(known, 0, 0), 1, bad, sem="relaxed")
-    return tl.where(known, grad, 0.0)
+def count(bad, numbers, nonfinite, inside):
+    """Count so many numbers that are not finite in each place that has any."""
+    if inside is not None:
+        bad = bad & inside
+    tl.atomic_add(nonfinite + tl.where(bad, 0, 0), numbers, bad, sem="relaxed")
 
 
 @triton.jit
@@ -65,9 +62,11 @@ def chosen_rows(row, key, share):
 
 
 @triton.jit
-def weight_in_mean(began, row, inside, number):
-    """What weight an iterate has in the mean of its row; one that has not begun begins."""
-    first = tl.load(began + row, inside)
+def weight_in_mean(first, began, row, inside, number):
+    """What weight an iterate has in the mean of its row; one that has not begun begins.
+
+    `first` is the number that `began` has.
+    """
     new = first == 0.0
     if inside is not None:
         new = new & inside
@@ -104,10 +103,8 @@ def store_moments(m, v, at, inside, exp_avg, exp_avg_sq, key):
 
 
 @triton.jit
-def into_mean(value, mean, rest, began, row, at, inside, number, put):
+def into_mean(value, old, weight, mean, rest, at, inside, put):
     """`mean.take_into_mean` of one number; what the parameter is afterwards."""
-    weight = weight_in_mean(began, row, inside, number)
-    old = tl.load(mean + at, inside)
     known = tl.abs(value) < INFINITY
     has = tl.abs(old) < INFINITY
     start = tl.where(has, old, value)
@@ -128,10 +125,8 @@ def into_mean(value, mean, rest, began, row, at, inside, number, put):
 
 
 @triton.jit
-def into_residue(value, mean, began, row, at, inside, number, put, grid, round_key):
+def into_residue(value, old, weight, mean, at, inside, put, grid, round_key):
     """`mean.take_into_residue` of one number; what the parameter is afterwards."""
-    weight = weight_in_mean(began, row, inside, number)
-    old = tl.load(mean + at, inside)
     place = value / grid
     known = tl.abs(place) < MAX_PLACE
     place = tl.where(known, place, 0.0)
@@ -165,8 +160,13 @@ def _step_rows(
     ones2, eps, sqrt_correction2, shrink, decay, round_key, key, share, fade_m, fade_v, weight,
     number, put, grid,
 ):  # fmt: skip
-    grad = finite(tl.load(g + at, inside), nonfinite, inside)
-    value = tl.load(p + at, inside) * shrink
+    grad, value = tl.load(g + at, inside), tl.load(p + at, inside)
+    if m is not None:
+        exp_avg, exp_avg_sq = moments_of(m, v, at, inside)
+    if mean is not None:
+        old, first = tl.load(mean + at, inside), tl.load(began + row, inside)
+    known = tl.abs(grad) < INFINITY
+    grad, value = tl.where(known, grad, 0.0), value * shrink
     if decay != 0.0:
         grad = grad + value * decay
     if factor is not None:
@@ -174,7 +174,6 @@ def _step_rows(
     if m is None:
         value = value - grad * size
     else:
-        exp_avg, exp_avg_sq = moments_of(m, v, at, inside)
         if share > 0.0:
             chosen = chosen_rows(row, key, share)
             exp_avg = tl.where(chosen, exp_avg * fade_m, exp_avg)
@@ -188,11 +187,14 @@ def _step_rows(
         value = value - size * exp_avg / (tl.sqrt_rn(exp_avg_sq) / sqrt_correction2 + eps)
         store_moments(m, v, at, inside, exp_avg, exp_avg_sq, round_key)
     if mean is not None:
+        portion = weight_in_mean(first, began, row, inside, number)
         if mean.dtype.element_ty == tl.int16:
-            value = into_residue(value, mean, began, row, at, inside, number, put, grid, round_key)
+            value = into_residue(value, old, portion, mean, at, inside, put, grid, round_key)
         else:
-            value = into_mean(value, mean, rest, began, row, at, inside, number, put)
+            value = into_mean(value, old, portion, mean, rest, at, inside, put)
     tl.store(p + at, value, inside)
+    if nonfinite is not None:
+        count(known == 0, 1, nonfinite, inside)
 
 
 @triton.jit(do_not_specialize=PLAIN_INTS)
@@ -257,7 +259,7 @@ def adam(grad, m, v, at, seen, size, beta2, ones1, ones2, eps, sqrt_correction2,
 
 
 @triton.jit(do_not_specialize=PLAIN_INTS)
-def step_in_own_frame(
+def step_in_own_frame(  # noqa: PLR0915  (all a step has)
     p, g, m, v, quats, scales, longest, mean, rest, began, factor, nonfinite, rows, min_aspect,
     size, beta2, ones1, ones2, eps, sqrt_correction2, shrink, decay, round_key, number, put,
 ):  # fmt: skip
@@ -276,25 +278,32 @@ def step_in_own_frame(
     row = tl.program_id(0) * FRAME_BLOCK + tl.arange(0, FRAME_BLOCK)
     inside = row < rows
     i, j, k, q = 3 * row, 3 * row + 1, 3 * row + 2, 4 * row
-    gx = finite(tl.load(g + i, inside), nonfinite, inside)
-    gy = finite(tl.load(g + j, inside), nonfinite, inside)
-    gz = finite(tl.load(g + k, inside), nonfinite, inside)
-    seen = ((gx != 0.0) | (gy != 0.0) | (gz != 0.0)) & inside
-    px = tl.load(p + i, inside) * shrink
-    py = tl.load(p + j, inside) * shrink
-    pz = tl.load(p + k, inside) * shrink
-    if decay != 0.0:
-        gx, gy, gz = gx + px * decay, gy + py * decay, gz + pz * decay
-
+    gx, gy, gz = tl.load(g + i, inside), tl.load(g + j, inside), tl.load(g + k, inside)
+    px, py, pz = tl.load(p + i, inside), tl.load(p + j, inside), tl.load(p + k, inside)
     w = tl.load(quats + q, inside)
     x = tl.load(quats + q + 1, inside)
     y = tl.load(quats + q + 2, inside)
     z = tl.load(quats + q + 3, inside)
+    sx = tl.load(scales + i, inside)
+    sy = tl.load(scales + j, inside)
+    sz = tl.load(scales + k, inside)
+    if mean is not None:
+        # By `row` Triton would read two at a time, and pass all else between threads for it.
+        first = tl.load(began + (q >> 2), inside)
+    # Moments are read later, of Gaussians in view alone.
+    a, b, c = tl.abs(gx) < INFINITY, tl.abs(gy) < INFINITY, tl.abs(gz) < INFINITY
+    if nonfinite is not None:
+        bad = tl.where(a, 0, 1) + tl.where(b, 0, 1) + tl.where(c, 0, 1)
+        count(bad > 0, bad, nonfinite, inside)
+    gx, gy, gz = tl.where(a, gx, 0.0), tl.where(b, gy, 0.0), tl.where(c, gz, 0.0)
+    seen = ((gx != 0.0) | (gy != 0.0) | (gz != 0.0)) & inside
+    px, py, pz = px * shrink, py * shrink, pz * shrink
+    if decay != 0.0:
+        gx, gy, gz = gx + px * decay, gy + py * decay, gz + pz * decay
+
     length = larger(tl.sqrt(w * w + x * x + y * y + z * z), 1e-12)
     w, x, y, z = w / length, x / length, y / length, z / length
-    sx = tl.exp(tl.load(scales + i, inside))
-    sy = tl.exp(tl.load(scales + j, inside))
-    sz = tl.exp(tl.load(scales + k, inside))
+    sx, sy, sz = tl.exp(sx), tl.exp(sy), tl.exp(sz)
     if longest is not None:
         most = tl.load(longest)
         sx, sy, sz = smaller(sx, most), smaller(sy, most), smaller(sz, most)
@@ -316,9 +325,11 @@ def step_in_own_frame(
     py = py - tl.where(tl.abs(dy) < INFINITY, dy, 0.0)
     pz = pz - tl.where(tl.abs(dz) < INFINITY, dz, 0.0)
     if mean is not None:
-        px = into_mean(px, mean, rest, began, row, i, inside, number, put)
-        py = into_mean(py, mean, rest, began, row, j, inside, number, put)
-        pz = into_mean(pz, mean, rest, began, row, k, inside, number, put)
+        ox, oy, oz = tl.load(mean + i, inside), tl.load(mean + j, inside), tl.load(mean + k, inside)
+        portion = weight_in_mean(first, began, q >> 2, inside, number)
+        px = into_mean(px, ox, portion, mean, rest, i, inside, put)
+        py = into_mean(py, oy, portion, mean, rest, j, inside, put)
+        pz = into_mean(pz, oz, portion, mean, rest, k, inside, put)
     tl.store(p + i, px, inside)
     tl.store(p + j, py, inside)
     tl.store(p + k, pz, inside)
