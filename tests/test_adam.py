@@ -287,6 +287,24 @@ def test_a_gradient_of_another_shape_is_refused(found: Any) -> None:
         steps(optimizers, params, 1)
 
 
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("factor", torch.ones(ROWS), "8 numbers as factor of sh0, but one is needed"),
+        ("param", torch.ones(ROWS, 1, 3), "another tensor in the place of sh0; change it in place"),
+    ],
+)
+def test_what_a_step_cannot_have_is_refused(field: str, value: Any, said: str) -> None:
+    class Wrong(Part):
+        def plan(self, step: Step, training: Any) -> None:
+            setattr(step, field, value)
+
+    params = parameters(ROWS, "sh0")
+    optimizers = PhaseScheduler(TOTAL, parts=[Wrong()]).upgrade(adams_of(params))
+    with pytest.raises(ValueError, match=said):
+        steps(optimizers, params, 1)
+
+
 # -- what changes without a new Parameter ----------------------------------------------------------
 
 

@@ -138,6 +138,27 @@ def test_a_group_that_comes_later_is_refused_too() -> None:
     assert optimizer.param_groups[1]["gaussian"] == "scales"
 
 
+def test_two_sets_under_one_name_are_told(recwarn: pytest.WarningsRecorder) -> None:
+    """And no optimizer that takes the place of one that has stepped."""
+    first, params = one(), parameters(ROWS, "means")
+    phases = PhaseScheduler(100, parts=[Averaging()])
+    steps({"means": phases.upgrade(first)}, params, 0)
+    phases.upgrade(first)
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match="another optimizer holds means already; for two sets"):
+        phases.upgrade(one())
+    phases = PhaseScheduler(100, parts=[Averaging()])
+    trained = phases.upgrade(adams_of(params))
+    steps(trained, params, 1)
+    phases.upgrade(adams_of(params))
+    assert not recwarn.list
+
+
+def part(**attributes: Any) -> PhaseScheduler:
+    """A scheduler of one part with these attributes."""
+    return PhaseScheduler(100, parts=[type("Mine", (Part,), attributes)()])
+
+
 SCHEDULERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "no length": (lambda: PhaseScheduler(0), ValueError, "total_steps=0, but an integer at least"),
     "a share beyond": (
@@ -154,6 +175,29 @@ SCHEDULERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         lambda: PhaseScheduler(100, parts=[Averaging]),  # pyright: ignore
         TypeError,
         r"write parts=\[Averaging\(\)\]",
+    ),
+    "INRIA's names": (
+        lambda: part(names=("opacity", "f_dc")),
+        ValueError,
+        r"Mine: names=.*, but gsplat's are needed: names=\('opacities', 'sh0'\)",
+    ),
+    "other names": (lambda: part(names=("means", "mlp")), ValueError, "Mine: names=.* is needed"),
+    "a name": (lambda: part(names="means"), ValueError, "Mine: names='means', but a tuple"),
+    "a phase": (lambda: part(during="exploration"), ValueError, "during='exploration', but None"),
+    "not saved": (
+        lambda: part(state_dict=lambda _: {}),
+        ValueError,
+        "Mine has a state_dict, but is not saved; set learns = True",
+    ),
+    "a kind twice": (
+        lambda: PhaseScheduler(100, parts=[OwnFrame(), type("Mine", (OwnFrame,), {})()]),
+        ValueError,
+        "OwnFrame is there twice in parts",
+    ),
+    "a name twice": (
+        lambda: PhaseScheduler(100, parts=[Averaging(), type("Averaging", (Part,), {})()]),
+        ValueError,
+        "Averaging is there twice in parts",
     ),
     "no star": (
         lambda: PhaseScheduler(100, parts=[DEFAULTS, Averaging()]),  # pyright: ignore

@@ -11,7 +11,9 @@ import torch
 from torch import Tensor
 from torch.optim import Adam, AdamW, Optimizer
 
-from opt3dgs_optim.names import GAUSSIAN_NAMES, split_name
+from opt3dgs_optim.checks import check_choice
+from opt3dgs_optim.clock import Phase
+from opt3dgs_optim.names import GAUSSIAN_NAMES, check_names, split_name
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.parts.curvature import Curvature
 from opt3dgs_optim.parts.own_frame import OwnFrame
@@ -86,7 +88,7 @@ def check_supported(call: str, optimizer: Any, slots: Slots, moments: int) -> No
         if name is not None and len(group["params"]) != 1:
             raise ValueError(
                 f"{call}: {shown} holds {len(group['params'])} tensors; give each Gaussian "
-                "parameter one group with one tensor"
+                "parameter one group with one tensor, and a group of something else another name"
             )
         for param in group["params"]:
             if param.dtype not in (torch.float32, torch.float64) or param.layout != torch.strided:
@@ -186,18 +188,28 @@ def check_parts(call: str, parts: Any) -> Sequence[Part]:
             if isinstance(part, (list, tuple)):
                 cure = "; write a star before it, parts=[*DEFAULTS, Harmonics()]"
             raise TypeError(f"{call}: {part!r} in parts is no Part object{cure}")
+        _check_part(f"{call}: {type(part).__name__}", part)
     kinds = [type(part) for part in parts]
-    if OwnFrame in kinds and Curvature in kinds:
+    if all(any(isinstance(part, kind) for part in parts) for kind in (OwnFrame, Curvature)):
         raise ValueError(
             f"{call}: OwnFrame and Curvature cannot be combined, since Curvature's pairs are in "
             "world units and OwnFrame's steps are not; leave one of the two out"
         )
-    for kind in kinds:
-        if kinds.count(kind) > 1:
+    for kind in kinds:  # what they note is saved by the class's name
+        if sum(issubclass(k, kind) or k.__name__ == kind.__name__ for k in kinds) > 1:
             raise ValueError(
                 f"{call}: {kind.__name__} is there twice in parts; give one part of each class"
             )
     return parts
+
+
+def _check_part(call: str, part: Part) -> None:
+    """Refuse a part that would never act, or not be saved."""
+    check_choice(call, "during", part.during, (None, *Phase))
+    if part.names is not None and (known := check_names(call, part.names)) != tuple(part.names):
+        raise ValueError(f"{call}: names={part.names!r}, but gsplat's are needed: names={known!r}")
+    if part.overrides("state_dict") and not part.learns:
+        raise ValueError(f"{call} has a state_dict, but is not saved; set learns = True in it")
 
 
 def named(optimizers: Any) -> list[tuple[str | None, Any]]:

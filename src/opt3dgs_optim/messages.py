@@ -80,7 +80,7 @@ class End:
         if self.upgraded is None:
             return (
                 "opt3dgs_optim: a PhaseScheduler was made, but its upgrade(optimizers) was not "
-                "called, so that it has done nothing"
+                "called in this process, so that it has done nothing here"
             )
         if self.upgraded and not self.done:
             return (

@@ -139,11 +139,8 @@ class ParamStepper:
             self._arrange(iteration)
         for part in self.acting[training.exploiting][0]:
             part.plan(step, training)
-        if step.grad is not grad and (got := getattr(step.grad, "shape", step.grad)) != grad.shape:
-            raise ValueError(
-                f"{self.call}.step: a part has put {got} in the place of the gradient of "
-                f"{self.name or 'a parameter'}, but a tensor of {tuple(grad.shape)} is needed"
-            )
+        if step.grad is not grad or step.param is not param or isinstance(step.factor, Tensor):
+            self._check_plan(step, param, grad)
         if step.plain:
             step.frame = None  # the rate of a plain step is the trainer's
         framed = step.frame is not None
@@ -159,6 +156,20 @@ class ParamStepper:
             begin_moments_anew(state)
         self.stepped_in = iteration
         return step
+
+    def _check_plan(self, step: Step, param: Tensor, grad: Tensor) -> None:
+        """Refuse what parts have put into a step that is no part of any."""
+        of, got = self.name or "a parameter", getattr(step.grad, "shape", step.grad)
+        put = None
+        if step.param is not param:
+            put = f"another tensor in the place of {of}; change it in place, in `after`"
+        elif isinstance(step.factor, Tensor) and step.factor.numel() != 1:
+            put = f"{step.factor.numel()} numbers as factor of {of}, but one is needed"
+        elif got != grad.shape:
+            needed = f"a tensor of {tuple(grad.shape)} is needed"
+            put = f"{got} in the place of the gradient of {of}, but {needed}"
+        if put is not None:
+            raise ValueError(f"{self.call}.step: a part has put {put}")
 
     def _begin(self, param: Tensor, state: dict[str, Any]) -> None:
         state["step"] = torch.zeros((), dtype=torch.float32, device="cpu")

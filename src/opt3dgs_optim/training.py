@@ -65,7 +65,7 @@ class Training(Clock):
                         f"{type(self).__name__}: {type(part).__name__} serves another training "
                         f"already, and has learnt there; make a new one, {type(part).__name__}(...)"
                     )
-                part._training = self
+                object.__setattr__(part, "_training", self)  # a frozen dataclass, too
 
     def part(self, kind: type[AnyPart]) -> AnyPart | None:
         """The part of that class, or None."""

@@ -12,6 +12,7 @@ beside a Triton that compiles.
 """
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportOperatorIssue=false
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportPossiblyUnboundVariable=false
 
 import triton
 import triton.language as tl
