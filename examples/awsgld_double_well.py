@@ -38,7 +38,7 @@ def walk(histogram: EnergyHistogram | None, factor: float = 1.0) -> tuple[int, f
 def main() -> int:
     """Print a line for each sampler."""
     torch.set_num_threads(1)
-    histogram = EnergyHistogram(40, (0.0, 8.0), temperature=1.0, warmup=0)
+    histogram = EnergyHistogram(energy_range=(0.0, 8.0), temperature=1.0, warmup=0)
     found = {"SGLD": walk(None), "AWSGLD": walk(histogram)}
     mean = found["AWSGLD"][2]
     found[f"SGLD, gradient times {mean:.2f}"] = walk(None, mean)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from problems import double_well, gradient, kramers_rate, nine_modes
@@ -86,9 +87,36 @@ def crossings(histogram: EnergyHistogram | None, steps: int) -> int:
 
 
 def test_the_histogram_crosses_where_the_walk_does_not() -> None:
-    flat = EnergyHistogram(40, (0.0, 8.0), temperature=1.0, warmup=0)
+    flat = EnergyHistogram(energy_range=(0.0, 8.0), temperature=1.0, warmup=0)
     assert crossings(None, 2_000) <= 1  # Kramers: 0.1 in that time
     assert crossings(flat, 4_000) >= 3
+
+
+@pytest.mark.thorough
+def test_reweighted_samples_have_the_law_without_a_histogram() -> None:
+    """Of the barrier, which the walk itself visits ten times as often, and of the energy."""
+    temperature, steps = 0.2, 20_000
+    flat = EnergyHistogram(energy_range=(0.0, 1.5), temperature=temperature, warmup=0)
+    x, walk = chains(torch.ones(1, 1, dtype=torch.float64), 0.01, temperature, histogram=flat)
+    edges = np.linspace(0.0, 1.5, flat.num_partitions + 1)[1:-1]
+    found = []
+    for step in range(steps):
+        at = x.detach()
+        energy = float((at**2 - 1) ** 2)
+        x.grad = 4 * at * (at**2 - 1)
+        if step > steps // 4:
+            log_psi = np.interp(energy, edges, flat.weights.log()[:-1])
+            found.append((float(at.abs() < 0.5), energy, math.exp(flat.zeta * log_psi)))
+        flat.observe(energy)
+        walk.step()
+    barrier, energies, weights = np.array(found).T
+    grid = np.linspace(-3, 3, 6001)
+    law = np.exp(-((grid**2 - 1) ** 2) / temperature)
+    exact = np.average(np.abs(grid) < 0.5, weights=law)
+    assert barrier.mean() > 5 * exact
+    assert np.average(barrier, weights=weights) == pytest.approx(exact, rel=0.3)
+    mean = np.average((grid**2 - 1) ** 2, weights=law)
+    assert np.average(energies, weights=weights) == pytest.approx(mean, rel=0.2)
 
 
 def modes_found(histogram: EnergyHistogram | None, steps: int) -> int:

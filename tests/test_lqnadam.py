@@ -16,7 +16,6 @@ from opt3dgs_optim.parts.curvature import HISTORY
 OPTIONS: list[dict[str, Any]] = [
     {},
     {"betas": (0.5, 0.99), "eps": 1e-15},
-    {"weight_decay": 0.1},
 ]
 
 
@@ -41,6 +40,12 @@ def test_without_pairs_it_is_torch_adam_bit_for_bit(rows: int, options: dict[str
     assert torch.equal(ours, theirs)
     assert torch.equal(a.state[ours]["exp_avg_sq"], b.state[theirs]["exp_avg_sq"])
     assert float(a.accepted_share) == 0.0  # pyright: ignore[reportArgumentType]
+
+
+def test_weight_decay_is_refused() -> None:
+    """Behind H g it would move the minimum, to H g + decay x = 0."""
+    with pytest.raises(ValueError, match=r"weight_decay=0.1 would be added behind H g.*the loss"):
+        LQNAdam([{"params": [points()], "weight_decay": 0.1}])
 
 
 def test_it_resumes_bit_for_bit() -> None:

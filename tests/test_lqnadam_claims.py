@@ -80,7 +80,7 @@ def crossings(histogram: EnergyHistogram | None, steps: int = 20_000) -> int:
 
 
 def for_sampling() -> EnergyHistogram:
-    return EnergyHistogram(40, (0.0, 8.0), temperature=1.0, warmup=0)
+    return EnergyHistogram(energy_range=(0.0, 8.0), temperature=1.0, warmup=0)
 
 
 @pytest.mark.parametrize(

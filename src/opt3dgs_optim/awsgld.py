@@ -74,7 +74,7 @@ class AWSGLD(StepAdam):
         ...     return min(seen) < -0.5 and max(seen) > 0.5
         >>> visits_both_wells(None)
         False
-        >>> visits_both_wells(EnergyHistogram(40, (0.0, 8.0), temperature=1.0, warmup=0))
+        >>> visits_both_wells(EnergyHistogram(energy_range=(0.0, 8.0), temperature=1.0, warmup=0))
         True
 
     Raises:

@@ -18,6 +18,7 @@ from opt3dgs_optim.training import Training
 
 # The temperature is not given in the paper; zeta * tau / du = 1.5 at its zeta and du.
 PAPER: dict[str, Any] = {"energy_range": (0.0, 0.2), "temperature": 2e-3, "warmup": 2500}
+PAPER["num_partitions"] = MOST = 200
 PAPER_CLAMP = (-5.0, 5.0)  # not given in the paper; the only published one of its family
 CALL = "EnergyHistogram"
 CLAMP = (-1.0, 3.0)  # twice as far from 1 as nu is two deviations out
@@ -38,14 +39,17 @@ class EnergyHistogram(Part):
 
     The default is made for trainings. **To sample** a fixed energy, give `energy_range`, from the
     lowest energy to a little above the barriers that are to be crossed, `temperature`, the same as
-    the noise's (`IsotropicNoise`), and `warmup=0`. The default's partitions follow the walk, so
-    the well in which it began looks like all there is. In a double well whose barrier is
-    six times the temperature, a walk of 20,000 steps of 0.006 crossed it once without a histogram,
-    5 times with the default, and some 40 times with a range and a temperature
-    (`python tests/test_lqnadam_claims.py`).
+    the noise's (`IsotropicNoise`), and `warmup=0`. The law is then exp(-energy / temperature) over
+    Psi(energy)^zeta, see `weights`. Energies outside the range have nu 1; an optimizer is one
+    chain, whatever its rows are. The default's partitions follow the walk, so the well in which it
+    began looks like all there is. In a double well whose barrier is six times the temperature, a
+    walk of 20,000 steps of 0.006 crossed it once without a histogram, 5 times with the default, and
+    some 40 times with a range and a temperature (`python tests/test_lqnadam_claims.py`).
 
     Args:
-        num_partitions: number of partitions; None: 48 if they follow the energy, 200 for a range.
+        num_partitions: number of partitions; None: 48 if they follow the energy; for a range as
+            many as are half a temperature wide, at most 200, which are the paper's. Where they are
+            narrower nu is often at its bounds, and the samples' law is not the one above.
         energy_range: (low, high) in units of the loss, cut uniformly; the first and the last
             partition are open (eq. 7). `"auto"`: see above.
         zeta: flattening exponent, from 0 to 1. With an automatic temperature it must be neither 0
@@ -73,12 +77,18 @@ class EnergyHistogram(Part):
         warmup: int = 250,
         clamp: tuple[float, float] | Literal["auto"] | None = "auto",
     ) -> None:
-        automatic = energy_range == "auto"
+        automatic = isinstance(energy_range, str) and energy_range == "auto"
         if automatic != (temperature == "auto"):
             given = f"energy_range={energy_range!r} and temperature={temperature!r}"
             raise ValueError(f"{CALL}: {given}, but either both are 'auto', or both are numbers")
+        self.energy_range, self.temperature = energy_range, temperature
+        span, tau, usual = (0.0, 0.0), 0.0, 48
+        if not automatic:
+            self.energy_range = span = check_interval(CALL, "energy_range", energy_range)
+            self.temperature = tau = check_number(CALL, "temperature", temperature, 0.0)
+            usual = half_a_temperature_wide(*span, tau)
+        wanted = usual if num_partitions is None else num_partitions
         fewest = 24 if automatic else 3  # at most half a deviation wide
-        wanted = (48 if automatic else 200) if num_partitions is None else num_partitions
         self.num_partitions = check_count(CALL, "num_partitions", wanted, fewest)
         ends = {"open_low": automatic, "open_high": automatic}
         self.zeta = check_number(CALL, "zeta", zeta, 0.0, 1.0, **ends)
@@ -88,13 +98,10 @@ class EnergyHistogram(Part):
         self.clamp = None if clamp is None else check_interval(CALL, "clamp", clamp)
         if self.clamp is not None and not self.clamp[0] <= 1 <= self.clamp[1]:
             raise ValueError(f"{CALL}: clamp={clamp!r}, but bounds on both sides of 1 are needed")
-        self.energy_range, self.temperature = energy_range, temperature
         self._partitions: FixedPartitions | MovingPartitions
         if automatic:
             self._partitions = MovingPartitions(self.num_partitions, self.zeta)
         else:
-            self.energy_range = span = check_interval(CALL, "energy_range", energy_range)
-            self.temperature = tau = check_number(CALL, "temperature", temperature, 0.0)
             self._partitions = FixedPartitions(self.num_partitions, span, self.zeta, tau)
         self.num_observed = 0
         self._place(torch.device("cpu"))
@@ -167,7 +174,11 @@ class EnergyHistogram(Part):
 
     @property
     def weights(self) -> Tensor:
-        """Theta, [num_partitions], positive, sum 1 (eq. 9)."""
+        """Theta, [num_partitions], positive, sum 1 (eq. 9).
+
+        For means under exp(-energy / temperature), a sample of energy u counts Psi(u)^zeta. The log
+        of Psi is that of Theta at each partition's upper edge, and linear between them (eq. 10).
+        """
         return self._partitions.weights
 
     @property
@@ -234,3 +245,8 @@ class EnergyHistogram(Part):
             return f"{line}1, warm-up: {int(self._taken)} of {self.warmup} energies"
         mean, deviation = float(self.mean_multiplier), float(self.multiplier_std)
         return f"{line}{float(self._nu):.4g}, mean {mean:.4g} +- {deviation:.2g}"
+
+
+def half_a_temperature_wide(low: float, high: float, temperature: float) -> int:
+    """How many partitions of a range are half a temperature wide, 3 to `MOST`."""
+    return max(3, round(min(2 * (high - low) / temperature, MOST))) if temperature else 3
