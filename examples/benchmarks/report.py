@@ -49,6 +49,7 @@ PHOTOS = (
     ("bonsai", "220 of 400x266", HALF),
     ("lego", "87 of 400x400", HALF),
     ("plush", "84 of 320x240", HALF),
+    ("train", "263 of 489x271", HALF),
 )
 Run = tuple[str, int]  # an arm, and the iterations that it is planned for
 lines = cache(evidence.read)
