@@ -34,4 +34,4 @@ def no_line_of_an_early_end(
     """Tests leave hundreds of trainings unfinished; each would say so in a line."""
     from opt3dgs_optim.messages import End
 
-    monkeypatch.setattr(End, "say", lambda _: None)
+    monkeypatch.setattr(End, "say", lambda *_: None)

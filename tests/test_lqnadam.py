@@ -16,6 +16,7 @@ from opt3dgs_optim.parts.curvature import HISTORY
 OPTIONS: list[dict[str, Any]] = [
     {},
     {"betas": (0.5, 0.99), "eps": 1e-15},
+    {"weight_decay": 0.1},
 ]
 
 
@@ -42,10 +43,18 @@ def test_without_pairs_it_is_torch_adam_bit_for_bit(rows: int, options: dict[str
     assert float(a.accepted_share) == 0.0  # pyright: ignore[reportArgumentType]
 
 
-def test_weight_decay_is_refused() -> None:
-    """Behind H g it would move the minimum, to H g + decay x = 0."""
-    with pytest.raises(ValueError, match=r"weight_decay=0.1 would be added behind H g.*the loss"):
-        LQNAdam([{"params": [points()], "weight_decay": 0.1}])
+def test_weight_decay_moves_the_minimum_as_adams_does() -> None:
+    """To H x + decay x = b; behind the direction it would be another."""
+    hessian = torch.tensor([[2.0, 0.9], [0.9, 1.0]], dtype=torch.float64)
+    b = torch.tensor([1.0, -2.0], dtype=torch.float64)
+    x = Parameter(torch.zeros(1, 2, dtype=torch.float64))
+    optimizer = LQNAdam([x], lr=0.1, weight_decay=1.0)
+    for step in range(600):
+        optimizer.param_groups[0]["lr"] = 0.1 * (1 - step / 600)
+        x.grad = x.detach() @ hessian - b
+        optimizer.step()
+    minimum = torch.linalg.solve(hessian + torch.eye(2, dtype=torch.float64), b)
+    torch.testing.assert_close(x.detach()[0], minimum, rtol=0, atol=1e-4)
 
 
 def test_it_resumes_bit_for_bit() -> None:

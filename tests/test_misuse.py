@@ -63,11 +63,11 @@ OPTIMIZERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         "SGD has a step of its own.*; or leave 'camera' out, which holds no Gaussians",
     ),
     "a foreign step": (lambda: Foreign(one().param_groups), TypeError, "Foreign has a step of its"),
-    "no optimizer": (lambda: torch.ones(3), TypeError, "Tensor is no optimizer; pass the trainer"),
+    "no optimizer": (lambda: torch.ones(3), TypeError, "Tensor is no optimizer; pass the one that"),
     "a model": (
         lambda: torch.nn.ParameterDict({"means": torch.ones(ROWS, 3)}),
         TypeError,
-        r"ParameterDict is no optimizer; pass the trainer's own \(gaussians.optimizer, say\)",
+        r"ParameterDict is no optimizer; pass the one that .* \(gaussians.optimizer, say\)",
     ),
     "others, in a list": (
         lambda: [one(), torch.optim.SGD([Parameter(torch.ones(3))], lr=0.1)],
@@ -145,7 +145,7 @@ def test_two_sets_under_one_name_are_told(recwarn: pytest.WarningsRecorder) -> N
     steps({"means": phases.upgrade(first)}, params, 0)
     phases.upgrade(first)
     assert not recwarn.list
-    with pytest.warns(UserWarning, match="another optimizer holds means already; for two sets"):
+    with pytest.warns(UserWarning, match="another optimizer holds means already; if both"):
         phases.upgrade(one())
     phases = PhaseScheduler(100, parts=[Averaging()])
     trained = phases.upgrade(adams_of(params))
@@ -179,10 +179,10 @@ SCHEDULERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
     "INRIA's names": (
         lambda: part(names=("opacity", "f_dc")),
         ValueError,
-        r"Mine: names=.*, but gsplat's are needed: names=\('opacities', 'sh0'\)",
+        r"Mine: names=\('opacity', 'f_dc'\), but a tuple of means, .*shN is needed",
     ),
     "other names": (lambda: part(names=("means", "mlp")), ValueError, "Mine: names=.* is needed"),
-    "a name": (lambda: part(names="means"), ValueError, "Mine: names='means', but a tuple"),
+    "a name": (lambda: part(names="means"), ValueError, "Mine: names='means', but a tuple of"),
     "a phase": (lambda: part(during="exploration"), ValueError, "during='exploration', but None"),
     "not saved": (
         lambda: part(state_dict=lambda _: {}),
@@ -366,16 +366,21 @@ def test_a_training_that_ends_early(total: int, done: int, finished: bool, said:
 def test_optimizers_that_make_no_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """As where the trainer makes its optimizers after `upgrade`."""
     told: list[Any] = []
-    monkeypatch.setattr(End, "say", lambda end: told.append(end.line()))
+    monkeypatch.setattr(End, "say", lambda end, line=None: told.append(line or end.line()))
     params = parameters(ROWS, "means")
-    phases = PhaseScheduler(600)
+    phases = PhaseScheduler(600, parts=[Averaging()])
     assert "its upgrade(optimizers) was not called" in str(phases.end_line())
     upgraded = phases.upgrade(adams_of(params))
     steps(adams_of(params), params, 3)
     assert "have made no step; upgrade those that the training steps" in str(phases.end_line())
     assert not told
     del upgraded  # as where a trainer makes others to load a checkpoint
-    assert told == [phases.end_line()]
+    assert len(told) == 1
+    assert "are gone before their first step; upgrade those that are made in their place" in told[0]
+    assert phases.end_line() is None  # it is said
+    phases.upgrade(adams := adams_of(params))
+    steps(adams, params, 3)
+    assert "ended at iteration 3 of 600" in str(phases.end_line())
 
 
 def test_a_schedule_that_another_takes_over_says_no_more() -> None:

@@ -23,7 +23,7 @@ from opt3dgs_optim.checkpoint import (
     complete_groups,
     drop_other_means,
     forget_own_frames,
-    next_by_counts,
+    iteration_by_counts,
     note_in_groups,
     numbers_of,
     recode_all,
@@ -337,12 +337,12 @@ class StepAdam(Adam):
             restore_training(training, saved)
             iteration = saved["iteration"] + missed
         else:
-            iteration = next_by_counts(type(self).__name__, counts, training, self.has_positions)
+            iteration = iteration_by_counts(type(self).__name__, counts, training)
         drop_other_means(self.state.values(), ours, training)
         self._steppers, self._in_order, self.next_iteration = [], [], iteration
-        clocks = training.clocks()
+        clocks = training.clocks()  # one that steps now and then lags
         if saved is not None or (counts and (self.has_positions or not any(clocks))):
-            training.resume(max([iteration, *clocks]))  # one that steps now and then lags
+            training.resume(max([iteration, *clocks]), saved is None and any(counts))
         recode_all(self.state, self.coded, saved, training)
         self.coded = training.moments == 16
         if not training.changes_steps:

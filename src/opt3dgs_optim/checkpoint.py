@@ -236,7 +236,7 @@ def steps_of_a_stock_adam(
     return missed
 
 
-def next_by_counts(call: str, counts: list[int], training: Training, tell: bool) -> int:
+def iteration_by_counts(call: str, counts: list[int], training: Training) -> int:
     """The iteration that comes next, by Adam's own counts of steps, of a stock checkpoint."""
     if not counts:
         return training.iteration + 1
@@ -245,12 +245,6 @@ def next_by_counts(call: str, counts: list[int], training: Training, tell: bool)
             "uncounted",
             f"{call}: it has moments, but does not count its steps, so that the clock begins at 0; "
             "call phases.observe(iteration=...) where the training goes on",
-        )
-        return 0
-    if tell:
-        training.messages.say_once(
-            f"opt3dgs_optim: the training goes on at iteration {max(counts)}, by Adam's count of "
-            "steps; where the trainer has left out steps, call phases.observe(iteration=...)"
         )
     return max(counts)
 

@@ -13,7 +13,7 @@ from torch.optim import Adam, AdamW, Optimizer
 
 from opt3dgs_optim.checks import check_choice
 from opt3dgs_optim.clock import Phase
-from opt3dgs_optim.names import GAUSSIAN_NAMES, check_names, split_name
+from opt3dgs_optim.names import GAUSSIAN, GAUSSIAN_NAMES, split_name
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.parts.curvature import Curvature
 from opt3dgs_optim.parts.own_frame import OwnFrame
@@ -56,8 +56,8 @@ def check_supported(call: str, optimizer: Any, slots: Slots, moments: int) -> No
     kind = type(optimizer)
     if not isinstance(optimizer, Optimizer):
         raise TypeError(
-            f"{call}: {kind.__name__} is no optimizer; pass the trainer's own "
-            "(gaussians.optimizer, say), when it is made, or a dict or list of them"
+            f"{call}: {kind.__name__} is no optimizer; pass the one that the trainer has made "
+            "(gaussians.optimizer, say), or a dict or list of them"
         )
     _check_bare(call, optimizer)
     owner = (
@@ -196,7 +196,8 @@ def check_parts(call: str, parts: Any) -> Sequence[Part]:
             "world units and OwnFrame's steps are not; leave one of the two out"
         )
     for kind in kinds:  # what they note is saved by the class's name
-        if sum(issubclass(k, kind) or k.__name__ == kind.__name__ for k in kinds) > 1:
+        own = kind.__module__.startswith(f"{__package__}.")
+        if sum(k.__name__ == kind.__name__ or (own and issubclass(k, kind)) for k in kinds) > 1:
             raise ValueError(
                 f"{call}: {kind.__name__} is there twice in parts; give one part of each class"
             )
@@ -206,8 +207,9 @@ def check_parts(call: str, parts: Any) -> Sequence[Part]:
 def _check_part(call: str, part: Part) -> None:
     """Refuse a part that would never act, or not be saved."""
     check_choice(call, "during", part.during, (None, *Phase))
-    if part.names is not None and (known := check_names(call, part.names)) != tuple(part.names):
-        raise ValueError(f"{call}: names={part.names!r}, but gsplat's are needed: names={known!r}")
+    names = part.names
+    if names is not None and (isinstance(names, str) or any(n not in GAUSSIAN for n in names)):
+        raise ValueError(f"{call}: names={names!r}, but a tuple of {', '.join(GAUSSIAN)} is needed")
     if part.overrides("state_dict") and not part.learns:
         raise ValueError(f"{call} has a state_dict, but is not saved; set learns = True in it")
 

@@ -44,7 +44,7 @@ class LQNAdam(StepAdam):
     Memory: Adam's, plus 160 bytes per row of three coordinates with five pairs.
 
     Args:
-        params, lr, betas, eps: as in `torch.optim.Adam`. Weight decay is a term of the loss.
+        params, lr, betas, eps, weight_decay: as in `torch.optim.Adam`.
         history_size, min_cosine, graft, backend: as in `Curvature`.
         moments: bits per number of each of Adam's two moments; 16 halves Adam's memory.
 
@@ -78,6 +78,7 @@ class LQNAdam(StepAdam):
         lr: float = 1e-3,
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-8,
+        weight_decay: float = 0.0,
         *,
         history_size: int = 5,
         min_cosine: float = 1e-6,
@@ -89,18 +90,13 @@ class LQNAdam(StepAdam):
         curvature = Curvature(
             history_size, min_cosine=min_cosine, graft=graft, names=None, backend=backend
         )
-        super().__init__(params, lr, betas, eps)
+        super().__init__(params, lr, betas, eps, weight_decay)
         slots = [split_name(group.get("name")) for group in self.param_groups]
         check_supported("LQNAdam", self, slots, moments)
         self.follow(Training([curvature], switch_step=0, moments=moments), slots)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Add a group as in `torch.optim.Adam`; parameters of one dimension get a warning."""
-        if param_group.get("weight_decay"):
-            raise ValueError(
-                f"LQNAdam: weight_decay={param_group['weight_decay']!r} would be added behind H g, "
-                "and move the minimum; add it to the loss"
-            )
         super().add_param_group(param_group)
         for param in self.param_groups[-1]["params"]:
             if param.dim() == 1 and len(param) > 1:

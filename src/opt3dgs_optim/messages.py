@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import multiprocessing
 import os
 import sys
 import warnings
@@ -58,8 +59,9 @@ class End:
         mean_at: the first iteration after which the mean is in the parameters' place; infinity: it
             is not planned yet; None: there is none, without `Averaging` or in so short a training.
         passed: the end after which a training of no planned end has gone on.
-        upgraded: whether optimizers were; None: never; False: but resumed, as a checkpoint may be
-            loaded to be looked at.
+        asked: whether `upgrade` was called.
+        upgraded: whether optimizers were, and the training was not resumed since: a checkpoint may
+            be loaded to be looked at.
         held: how many of them there are still.
         done: iterations, if any was made here.
     """
@@ -69,20 +71,20 @@ class End:
         self.total_steps: int | None = None
         self.mean_at: float | None = None
         self.passed: int | None = None
-        self.upgraded: bool | None = None
+        self.asked = self.upgraded = self.finished = self._gone = False
         self.held = self.done = 0
-        self.finished = self._said = False
+        self._error = id(getattr(sys, "last_value", None))  # of before, in an interpreter
 
     def line(self) -> str | None:
         """The warning; None: nothing is wrong."""
-        if self.finished:
-            return None
-        if self.upgraded is None:
+        if self.finished or (not self.asked and multiprocessing.parent_process()):
+            return None  # a child makes the schedulers of modules once more
+        if not self.asked:
             return (
                 "opt3dgs_optim: a PhaseScheduler was made, but its upgrade(optimizers) was not "
-                "called in this process, so that it has done nothing here"
+                "called, so that it has done nothing"
             )
-        if self.upgraded and not self.done:
+        if self.upgraded and not self.done and not self._gone:
             return (
                 "opt3dgs_optim: the optimizers that were upgraded have made no step; upgrade those "
                 "that the training steps, below the lines that make them or load a checkpoint"
@@ -104,19 +106,22 @@ class End:
             f"parameters are the last iterate and no mean; {cure}"
         )
 
-    def say(self) -> None:
-        """Log the line, if there is one; not where an error has ended the program."""
-        line = None if self._said or hasattr(sys, "last_value") else self.line()
-        if line is not None:
-            self._said = True
+    def say(self, line: str | None = None) -> None:
+        """Log this line, or that of the end; nothing where an error has ended the program."""
+        line = line or self.line()
+        if line is not None and id(getattr(sys, "last_value", None)) == self._error:
             LOGGER.warning(line)
 
     def hold(self, optimizer: Any) -> None:
         """Have one more, and say at once if all of them are gone before their first step."""
-        self.held += 1
+        self.held, self._gone = self.held + 1, False
         weakref.finalize(optimizer, self._let_go).atexit = False
 
     def _let_go(self) -> None:
         self.held -= 1
         if not self.held and self.upgraded and not self.done:
-            self.say()
+            self._gone = True
+            self.say(
+                "opt3dgs_optim: the optimizers that were upgraded are gone before their first "
+                "step; upgrade those that are made in their place"
+            )

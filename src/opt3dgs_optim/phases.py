@@ -122,6 +122,7 @@ class PhaseScheduler(Training):
             TypeError, ValueError: an optimizer is outside of what is taken (`check_supported`), or
                 none holds Gaussians; nothing has been changed.
         """
+        self._end.asked = True
         given = named(optimizers)
         slots = [slots_of(key, optimizer) for key, optimizer in given]
         saved: list[Any] = []
@@ -135,7 +136,7 @@ class PhaseScheduler(Training):
             try:
                 check_supported(f"{CALL}.upgrade", optimizer, its, self.moments)
             except (TypeError, ValueError) as error:
-                if (key is None and not its) or any(name for _, name in its):
+                if len(given) == 1 or (key is None and not its) or any(name for _, name in its):
                     raise
                 which = "it" if key is None else repr(key)
                 raise type(error)(
@@ -162,9 +163,9 @@ class PhaseScheduler(Training):
             if held is not None and held[0]() not in (None, optimizer) and self.iteration < 0:
                 self.messages.warn_once(
                     "second",
-                    f"{CALL}.upgrade: another optimizer holds {name} already; for two sets of "
-                    "Gaussians name the groups 'first#means', 'second#means', or make a scheduler "
-                    "for each",
+                    f"{CALL}.upgrade: another optimizer holds {name} already; if both are "
+                    "stepped, of two sets of Gaussians, name the groups 'first#means', "
+                    "'second#means', or make a scheduler for each",
                 )
 
     def _say_upgraded(self, names: str) -> None:
@@ -205,10 +206,10 @@ class PhaseScheduler(Training):
             iteration: from 0; for trainers whose count differs from the number of their steps.
 
         Raises:
-            ValueError: the loss is not a single number, or an int, which is hardly one; or the
-                clock would go back, or beyond 2 * `total_steps`, or has no optimizers yet.
+            ValueError: the loss is not a single number, or a count; or the clock would go back, or
+                beyond 2 * `total_steps`, or has no optimizers yet.
         """
-        if type(loss) is int:
+        if type(loss) is int and loss > 0:
             raise ValueError(
                 f"{CALL}.observe: loss={loss}, an integer; for the trainer's count write "
                 f"observe(iteration={loss})"
@@ -216,8 +217,8 @@ class PhaseScheduler(Training):
         if iteration is not None:
             if not self.all_optimizers:
                 raise ValueError(
-                    f"{CALL}.observe: iteration={iteration} before upgrade(optimizers), which "
-                    "would set the clock anew; call it below"
+                    f"{CALL}.observe: iteration={iteration} before upgrade(optimizers), where a "
+                    "checkpoint sets the clock; call it below"
                 )
             iteration = check_count(f"{CALL}.observe", "iteration", iteration, 0)
             most = math.inf if self.end_step is None else 2 * self.end_step
@@ -269,12 +270,13 @@ class PhaseScheduler(Training):
 
     def go_on(self) -> None:
         """Have no end any more, after one."""
-        self._end.passed = self.end_step
+        if self.ended:
+            self._end.passed = self.end_step
+            self.messages.say_once(
+                f"opt3dgs_optim: the end that was planned, at iteration {self.end_step}, is over; "
+                "the training goes on, and the parameters are no mean any more"
+            )
         super().go_on()
-        self.messages.say_once(
-            f"opt3dgs_optim: the end that was planned, at iteration {self._end.passed}, is over; "
-            "the training goes on, and the parameters are no mean any more"
-        )
 
     def _plan_end(self) -> None:
         total, averaging = self.end_step, self.part(Averaging)
@@ -308,9 +310,14 @@ class PhaseScheduler(Training):
 
     # -- what it watches ---------------------------------------------------------------------------
 
-    def resume(self, iteration: int) -> None:
+    def resume(self, iteration: int, by_count: bool = False) -> None:
         """Go on from a checkpoint, which may have been loaded to be looked at alone."""
         super().resume(iteration)
+        if by_count and self.changes_steps:
+            self.messages.say_once(
+                f"opt3dgs_optim: the training goes on at iteration {iteration}, by Adam's count of "
+                "steps; where the trainer has left out steps, call phases.observe(iteration=...)"
+            )
         self._end.upgraded, self._end.done, self._end.finished = False, 0, False
 
     def advanced(self) -> None:

@@ -85,6 +85,7 @@ class Step:
         factor: on the learning rate; on a device it may be a tensor of one element.
         fresh: Adam's moments begin anew before the step.
         plain: no moments and no frame: the step is the gradient times the rate.
+        decayed: the gradient has the trainer's weight decay of Adam's kind in it.
         fade, frame, hold: see there; None: not in this step.
         put: whether the running mean, with this iterate in it, takes the parameter's place; None:
             this iterate is not averaged.
@@ -113,6 +114,7 @@ class Step:
     factor: Any = 1.0
     fresh: bool = False
     plain: bool = False
+    decayed: bool = False
     fade: Fade | None = None
     frame: Frame | None = None
     hold: Hold | None = None

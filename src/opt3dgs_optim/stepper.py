@@ -94,7 +94,7 @@ class ParamStepper:
         if decay := group["weight_decay"]:
             if group.get("decoupled_weight_decay"):
                 step.shrink = float(1.0 - step.lr * decay)
-            else:
+            elif not step.decayed:
                 step.decay = float(decay)
         if training.moments == 16:
             step.rounding = mixed(int(t))

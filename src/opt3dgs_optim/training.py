@@ -138,8 +138,11 @@ class Training(Clock):
             self._look_at = iteration + LOOK_INTERVAL
             self.look_at_numbers()
 
-    def resume(self, iteration: int) -> None:
-        """Go on at an iteration; drop what was kept from step to step before."""
+    def resume(self, iteration: int, by_count: bool = False) -> None:
+        """Go on at an iteration; drop what was kept from step to step before.
+
+        `by_count`: whether Adam's count of steps has said so.
+        """
         super().resume(iteration)
         self.unsaved.clear()
         self._look_at = min(self._look_at, iteration + LOOK_INTERVAL)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 import weakref
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -15,7 +17,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from opt3dgs_optim import cuda
 from opt3dgs_optim.lbfgs import lqn_direction, new_history, two_loop
 from opt3dgs_optim.lbfgs import pairs as columns_of
-from opt3dgs_optim.lbfgs.backend import obstacle
+from opt3dgs_optim.lbfgs.backend import backend_info, obstacle
 
 # inductor imports parts of torch that torch itself has deprecated
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
@@ -114,6 +116,28 @@ def test_operators_of_a_chunk() -> None:
 
 
 # -- which backend runs ----------------------------------------------------------------------------
+
+
+def test_a_gpu_that_nothing_compiles_for_has_plain_torch(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As with an NVRTC that does not know it; of each GPU by itself."""
+    asked = []
+
+    def kernel(_: str, device: int, *__: Any) -> None:
+        asked.append(device)
+        if device == 1:
+            raise RuntimeError("invalid value for --gpu-architecture")
+
+    monkeypatch.setitem(sys.modules, "cuda.core", ModuleType("cuda.core"))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(cuda, "_kernel", kernel)
+    monkeypatch.setattr(cuda, "missing", inspect.unwrap(cuda.missing))
+    assert backend_info("cuda:0").backend == "cuda"
+    found = backend_info("cuda:1")
+    assert (found.backend, asked) == ("torch", [0, 1])
+    assert "cannot compile for this GPU: RuntimeError: invalid value" in found.reason
+    assert found.reason in caplog.text
 
 
 def test_what_insists_on_a_kernel_is_told_why_there_is_none() -> None:

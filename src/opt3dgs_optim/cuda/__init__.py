@@ -15,6 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from opt3dgs_optim.messages import LOGGER
+
 MOST_PAIRS = 5  # of curvature, that fit into a thread's registers
 BLOCK = 128  # threads; the .cu files promise it to the compiler
 HEADER = "two_loop.cuh"
@@ -166,8 +168,12 @@ def _aligned(history: Tensor) -> Tensor:
 
 
 @functools.cache
-def missing() -> str | None:
-    """Why the kernels cannot be compiled and launched in this process, or None."""
+def missing(device: int | None = None) -> str | None:
+    """Why the kernels cannot be compiled and launched for a GPU, or None.
+
+    Args:
+        device: its index; None: the present one. The first call compiles a kernel for it.
+    """
     if torch.version.hip is not None:
         return "this torch is built for ROCm, and the kernels are CUDA"
     try:
@@ -180,7 +186,10 @@ def missing() -> str | None:
     if not torch.cuda.is_available():
         return "torch sees no CUDA device: no NVIDIA driver, or a build of torch without CUDA"
     try:  # the one of the defaults: NVRTC, and a driver, may not know each other or the GPU
-        _kernel("lqn_direction", torch.cuda.current_device(), torch.float32, MOST_PAIRS)
+        index = torch.cuda.current_device() if device is None else device
+        _kernel("lqn_direction", index, torch.float32, MOST_PAIRS)
     except Exception as error:
-        return f"cuda.core cannot compile for this GPU: {type(error).__name__}: {error}"
+        reason = f"cuda.core cannot compile for this GPU: {type(error).__name__}: {error}"
+        LOGGER.warning("opt3dgs_optim: %s; the curvature runs in plain torch", reason)
+        return reason
     return None

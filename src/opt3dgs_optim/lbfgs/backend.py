@@ -73,7 +73,7 @@ def obstacle(
         kind = str(dtype).removeprefix("torch.")
         found = f"the kernels take float32 and float64, not {kind}"
     else:
-        found = cuda.missing()
+        found = cuda.missing(device.index)
     if found is not None and backend == "cuda":
         raise RuntimeError(
             f"backend='cuda' was asked for on {device} in {dtype}, but {found}; backend='auto' "

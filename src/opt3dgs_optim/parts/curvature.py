@@ -83,6 +83,9 @@ class Curvature(Part):
         rows = len(param) if param.dim() else 1
         position = param.detach().reshape(rows, math.prod(param.shape[1:]))
         gradient = step.grad.reshape(position.shape)
+        if step.group["weight_decay"] and not step.group.get("decoupled_weight_decay"):
+            gradient = gradient.add(position, alpha=step.group["weight_decay"])
+            step.decayed = True  # behind H it would move the minimum
         history = step.keep(step.state, HISTORY, history_shape(position, self.history_size))
         fed, accepted, candidates = lqn_direction(
             position,

@@ -223,7 +223,8 @@ class EnergyHistogram(Part):
         )
         if not fits or learnt[0] < 0 or not self._partitions.fits(learnt[5:]):
             raise ValueError(
-                f"{CALL}.load_state_dict: it is damaged, or of another histogram; load what one "
+                f"{CALL}.load_state_dict: it is damaged, or of another histogram (0.1.0 had 200 "
+                "partitions of a range); load what one "
                 f"with num_partitions={self.num_partitions} and energy_range={self.energy_range!r} "
                 "has learnt"
             )

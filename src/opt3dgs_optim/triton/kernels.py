@@ -3,9 +3,8 @@
 Every number is read once and written once; nothing lies between. A thread has four numbers of
 `step_rows`, or two Gaussians of `step_in_own_frame`. What changes from step to step is an argument
 that compiles nothing anew; what is not there is None, and compiles to nothing.
-What a load gives outside of its mask is never stored. Loads stand above the first atomic and the
-first store, which a compiler moves no load past: so they wait for the memory together.
-
+What a load gives outside of its mask is never stored. A compiler moves no load past an atomic or
+a store: so `step_rows` loads what every step has above them, and waits for all of it at once.
 No argument is a constexpr, so that a compiled kernel takes the same arguments in every version of
 Triton. Nothing of Triton's standard library is used, so that Triton's interpreter can run this file
 beside a Triton that compiles.
