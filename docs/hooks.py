@@ -8,17 +8,10 @@ from __future__ import annotations
 
 import html
 import re
-from pathlib import Path
 from typing import Any
 
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.+?)\\[)\]]</\1>', re.S)
 PICTURE = re.compile(r'<img [^>]*\bsrc="([^":]+)"[^>]*>')
-FETCHES = (
-    re.compile(r"<(?:script|img|iframe|source|video|embed)\b[^>]*\bsrc=[\"']?(?:https?:)?//", re.I),
-    re.compile(r"<link\b(?=[^>]*\brel=[\"']?(?:stylesheet|preload|preconnect|icon))"
-               r"[^>]*\bhref=[\"']?(?:https?:)?//", re.I),
-    re.compile(r"(?:@import\s+|url\()[\"']?(?:https?:)?//", re.I),
-)  # fmt: skip
 
 
 def on_config(config: Any, **_: Any) -> None:
@@ -32,20 +25,6 @@ def on_page_content(html: str, **_: Any) -> str:
     """Turn the formulas into MathML, let a picture open by itself."""
     html = FORMULA.sub(lambda m: mathml(m[2], block=m[1] == "div"), html)
     return PICTURE.sub(r'<a class="picture" href="\1">\g<0></a>', html)
-
-
-def on_post_build(config: Any, **_: Any) -> None:
-    """Fail where a page or style sheet would fetch something from the net."""
-    for path in sorted(Path(config["site_dir"]).rglob("*")):
-        if path.suffix in (".html", ".css"):
-            found = fetched(path.read_text(encoding="utf-8"))
-            if found:
-                raise SystemExit(f"{path} fetches from the net: {found}")
-
-
-def fetched(text: str) -> list[str]:
-    """What a browser would load from another server when it shows `text`."""
-    return [match[0] for pattern in FETCHES for match in pattern.finditer(text)]
 
 
 def mathml(latex: str, *, block: bool) -> str:

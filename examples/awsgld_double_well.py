@@ -40,6 +40,7 @@ def main() -> int:
     torch.set_num_threads(1)
     histogram = EnergyHistogram(energy_range=(0.0, 8.0), temperature=1.0, warmup=0)
     found = {"SGLD": walk(None), "AWSGLD": walk(histogram)}
+    found["AWSGLD, default range"] = walk(EnergyHistogram())
     mean = found["AWSGLD"][2]
     found[f"SGLD, gradient times {mean:.2f}"] = walk(None, mean)
     print(f"{STEPS:,} steps of {RATE}:")

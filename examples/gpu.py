@@ -3,12 +3,10 @@
 On a machine with an NVIDIA GPU, torch for it and `pip install -e ".[cuda,test]"`, in ten minutes:
 
 1. `opt3dgs doctor`, and the tests marked `cuda`;
-2. what a step costs beside six fused torch Adams: time, launches, waits for the device, memory;
-3. with `--gsplat PATH/examples/simple_trainer.py` and `--scene DIR`, gsplat's own `mcmc` training,
-   stock and with the lines of `opt3dgs lines`.
+2. what a step costs beside six fused torch Adams: time, launches, waits for the device, memory.
 
-Writes `report.md` and `report.json` to `--out`. With `--device cpu` the first two run on a CPU, at
-smaller sizes, which says nothing about a GPU.
+Writes `report.md` and `report.json` to `--out`. With `--device cpu` it runs on a CPU, at smaller
+sizes, which says nothing about a GPU. `benchmarks/simple_trainer.py` runs gsplat's own trainer.
 """
 
 from __future__ import annotations
@@ -17,8 +15,6 @@ import argparse
 import json
 import logging
 import os
-import re
-import shutil
 import statistics
 import subprocess
 import sys
@@ -63,35 +59,6 @@ def run(words: Sequence[str], folder: Path = ROOT) -> tuple[int, str, float]:
         check=False,
     )
     return done.returncode, done.stdout, round(time.perf_counter() - begin, 1)
-
-
-def training(script: Path, scene: Path, out: Path, iterations: int) -> dict[str, Any]:
-    """What gsplat's script says of its last evaluation, and its seconds; or its last line."""
-    count = str(iterations)
-    words = [str(script), "mcmc", "--data_dir", str(scene), "--data_factor", "1"]
-    words += ["--result_dir", str(out), "--disable_viewer", "--disable_video"]
-    words += ["--max_steps", count, "--eval_steps", count, "--save_steps", count]
-    code, said, seconds = run(words, out / "cwd")
-    if code:
-        lines = [line.strip() for line in re.split(r"[\r\n]", said) if line.strip()]
-        return {"failed": (lines or ["no output"])[-1], "seconds": seconds}
-    found: dict[str, Any] = {"seconds": seconds}
-    for path in sorted((out / "stats").glob("*_step*.json")):
-        found |= json.loads(path.read_text(encoding="utf-8"))
-    return {key: value for key, value in found.items() if isinstance(value, (int, float, str))}
-
-
-def trainings(script: Path, scene: Path, out: Path, iterations: int) -> dict[str, Any]:
-    """gsplat's training as it is, and with the lines that `opt3dgs lines` puts into a copy."""
-    edited = out / "edited"
-    shutil.rmtree(edited, ignore_errors=True)
-    plain = shutil.ignore_patterns(".git", "*.png", "*.jpg", "*.gif", "*.mp4", "results")
-    shutil.copytree(script.parent, edited, ignore=plain)
-    code, said, _ = run([*PACKAGE, "lines", str(edited / script.name), "--write"], out)
-    if code:
-        return {"failed": said.strip()}
-    scripts = {"stock": script, "with the lines": edited / script.name}
-    return {kind: training(s, scene, out / kind, iterations) for kind, s in scripts.items()}
 
 
 def recursion(device: torch.device, rounds: int, points: int = 10_000) -> str:
@@ -143,8 +110,7 @@ def report(made: dict[str, Any]) -> str:
         lines += ["On a GPU the six Adams are PyTorch's fused ones.", "", counts(made["steps"])]
         lines += ["", bandwidth(made["steps"])]
     lines += [f"\n{points:,} Gaussians: the device has no room." for points in made["no_room"]]
-    said = json.dumps(made["training"], indent=1)
-    return "\n".join([*lines, "", "## gsplat's own trainer", "", "```json", said, "```", ""])
+    return "\n".join([*lines, ""])
 
 
 def write(made: dict[str, Any], out: Path) -> None:
@@ -155,28 +121,22 @@ def write(made: dict[str, Any], out: Path) -> None:
 
 @command("gpu")
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; 1 where the doctor, a test or a training has failed."""
+    """The command line; 1 where the doctor or a test has failed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     add = parser.add_argument
     add("--device", choices=("cuda", "cpu"), default="cuda")
     add("--points", type=int, nargs="+", metavar="N", help="numbers of Gaussians to step")
     add("--rounds", type=int, default=30, metavar="N", help="of every measurement")
-    add("--gsplat", type=Path, metavar="FILE", help="simple_trainer.py of a gsplat checkout")
-    add("--scene", type=Path, metavar="DIR", help="for it, in COLMAP's layout")
-    add("--iterations", type=int, default=3_000, metavar="N", help="of its trainings")
     add("-o", "--out", type=Path, default=Path("runs/gpu"), metavar="DIR")
     args = parser.parse_args(arguments)
     if args.device == "cuda" and not torch.cuda.is_available():
-        raise ValueError("torch sees no CUDA device; --device cpu runs the first parts on a CPU")
-    if args.gsplat is not None and not (args.gsplat.is_file() and args.scene is not None):
-        raise ValueError(f"--gsplat {args.gsplat}: simple_trainer.py, and --scene DIR, are needed")
+        raise ValueError("torch sees no CUDA device; --device cpu runs on a CPU")
     check_folder(args.out)
     logging.getLogger("opt3dgs_optim").setLevel(logging.ERROR)  # nothing is trained to its end
     device, out = torch.device(args.device), args.out.resolve()
     torch.set_num_threads(1)
     about = {"machine": steps.machine(device), "date": time.strftime("%Y-%m-%d", time.gmtime())}
     made: dict[str, Any] = {"about": {**about, **versions(device)}, "steps": {}, "no_room": []}
-    made["training"] = {}
     for name, words in (
         ("doctor", (*PACKAGE, "doctor", "--device", args.device)),
         ("tests", TESTS),
@@ -192,13 +152,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except torch.cuda.OutOfMemoryError:
             made["no_room"].append(points)
         write(made, out)  # what is measured is kept, whatever comes
-    if args.gsplat is not None:
-        found = trainings(args.gsplat.resolve(), args.scene.resolve(), out, args.iterations)
-        made["training"] = found
     write(made, out)
     print(out / "report.md")
-    failed = any("failed" in found for found in (made["training"], *made["training"].values()))
-    return int(made["doctor"]["code"] != 0 or made["tests"]["code"] not in (0, 5) or failed)
+    return int(made["doctor"]["code"] != 0 or made["tests"]["code"] not in (0, 5))
 
 
 if __name__ == "__main__":

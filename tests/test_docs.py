@@ -9,14 +9,13 @@ import importlib.util
 import io
 import pkgutil
 import re
-import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from docs_blocks import DOCS, ROOT, Block, anchors, blocks, name, pages, trainer_names, unfenced
+from docs_blocks import DOCS, ROOT, Block, anchors, blocks, name, pages, unfenced
 from docs_commands import SHELL, check_command, commands
 
 import opt3dgs_optim
@@ -55,7 +54,9 @@ def test_python_blocks_run_and_print_what_is_shown(
 ) -> None:
     """The blocks of a page run one after the other, in one namespace and an empty folder."""
     monkeypatch.chdir(tmp_path)
-    namespace: dict[str, Any] = {**trainer_names(), "__name__": "docs"}
+    means = torch.nn.Parameter(torch.ones(4, 3))
+    optimizers = {"means": torch.optim.Adam([means])}  # README's first block is of a trainer
+    namespace: dict[str, Any] = {"__name__": "docs", "total_steps": 9, "optimizers": optimizers}
     printed = io.StringIO()
     try:
         for block in blocks(page):
@@ -100,23 +101,6 @@ def test_commands_exist_with_their_options(page: Path) -> None:
     for block in blocks(page, *SHELL):
         for words in commands(block):
             check_command(words)
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "python -m opt3dgs_optim.no_such_module",
-        "opt3dgs report runs --no-such-option",
-        "python examples/no_such_file.py",
-        "python examples/quickstart.py --no-such-option",
-        "pip install .[no_such_extra]",
-        "pip install another_package",
-        "no-such-program",
-    ],
-)
-def test_wrong_commands_are_noticed(line: str) -> None:
-    with pytest.raises((AssertionError, ModuleNotFoundError)):
-        check_command(shlex.split(line))
 
 
 # -- links -----------------------------------------------------------------------------------------
@@ -167,22 +151,6 @@ def build_hooks() -> Any:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
-
-
-@pytest.mark.parametrize(
-    ("text", "bad"),
-    [
-        ('<script src="https://cdn.example/x.js"></script>', True),
-        ('<link rel="stylesheet" href="//fonts.example/css">', True),
-        ("@import 'https://x.example/a.css';", True),
-        ("a { background: url(//x.example/a.png) }", True),
-        ('<img src="https://x.example/a.png">', True),
-        ('<a href="https://arxiv.org/abs/2511.13571">', False),
-        ('<img src="results/a.png"><script src="assets/a.js"></script>', False),
-    ],
-)
-def test_what_would_come_from_the_net_is_found(text: str, bad: bool) -> None:
-    assert bool(build_hooks().fetched(text)) is bad
 
 
 def test_formulas_become_mathml() -> None:

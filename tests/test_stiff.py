@@ -284,7 +284,7 @@ def test_two_loop_with_a_line_search_reaches_the_minimum(problem: Problem, rows:
     scale, turn = log_uniform(rows, 1e-8, 1e8), rotations(rows, problem.dim)
     value = placed(problem, scale, turn)
     start = to_world(problem.starts(rows), scale, turn)
-    end = minimise(value, start, 150)[-1]
+    end = minimise(value, start, 150)
     bound = REACHED.get(problem.name, 1e-25)
     assert float(value(end).max()) < bound * problem.start_value
     if problem.name in ("Rosenbrock", "Beale", "Helical valley", "Wood"):

@@ -29,17 +29,17 @@ class LQNAdam(StepAdam):
 
     - on quadratics it is **slower than Adam** with a tuned learning rate for the first few hundred
       steps. After 200 steps, with three coordinates in random axes, Adam's error is smaller by more
-      than a factor of 100 where the condition is 100, and by a factor of 3 where it is 10,000;
+      than a factor of 100 where the condition is 100, and by a factor of 2 where it is 10,000;
     - it is **faster in narrow valleys**, by steps, given time. After 1,000 steps its error on the
       quadratics of condition 10,000 is smaller than Adam's by a factor of 10 and more. In the
-      curved valley of Rosenbrock's function it is smaller by a factor of 3 after 200 steps;
+      curved valley of Rosenbrock's function it is smaller by a factor of 10 after 200 steps;
     - on a CPU a step takes 10 (50 rows) to 20 times (10,000) as long as Adam's, so that by seconds
       it was faster on none of these;
     - in the last phase of a splatting training, for which the paper proposes it, it changes next to
       nothing here: positions hardly move by then (`docs/evidence.md`).
 
-    The first two compare each one's best of six learning rates; `tests/test_lqnadam_claims.py`
-    in a clone measures them.
+    The first two compare each one's best of six learning rates; `examples/lqnadam_quadratics.py`
+    measures them.
 
     Memory: Adam's, plus 160 bytes per row of three coordinates with five pairs.
 

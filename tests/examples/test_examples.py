@@ -76,7 +76,7 @@ def test_awsgld_crosses_the_barrier_and_sgld_does_not(
 ) -> None:
     monkeypatch.setattr(awsgld_double_well, "STEPS", 3_000)
     assert awsgld_double_well.main() == 0
-    _, sgld, awsgld, constant = capsys.readouterr().out.splitlines()
+    _, sgld, awsgld, _, constant = capsys.readouterr().out.splitlines()
     counts = [int(line.split(" crossings")[0].split()[-1]) for line in (sgld, awsgld, constant)]
     assert counts[0] <= 1
     assert min(counts[1:]) >= 2

@@ -19,7 +19,6 @@ from opt3dgs_optim.hosts.pages import OPEN_END, places_in, section
 from opt3dgs_optim.hosts.trainers import TRAINERS
 
 ROOT = Path(__file__).resolve().parents[2]
-PATCHES = ROOT / "examples" / "hosts"
 DOCS = ROOT / "docs" / "hosts"
 PYTHON = [name for name, trainer in TRAINERS.items() if trainer.places]
 FLAT = ("gsplat-2dgs",)  # flat Gaussians, with a third scale that nothing trains
@@ -209,22 +208,3 @@ def test_an_unknown_trainer(word: str, capsys: pytest.CaptureFixture[str]) -> No
     assert ANY in said
     assert lines.main([word, "--open-end"]) == 2
     assert capsys.readouterr().err == said
-
-
-@pytest.mark.parametrize("patch", sorted(PATCHES.glob("*.patch")), ids=lambda path: path.stem)
-def test_a_patch_adds_the_lines(patch: Path) -> None:
-    trainer = TRAINERS[patch.stem]
-    text = patch.read_text(encoding="utf-8")
-    changed = [line for line in text.splitlines() if re.match(r"[+-](?!\+\+|--)", line)]
-    added = [line[1:].strip() for line in changed if line.startswith("+")]
-    expected = [line for place in trainer.places for line in place.lines * place.times]
-    assert added == expected
-    assert len(added) == len(changed)  # nothing is taken away
-    commit = re.findall(r"Read at (?:main )?(.+?)[,. ]", trainer.head)[0]
-    assert commit in text
-
-
-def test_every_edited_trainer_has_a_patch() -> None:
-    assert {path.stem for path in PATCHES.glob("*.patch")} == {
-        name for name, trainer in TRAINERS.items() if trainer.signs
-    }

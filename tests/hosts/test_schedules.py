@@ -29,7 +29,6 @@ from opt3dgs_optim.hosts.trainers import TRAINERS
 
 STOCK = {name: text for name, one in TRAINERS.items() if (text := schedule(one)) is not None}
 MANY = [*range(300, 3000, 10), 3330, 7010, 7500, 9990, 10_000, 14_990, 15_000, 29_990, 30_000]
-SUPPORT = Path(__file__).resolve().parent / "support"
 INRIA = {  # name: folder and script
     "inria": ("gaussian-splatting", "train.py"), "3dgs-mcmc": ("3dgs-mcmc", "train.py"),
     "2dgs": ("2d-gaussian-splatting", "train.py"), "taming-3dgs": ("taming-3dgs", "train.py"),
@@ -216,7 +215,7 @@ def test_gsplats_configuration(name: str, version: str, tmp_path: Path) -> None:
     for words in commands(name, 10_000):
         script = source(f"gsplat-{version}", words[1])
         code = [sys.executable, "-c", GSPLAT, str(script), *words[2:]]
-        env = {"PYTHONPATH": ":".join([str(SUPPORT), *sys.path]), "PATH": "/usr/bin:/bin"}
+        env = {"PYTHONPATH": ":".join(sys.path), "PATH": "/usr/bin:/bin"}
         done = subprocess.run(
             code, cwd=tmp_path, env=env, capture_output=True, text=True, check=False
         )

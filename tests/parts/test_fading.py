@@ -14,6 +14,7 @@ from torch.optim import Adam
 
 from opt3dgs_optim import Fading, PhaseScheduler
 from opt3dgs_optim.clock import Clock
+from opt3dgs_optim.step import chosen_rows
 
 CPU = torch.device("cpu")
 
@@ -25,11 +26,11 @@ def test_a_share_of_the_points_is_chosen(event: int, seed: int, share: float) ->
     """By a hash: within five deviations of the share; other events and seeds choose others."""
     count = 20_000
     part = Fading(share=share, seed=seed)
-    chosen = part.chosen(event, count, CPU)
+    chosen = chosen_rows(part.fade(event), count, CPU)
     assert abs(int(chosen.sum()) - share * count) < 5 * (count * share * (1 - share)) ** 0.5
     for other in (
-        part.chosen(event + 1, count, CPU),
-        Fading(share, seed=seed + 1).chosen(event, count, CPU),
+        chosen_rows(part.fade(event + 1), count, CPU),
+        chosen_rows(Fading(share, seed=seed + 1).fade(event), count, CPU),
     ):
         both = float((chosen & other).sum()) / count
         assert abs(both - share**2) < 0.03
@@ -105,7 +106,7 @@ def test_a_faded_step_is_as_long_as_before_then_up_to_five_times() -> None:
         lengths.append((before - param.detach()).abs())
     at = next(i for i, each in enumerate(lengths) if each.amax() > each.amin() * 1.01)
     faded = (lengths[at + 5] > 2 * lengths[at - 1]).flatten()
-    assert torch.equal(faded, part.chosen(0, 1000, CPU))
+    assert torch.equal(faded, chosen_rows(part.fade(0), 1000, CPU))
     assert max(float(each.amax()) for each in lengths) <= 5.0
     assert max(float(each.amax()) for each in lengths) > 3.0
 

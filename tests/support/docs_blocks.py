@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import re
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
-
-import torch
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -72,82 +66,3 @@ def anchors(page: Path) -> set[str]:
     headings = re.findall(r"^#{1,6} +(.+?) *$", text, re.M)
     slugs = (re.sub(r"[^\w\s-]", "", heading.lower()) for heading in headings)
     return {re.sub(r"[\s]+", "-", slug.strip()) for slug in slugs}
-
-
-def adams(names: dict[str, int]) -> dict[str, torch.optim.Adam]:
-    """One Adam per parameter, of that many columns."""
-    return {
-        name: torch.optim.Adam(
-            [{"params": torch.nn.Parameter(torch.ones(4, columns)), "lr": 1e-3, "name": name}],
-            eps=1e-15,
-        )
-        for name, columns in names.items()
-    }
-
-
-def trainer_names() -> dict[str, Any]:
-    """What the excerpts of gsplat's and INRIA's trainers find around them."""
-    names = {"xyz": 3, "scaling": 3, "rotation": 4, "opacity": 1}
-    groups = [o.param_groups[0] for o in adams(names).values()]
-    image = torch.rand(3, 8, 8, requires_grad=True)
-    # What the trainers say before the line that is shown.
-    loss = image.square().mean()
-    loss.backward()
-    dict_of_adams = adams({"means": 3, "scales": 3, "quats": 4})
-    one_adam = torch.optim.Adam(groups, lr=0.0, eps=1e-15)
-    one_adam._optimizers = adams({"means": 3, "scales": 3})  # type: ignore[attr-defined]  # fVDB's
-    trainer = SimpleNamespace(
-        optimizers=dict_of_adams,
-        cfg=SimpleNamespace(strategy={}),
-        scene=SimpleNamespace(on_remove=print),  # told of row edits, as gsplat's
-        splats=torch.nn.ParameterDict(
-            {name: o.param_groups[0]["params"][0] for name, o in dict_of_adams.items()}
-        ),
-        strategy_state={},
-        config=SimpleNamespace(crops_per_image=1),
-        model=SimpleNamespace(optimizer=adams({"positions": 3})["positions"]),
-        trainer=SimpleNamespace(max_steps=100),
-        gaussian_optimizers=[*adams({"means": 3, "shs_dc": 3}).values()],
-        optimizer=one_adam,
-        num_iters=100,
-        step=0,
-        _global_step=0,
-    )
-    strategy = SimpleNamespace(method="GSStrategy")
-    return {
-        "torch": torch,
-        "os": os,
-        "self": trainer,
-        "conf": SimpleNamespace(n_iterations=100, strategy=strategy),
-        "opt_args": SimpleNamespace(iterations=100),
-        "total_steps": 100,
-        "optimizers": dict_of_adams,
-        "global_step": 1,
-        "PATH": Path(tempfile.mkdtemp()) / "training.pt",
-        "device": "cpu",
-        "loss": loss,
-        "loss_sum": loss,
-        "total_loss": loss,
-        "batch_losses": {"total_loss": loss},
-        "metrics": {"loss": loss},
-        "rgb_pred": image,
-        "rgb_gt": torch.rand(3, 8, 8),
-        "DefaultStrategy": dict,
-        "cfg": SimpleNamespace(max_steps=100),
-        "max_steps": 100,
-        "world_size": 1,
-        "masks": torch.ones(3, 8, 8, dtype=torch.bool),
-        "iteration": 1,
-        "step": 0,
-        "gaussians": SimpleNamespace(
-            optimizer=torch.optim.Adam(
-                [o.param_groups[0] for o in adams(names).values()], lr=0.0, eps=1e-15
-            ),
-            shoptimizer=None,
-        ),
-        "opt": SimpleNamespace(iterations=100),
-        "colors": image,
-        "pixels": torch.rand(3, 8, 8),
-        "image": image,
-        "gt_image": torch.rand(3, 8, 8),
-    }

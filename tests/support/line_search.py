@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from problems import gradient
@@ -18,41 +17,27 @@ def minimise(
     value: Function,
     x: Tensor,
     iterations: int,
-    *,
-    history_size: int = 5,
-    first: float = 0.1,
-    step: Callable[..., Any] = lqn_direction,
-) -> list[Tensor]:
-    """L-BFGS on every row of `x` [N, D]; the points after each iteration.
+) -> Tensor:
+    """Where L-BFGS on every row of `x` [N, D] ends.
 
-    It ends early where no row can go down any further.
-
-    Args:
-        value: the function of every row.
-        x: the starts.
-        iterations: line searches, of up to 50 evaluations each.
-        history_size: K.
-        first: length of the first step, as a share of the start's own length: rows may be in any
-            units, and the method has to go the same way in all of them.
-        step: the recursion, `lqn_direction` or another backend's.
+    That is early where no row can go down any further. The first step is a tenth of the start's
+    own length: rows may be in any units, and the method has to go the same way in all of them.
     """
-    history = new_history(x, history_size)
+    history = new_history(x, 5)
     options = {"min_cosine": 1e-14, "graft": False}
-    length = x.norm(dim=1, keepdim=True) * first
-    training = []
+    length = x.norm(dim=1, keepdim=True) * 0.1
     for _ in range(iterations):
         g = gradient(value, x)
-        found = step(x, g, history, history_size, **options)[0]
+        found = lqn_direction(x, g, history, 5, **options)[0]  # pyright: ignore
         unit = g / g.abs().amax(1, keepdim=True).clamp(min=1e-300)
         steepest = -unit / unit.norm(dim=1, keepdim=True).clamp(min=1e-300) * length
         own = (found == g).all(1)  # no pair, or no descent: the length of g says nothing
         down = torch.where(own[:, None], steepest, -found)
         lengths = weak_wolfe(value, x, g, down)
         x = x + lengths[:, None] * down
-        training.append(x)
         if not bool(lengths.any()):
             break
-    return training
+    return x
 
 
 def weak_wolfe(value: Function, x: Tensor, g: Tensor, down: Tensor) -> Tensor:

@@ -7,14 +7,13 @@ import math
 import numpy as np
 
 
-def dense_bfgs(s: np.ndarray, y: np.ndarray, gamma: float | None = None) -> np.ndarray:
+def dense_bfgs(s: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Inverse-Hessian matrix after the pairs s, y [K, D], oldest first, one BFGS update each.
 
     Nocedal and Wright (2006), eq. 7.16, from H0 = gamma I with gamma = s.y / y.y of the newest.
     """
     dim = s.shape[1]
-    if gamma is None:
-        gamma = float(s[-1] @ y[-1] / (y[-1] @ y[-1]))
+    gamma = float(s[-1] @ y[-1] / (y[-1] @ y[-1]))
     h = gamma * np.eye(dim)
     for s_k, y_k in zip(s, y, strict=True):
         rho = 1.0 / float(s_k @ y_k)

@@ -23,7 +23,6 @@ class Problem:
     start: tuple[float, ...]
     start_value: float
     minimum: tuple[float, ...]
-    minimum_value: float = 0.0
 
     @property
     def dim(self) -> int:
@@ -36,10 +35,6 @@ class Problem:
     def minima(self, rows: int, dtype: torch.dtype = torch.float64) -> Tensor:
         """[rows, D] copies of the minimum."""
         return torch.tensor(self.minimum, dtype=dtype).repeat(rows, 1)
-
-    def gradient(self, x: Tensor) -> Tensor:
-        """[N, D] of [N, D]."""
-        return gradient(self.value, x)
 
 
 def gradient(value: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
@@ -118,10 +113,6 @@ SMOOTH = (  # one valley each: a quasi-Newton method with a line search gets to 
     Problem("Helical valley", helical_valley, (-1.0, 0.0, 0.0), 2500.0, (1.0, 0.0, 0.0)),
     Problem("Powell singular", powell_singular, (3.0, -1.0, 0.0, 1.0), 215.0, (0.0,) * 4),
     Problem("Wood", wood, (-3.0, -1.0, -3.0, -1.0), 19192.0, (1.0,) * 4),
-)
-MULTIMODAL = (
-    Problem("Double well", double_well, (-1.0,), 0.0, (-1.0,)),
-    Problem("Nine modes", nine_modes, (2.0, 2.0), 1.606553371, (0.0, 0.0), -20 / 3),
 )
 
 

@@ -6,14 +6,11 @@ import functools
 import math
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
-
 from opt3dgs_optim.checks import check_count, check_number, set_options
 from opt3dgs_optim.clock import Clock
 from opt3dgs_optim.names import GAUSSIAN, check_names
 from opt3dgs_optim.part import Part
-from opt3dgs_optim.step import Fade, Step, chosen_rows, mixed
+from opt3dgs_optim.step import Fade, Step, mixed
 from opt3dgs_optim.training import Training
 
 CALL = "Fading"
@@ -112,10 +109,6 @@ class Fading(Part):
         """What an event does."""
         key = mixed((event + self.seed * 0x9E3779B1) & 0xFFFFFFFF)
         return Fade(key, self.share, self.exp_avg, self.exp_avg_sq)
-
-    def chosen(self, event: int, num_points: int, device: torch.device) -> Tensor:
-        """Which points an event fades, [num_points] bool: the same in every parameter."""
-        return chosen_rows(self.fade(event), num_points, device)
 
 
 def share_of_events(num_points: int) -> float:
