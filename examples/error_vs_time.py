@@ -1,13 +1,13 @@
 """Error against run time, ways of training side by side: python examples/error_vs_time.py
 
 Trains a small scene that it draws itself, so nothing is downloaded: 3DGS-MCMC as its authors
-publish it (`mcmc`), the same with this package's defaults (`defaults`), and with all steps three
+publish it (`stock`), the same with this package's defaults (`defaults`), and with all steps three
 times as long (`x3`, the best of the constant factors that were tried at this length). They take
 turns, so that what else the machine does slows all of them alike, and are compared at equal
 seconds. Under a minute on a free core, two on a busy one; the first start compiles the renderer.
 
     python examples/error_vs_time.py --seeds 3 --iterations 7500           (half an hour)
-    python examples/error_vs_time.py --scene DIR --size images_4 --points 10000 --arms mcmc,own,x2
+    python examples/error_vs_time.py --scene DIR --size images_4 --points 10000 --arms stock,defaults,x2
 
 Longer trainings, which are resumed after a stop: examples/benchmarks/train.py.
 """
