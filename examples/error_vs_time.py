@@ -7,7 +7,7 @@ turns, so that what else the machine does slows all of them alike, and are compa
 seconds. Under a minute on a free core, two on a busy one; the first start compiles the renderer.
 
     python examples/error_vs_time.py --seeds 3 --iterations 7500           (half an hour)
-    python examples/error_vs_time.py --scene DIR --size images_4 --points 10000 --arms stock,defaults,x2
+    python examples/error_vs_time.py --scene DIR --size images_4 --points 10000 --arms stock,x2
 
 Longer trainings, which are resumed after a stop: examples/benchmarks/train.py.
 """
