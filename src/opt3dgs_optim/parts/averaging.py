@@ -23,9 +23,10 @@ class Averaging(Part):
 
     Every step follows one view, so the parameters wander around what fits all views, further with
     higher learning rates; their mean does not. Averaging covers the last thirtieth of the run, or
-    the last fifth of the fall where no end was planned: 250 to 499 of its iterates, or all if there
-    are fewer. In the last tenth of it, at least the last two iterations, the mean takes the
-    parameters' place, because trainers save before their last step. Until then nothing is changed.
+    the last fifth of the fall where no end was planned: at least 250 of its iterates, or all if
+    there are fewer. In its last tenth, at least the last two iterations, every iterate counts, and
+    the mean takes the parameters' place, because trainers save before their last step. Until then
+    nothing is changed.
 
     After an edit of rows the edited parameters' means begin anew: density control should end before
     the averaging. Iterates that are not finite are left out. In the last thirtieth it takes the
