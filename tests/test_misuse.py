@@ -363,6 +363,15 @@ def test_a_training_that_ends_early(total: int, done: int, finished: bool, said:
     assert line is None or (f"iteration {done} of 600" in line and "phases.finish()" in line)
 
 
+def test_lines_below_the_loop() -> None:
+    """The optimizer has made its steps before, and makes no other."""
+    params = parameters(ROWS, "means")
+    steps(adams := adams_of(params), params, 3)
+    phases = PhaseScheduler(600, parts=[Averaging()])
+    phases.upgrade(adams)
+    assert "have made no step; upgrade those that the training steps" in str(phases.end_line())
+
+
 def test_optimizers_that_make_no_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """As where the trainer makes its optimizers after `upgrade`."""
     told: list[Any] = []

@@ -94,7 +94,7 @@ class End:
         where = f" of {self.total_steps or 'no planned end'}"
         cure = (
             "make total_steps the number of steps, upgrade optimizers that are made anew, and call "
-            "phases.finish() where a training ends early"
+            "phases.finish() where a training ends within its last thirtieth"
         )
         if self.passed is not None and self.total_steps is None:
             where = f", after the end that was planned at {self.passed}"

@@ -147,9 +147,9 @@ class PhaseScheduler(Training):
             saved.append(check_groups(f"{CALL}.upgrade", optimizer.param_groups))
         check_held_together(f"{CALL}.upgrade", given, slots, self.moments)
         restore_parts(self, [each for each in saved if each is not None])
-        self._end.upgraded = True
         for (_, optimizer), its in zip(given, slots, strict=True):
             self._upgrade(optimizer, its)
+        self._end.upgraded = True
         others = line_of_unknown_groups(f"{CALL}.upgrade", given, slots)
         if others and any(part.names is not None for part in self.parts):
             self.messages.warn_once("names", others)

@@ -8,7 +8,6 @@ photos in `images` and `images_4`. Some forty trainings of half a minute on a co
 from __future__ import annotations
 
 import importlib.util
-import math
 import subprocess
 import sys
 from importlib.metadata import entry_points
@@ -33,6 +32,7 @@ OLDER = [("gsplat", "gsplat-1.5.3"), ("gsplat", "gsplat-1.4.0"), ("gsplat-2dgs",
          ("gsplat-2dgs", "gsplat-1.4.0"), ("inria", "gaussian-splatting-2024-04")]  # fmt: skip
 FORKS = ("mip-splatting", "gaussian-opacity-fields", "RaDe-GS", "PGSR", "DashGaussian",
          "AbsGS", "Pixel-GS", "StopThePop")  # fmt: skip
+SCRIPTS = {"DashGaussian": "train_dash.py"}  # its train.py is INRIA's own
 EACH = [(name, PLACES.get(name, name)) for name, each in TABLE.items() if each.signs]
 
 pytestmark = pytest.mark.hosts
@@ -41,7 +41,7 @@ pytestmark = pytest.mark.hosts
 @pytest.mark.parametrize(("name", "folder"), [*EACH, *OLDER, *(("inria", each) for each in FORKS)])
 def test_the_real_file_gets_its_lines(name: str, folder: str, tmp_path: Path) -> None:
     """And no linter finds a name in it that is not defined."""
-    path = TRAINERS / folder / TABLE[name].file
+    path = TRAINERS / folder / SCRIPTS.get(folder, TABLE[name].file)
     if not path.is_file():
         pytest.skip(f"no {path}: put its sources there, set OPT3DGS_TRAINERS")
     found, new = diff.edited(path.read_bytes().decode())
@@ -64,10 +64,11 @@ def test_trains_saves_the_mean_and_resumes(trial: Trial, scene: Path, tmp_path: 
     steps = LENGTH if trial.gsplat else LENGTH - 1
     assert f"opt3dgs_optim: {steps} iterations" in ours.output
     assert "no mean" not in ours.output  # said of a training that ends before its end
-    if ours.psnr is not None:  # mini-splatting prints none
-        assert stock.psnr is not None
-        assert math.isfinite(ours.psnr)
-        assert ours.psnr > stock.psnr - trial.worse
+    assert stock.num_saved(stock.saved()) > 1000  # and so does the comparison below mean something
+    assert ours.num_saved(ours.saved()) > 1000
+    assert stock.psnr is not None
+    assert ours.psnr is not None
+    assert ours.psnr > stock.psnr - trial.worse
     ends_at_the_mean(trial, ours, ours.saved())
     if trial.gsplat:
         return

@@ -24,8 +24,8 @@ def test_trained_edited_saved_and_resumed(name: str, folder: str, kinds: int) ->
     """Bit for bit the trainer's own without parts, and through its checkpoint."""
     if not (TRAINERS / folder).is_dir():
         pytest.skip(f"no {TRAINERS / folder}: put its sources there, set OPT3DGS_TRAINERS")
-    if name == "3dgrut" and not importlib.util.find_spec("hydra"):
-        pytest.skip("3dgrut needs hydra-core: pip install it")
+    if name == "3dgrut" and not all(map(importlib.util.find_spec, ("hydra", "sklearn"))):
+        pytest.skip("3dgrut needs hydra-core and scikit-learn: pip install them")
     command = [sys.executable, without_renderer.__file__, name, str(TRAINERS / folder)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]

@@ -11,7 +11,9 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 from PIL import Image
+from plyfile import PlyData
 
 from opt3dgs_optim.hosts import diff
 from opt3dgs_optim.hosts.pages import places_in
@@ -90,7 +92,7 @@ class Done:
     @property
     def psnr(self) -> float | None:
         """That of the test views, which the trainer printed last, dB."""
-        found = re.findall(r"(?:Evaluating test: .*?PSNR |PSNR: )([\d.]+)", self.output)
+        found = re.findall(r"(?:Evaluating test: .*?PSNR |PSNR *: +)([\d.]+)", self.output)
         return float(found[-1]) if found else None
 
     def saved(self) -> Path:
@@ -100,6 +102,12 @@ class Done:
             *self.out.glob(f"point_cloud/iteration_{LENGTH}/point_cloud.ply"),
         ]
         return path
+
+    def num_saved(self, path: Path) -> int:
+        """How many Gaussians that file has."""
+        if path.suffix == ".ply":
+            return PlyData.read(str(path))["vertex"].count
+        return len(torch.load(path, weights_only=False)["splats"]["means"])
 
 
 _TAMING = "--cams 2 --percent_dense 0.03 --mode final_count --budget 6000"
@@ -114,12 +122,17 @@ TRIALS = (
     # Its steps have no bias correction, and annealing makes them up to four times longer still.
     Trial("gaussian-splatting", "--optimizer_type sparse_adam --disable_viewer", worse=6.0),
     Trial("3dgs-mcmc", "--cap_max 2500 --init_type sfm"),
-    Trial("2d-gaussian-splatting"),
+    Trial("2d-gaussian-splatting", "--opacity_cull 0.005"),  # else none is left after a reset
     Trial("taming-3dgs", _TAMING),
     Trial("mini-splatting", "--simp_iteration1 28 --densify_until_iter 28 --simp_iteration2 32 "
           "--imp_metric indoor", script="ms/train.py"),
 )  # fmt: skip
 GSPLAT_NEEDS = "torchmetrics tyro cv2 sklearn yaml imageio"
+NEEDS = {  # what a trainer imports before it is asked for anything
+    **{f"gsplat-{version}": GSPLAT_NEEDS for version in ("1.4.0", "1.5.3")},
+    "gsplat-main": f"{GSPLAT_NEEDS} piexif pycolmap",
+    "gaussian-splatting": "cv2",
+}
 
 
 def missing(trial: Trial) -> str | None:
@@ -128,7 +141,7 @@ def missing(trial: Trial) -> str | None:
 
     if not (TRAINERS / trial.trainer / trial.script).is_file():
         return f"no {TRAINERS / trial.trainer}: put its sources there, set OPT3DGS_TRAINERS"
-    names = GSPLAT_NEEDS.split() if trial.gsplat else []
+    names = NEEDS.get(trial.trainer, "").split()
     lacking = [name for name in names if not importlib.util.find_spec(name)]
     return f"{trial.trainer} needs {', '.join(lacking)}: pip install them" if lacking else None
 

@@ -2,7 +2,8 @@
 
 Its page has the options of the stock schedule of 30,000 iterations, and the lines of its file in
 which a number stands that no option has. Here each number is scaled by N/30,000. Ends are rounded
-down and all else up, so that no refinement and no reset of opacities is added.
+down and all else up, so that no refinement and no reset of opacities is added. A number with an
+exponent counts no iterations, and stays.
 """
 
 from __future__ import annotations
