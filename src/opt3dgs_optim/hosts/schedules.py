@@ -2,8 +2,8 @@
 
 Its page has the options of the stock schedule of 30,000 iterations, and the lines of its file in
 which a number stands that no option has. Here each number is scaled by N/30,000. Ends are rounded
-down and all else up, so that no refinement and no reset of opacities is added. A number with an
-exponent counts no iterations, and stays.
+down and all else up, so that no refinement and no reset of opacities is added (gsplat rounds its
+own down). A number with an exponent counts no iterations, and stays.
 """
 
 from __future__ import annotations
@@ -31,10 +31,12 @@ def shortened(stock: str, iterations: int) -> str:
     Raises:
         ValueError: so many iterations are not to be had.
     """
-    if iterations < 300 or iterations % 10:
+    found = re.search(r"in multiples of (\d+)", stock)
+    unit = int(found[1]) if found else 10
+    if iterations < 300 or iterations % unit:
         raise ValueError(
-            f"--iterations {iterations}, but a multiple of 10 is needed, 300 or more: opacities "
-            "are reset every tenth of a training, and some steps are a 300th of it apart"
+            f"--iterations {iterations}, but a multiple of {unit} is needed, 300 or more: "
+            "opacities are reset every tenth of a training, and some steps are a 300th of it apart"
         )
     groups = []
     for group in stock.split("\n\n"):
