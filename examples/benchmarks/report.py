@@ -46,6 +46,7 @@ NAMES = {
 PHOTOS = (
     ("bonsai", "220 of 800x532", WHOLE),
     ("lego", "87 of 800x800", WHOLE),
+    ("train", "263 of 979x543", WHOLE),
     ("bonsai", "220 of 400x266", HALF),
     ("lego", "87 of 400x400", HALF),
     ("plush", "84 of 320x240", HALF),
@@ -176,7 +177,7 @@ def less_stock(scenes: Iterable[str], runs: Sequence[Run], **those: Any) -> str:
 def whole() -> str:
     """A third and a half of stock's iterations against all of them, at whole size."""
     runs = [THIRD, MANY, ("defaults", 15_000)]
-    return less_stock(["bonsai", "lego"], runs, **WHOLE)
+    return less_stock(["bonsai", "lego", "train"], runs, **WHOLE)
 
 
 def outdoors() -> str:
