@@ -48,6 +48,7 @@ def trainer(
     density: str = "VanillaDensityControllerImpl",
     strategy: str = "VanillaOptStrategy",
     total: int = TOTAL,
+    epochs: int = -1,
 ) -> Any:
     """What the plugin sees of the trainer's `GaussianSplatting`."""
     torch.manual_seed(0)
@@ -63,7 +64,7 @@ def trainer(
         for names in NAMES
     ]
     return types.SimpleNamespace(
-        trainer=types.SimpleNamespace(max_steps=total),
+        trainer=types.SimpleNamespace(max_steps=total, max_epochs=epochs),
         gaussian_optimizers=optimizers,
         density_controller=type(density, (), {})(),
         hparams={"opt_strategy": type(strategy, (), {})()},
@@ -127,11 +128,13 @@ def test_a_checkpoint_of_the_unchanged_trainer(lightning: Any) -> None:
     assert module.phases.iteration == 30
 
 
-@pytest.mark.parametrize("total", [-1, 0, None])
-def test_a_number_of_iterations_is_needed(lightning: Any, total: Any) -> None:
+@pytest.mark.parametrize(("total", "epochs"), [(-1, -1), (TOTAL, 3), (-1, 3)])
+def test_a_number_of_iterations_is_needed(lightning: Any, total: int, epochs: int) -> None:
+    """Where epochs are given, the trainer has its 30,000 `max_steps` all the same."""
+    host = trainer(total=total, epochs=epochs)
     with pytest.raises(ValueError, match="the number of iterations is needed"):
-        set_up(lightning, trainer(total=total))
-    assert set_up(lightning, trainer(total=total), total_steps=50).phases.total_steps == 50
+        set_up(lightning, host)
+    assert set_up(lightning, host, total_steps=50).phases.total_steps == 50
 
 
 def test_accumulated_gradients_are_refused(lightning: Any) -> None:

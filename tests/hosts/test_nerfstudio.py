@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
 import re
 import sys
 import types
@@ -56,25 +55,6 @@ class Spec:
     description: str
 
 
-class Trainer:
-    """Of the main branch."""
-
-    def __init__(self, start: int = 0, total: int = TOTAL) -> None:
-        self.config, self._start_step = types.SimpleNamespace(max_num_iterations=total), start
-
-    def train(self) -> range:
-        num_iterations = self.config.max_num_iterations - self._start_step
-        return range(self._start_step, self._start_step + num_iterations)
-
-
-class OlderTrainer(Trainer):
-    """Of 1.1.5."""
-
-    def train(self) -> range:
-        num_iterations = self.config.max_num_iterations
-        return range(self._start_step, self._start_step + num_iterations)
-
-
 def method(name: str, model: Any) -> Any:
     pipeline = types.SimpleNamespace(model=model)
     return types.SimpleNamespace(method_name=name, pipeline=pipeline, max_num_iterations=TOTAL)
@@ -101,11 +81,19 @@ def ours(request: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     sys.modules.pop("opt3dgs_optim.hosts.nerfstudio", None)
 
 
-def set_up(ours: Any, spec: Any, trainer: Any) -> tuple[Any, dict[str, torch.optim.Adam]]:
+def set_up(
+    ours: Any, spec: Any, accumulated: int = 1, *, resumed: bool = False
+) -> tuple[Any, dict[str, torch.optim.Adam]]:
     """The model and the optimizers, when the trainer is set up."""
     model = ours.Opt3DGSSplatfactoModel(spec.config.pipeline.model)
     optimizers = {n: torch.optim.Adam([p], eps=1e-15) for n, p in model.gauss_params.items()}
     optimizers["camera_opt"] = torch.optim.Adam([Parameter(torch.zeros(1, 6))])
+    if resumed:  # nerfstudio's model makes its Parameters anew where it loads a checkpoint
+        for name, param in model.gauss_params.items():
+            model.gauss_params[name] = Parameter(param.detach().clone())
+    steps = {"camera_opt": accumulated}
+    config = types.SimpleNamespace(max_num_iterations=TOTAL, gradient_accumulation_steps=steps)
+    trainer = types.SimpleNamespace(config=config)
     held = types.SimpleNamespace(optimizers=optimizers)
     attributes = types.SimpleNamespace(optimizers=held, trainer=trainer)
     assert model.get_training_callbacks(attributes) == ["splatfacto's own"]
@@ -115,7 +103,7 @@ def set_up(ours: Any, spec: Any, trainer: Any) -> tuple[Any, dict[str, torch.opt
 @pytest.mark.parametrize("attribute", ["splatfacto_opt3dgs", "splatfacto_mcmc_opt3dgs"])
 def test_the_optimizers_are_upgraded(ours: Any, attribute: str) -> None:
     spec = getattr(ours, attribute)
-    model, optimizers = set_up(ours, spec, Trainer())
+    model, optimizers = set_up(ours, spec)
     assert model.phases.parts == DEFAULTS
     for _ in range(TOTAL):
         for param in model.gauss_params.values():
@@ -129,21 +117,14 @@ def test_the_optimizers_are_upgraded(ours: Any, attribute: str) -> None:
         assert torch.equal(state["averaging.mean"], model.gauss_params[name]), name
 
 
-@pytest.mark.parametrize("kind", [Trainer, OlderTrainer])
-@pytest.mark.parametrize("start", [0, 15])
-def test_the_schedule_ends_with_the_trainer(ours: Any, kind: Any, start: int) -> None:
-    trainer = kind(start)
-    model, _ = set_up(ours, ours.splatfacto_opt3dgs, trainer)
-    assert model.phases.total_steps == trainer.train()[-1] + 1
-    assert model.phases.total_steps == TOTAL + (start if kind is OlderTrainer else 0)
+def test_a_resumed_training_is_refused(ours: Any) -> None:
+    with pytest.raises(ValueError, match="would not train them; train in one piece"):
+        set_up(ours, ours.splatfacto_opt3dgs, resumed=True)
 
 
-def test_a_number_of_steps(ours: Any) -> None:
-    spec = ours.splatfacto_opt3dgs
-    with pytest.raises(ValueError, match=r"set pipeline\.model\.total_steps"):
-        set_up(ours, spec, None)
-    spec.config.pipeline.model.total_steps = 31
-    assert set_up(ours, spec, None)[0].phases.total_steps == 31
+def test_accumulated_gradients_are_refused(ours: Any) -> None:
+    with pytest.raises(ValueError, match=r"\{'camera_opt': 4\}, which leaves out steps"):
+        set_up(ours, ours.splatfacto_opt3dgs, accumulated=4)
 
 
 def test_every_entry_point_is_a_method(ours: Any) -> None:
@@ -172,19 +153,3 @@ def test_without_nerfstudio_the_import_says_so(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setitem(sys.modules, "nerfstudio", None)
     with pytest.raises(ImportError, match="pip install nerfstudio"):
         importlib.import_module("opt3dgs_optim.hosts.nerfstudio")
-
-
-@pytest.mark.hosts
-@pytest.mark.parametrize(
-    ("folder", "left_only"), [("nerfstudio", True), ("nerfstudio-1.1.5", False)]
-)
-def test_the_real_trainers_count_so(folder: str, left_only: bool) -> None:
-    """What `end_of` looks for is in the real `train`."""
-    path = Path(os.environ.get("OPT3DGS_TRAINERS", "/no/trainers")) / folder
-    path = path / "nerfstudio/engine/trainer.py"
-    if not path.is_file():
-        pytest.skip(f"no {path}: put its sources there, set OPT3DGS_TRAINERS")
-    text = path.read_text(encoding="utf-8")
-    train = text[text.index("    def train(self)") : text.index("    def shutdown(self)")]
-    assert ("max_num_iterations - self._start_step" in train) == left_only
-    assert "range(self._start_step, self._start_step + num_iterations)" in train

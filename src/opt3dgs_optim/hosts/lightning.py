@@ -1,7 +1,7 @@
 """The plugin `Opt3DGS` of gaussian-splatting-lightning (yzslab), named in a configuration:
 
 model:
-  plugins:
+  plugins+:
     - class_path: opt3dgs_optim.hosts.lightning.Opt3DGS
 """
 
@@ -46,15 +46,15 @@ class Opt3DGSModule(PluginModule):
         checkpoint after that.
 
         Raises:
-            ValueError: neither the plugin nor the trainer says the number of iterations, or
-                gradients are accumulated.
+            ValueError: the number of iterations is not known, as where the trainer counts epochs
+                and the plugin has no `total_steps`, or gradients are accumulated.
             TypeError: the optimizers are none of torch's Adam.
         """
-        total = self.config.total_steps or pl_module.trainer.max_steps
-        if total is None or total < 1:
+        trainer, total = pl_module.trainer, self.config.total_steps
+        if total is None and (trainer.max_steps < 1 or (trainer.max_epochs or 0) > 0):
             raise ValueError(
-                f"Opt3DGS: total_steps={self.config.total_steps} and max_steps={total} of the "
-                "trainer, but the number of iterations is needed; set total_steps of the plugin"
+                f"Opt3DGS: max_steps={trainer.max_steps} and max_epochs={trainer.max_epochs} of "
+                "the trainer, but the number of iterations is needed; set total_steps of the plugin"
             )
         strategy = type(pl_module.hparams["opt_strategy"]).__name__
         if strategy.startswith("GradAcc"):  # it takes all but torch's own classes for sparse Adams
@@ -62,7 +62,7 @@ class Opt3DGSModule(PluginModule):
                 f"Opt3DGS: opt_strategy={strategy} would not accumulate gradients for upgraded "
                 "optimizers; VanillaOptStrategy is needed"
             )
-        self.phases = PhaseScheduler(total)
+        self.phases = PhaseScheduler(trainer.max_steps if total is None else total)
         self.phases.upgrade(pl_module.gaussian_optimizers)
         pl_module.on_after_backward_hooks.append(self._count)
 

@@ -1,13 +1,12 @@
 """The methods `splatfacto-opt3dgs` and `splatfacto-mcmc-opt3dgs` of nerfstudio.
 
 nerfstudio finds them through the entry point `nerfstudio.method_configs`: install the package
-beside it, then `ns-train splatfacto-opt3dgs --data DATA`. Leave gradient accumulation at 1.
+beside it, then `ns-train splatfacto-opt3dgs --data DATA`.
 """
 
 from __future__ import annotations
 
 import copy
-import inspect
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -32,8 +31,6 @@ class Opt3DGSSplatfactoModelConfig(SplatfactoModelConfig):
     """Splatfacto, whose optimizers are upgraded."""
 
     _target: type = field(default_factory=lambda: Opt3DGSSplatfactoModel)
-    total_steps: int | None = None
-    """steps of the training; by default until the trainer's last iteration"""
 
 
 class Opt3DGSSplatfactoModel(SplatfactoModel):
@@ -46,26 +43,24 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
         """As splatfacto's; the trainer calls it when a checkpoint has been loaded.
 
         Raises:
-            ValueError: neither the config nor a trainer says the number of iterations.
+            ValueError: the training is a resumed one, or gradients are accumulated.
         """
-        attributes, total = training_callback_attributes, self.config.total_steps
-        if total is None and attributes.trainer is not None:
-            total = end_of(attributes.trainer)
-        if total is None:
+        attributes = training_callback_attributes
+        trainer, optimizers = attributes.trainer, attributes.optimizers.optimizers
+        held = {id(p) for o in optimizers.values() for g in o.param_groups for p in g["params"]}
+        if not held.issuperset(map(id, self.gauss_params.values())):
             raise ValueError(
-                "Opt3DGSSplatfactoModel: total_steps=None and no trainer, but the number of "
-                "iterations is needed; set pipeline.model.total_steps"
+                "Opt3DGSSplatfactoModel: nerfstudio's optimizers do not hold the Gaussians of the "
+                "checkpoint that it has loaded, and would not train them; train in one piece"
             )
-        self.phases = PhaseScheduler(total)
-        self.phases.upgrade(attributes.optimizers.optimizers)
+        if max(trainer.config.gradient_accumulation_steps.values(), default=1) > 1:
+            raise ValueError(
+                "Opt3DGSSplatfactoModel: gradient_accumulation_steps="
+                f"{trainer.config.gradient_accumulation_steps}, which leaves out steps; 1 is needed"
+            )
+        self.phases = PhaseScheduler(trainer.config.max_num_iterations)
+        self.phases.upgrade(optimizers)
         return super().get_training_callbacks(attributes)
-
-
-def end_of(trainer: Any) -> int:
-    """The iteration at which a trainer ends; after a resume, 1.1.5 makes all of them once more."""
-    # Both call themselves 1.1.5: only the code of `train` tells them apart.
-    left_only = "max_num_iterations - self._start_step" in inspect.getsource(type(trainer).train)
-    return trainer.config.max_num_iterations + (0 if left_only else trainer._start_step)
 
 
 def __getattr__(name: str) -> Any:
@@ -82,4 +77,4 @@ def __getattr__(name: str) -> Any:
     config.method_name = f"{base}-opt3dgs"
     options = {k: v for k, v in vars(config.pipeline.model).items() if k != "_target"}
     config.pipeline.model = Opt3DGSSplatfactoModelConfig(**options)
-    return MethodSpecification(config=config, description=f"{base} with Opt3DGS's optimizers")
+    return MethodSpecification(config=config, description=f"{base} with opt3dgs_optim's steps")
