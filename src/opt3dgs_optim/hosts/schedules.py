@@ -35,8 +35,7 @@ def shortened(stock: str, iterations: int) -> str:
     unit = int(found[1]) if found else 10
     if iterations < 300 or iterations % unit:
         raise ValueError(
-            f"--iterations {iterations}, but a multiple of {unit} is needed, 300 or more: "
-            "opacities are reset every tenth of a training, and some steps are a 300th of it apart"
+            f"--iterations {iterations}, but a multiple of {unit} is needed, 300 or more"
         )
     groups = []
     for group in stock.split("\n\n"):
