@@ -43,7 +43,7 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
         """As splatfacto's; the trainer calls it when a checkpoint has been loaded.
 
         Raises:
-            ValueError: the training is a resumed one, or gradients are accumulated.
+            ValueError: the training is a resumed one, or Gaussians' gradients are accumulated.
         """
         attributes = training_callback_attributes
         trainer, optimizers = attributes.trainer, attributes.optimizers.optimizers
@@ -53,10 +53,11 @@ class Opt3DGSSplatfactoModel(SplatfactoModel):
                 "Opt3DGSSplatfactoModel: nerfstudio's optimizers do not hold the Gaussians of the "
                 "checkpoint that it has loaded, and would not train them; train in one piece"
             )
-        if max(trainer.config.gradient_accumulation_steps.values(), default=1) > 1:
+        asked = trainer.config.gradient_accumulation_steps
+        if any(asked.get(name, 1) > 1 for name in self.gauss_params):
             raise ValueError(
-                "Opt3DGSSplatfactoModel: gradient_accumulation_steps="
-                f"{trainer.config.gradient_accumulation_steps}, which leaves out steps; 1 is needed"
+                f"Opt3DGSSplatfactoModel: gradient_accumulation_steps={asked} leave out steps of "
+                "Gaussians; 1 is needed for them"
             )
         self.phases = PhaseScheduler(trainer.config.max_num_iterations)
         self.phases.upgrade(optimizers)
