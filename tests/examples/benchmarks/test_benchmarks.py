@@ -196,9 +196,8 @@ def test_the_readme_says_what_was_measured() -> None:
         same, stock = report.of(report.THIRD, scene, **those), thirds[scene][0]
         assert same[0]["gaussians"] == pytest.approx(stock[0]["gaussians"], rel=0.05)
         less[scene] = -report.gain(same, stock)["psnr"]
-    assert max(less.values()) == less["plush"]
-    assert all(less[scene] < 0.05 for scene in ("bonsai", "lego"))
-    assert f"two scenes are level, and one is {less['plush']:.1f} dB below" in words
+    assert all(each < 0.05 for each in less.values())
+    assert "with as many or fewer, they are level" in words
     few = [re.findall(r"\| ([+-][\d.]+) / ", row)[-1] for row in report.few().splitlines()[2:]]
     assert f"lose up to {-min(map(float, few)):.1f} dB (one seed)" in words
     whole = json.loads(report.GPU.read_text(encoding="utf-8"))["iterations"]["results"]
