@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 import pytest
 from trials import TRAINERS as SOURCES
-from trials import Trial, copy_edited, missing, run
+from trials import Trial, copy_edited, missing, num_saved, run
 
 from opt3dgs_optim.hosts import lines
 from opt3dgs_optim.hosts.schedules import schedule, shortened
@@ -403,4 +403,4 @@ def test_what_is_printed_is_pasted_and_runs_to_its_end(
     assert done.psnr is not None
     saved = [f"*/ckpt_{SHORTEST - 1}_rank0.pt", f"*/iteration_{SHORTEST}/point_cloud.ply"]
     (path,) = out.glob(saved[not trial.gsplat])
-    assert done.num_saved(path) > 1000
+    assert num_saved(path) > 1000

@@ -103,11 +103,12 @@ class Done:
         ]
         return path
 
-    def num_saved(self, path: Path) -> int:
-        """How many Gaussians that file has."""
-        if path.suffix == ".ply":
-            return PlyData.read(str(path))["vertex"].count
-        return len(torch.load(path, weights_only=False)["splats"]["means"])
+
+def num_saved(path: Path) -> int:
+    """How many Gaussians a saved .ply, or a checkpoint of gsplat's, has."""
+    if path.suffix == ".ply":
+        return PlyData.read(str(path))["vertex"].count
+    return len(torch.load(path, weights_only=False)["splats"]["means"])
 
 
 _TAMING = "--cams 2 --percent_dense 0.03 --mode final_count --budget 6000"
