@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 import inspect
 import re
+import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -231,6 +234,30 @@ def test_codes_are_read_four_at_a_time(driver: FakeDriver) -> None:
         assert ptx.count("ld.global.v4.b32") == reads * numbers
         assert ptx.count("ld.global.v2.b32") == reads * codes
         assert ".local" not in ptx
+
+
+@pytest.mark.parametrize(
+    ("options", "most"),
+    [({}, 40), ({"coded": True}, 48), ({"mean": True}, 64), ({"mean": True, "coded": True}, 64)],
+    ids=str,
+)
+def test_programs_have_few_registers(
+    driver: FakeDriver, tmp_path: Path, options: Any, most: int
+) -> None:
+    """65,536 for the programs of 256 threads that run at a time: 6 with 40, 5 with 48, 4 with 64.
+
+    The last program alone has a mask, which must not cost the others registers.
+    """
+    launched(driver, (64, 4), **options)
+    ((_, made),) = triton._COMPILED.items()
+    (path := tmp_path / "kernel.cubin").write_bytes(made.asm["cubin"])
+    spec = importlib.util.find_spec("triton")
+    assert spec is not None
+    assert spec.origin is not None
+    tool = Path(spec.origin).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
+    command = [str(tool), "--dump-resource-usage", str(path)]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert [int(n) for n in re.findall(r"REG:(\d+)", said)][0] <= most
 
 
 @pytest.mark.parametrize("options", [{}, {"mean": True, "factor": torch.ones(1)}], ids=str)

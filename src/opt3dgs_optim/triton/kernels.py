@@ -20,6 +20,7 @@ INFINITY = tl.constexpr(float("inf"))
 MAX_PLACE, MAX_AWAY = tl.constexpr(8388608.0), tl.constexpr(24576.0)  # as in `mean`
 LARGEST = tl.constexpr(9.223371761976868e18)  # float32's in `step.LARGEST`: its square is finite
 ROWS_BLOCK = tl.constexpr(1024)  # numbers of a program
+TAIL_BLOCK = tl.constexpr(256)  # of them at a time in the last program
 FRAME_BLOCK = tl.constexpr(128)  # Gaussians of a program
 LOOK_BLOCK = tl.constexpr(1024)  # Gaussians of a program that looks at them
 # Numbers of Python that a step changes; with an unknown size Triton compiles one kernel for all.
@@ -223,22 +224,24 @@ def step_rows(
         numbers: 64 bits, where there are more than 2^31.
     """
     first = tl.program_id(0).to(numbers.dtype) * ROWS_BLOCK
-    row = rows_of(first, width)
     # Without a mask four numbers are read at a time.
     if first <= numbers - ROWS_BLOCK:
-        at = first + tl.arange(0, ROWS_BLOCK)
+        at, row = first + tl.arange(0, ROWS_BLOCK), rows_of(first, width)
         _step_rows(
             p, g, m, v, mean, rest, began, held, factor, nonfinite, at, row, None, size,
             beta2, ones1, ones2, eps, sqrt_correction2, shrink, decay, round_key, key, share,
             fade_m, fade_v, weight, number, put, grid,
         )  # fmt: skip
-    else:  # in 64 bits, since the place of a number that is not there may need them
-        last = first.to(tl.int64) + tl.arange(0, ROWS_BLOCK)
-        _step_rows(
-            p, g, m, v, mean, rest, began, held, factor, nonfinite, last, row, last < numbers, size,
-            beta2, ones1, ones2, eps, sqrt_correction2, shrink, decay, round_key, key, share,
-            fade_m, fade_v, weight, number, put, grid,
-        )  # fmt: skip
+    else:
+        # One a thread, since every program has as many registers as the branch that needs most;
+        # in 64 bits, since the place of a number that is not there may need them.
+        for part in range(0, ROWS_BLOCK, TAIL_BLOCK):
+            last = first.to(tl.int64) + part + tl.arange(0, TAIL_BLOCK)
+            _step_rows(
+                p, g, m, v, mean, rest, began, held, factor, nonfinite, last, last // width,
+                last < numbers, size, beta2, ones1, ones2, eps, sqrt_correction2, shrink, decay,
+                round_key, key, share, fade_m, fade_v, weight, number, put, grid,
+            )  # fmt: skip
 
 
 @triton.jit
