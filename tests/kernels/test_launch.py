@@ -257,7 +257,7 @@ def test_programs_have_few_registers(
     tool = Path(spec.origin).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
     command = [str(tool), "--dump-resource-usage", str(path)]
     said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert [int(n) for n in re.findall(r"REG:(\d+)", said)][0] <= most
+    assert next(int(n) for n in re.findall(r"REG:(\d+)", said)) <= most
 
 
 @pytest.mark.parametrize("options", [{}, {"mean": True, "factor": torch.ones(1)}], ids=str)
