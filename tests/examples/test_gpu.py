@@ -37,27 +37,29 @@ def test_all_of_it_runs_on_a_cpu(said: dict[str, tuple[int, str]], tmp_path: Pat
     page = (tmp_path / "report.md").read_text(encoding="utf-8")
     assert "## doctor: exit status 0\n\n```text\nall is well\n" in page
     assert "| defaults | - | - | " in page
-    assert "no room" not in page
+    assert page.count("`two_loop` of 64 points with 5 pairs: ") == 1
+    assert made["failed"] == {}
     said["pytest"] = 1, "2 failed"
     assert gpu.main(small(tmp_path)) == 1
     assert "2 failed" in (tmp_path / "report.md").read_text(encoding="utf-8")
 
 
-def test_a_size_that_has_no_room_loses_no_other(
+def test_a_measurement_that_fails_loses_no_other(
     said: dict[str, tuple[int, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     measure = steps.measure
 
     def measured(points: int, *others: Any) -> Any:
         if points > 64:
-            raise torch.cuda.OutOfMemoryError
+            raise torch.cuda.OutOfMemoryError("no room")
+        assert "all is well" in (tmp_path / "report.md").read_text(encoding="utf-8")
         return measure(points, *others)
 
     monkeypatch.setattr(steps, "measure", measured)
-    assert gpu.main([*small(tmp_path), "--points", "64", "5000000"]) == 0
+    assert gpu.main([*small(tmp_path), "--points", "64", "128"]) == 1
     page = (tmp_path / "report.md").read_text(encoding="utf-8")
     assert "| defaults | - | - | " in page
-    assert "5,000,000 Gaussians: the device has no room." in page
+    assert "steps, 128: OutOfMemoryError: no room" in page
 
 
 def test_without_a_gpu_it_says_so(
