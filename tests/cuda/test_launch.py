@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -97,6 +98,20 @@ def test_another_device_is_current_for_the_launch_alone(machine: Machine) -> Non
     machine.launched = type("At", (list,), {"append": lambda *_: current.append(machine.current)})()
     cuda.two_loop(*case(9), 5)
     assert (current, machine.current) == ([HERE], 3)
+
+
+def test_a_look_whether_a_device_can_leaves_another_current(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+
+    def kernel(_: str, device: int, *__: Any) -> None:
+        machine.current = device  # as cuda.core's set_current
+
+    monkeypatch.setattr(cuda, "_kernel", kernel)
+    machine.current = 0
+    assert inspect.unwrap(cuda.missing)(1) is None
+    assert machine.current == 0
 
 
 def test_no_rows_are_no_launch(machine: Machine) -> None:

@@ -187,7 +187,8 @@ def missing(device: int | None = None) -> str | None:
         return "torch sees no CUDA device: no NVIDIA driver, or a build of torch without CUDA"
     try:  # the one of the defaults: NVRTC, and a driver, may not know each other or the GPU
         index = torch.cuda.current_device() if device is None else device
-        _kernel("lqn_direction", index, torch.float32, MOST_PAIRS)
+        with torch.cuda.device(index):  # cuda.core makes it the current one, and leaves it so
+            _kernel("lqn_direction", index, torch.float32, MOST_PAIRS)
     except Exception as error:
         reason = f"cuda.core cannot compile for this GPU: {type(error).__name__}: {error}"
         LOGGER.warning("opt3dgs_optim: %s; the curvature runs in plain torch", reason)

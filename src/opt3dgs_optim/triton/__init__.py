@@ -287,7 +287,7 @@ def _run(
         )  # fmt: skip
         return
     kernel = getattr(_kernels(), name)
-    # Without the fusion of a product and a sum the numbers are those of torch's operators.
+    # As torch's operators: without the fusion of a product and a sum.
     options = {"enable_fp_fusion": False, "num_warps": WARPS[name]}
     compiled = kernel[programs,](*tensors, *numbers, **options)
     if compiled is not None:
