@@ -156,6 +156,7 @@ def test_two_sets_under_one_name_are_told(recwarn: pytest.WarningsRecorder) -> N
 
 def part(**attributes: Any) -> PhaseScheduler:
     """A scheduler of one part with these attributes."""
+    attributes = {"plan": lambda *_: None, **attributes}
     return PhaseScheduler(100, parts=[type("Mine", (Part,), attributes)()])
 
 
@@ -182,6 +183,11 @@ SCHEDULERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         r"Mine: names=\('opacity', 'f_dc'\), but a tuple of means, .*shN is needed",
     ),
     "other names": (lambda: part(names=("means", "mlp")), ValueError, "Mine: names=.* is needed"),
+    "no names": (
+        lambda: PhaseScheduler(100, parts=[Fading(names=())]),
+        ValueError,
+        r"Fading: names=\(\), but a tuple of means",
+    ),
     "a name": (lambda: part(names="means"), ValueError, "Mine: names='means', but a tuple of"),
     "a phase": (lambda: part(during="exploration"), ValueError, "during='exploration', but None"),
     "not saved": (
@@ -189,13 +195,20 @@ SCHEDULERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         ValueError,
         "Mine has a state_dict, but is not saved; set learns = True",
     ),
+    "of an older Part": (
+        lambda: part(plan=Part.plan, before=lambda *_: None),
+        ValueError,
+        "Mine has none of plan, after, observe, pixel_loss, numbers, so that it would never act",
+    ),
     "a kind twice": (
         lambda: PhaseScheduler(100, parts=[OwnFrame(), type("Mine", (OwnFrame,), {})()]),
         ValueError,
         "OwnFrame is there twice in parts",
     ),
     "a name twice": (
-        lambda: PhaseScheduler(100, parts=[Averaging(), type("Averaging", (Part,), {})()]),
+        lambda: PhaseScheduler(
+            100, parts=[Averaging(), type("Averaging", (Part,), {"after": print})()]
+        ),
         ValueError,
         "Averaging is there twice in parts",
     ),

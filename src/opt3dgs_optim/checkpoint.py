@@ -14,19 +14,15 @@ from opt3dgs_optim.contract import REFUSED, Slots
 from opt3dgs_optim.mean import (
     BEGAN,
     MEAN,
-    OF_MEAN,
     RESIDUE,
     REST,
     drop_kept,
     drop_means,
     kept_in,
 )
-from opt3dgs_optim.moments import CODES, MOMENTS, recode
-from opt3dgs_optim.parts.curvature import HISTORY
+from opt3dgs_optim.moments import MOMENTS, recode
 from opt3dgs_optim.stepper import begin_moments_anew
 from opt3dgs_optim.training import Training
-
-KEPT = (*OF_MEAN, HISTORY)  # for rows, beside moments
 
 # In each group of a checkpoint, as a line of JSON, so that a group may be moved or dropped, and
 # that who takes nested states apart (torch.distributed.checkpoint) finds one leaf.
@@ -365,24 +361,18 @@ def check_moments(call: str, state: Any) -> None:
         raise ValueError(f"{call} has no {missing[0]}, but {sorted(map(str, state))}")
     check_count(call, "step", whole(state["step"]), 0)
     shapes: dict[str, tuple[int, ...]] = {}
-    for key in (*MOMENTS, *KEPT):
-        value: Any = state.get(key)
-        if value is None and key in KEPT:
-            continue
-        if not isinstance(value, Tensor) or not (
-            value.is_floating_point() or (key in (*MOMENTS, RESIDUE) and value.dtype == CODES)
-        ):
+    for key in (*MOMENTS, *kept_in(state)):
+        value: Any = state[key]
+        if not isinstance(value, Tensor) or value.is_complex():
             raise ValueError(f"{call} has {key}={value!r}, but a tensor of real numbers is needed")
         shapes[key] = tuple(value.shape)
     one = shapes["exp_avg"]
-    rows = one[:1] or (1,)  # a scalar is one row
+    rows = one[:1], one[:1] or (1,)  # a scalar is one row
     like = ("exp_avg_sq", MEAN, RESIDUE, REST)
-    if any(shapes.get(key, one) != one for key in like) or any(
-        shapes.get(key, rows)[:1] not in (rows, one[:1]) for key in KEPT if key not in like
-    ):
+    if any(shape != one if key in like else shape[:1] not in rows for key, shape in shapes.items()):
         raise ValueError(f"{call} has shapes {shapes}, but the same rows are needed in all")
     means = (MEAN in shapes) + (RESIDUE in shapes)
-    if means != (BEGAN in shapes) or shapes.get(BEGAN, rows) not in (rows, one[:1]):
+    if means != (BEGAN in shapes) or shapes.get(BEGAN, rows[0]) not in rows:
         raise ValueError(f"{call} has shapes {shapes}, but {BEGAN} needs a number for each row")
 
 

@@ -1,4 +1,4 @@
-"""What is taken: one function that refuses the rest, in a sentence that says what to do."""
+"""What is taken; the rest is refused, in sentences that say what to do."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from opt3dgs_optim.parts.own_frame import OwnFrame
 
 OWN_STEPS = ("SelectiveAdam", "SparseGaussianAdam")  # gsplat's and 3DGRUT's, and INRIA's
 Slots = list[tuple[str, str | None]]  # by group: the set of Gaussians, which parameter of it
+HOOKS = ("plan", "after", "observe", "pixel_loss", "numbers")  # a part has one of them at least
 REFUSED = ("amsgrad", "maximize", "differentiable", "capturable")
 
 
@@ -208,8 +209,10 @@ def _check_part(call: str, part: Part) -> None:
     """Refuse a part that would never act, or not be saved."""
     check_choice(call, "during", part.during, (None, *Phase))
     names = part.names
-    if names is not None and (isinstance(names, str) or any(n not in GAUSSIAN for n in names)):
+    if names is not None and not (names and set(names) <= set(GAUSSIAN)):
         raise ValueError(f"{call}: names={names!r}, but a tuple of {', '.join(GAUSSIAN)} is needed")
+    if not any(map(part.overrides, HOOKS)):
+        raise ValueError(f"{call} has none of {', '.join(HOOKS)}, so that it would never act")
     if part.overrides("state_dict") and not part.learns:
         raise ValueError(f"{call} has a state_dict, but is not saved; set learns = True in it")
 

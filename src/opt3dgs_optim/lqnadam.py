@@ -33,8 +33,8 @@ class LQNAdam(StepAdam):
     - it is **faster in narrow valleys**, by steps, given time. After 1,000 steps its error on the
       quadratics of condition 10,000 is smaller than Adam's by a factor of 10 and more. In the
       curved valley of Rosenbrock's function it is smaller by a factor of 10 after 200 steps;
-    - on a CPU a step takes 10 (50 rows) to 20 times (10,000) as long as Adam's, so that by seconds
-      it was faster on none of these;
+    - on a CPU a step takes ten (50 rows) to a hundred times (100,000) as long as Adam's, so that by
+      seconds it was faster on none of these;
     - in the last phase of a splatting training, for which the paper proposes it, it changes next to
       nothing here: positions hardly move by then (`docs/evidence.md`).
 

@@ -56,13 +56,14 @@ def chances(like: Tensor, key: int, at: int) -> Tensor:
         at: the place of the first number in its parameter.
     """
     x = torch.arange(like.numel(), dtype=torch.int32, device=like.device)
-    x = x.add_(_signed(at)).bitwise_xor_(_signed(key))
+    x = x.add_(signed(at)).bitwise_xor_(signed(key))
     x = x.bitwise_xor_((x >> 16) & 0xFFFF).mul_(0x7FEB352D)
-    x = x.bitwise_xor_((x >> 15) & 0x1FFFF).mul_(_signed(0x846CA68B))
+    x = x.bitwise_xor_((x >> 15) & 0x1FFFF).mul_(signed(0x846CA68B))
     return x.bitwise_xor_((x >> 16) & 0xFFFF).view(like.shape)
 
 
-def _signed(number: int) -> int:
+def signed(number: int) -> int:
+    """32 bits as an int32, which has a sign."""
     return (number + 2**31) % 2**32 - 2**31
 
 

@@ -35,15 +35,3 @@ def split_name(name: Any) -> tuple[str, str | None]:
         return "", None
     prefix, _, last = name.rpartition("#")
     return prefix, _CANONICAL.get(last)
-
-
-def check_names(call: str, names: Any) -> tuple[str, ...]:
-    """gsplat's names of these Gaussian parameters; ValueError for another name, or none at all."""
-    given = names if isinstance(names, (tuple, list)) else ()
-    found = tuple(known for name in given if (known := split_name(name)[1]) is not None)
-    if not found or len(found) < len(given):
-        raise ValueError(
-            f"{call}: names={names!r}, but a tuple of Gaussian parameters' names is needed: "
-            f"{', '.join(GAUSSIAN_NAMES)}"
-        )
-    return found

@@ -29,7 +29,6 @@ from opt3dgs_optim.device import num_ranks
 from opt3dgs_optim.messages import LOGGER, End, say
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.parts.averaging import Averaging
-from opt3dgs_optim.parts.fading import Fading
 from opt3dgs_optim.parts.own_frame import OwnFrame
 from opt3dgs_optim.plateau import Plateau
 from opt3dgs_optim.presets import DEFAULTS, PAPER_STEPS, PAPER_SWITCH, paper_parts
@@ -170,12 +169,7 @@ class PhaseScheduler(Training):
 
     def _say_upgraded(self, names: str) -> None:
         """One line, so that a user sees that something has happened."""
-        means, fading = self.param_of("", "means"), self.part(Fading)
-        parts = [type(part).__name__ for part in self.parts]
-        if means is not None and fading is not None and self.end_step is not None:
-            events = fading.num_events(self.end_step, len(means))
-            parts[self.parts.index(fading)] += f" ({events} times)"
-        listed = ", ".join(parts) or "no parts"
+        listed = ", ".join(type(part).__name__ for part in self.parts) or "no parts"
         length = "no planned end" if self.open_end else f"{self.end_step} iterations"
         say(f"opt3dgs_optim: {length}, {listed}, in the steps of {names}")
 
@@ -247,9 +241,8 @@ class PhaseScheduler(Training):
     def pixel_loss(self, render: Tensor, target: Tensor) -> Tensor:
         """The photometric term of two images in 0..1: mean |error|, unless a part says another.
 
-        It is for the iteration of the next step.
-
-        `SquaredLoss` has the paper's mean squared error while exploiting.
+        It is for the iteration of the next step. `SquaredLoss` has the paper's mean squared error
+        while exploiting.
         """
         if render.shape != target.shape:
             raise ValueError(

@@ -79,7 +79,8 @@ class Step:
         set: the set of Gaussians that it belongs to, "" where there is one.
         group, state: torch's parameter group and the optimizer's state of the parameter.
         iteration: of the training, from 0.
-        stepped_in: the iteration of the parameter's step before this one; -1: none.
+        stepped_in: the iteration of the parameter's step before this one; of its first step, the
+            iteration before it.
         keep: `keep(state, key, shape)` is what a part keeps for the rows, see
             `ParamStepper.keep`.
         factor: on the learning rate; on a device it may be a tensor of one element.

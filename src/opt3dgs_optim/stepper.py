@@ -33,8 +33,8 @@ class ParamStepper:
         acting: by `Training.exploiting`: the parts with a `plan`, and with an `after`.
         later: what later steps may have and the first has not, see `Part.later`.
         counter: where its device counts numbers that are not finite; None on a CPU.
-        stepped_in: the iteration of its last step; -1: none; None: it is not known, and counts as
-            the one before its next step, so that events of earlier ones are not made up for.
+        stepped_in: the iteration of its last step; None: it is not known, and counts as the one
+            before its next step, so that events of earlier ones are not made up for.
         framed: whether its moments are those of the own frame; None: it has none yet.
     """
 

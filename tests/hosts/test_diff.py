@@ -176,7 +176,7 @@ def test_what_cannot_be_read(
     assert lines.main([str(path), "--write"]) == 1
     said = capsys.readouterr().err
     assert str(path) in said
-    assert ("there is no such file" in said) == (not path.is_file())
+    assert ("that is no file" in said) == (not path.is_file())
 
 
 @pytest.mark.parametrize(

@@ -53,7 +53,7 @@ def launched(driver: FakeDriver, shape: tuple[int, ...], **options: Any) -> list
         ((500, 3), {"frame": True, "mean": True}),
         ((500, 15, 3), {"fade": True}),
         ((500, 3), {"hold": True, "mean": True, "put": True}),
-        ((500,), {"plain": True, "factor": torch.ones(1)}),
+        ((500,), {"factor": torch.ones(1)}),
     ],
 )
 def test_a_compiled_kernel_is_launched_as_tritons_launcher_does(
@@ -189,7 +189,6 @@ COMPILED = {
     "held": {"hold": True},
     "mean": {"mean": True},
     "all": {"hold": True, "mean": True, "factor": torch.ones(1)},
-    "plain": {"plain": True},
     "long": {"numbers": 2**31 + 7},
 }
 
@@ -208,12 +207,12 @@ def test_rows_are_read_four_numbers_at_a_time(
     launched(driver, (64, 4), **options)
     ((key, made),) = triton._COMPILED.items()
     ptx = made.asm["ptx"]
-    moments, means = (0 if "plain" in options else 2), (1 if "mean" in options else 0)
+    means = 1 if "mean" in options else 0
     reads = ROWS_BLOCK // (4 * 32 * triton.WARPS["step_rows"])  # of four numbers, by its threads
-    assert ptx.count("ld.global.v4") == reads * (2 + moments + means)
+    assert ptx.count("ld.global.v4") == reads * (4 + means)
     together = ptx[ptx.index("ld.global.v4") : ptx.rindex("ld.global.v4")]
     assert re.search(r"\b(st\.\w+|red|atom|bar)\b", together) is None  # nothing waits between them
-    assert ptx.count("st.global.v4") == reads * (1 + moments + means)
+    assert ptx.count("st.global.v4") == reads * (3 + means)
     assert ".local" not in ptx  # all in registers
     assert "sqrt.approx" not in ptx  # it takes small numbers for 0
     assert key[3] == (27 if long is None else 32)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import sys
 import weakref
+from contextlib import nullcontext
 from types import ModuleType
 from typing import Any
 
@@ -131,6 +132,7 @@ def test_a_gpu_that_nothing_compiles_for_has_plain_torch(
 
     monkeypatch.setitem(sys.modules, "cuda.core", ModuleType("cuda.core"))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device", nullcontext)
     monkeypatch.setattr(cuda, "_kernel", kernel)
     monkeypatch.setattr(cuda, "missing", inspect.unwrap(cuda.missing))
     assert backend_info("cuda:0").backend == "cuda"

@@ -235,4 +235,4 @@ def test_whatever_the_optimizers_hold_is_averaged() -> None:
 
 def test_averaging_names_what_is_no_gaussian_parameter() -> None:
     with pytest.raises(ValueError, match="Averaging: names=\\('anchor',\\)"):
-        Averaging(names=("anchor",))
+        PhaseScheduler(TOTAL, parts=[Averaging(names=("anchor",))])

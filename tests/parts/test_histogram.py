@@ -454,3 +454,16 @@ def test_says_what_it_is() -> None:
         "clamp=(-5.0, 5.0)): nu 1, warm-up: 0 of 2500 energies"
     )
     assert EnergyHistogram.paper().weights.tolist() == [1 / 200] * 200
+
+
+def test_the_loss_of_the_first_step_that_exploits_is_left_alone() -> None:
+    """It may be another loss: `SquaredLoss` squares it."""
+    param = torch.nn.Parameter(torch.ones(4, 3))
+    histogram = EnergyHistogram(**FIXED)
+    phases = PhaseScheduler(10, parts=[histogram], switch=0.5)
+    (optimizer,) = phases.upgrade([torch.optim.Adam([{"params": [param], "name": "means"}])])
+    for _ in range(10):
+        param.grad = torch.ones_like(param)
+        phases.observe(0.5)
+        optimizer.step()
+    assert histogram.num_observed == 5

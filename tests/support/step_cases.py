@@ -171,7 +171,7 @@ def combinations() -> Iterator[tuple[dict[str, Any], tuple[int, ...]]]:
     for mean, decay in itertools.product((False, True), (0.0, 0.01)):
         options = {"mean": mean, "put": mean, "decay": decay, "bad": 2}
         yield {"frame": True, **options}, (257, 3)
-        yield {"plain": True, "factor": torch.tensor(0.7), **options}, (257, 4)
+        yield {"factor": torch.tensor(0.7), **options}, (257, 4)
 
 
 def coded_combinations() -> Iterator[tuple[dict[str, Any], tuple[int, ...]]]:

@@ -180,7 +180,7 @@ def missing(device: int | None = None) -> str | None:
         importlib.import_module("cuda.core")
     except ModuleNotFoundError:
         extra = "cuda12" if (torch.version.cuda or "").startswith("12") else "cuda"
-        return f"cuda.core is not installed (pip install 'opt3dgs_optim[{extra}]')"
+        return f"cuda.core is not installed (in a clone: pip install '.[{extra}]')"
     except Exception as error:  # whatever a broken installation raises is the reason to show
         return f"cuda.core cannot be imported: {type(error).__name__}: {error}"
     if not torch.cuda.is_available():

@@ -66,7 +66,7 @@ def put(path: Path, *, write: bool) -> tuple[str, str]:
         ValueError: the file is refused; the message has what to do by hand.
     """
     if not path.is_file():
-        raise ValueError("there is no such file; give the path of the trainer's script")
+        raise ValueError("that is no file; give the path of the trainer's script")
     old = path.read_bytes().decode()
     trainer, new = edited(old)
     done = "not written"

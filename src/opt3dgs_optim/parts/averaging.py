@@ -6,8 +6,7 @@ import functools
 import math
 from dataclasses import dataclass
 
-from opt3dgs_optim.checks import set_options
-from opt3dgs_optim.names import GAUSSIAN, check_names
+from opt3dgs_optim.names import GAUSSIAN
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.step import Step
 from opt3dgs_optim.training import Training
@@ -35,20 +34,13 @@ class Averaging(Part):
     and the training goes on without.
 
     Args:
-        names: the Gaussian parameters, under gsplat's or INRIA's names; None: every parameter of
-            the upgraded optimizers: cameras, exposures, anchors, networks.
-
-    Raises:
-        ValueError: a name is not that of a Gaussian parameter.
+        names: the Gaussian parameters, under gsplat's names; None: every parameter of the upgraded
+            optimizers: cameras, exposures, anchors, networks.
     """
 
     names: tuple[str, ...] | None = GAUSSIAN
 
     later = ("mean",)
-
-    def __post_init__(self) -> None:
-        names = None if self.names is None else check_names(type(self).__name__, self.names)
-        set_options(self, names=names)
 
     @staticmethod
     def start(total_steps: int, fall_step: int | None = None) -> int:

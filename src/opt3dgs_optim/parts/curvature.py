@@ -14,7 +14,6 @@ from opt3dgs_optim.clock import Phase
 from opt3dgs_optim.lbfgs.backend import BACKENDS, Backend
 from opt3dgs_optim.lbfgs.history import MAX_HISTORY, history_shape
 from opt3dgs_optim.lbfgs.two_loop import lqn_direction
-from opt3dgs_optim.names import check_names
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.step import Step
 from opt3dgs_optim.training import Training
@@ -36,7 +35,7 @@ class Curvature(Part):
         history_size: K, number of pairs, 1 to 16 (the paper: 5).
         min_cosine: a pair is accepted if s.y > min_cosine |s| |y|.
         graft: give the pseudo-gradient of each point the length of its gradient.
-        names: the Gaussian parameters, under gsplat's or INRIA's names; None: every parameter.
+        names: the Gaussian parameters, under gsplat's names; None: every parameter.
         backend: `"auto"` runs points in three dimensions as a CUDA kernel where it can, and all
             else as pure torch; `"cuda"` and `"torch"` insist. See `backend_info`.
 
@@ -61,7 +60,7 @@ class Curvature(Part):
         self.history_size = check_count(call, "history_size", history_size, 1, MAX_HISTORY)
         self.min_cosine = check_number(call, "min_cosine", min_cosine, 0.0, 1.0, open_high=True)
         self.graft = check_choice(call, "graft", graft)
-        self.names = None if names is None else check_names(call, names)
+        self.names = names
         self.backend: Backend = check_choice(call, "backend", backend, BACKENDS)
         self._tally: Tensor | None = None  # [2] accepted pairs and candidates of the last step
         self._counted_in: int | None = None

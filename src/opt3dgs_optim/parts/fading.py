@@ -7,8 +7,7 @@ import math
 from dataclasses import dataclass
 
 from opt3dgs_optim.checks import check_count, check_number, set_options
-from opt3dgs_optim.clock import Clock
-from opt3dgs_optim.names import GAUSSIAN, check_names
+from opt3dgs_optim.names import GAUSSIAN
 from opt3dgs_optim.part import Part
 from opt3dgs_optim.step import Fade, Step, mixed
 from opt3dgs_optim.training import Training
@@ -44,11 +43,10 @@ class Fading(Part):
         start, stop: the stretch over which they are spread, as shares of a planned run; the last
             event is at its end.
         seed: of the choice of points.
-        names: the Gaussian parameters, under gsplat's or INRIA's names.
+        names: the Gaussian parameters, under gsplat's names.
 
     Raises:
-        ValueError: an option is outside what is allowed, or a name is not one of a Gaussian
-            parameter.
+        ValueError: an option is outside what is allowed.
     """
 
     share: float = 0.2
@@ -71,39 +69,23 @@ class Fading(Part):
             start=start,
             stop=check_number(CALL, "stop", self.stop, start, 1.0, open_low=True),
             seed=check_count(CALL, "seed", self.seed, 0),
-            names=check_names(CALL, self.names),
         )
 
     def plan(self, step: Step, training: Training) -> None:
         """Fade by the newest event since this parameter's last step, if there was one."""
-        if training.open_end or training.end_step is None:
-            done = self.events_before(step.stepped_in + 1, training)
-            now = self.events_before(step.iteration + 1, training)
-        else:  # every step asks
-            options = training.end_step, self.start, self.stop, self.events
-            done = _events_before(step.stepped_in + 1, *options)
-            now = _events_before(step.iteration + 1, *options)
+        total = None if training.open_end else training.end_step
+        options = total, training.fall_step, self.start, self.stop, self.events
+        done = events_before(step.stepped_in + 1, *options)
+        now = events_before(step.iteration + 1, *options)
         # Several are due where the trainer has left steps out; they are one. Most steps have none,
         # and an empty `any` costs a third of this.
         if now > done and any(self.happens(e, len(step.param)) for e in range(done, now)):
             step.fade = self.fade(now - 1)
 
-    def events_before(self, iteration: int, training: Clock) -> int:
-        """Number of events before the step of this iteration (from 0)."""
-        total, fall = training.end_step, training.fall_step
-        if not training.open_end and total is not None:
-            return _events_before(iteration, total, self.start, self.stop, self.events)
-        return _open_events_before(iteration if fall is None else min(iteration, fall), self.events)
-
     def happens(self, event: int, num_points: int) -> bool:
         """Whether an event fades any of so many points: of more than 10,000, some do."""
         share = share_of_events(num_points)
         return int((event + 1) * share) > int(event * share)
-
-    def num_events(self, total_steps: int, num_points: int) -> int:
-        """How many events a run of so many points has."""
-        events = _events_before(total_steps, total_steps, self.start, self.stop, self.events)
-        return int(events * share_of_events(num_points))
 
     def fade(self, event: int) -> Fade:
         """What an event does."""
@@ -119,16 +101,21 @@ def share_of_events(num_points: int) -> float:
 
 
 @functools.lru_cache(maxsize=64)  # every parameter asks for the same two iterations
-def _events_before(iteration: int, total_steps: int, start: float, stop: float, events: int) -> int:
+def events_before(
+    iteration: int,
+    total_steps: int | None,
+    fall: int | None,
+    start: float,
+    stop: float,
+    events: int,
+) -> int:
+    """Number of events before the step of this iteration (from 0)."""
+    if total_steps is None:  # no end is planned: `events` / (3 i) of them in iteration i
+        each = events / 3
+        first = MIN_ITERATIONS_BETWEEN_EVENTS * each
+        last = iteration if fall is None else min(iteration, fall)
+        return int(each * math.log(max(last / first, 1.0)))
     length = stop - start
     share = (iteration / total_steps - start) / length
     most = min(events, length * total_steps / MIN_ITERATIONS_BETWEEN_EVENTS)
     return int(min(max(share, 0.0), 1.0) * most)
-
-
-@functools.lru_cache(maxsize=64)
-def _open_events_before(iteration: int, events: int) -> int:
-    """Of a training of no planned end: `events` / (3 i) of them in iteration i."""
-    each = events / 3
-    first = MIN_ITERATIONS_BETWEEN_EVENTS * each
-    return int(each * math.log(max(iteration / first, 1.0)))

@@ -132,10 +132,10 @@ class EnergyHistogram(Part):
         Args:
             energy: the training loss of this iteration, 0-d (or one element; ValueError of more).
                 One that is not finite changes nothing. A GPU is not waited for.
-            training: the training's; while it exploits, energies are left alone.
+            training: the training's; where the next step exploits, energies are left alone.
         """
         value = check_energy(f"{CALL}.observe", "energy", energy, torch.float64)
-        if training is not None and training.phase is not self.during:
+        if training is not None and training.exploits_next:  # its loss may be another
             return self._nu
         if value.device != self._nu.device:  # a trainer's GPU, or resumed from a checkpoint
             learnt = self.state_dict()["learnt"]
@@ -223,8 +223,7 @@ class EnergyHistogram(Part):
         )
         if not fits or learnt[0] < 0 or not self._partitions.fits(learnt[5:]):
             raise ValueError(
-                f"{CALL}.load_state_dict: it is damaged, or of another histogram (0.1.0 had 200 "
-                "partitions of a range); load what one "
+                f"{CALL}.load_state_dict: it is damaged, or of another histogram; load what one "
                 f"with num_partitions={self.num_partitions} and energy_range={self.energy_range!r} "
                 "has learnt"
             )

@@ -16,7 +16,7 @@ from opt3dgs_optim.runs.lines import Run, read_run
 from opt3dgs_optim.runs.plot import draw
 from opt3dgs_optim.runs.stats import Comparison, Stat, compare, gain_at_end
 
-NO_PICTURE = "report: no picture without matplotlib: pip install 'opt3dgs_optim[report]'"
+NO_PICTURE = "report: no picture without matplotlib: pip install matplotlib"
 READING = (
     "Mean ± standard error over the seeds; (k of n) where not all n runs have the value. "
     "*seconds to baseline*: until the arm first reaches the baseline's mean final value. "

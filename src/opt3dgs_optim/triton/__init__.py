@@ -18,7 +18,7 @@ from torch import Tensor
 from opt3dgs_optim.cuda import several_gpus
 from opt3dgs_optim.mean import Mean, mean_of
 from opt3dgs_optim.messages import LOGGER
-from opt3dgs_optim.moments import CODES, MOMENTS
+from opt3dgs_optim.moments import CODES, MOMENTS, signed
 from opt3dgs_optim.step import Hold, Step
 
 ROWS_BLOCK, FRAME_BLOCK, LOOK_BLOCK = 1024, 128, 1024  # as in `kernels`
@@ -88,7 +88,7 @@ def fits(step: Step) -> bool:  # noqa: PLR0911
     """`takes`, wherever the tensors lie."""
     frame, hold, mean, state, param = step.frame, step.hold, step.mean, step.state, step.param
     device, numbers = param.get_device(), param.numel()
-    if numbers and not param.data_ptr():  # of a subclass without memory of its own, a DTensor
+    if step.plain or (numbers and not param.data_ptr()):  # or without memory of its own, a DTensor
         return False
     for tensor in (param, step.grad, state["exp_avg"], state["exp_avg_sq"]):
         if tensor.dtype not in DTYPES or not _lies_on(device, tensor):
@@ -102,14 +102,12 @@ def fits(step: Step) -> bool:  # noqa: PLR0911
     if frame is None:
         if numbers > MAX_WIDTH and numbers > MAX_WIDTH * param.shape[0]:
             return False
-        if step.plain:
-            return step.fade is None and hold is None
         return hold is None or (
             hold.rows.dtype is torch.bool
             and len(hold.rows) == len(param)
             and _lies_on(device, hold.rows)
         )
-    if step.plain or step.fade is not None or hold is not None:
+    if step.fade is not None or hold is not None:
         return False  # none of our parts says so of positions in their own frames
     rows = param.shape[0]
     if frame.quats.numel() != 4 * rows or frame.scales.numel() != 3 * rows or 4 * rows >= 2**31:
@@ -218,15 +216,14 @@ def launch(step: Step) -> None:
         on_device = factor
     else:
         size *= float(factor)
-    if not step.plain:
-        size /= step.correction1
+    size /= step.correction1
     kept = NO_MEAN if step.mean is None else step.mean
     mean, began, rest = kept.tensor, kept.began, kept.rest
     number, put = float(kept.count), 1.0 if kept.put else 0.0
     coded = exp_avg.dtype is CODES, mean is not None and mean.dtype is CODES
     adam = (
         step.beta2, 1 - step.beta1, 1 - step.beta2, step.eps, step.sqrt_correction2,
-        step.shrink, step.decay, step.rounding and _signed(step.rounding),
+        step.shrink, step.decay, signed(step.rounding),
     )  # fmt: skip
     if frame is not None:
         _run(
@@ -240,19 +237,13 @@ def launch(step: Step) -> None:
     share, fade_m, fade_v = map(float, fades)
     held = None if hold is None else hold.rows.view(torch.uint8)
     weight = 0.0 if hold is None else float(hold.weight)
-    m, v = (None, None) if step.plain else (exp_avg, exp_avg_sq)
     _run(
         "step_rows", -(-numbers // ROWS_BLOCK),
-        (param, step.grad, m, v, mean, rest, began, held, on_device, step.nonfinite),
+        (param, step.grad, exp_avg, exp_avg_sq, mean, rest, began, held, on_device, step.nonfinite),
         (numbers, numbers // param.shape[0] if param.dim() else 1, size, *adam,
-         key and _signed(key), share, fade_m, fade_v, weight, number, put, kept.grid),
+         signed(key), share, fade_m, fade_v, weight, number, put, kept.grid),
         coded,
     )  # fmt: skip
-
-
-def _signed(number: int) -> int:
-    """32 bits as an argument of one type."""
-    return number if number < 2**31 else number - 2**32
 
 
 def _run(

@@ -162,8 +162,7 @@ def _step_rows(
     number, put, grid,
 ):  # fmt: skip
     grad, value = tl.load(g + at, inside), tl.load(p + at, inside)
-    if m is not None:
-        exp_avg, exp_avg_sq = moments_of(m, v, at, inside)
+    exp_avg, exp_avg_sq = moments_of(m, v, at, inside)
     if mean is not None:
         old, first = tl.load(mean + at, inside), tl.load(began + row, inside)
     known = tl.abs(grad) < INFINITY
@@ -172,21 +171,18 @@ def _step_rows(
         grad = grad + value * decay
     if factor is not None:
         size = size * tl.load(factor)
-    if m is None:
-        value = value - grad * size
-    else:
-        if share > 0.0:
-            chosen = chosen_rows(row, key, share)
-            exp_avg = tl.where(chosen, exp_avg * fade_m, exp_avg)
-            exp_avg_sq = tl.where(chosen, exp_avg_sq * fade_v, exp_avg_sq)
-        if held is not None:
-            least = grad * weight
-            least = tl.where(tl.load(held + row, inside) != 0, least * least, 0.0)
-            exp_avg_sq = larger(exp_avg_sq, least)
-        exp_avg = exp_avg + (grad - exp_avg) * ones1
-        exp_avg_sq = exp_avg_sq * beta2 + grad * grad * ones2
-        value = value - size * exp_avg / (tl.sqrt_rn(exp_avg_sq) / sqrt_correction2 + eps)
-        store_moments(m, v, at, inside, exp_avg, exp_avg_sq, round_key)
+    if share > 0.0:
+        chosen = chosen_rows(row, key, share)
+        exp_avg = tl.where(chosen, exp_avg * fade_m, exp_avg)
+        exp_avg_sq = tl.where(chosen, exp_avg_sq * fade_v, exp_avg_sq)
+    if held is not None:
+        least = grad * weight
+        least = tl.where(tl.load(held + row, inside) != 0, least * least, 0.0)
+        exp_avg_sq = larger(exp_avg_sq, least)
+    exp_avg = exp_avg + (grad - exp_avg) * ones1
+    exp_avg_sq = exp_avg_sq * beta2 + grad * grad * ones2
+    value = value - size * exp_avg / (tl.sqrt_rn(exp_avg_sq) / sqrt_correction2 + eps)
+    store_moments(m, v, at, inside, exp_avg, exp_avg_sq, round_key)
     if mean is not None:
         portion = weight_in_mean(first, began, row, inside, number)
         if mean.dtype.element_ty == tl.int16:
@@ -207,9 +203,8 @@ def step_rows(
     """Step a parameter [rows, width], ROWS_BLOCK of its numbers in a program.
 
     Args:
-        p, g, m, v, mean: numbers float32: parameter, gradient, moments (or codes int16; None: the
-            step is the gradient times the rate), mean (or None).
-            A mean of int16 is what `mean.take_into_residue` keeps, with its `grid`.
+        p, g, m, v, mean: numbers float32: parameter, gradient, moments (or codes int16), mean (or
+            None). A mean of int16 is what `mean.take_into_residue` keeps, with its `grid`.
         rest: numbers float32, of a mean that is the sum of both; or None.
         began: [rows] float32, the number with which a row's mean began, 0: it begins now; or None.
         held: [rows] uint8, not 0: raise the second moment to (weight * gradient)^2; or None.
