@@ -105,10 +105,12 @@ def test_a_scheduler_of_rates_is_made_before_or_after(before: bool) -> None:
         assert group["lr"] == pytest.approx(RATES[group["gaussian"]] * 0.9**20)
 
 
-def test_a_grad_scaler_unscales_and_leaves_steps_out() -> None:
+@pytest.mark.parametrize("fused", [False, True])
+def test_a_grad_scaler_unscales_and_leaves_steps_out(fused: bool) -> None:
+    """A fused Adam of torch's does that itself, and its kernel makes no step of ours."""
     params = parameters(ROWS)
     phases = PhaseScheduler(TOTAL)
-    optimizers = phases.upgrade(adams_of(params))
+    optimizers = phases.upgrade(adams_of(params, fused=fused))
     scaler = torch.amp.GradScaler("cpu", init_scale=1024.0)  # pyright: ignore
     for bad in (False, True, False):
         total = torch.stack([p.square().sum() for p in params.values()]).sum()

@@ -346,6 +346,16 @@ def test_numbers_that_are_not_finite_are_told_at_the_end() -> None:
         optimizers["means"].step()
 
 
+def test_numbers_of_the_last_iterations_that_are_not_finite_are_told() -> None:
+    params = parameters(ROWS, "means")
+    optimizers = PhaseScheduler(80, parts=[Averaging()]).upgrade(adams_of(params))
+    steps(optimizers, params, 78)
+    params["means"].grad = torch.full((ROWS, 3), torch.nan)
+    optimizers["means"].step()
+    with pytest.warns(UserWarning, match="iteration 79: 12 numbers of gradients"):
+        optimizers["means"].step()
+
+
 def test_positions_of_a_name_that_is_not_known() -> None:
     params = parameters(ROWS, "scales", "quats")
     given = adams_of(params) | {"mu": Adam([Parameter(torch.ones(ROWS, 3))], lr=0.01)}

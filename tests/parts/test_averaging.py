@@ -76,6 +76,29 @@ def test_a_long_run_averages_every_so_many_th_iterate(moments: Any) -> None:
     assert away < (1e-5 if moments == 32 else 20 * GRIDS["sh0"])
 
 
+def test_rows_that_were_reset_stay_as_they_are_at_an_early_end() -> None:
+    params = parameters(ROWS, "sh0")
+    phases = PhaseScheduler(TOTAL, parts=[Averaging()])
+    optimizers = phases.upgrade(adams_of(params))
+    steps(optimizers, params, Averaging.start(TOTAL) + 2)
+    optimizers["sh0"].reset_rows(params["sh0"], torch.tensor([1]))
+    before = params["sh0"].detach().clone()
+    phases.finish()
+    same = (params["sh0"] == before).flatten(1).all(1)
+    assert same.tolist() == [row == 1 for row in range(ROWS)]
+
+
+def test_a_training_that_counts_from_one_ends_at_its_mean() -> None:
+    params = parameters(ROWS, "sh0")
+    phases = PhaseScheduler(TOTAL, parts=[Averaging()])
+    optimizers = phases.upgrade(adams_of(params))
+    for iteration in range(1, TOTAL + 1):
+        phases.observe(iteration=iteration)
+        steps(optimizers, params, 1, seed=iteration)
+    phases.finish()
+    assert torch.equal(optimizers["sh0"].state[params["sh0"]]["averaging.mean"], params["sh0"])
+
+
 @pytest.mark.parametrize(("total", "said"), [(20, []), (40, [40]), (300, [299])])
 def test_the_line_says_where_the_mean_is_put(total: int, said: list[int], caplog: Any) -> None:
     """A trial of fewer than 30 iterations has none, and one of fewer than 60 a mean of one."""

@@ -75,6 +75,14 @@ def test_looks_keep_step_with_no_order_of_views() -> None:
             assert 0.1 < sum(i % cameras == camera for i in looks) / views < 0.4
 
 
+def test_what_is_of_no_view_does_not_count() -> None:
+    """Gradients that are zero everywhere, as of a loss of the regularisers alone."""
+    params, optimizers, phases = scene(4)
+    for in_view in [slice(None)] + 40 * [slice(0)]:
+        step(params, optimizers, in_view)
+    assert phases.numbers() == {"visible_share": 1.0}
+
+
 def test_a_load_of_a_start_begins_with_a_share_of_one() -> None:
     """What was on its way then belongs to another training."""
     params, optimizers, phases = scene(4)

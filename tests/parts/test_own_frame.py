@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from gaussians import adam_of, adams_of, make_gaussians, parameters, steps
+from gaussians import adam_of, adams_of, make_gaussians, parameters, same_tensors, steps
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from row_edits import added, apply, relocated, removed
@@ -16,7 +16,8 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from opt3dgs_optim import OwnFrame, PhaseScheduler
+from opt3dgs_optim import Fading, OwnFrame, PhaseScheduler
+from opt3dgs_optim.names import GAUSSIAN
 from opt3dgs_optim.parts.own_frame import STEADY, min_aspect_of
 from opt3dgs_optim.training import Training
 
@@ -362,3 +363,14 @@ def test_of_two_sets_the_one_in_own_frames_is_known_after_a_load() -> None:
         steps({"all": resumed}, others, 10, seed=1)
     steps({"all": optimizer}, params, 10, seed=1)
     assert all(torch.equal(params[name], others[name]) for name in params)
+
+
+def test_moments_in_the_own_frame_are_not_faded() -> None:
+    """A faded step would be half a standard deviation long."""
+    trained = []
+    for names in (GAUSSIAN, tuple(name for name in GAUSSIAN if name != "means")):
+        params = parameters(ROWS)
+        parts = [OwnFrame(), Fading(names=names)]
+        steps(PhaseScheduler(TOTAL, parts=parts).upgrade(adams_of(params)), params, TOTAL)
+        trained.append(params)
+    assert same_tensors(*trained)
