@@ -304,3 +304,28 @@ def test_rows_that_moved_since_the_last_step_are_not_saved_with_their_old_mean(
         steps(optimizers, params, 2, seed=1)
         ends.append({name: param.detach().clone() for name, param in params.items()})
     assert same_tensors(*ends)
+
+
+def test_a_training_that_is_put_back_makes_the_same_steps_again() -> None:
+    """The same optimizers: what was kept from step to step since then is of no use."""
+    params = parameters(40)
+    optimizer = PhaseScheduler(600).upgrade(adam_of(params))
+
+    def train(iterations: range) -> None:
+        for iteration in iterations:
+            for name, param in params.items():
+                draw = torch.Generator().manual_seed(iteration)
+                param.grad = torch.randn(param.shape, generator=draw)
+                if name == "means":  # a view sees one of forty
+                    param.grad[torch.arange(40) != iteration % 40] = 0.0
+            optimizer.step()
+
+    train(range(250))
+    saved, start = copy.deepcopy(optimizer.state_dict()), copy.deepcopy(params)
+    train(range(250, 420))
+    end = copy.deepcopy(params)
+    for name, param in params.items():
+        param.data.copy_(start[name])
+    optimizer.load_state_dict(saved)
+    train(range(250, 420))
+    assert same_tensors(params, end)
