@@ -435,8 +435,8 @@ def test_finish_of_a_resumed_training_before_there_is_a_mean(
     phases.upgrade(adams_of(params))["means"].load_state_dict(trained["means"].state_dict())
     assert phases.end_line() is None
     phases.finish()
-    said = "finish() at iteration 5: averaging begins at 580 of 600, and the parameters stay the"
-    assert f"{said} last iterate" in caplog.text
+    said = "finish() at iteration 5: averaging begins at 580 of 600, anew where rows are edited"
+    assert f"{said}, and the parameters stay the last iterate" in caplog.text
     optimizers = phases.upgrade(adams_of(params))
     optimizers["means"].load_state_dict(trained["means"].state_dict())
     steps(optimizers, params, 3)

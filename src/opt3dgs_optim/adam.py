@@ -304,6 +304,7 @@ class StepAdam(Adam):
             saved = check_loaded(call, given, own)
             if saved is not None:
                 restore_parts(self.training, [saved])
+            self._steppers, self._in_order = [], []  # what is loaded is no edit of their rows
 
         def go_on(_: Any) -> None:
             self.coded = False  # what is loaded is numbers

@@ -223,7 +223,9 @@ def steps_of_a_stock_adam(
     counts: list[int], saved: Mapping[str, Any] | None, training: Training
 ) -> int:
     """How many steps a stock Adam has made with a checkpoint of ours; tell of them."""
-    missed = 0 if saved is None else max(max(counts, default=0) - saved["steps"], 0)
+    made, missed = max(counts, default=0), 0
+    if saved is not None and counts:  # it counts from 0 where the state was dropped before
+        missed = made if made < saved["steps"] else made - saved["steps"]
     if missed:
         training.messages.say_once(
             f"opt3dgs_optim: a stock Adam has gone on for {missed} steps with this checkpoint; "

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from opt3dgs_optim.adam import StepAdam, upgraded_class
-from opt3dgs_optim.checkpoint import check_groups, restore_parts
+from opt3dgs_optim.checkpoint import check_groups, numbers_of, restore_parts
 from opt3dgs_optim.checks import check_count, check_energy, check_number
 from opt3dgs_optim.clock import CALL, Phase
 from opt3dgs_optim.contract import (
@@ -143,7 +143,10 @@ class PhaseScheduler(Training):
                 ) from None
             if ours and optimizer.training is not self:
                 check_slots(f"{CALL}.upgrade", optimizer.param_groups, optimizer._slots)
-            saved.append(check_groups(f"{CALL}.upgrade", optimizer.param_groups))
+            if ours and optimizer.training is not self:  # as a checkpoint of now
+                saved.append(numbers_of(optimizer.training, 0, 0, 0))
+            else:
+                saved.append(check_groups(f"{CALL}.upgrade", optimizer.param_groups))
         check_held_together(f"{CALL}.upgrade", given, slots, self.moments)
         restore_parts(self, [each for each in saved if each is not None])
         for (_, optimizer), its in zip(given, slots, strict=True):
@@ -294,7 +297,8 @@ class PhaseScheduler(Training):
             if not found and last is not None and self.iteration < last:
                 begins = "with the end that finish_in plans"
                 if total is not None:
-                    begins = f"at {Averaging.start(total, self.fall_step)} of {total}"
+                    start = Averaging.start(total, self.fall_step)
+                    begins = f"at {start} of {total}, anew where rows are edited"
                 LOGGER.warning(
                     "opt3dgs_optim: finish() at iteration %d: averaging begins %s, and the "
                     "parameters stay the last iterate", self.iteration + 1, begins,

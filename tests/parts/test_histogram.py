@@ -467,3 +467,18 @@ def test_the_loss_of_the_first_step_that_exploits_is_left_alone() -> None:
         phases.observe(0.5)
         optimizer.step()
     assert histogram.num_observed == 5
+
+
+def test_another_scheduler_goes_on_with_what_was_learnt() -> None:
+    param = torch.nn.Parameter(torch.ones(4, 3))
+    adam, learnt = torch.optim.Adam([{"params": [param], "name": "means"}]), []
+    for total in (100, 200):
+        phases = PhaseScheduler(total, parts=[histogram := EnergyHistogram(**FIXED)])
+        phases.upgrade(adam)
+        learnt.append(histogram.state_dict())
+        for energy in stream(20):
+            param.grad = torch.ones_like(param)
+            phases.observe(energy)
+            adam.step()
+        learnt.append(histogram.state_dict())
+    assert learnt[1] == learnt[2] != learnt[0]

@@ -127,6 +127,10 @@ def test_flat_and_round_gaussians_step_as_those_with_three_scales(width: int) ->
 
 def edit(params: dict[str, Any], optimizers: dict[str, Any], kind: str) -> None:
     """As density control does."""
+    if kind == "prune, of that address":  # which memory that is freed gives to the next
+        there = torch.from_numpy(params["means"].detach().numpy())
+        params["means"] = optimizers["means"].param_groups[0]["params"][0] = Parameter(there)
+        return
     last = torch.tensor([len(params["means"]) - 1])
     made = {"clone": added(last), "prune": removed(last), "relocate": relocated(last, last - 1)}
     made["prune nothing"] = removed(last[:0])
@@ -163,6 +167,8 @@ def test_no_axis_counts_as_longer_than_six_medians_unless_rows_are_relocated() -
         ("prune nothing", bound),
         ("prune nothing", bound),
         ("relocate", bound),
+        ("prune, of that address", bound),
+        ("prune, of that address", bound),
     ):
         if kind is not None:
             edit(params, optimizers, kind)

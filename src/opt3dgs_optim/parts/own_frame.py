@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.multiprocessing.reductions import StorageWeakRef
 
 from opt3dgs_optim.checks import check_number, set_options
 from opt3dgs_optim.part import Part
@@ -213,22 +214,25 @@ class _Bound(NamedTuple):
 
     Attributes:
         means: the Parameter that the trainer had in the last step, a weak reference.
-        rows: how many, and where they lie, see `rows_of`.
+        rows: how many, and in which memory, see `rows_of`.
         steady: how many edits in a row have left that.
         found_in: the hundred of iterations; -1: it is to be found.
         longest: [] the standard deviation that a longer axis counts as; infinite: none does.
     """
 
     means: weakref.ref[Tensor]
-    rows: tuple[int, int]
+    rows: tuple[int, StorageWeakRef]
     steady: int
     found_in: int
     longest: Tensor
 
 
-def rows_of(means: Tensor) -> tuple[int, int]:
-    """How many rows there are, and their address: relocation makes a Parameter of the same."""
-    return len(means), means.data_ptr()
+def rows_of(means: Tensor) -> tuple[int, StorageWeakRef]:
+    """How many rows there are, and their memory: relocation makes a Parameter of the same.
+
+    Not its address, which memory that is freed gives to the next.
+    """
+    return len(means), StorageWeakRef(means.untyped_storage())
 
 
 def _notes(of_set: str) -> tuple[str, ...]:
