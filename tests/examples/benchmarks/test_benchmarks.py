@@ -189,15 +189,14 @@ def test_the_readme_says_what_was_measured() -> None:
     more = {s: ours[0]["gaussians"] / stock[0]["gaussians"] for s, (stock, ours) in thirds.items()}
     assert max(more.values()) == more["bonsai"]
     said = f"with up to {100 * (more['bonsai'] - 1):.0f} % more Gaussians"
-    assert said in words
+    assert f"{said}, or with as many or fewer" in words
     less = {}
     for scene, threshold in (("bonsai", 1.3), ("lego", 0.89), ("plush", 1.18)):
         those = {"density": "clone-and-split", "threshold": threshold, **report.HALF}
         same, stock = report.of(report.THIRD, scene, **those), thirds[scene][0]
         assert same[0]["gaussians"] == pytest.approx(stock[0]["gaussians"], rel=0.05)
         less[scene] = -report.gain(same, stock)["psnr"]
-    assert all(each < 0.05 for each in less.values())
-    assert "with as many or fewer, they are level" in words
+    assert f"{max(less.values()):.1f}" <= f"{worst:.1f}"
     few = [re.findall(r"\| ([+-][\d.]+) / ", row)[-1] for row in report.few().splitlines()[2:]]
     assert f"lose up to {-min(map(float, few)):.1f} dB (one seed)" in words
     whole = json.loads(report.GPU.read_text(encoding="utf-8"))["iterations"]["results"]
