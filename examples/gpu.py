@@ -157,7 +157,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # On a GPU all of PyTorch's Adams are the fused ones.
     names = [n for n in steps.SUBJECTS if args.device == "cpu" or "fused" not in n]
     sizes = args.points or POINTS[args.device]
-    measurements = [("two_loop", points) for points in (min(sizes), max(sizes))]
+    measurements = [("two_loop", points) for points in sorted({min(sizes), max(sizes)})]
     measurements += [("steps", points) for points in sizes]
     for what, points in tqdm(measurements, unit="measurement"):
         write(made, out)  # what is measured is kept, whatever comes

@@ -137,6 +137,7 @@ STOCK, SHORT, THIRD = ("stock", 30_000), ("stock", 10_000), ("defaults", 10_000)
 MANY = ("harmonics", 10_000)  # for many photos, where colours have more than degree 0
 OTHERS = (
     THIRD,
+    ("defaults", 7_500),
     SHORT,
     *((arm, 10_000) for arm in ("x2", "x3", "averaged", "learn2splat")),
     *((arm, 30_000) for arm in ("x2", "averaged")),
