@@ -25,9 +25,9 @@ TOTAL, ROWS = 30_000, 50
 MOST = {
     "upgrade": (52, 8, 195),
     "iteration": (25, 9, 80),
-    "iteration, at most": (34, 11, 90),  # one that looks who is out of view
-    "last thirtieth": (34, 12, 112),
-    "last thirtieth, at most": (37, 13, 118),
+    "iteration, at most": (33, 11, 90),  # one that looks who is out of view
+    "last thirtieth": (33, 12, 112),
+    "last thirtieth, at most": (36, 13, 118),
 }
 
 

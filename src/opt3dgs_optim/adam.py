@@ -36,7 +36,7 @@ from opt3dgs_optim.contract import Slots, bare, check_held, check_slots, check_s
 from opt3dgs_optim.mean import kept_in, put_mean
 from opt3dgs_optim.moments import MOMENTS, as_numbers
 from opt3dgs_optim.names import split_name
-from opt3dgs_optim.sparse_adam import refuse_capture, refuse_mask, step_around
+from opt3dgs_optim.sparse_adam import check_arguments, refuse_capture, refuse_mask, step_around
 from opt3dgs_optim.stepper import ParamStepper
 from opt3dgs_optim.training import Training
 
@@ -142,12 +142,12 @@ class StepAdam(Adam):
     step.hooked = True  # pyright: ignore[reportFunctionMemberAccess]
 
     def _step(self, closure: Any = None, *masked: Any, **masks: Any) -> Any:
-        given: tuple[Any, ...] = ()
+        loss, training, given = None, self.training, ()
         if self._masked:
             given = () if closure is None and not masked else (closure, *masked)
+            check_arguments(type(self).__name__, self._base.step, self, *given, masks)
         elif masked or masks or isinstance(closure, Tensor):
             refuse_mask(type(self).__name__)
-        loss, training = None, self.training
         if callable(closure):
             with torch.enable_grad():
                 loss = closure()

@@ -20,7 +20,7 @@ from opt3dgs_optim.mean import (
     drop_means,
     kept_in,
 )
-from opt3dgs_optim.moments import MOMENTS, recode
+from opt3dgs_optim.moments import CODES, MOMENTS, recode
 from opt3dgs_optim.stepper import begin_moments_anew
 from opt3dgs_optim.training import Training
 
@@ -365,7 +365,9 @@ def check_moments(call: str, state: Any) -> None:
     shapes: dict[str, tuple[int, ...]] = {}
     for key in (*MOMENTS, *kept_in(state)):
         value: Any = state[key]
-        if not isinstance(value, Tensor) or value.is_complex():
+        if not isinstance(value, Tensor) or not (
+            value.is_floating_point() or (key in (*MOMENTS, RESIDUE) and value.dtype == CODES)
+        ):
             raise ValueError(f"{call} has {key}={value!r}, but a tensor of real numbers is needed")
         shapes[key] = tuple(value.shape)
     one = shapes["exp_avg"]

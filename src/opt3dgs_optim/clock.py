@@ -168,8 +168,11 @@ class Clock:
             iteration = max(present + begins, 0)
         self._resumed, self._begun = False, iteration
         optimizer.next_iteration = iteration + 1
-        if iteration > self.iteration:
-            self.put_on(iteration)
+        if iteration > self.iteration:  # as `put_on`, without a call more in every iteration
+            if self.fall_step is not None and iteration >= (self.end_step or 0):
+                self.go_on()
+            self.go_to(iteration)
+            self.advanced()
         return iteration
 
     def put_on(self, iteration: int) -> None:

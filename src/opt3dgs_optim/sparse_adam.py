@@ -9,6 +9,8 @@ out of view are held by the mask already, and moments are theirs.
 from __future__ import annotations
 
 import contextlib
+import functools
+import inspect
 from collections.abc import Callable, MutableMapping
 from typing import Any
 
@@ -27,6 +29,17 @@ from opt3dgs_optim.step import (
 )
 from opt3dgs_optim.stepper import FRAME_EPS, ParamStepper
 from opt3dgs_optim.training import Training
+
+_signature = functools.lru_cache(maxsize=8)(inspect.signature)  # every step asks
+
+
+def check_arguments(call: str, step: Any, *args: Any) -> None:
+    """TypeError unless a step takes these arguments: self, the others, and a dict of named ones."""
+    *given, named = args
+    try:
+        _signature(step).bind(*given, **named)
+    except TypeError as error:
+        raise TypeError(f"{call}.step: {error}; it needs its mask, as before the upgrade") from None
 
 
 def refuse_mask(call: str) -> None:
