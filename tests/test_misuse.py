@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import subprocess
 import sys
 from collections.abc import Callable
@@ -9,7 +10,7 @@ from typing import Any
 
 import pytest
 import torch
-from gaussians import adams_of, parameters, steps
+from gaussians import adam_of, adams_of, parameters, steps
 from torch.nn import Parameter
 from torch.optim import Adam
 
@@ -333,6 +334,21 @@ def test_numbers_that_are_not_finite_are_told_once(recwarn: pytest.WarningsRecor
     assert len(found) == 1
     assert "iteration 100: 1200 numbers of gradients have not been finite" in found[0]
     assert "look for the first NaN of the loss" in found[0]
+
+
+def test_numbers_that_are_not_finite_are_told_where_a_training_goes_back() -> None:
+    """To a checkpoint, in the same process."""
+    params = parameters(ROWS, "means")
+    optimizer = PhaseScheduler(900, parts=[Averaging()]).upgrade(adam_of(params))
+    steps({"all": optimizer}, params, 10)
+    saved = copy.deepcopy(optimizer.state_dict())
+    steps({"all": optimizer}, params, 500)
+    optimizer.load_state_dict(saved)
+    params["means"].grad = torch.full((ROWS, 3), torch.nan)
+    for _ in range(100):
+        optimizer.step()
+    with pytest.warns(UserWarning, match=f"iteration 110: {3 * ROWS * 100} numbers of gradients"):
+        optimizer.step()
 
 
 def test_numbers_that_are_not_finite_are_told_at_the_end() -> None:

@@ -194,7 +194,6 @@ def put_mean(param: Tensor, state: Mapping[str, Tensor], name: str | None) -> bo
         mean = mean_of_residue(param, residue.to(CODES), grid)
     if mean is None or mean.shape != param.shape:
         return False
-    known = torch.isfinite(param) & torch.isfinite(mean)
-    known &= like_rows(state[BEGAN] > 0, param)
+    known = torch.isfinite(param) & like_rows(state[BEGAN] > 0, param)
     param.copy_(torch.where(known, mean, param))
     return True

@@ -145,7 +145,7 @@ class Training(Clock):
         """
         super().resume(iteration)
         self.unsaved.clear()
-        self._look_at = min(self._look_at, iteration + LOOK_INTERVAL)
+        self._look_at = iteration + LOOK_INTERVAL
 
     def look_at_numbers(self) -> None:
         """Say once that gradients have not been finite."""

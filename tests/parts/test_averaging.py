@@ -203,6 +203,18 @@ def test_what_comes_after_the_mean_is_not_taken_back(moments: Any, caplog: Any) 
     assert "finish() at iteration" not in caplog.text
 
 
+@pytest.mark.parametrize("moments", [32, 16])
+@pytest.mark.parametrize("count", [295, TOTAL])
+def test_a_number_that_is_lost_is_not_hidden_by_its_mean(count: int, moments: Any) -> None:
+    """As the step that puts the mean leaves it: a trainer has to see it."""
+    params = parameters(ROWS, "sh0")
+    phases, _ = averaged(params, count, moments)
+    with torch.no_grad():
+        params["sh0"][2, 0, 1] = torch.nan
+    phases.finish()
+    assert torch.isnan(params["sh0"]).sum() == 1
+
+
 def test_finish_takes_away_the_noise_that_came_after_the_last_step() -> None:
     """3DGS-MCMC's, where the step had put the mean."""
     params = parameters(ROWS, "sh0")

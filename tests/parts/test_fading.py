@@ -93,6 +93,25 @@ def test_how_many_events_a_run_has(steps_of_run: int, points: int, times: int) -
     assert sum(part.happens(event, points) for event in events) == times
 
 
+def test_of_events_that_came_between_two_steps_any_fades() -> None:
+    """Of so many points the first of two events fades some, and the second none."""
+    part, rows, clock = Fading(names=("scales",)), 30_000, Clock(300)
+    due = [i for i in range(300) if before(part, i + 1, clock) > before(part, i, clock)]
+    some = [part.happens(event, rows) for event in range(len(due))]
+    at = next(e for e in range(len(due)) if some[e : e + 2] == [True, False])
+    left_out = range(due[at], due[at + 1])  # the last step before was without both
+    param = Parameter(torch.zeros(rows, 1))
+    optimizer = PhaseScheduler(300, parts=[part]).upgrade(
+        Adam([{"params": [param], "name": "scales"}], lr=1.0)
+    )
+    for iteration in range(left_out.stop + 1):
+        param.grad = None if iteration in left_out else torch.ones(rows, 1)
+        optimizer.step()
+    chosen = chosen_rows(part.fade(at + 1), rows, CPU)
+    moments = optimizer.state[param]["exp_avg"][:, 0]
+    assert bool((moments[chosen] < moments[~chosen].amin()).all())
+
+
 def test_events_end_each_part_of_the_stretch() -> None:
     """The 24th, 32nd, 40th and 48th of 64 steps end the quarters of it."""
     part, phases = Fading(0.4, events=4, start=0.25, stop=0.75), PhaseScheduler(64)
