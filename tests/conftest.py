@@ -28,9 +28,7 @@ def level_of_the_log() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def no_line_of_an_early_end(
-    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def no_line_of_an_early_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tests leave hundreds of trainings unfinished; each would say so in a line."""
     from opt3dgs_optim.messages import End
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import io
 import json
 import math
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 import row_edits
 import torch
-from gaussians import adam_of, adams_of, parameters, same_tensors, steps
+from gaussians import adam_of, adams_of, parameters, same_tensors, steps, through_a_file
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -33,13 +32,6 @@ def trained(count: int = 59) -> tuple[PhaseScheduler, Any, dict[str, Any]]:
         phases.observe(0.1 + 0.01 * (iteration % 7))
         steps({"all": optimizer}, params, 1, seed=iteration)
     return phases, optimizer, params
-
-
-def through_a_file(saved: Any) -> Any:
-    buffer = io.BytesIO()
-    torch.save(saved, buffer)
-    buffer.seek(0)
-    return torch.load(buffer, weights_only=True)
 
 
 def opened(state: Any) -> Any:
@@ -194,7 +186,7 @@ def test_the_usual_damage_is_refused(path: tuple[Any, ...], wrong: Any) -> None:
 
 def test_a_state_of_an_unknown_parameter_is_refused() -> None:
     phases, optimizer, params = trained(3)
-    before, state = snapshot(phases, optimizer, params), damaged(("state",), SAVED["state"])
+    before, state = snapshot(phases, optimizer, params), closed(copy.deepcopy(SAVED))
     state["state"][len(NAMES)] = state["state"][0]
     with pytest.raises(ValueError, match=r"Adam.load_state_dict: the state is not of .* \[0, 1\]"):
         optimizer.load_state_dict(state)
@@ -225,8 +217,11 @@ def test_the_state_is_plain_and_of_the_moment() -> None:
 
 
 @pytest.mark.parametrize("anew", [False, True])
-def test_a_stock_adam_that_goes_on_with_a_checkpoint_of_ours_is_noticed(anew: bool) -> None:
+def test_a_stock_adam_that_goes_on_with_a_checkpoint_of_ours_is_noticed(
+    anew: bool, caplog: pytest.LogCaptureFixture
+) -> None:
     """Its own steps say how far it has come, and its moments are no own frame's."""
+    caplog.set_level("INFO")
     params = parameters(ROWS, "means", "scales", "quats")
     optimizer = PhaseScheduler(1000).upgrade(adam_of(params))
     steps({"all": optimizer}, params, 30)
@@ -239,6 +234,7 @@ def test_a_stock_adam_that_goes_on_with_a_checkpoint_of_ours_is_noticed(anew: bo
     again.load_state_dict(stock.state_dict())
     phases = PhaseScheduler(1000)
     phases.upgrade(again)
+    assert caplog.text.count("a stock Adam has gone on for 20 steps with this checkpoint") == 1
     steps({"all": again}, params, 1)
     assert phases.iteration == 50
     assert again.state[params["means"]]["step"] == 1  # they begin anew, in the own frame
@@ -263,6 +259,20 @@ def test_it_is_told_where_a_stock_checkpoint_goes_on(
     PhaseScheduler(100, parts=[Averaging()]).upgrade(made)
     said = "goes on at iteration 30, by Adam's count of steps; where the trainer has left out steps"
     assert caplog.text.count(said) == (not ours)
+
+
+def test_it_is_told_where_a_checkpoint_has_lost_its_mean(caplog: pytest.LogCaptureFixture) -> None:
+    """As where torch.distributed.checkpoint loads what a new optimizer has, and no more."""
+    caplog.set_level("INFO")
+    _, optimizer, _ = trained()
+    said = "the checkpoint was loaded without the mean of the last iterates"
+    for told in (0, 1):
+        saved = optimizer.state_dict()
+        for state in saved["state"].values():
+            for key in [key for key in state if "." in key] * told:
+                del state[key]
+        optimizer.load_state_dict(saved)
+        assert caplog.text.count(said) == told
 
 
 @pytest.mark.parametrize(

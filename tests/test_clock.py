@@ -171,13 +171,3 @@ def test_two_sets_of_gaussians_count_once() -> None:
     assert part.seen["means"] == [i for i in range(10) for _ in "ab"]
     assert part.seen["scales"] == [i for i in range(10) for _ in "ab"]
     assert phases.iteration == 9
-
-
-def test_steps_after_the_end_are_told() -> None:
-    params = parameters(5)
-    phases = PhaseScheduler(TOTAL)
-    adams = phases.upgrade(adams_of(params))
-    steps(adams, params, TOTAL - 3)
-    phases.finish()
-    with pytest.warns(UserWarning, match=r"iteration 117 comes after finish\(\)"):
-        steps(adams, params, 2)

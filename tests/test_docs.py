@@ -9,7 +9,6 @@ import importlib.util
 import io
 import pkgutil
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +23,6 @@ PAGES = pages()
 README = ROOT / "README.md"
 MODULES = [each.name for each in pkgutil.walk_packages(opt3dgs_optim.__path__, "opt3dgs_optim.")]
 OF_OTHERS = ("hosts.nerfstudio", "hosts.lightning", "__main__")  # import what only their users have
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Small tensors on a busy machine: threads would wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def of_pages(*languages: str) -> list[Any]:

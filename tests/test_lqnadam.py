@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import warnings
 from typing import Any
 
 import pytest
 import torch
+from gaussians import through_a_file
 from torch.nn import Parameter
 
 from opt3dgs_optim import Curvature, LQNAdam
@@ -67,11 +67,9 @@ def test_it_resumes_bit_for_bit() -> None:
             optimizer.step()
 
     go(x, optimizer)
-    y, buffer = Parameter(x.detach().clone()), io.BytesIO()
+    y = Parameter(x.detach().clone())
     twin = LQNAdam([{"params": [y], "name": "means"}], lr=0.3)
-    torch.save(optimizer.state_dict(), buffer)
-    buffer.seek(0)
-    twin.load_state_dict(torch.load(buffer, weights_only=True))
+    twin.load_state_dict(through_a_file(optimizer.state_dict()))
     go(x, optimizer)
     go(y, twin)
     assert torch.equal(x, y)
@@ -103,10 +101,6 @@ def test_what_is_outside_is_refused() -> None:
     for dtype in (torch.float16, torch.complex64):
         with pytest.raises(ValueError, match=str(dtype)):
             LQNAdam([Parameter(torch.ones(2, 2, dtype=dtype))])
-    optimizer = LQNAdam([points()])
-    with pytest.raises(ValueError, match="float16"):
-        optimizer.add_param_group({"params": [Parameter(torch.ones(2, 2).half())]})
-    assert len(optimizer.param_groups) == 1
     with pytest.raises(ValueError, match="Curvature: history_size=17"):
         LQNAdam([points()], history_size=17)
     assert LQNAdam([points()], moments=16).training.moments == 16

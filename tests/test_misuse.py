@@ -20,6 +20,7 @@ from opt3dgs_optim import (
     Curvature,
     EnergyHistogram,
     Fading,
+    LQNAdam,
     OwnFrame,
     Part,
     PhaseScheduler,
@@ -64,7 +65,6 @@ OPTIMIZERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         "SGD has a step of its own.*; or leave 'camera' out, which holds no Gaussians",
     ),
     "a foreign step": (lambda: Foreign(one().param_groups), TypeError, "Foreign has a step of its"),
-    "no optimizer": (lambda: torch.ones(3), TypeError, "Tensor is no optimizer; pass the one that"),
     "a model": (
         lambda: torch.nn.ParameterDict({"means": torch.ones(ROWS, 3)}),
         TypeError,
@@ -96,6 +96,11 @@ OPTIMIZERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         lambda: one(torch.ones(ROWS, 4, 3)),
         ValueError,
         r"means is \(4, 4, 3\); Gaussian parameters have a row .*, and positions are \[N, 3\]",
+    ),
+    "one with parts": (
+        lambda: LQNAdam([{"params": [Parameter(torch.ones(ROWS, 3))], "name": "means"}]),
+        TypeError,
+        "LQNAdam has parts of its own; upgrade a torch.optim.Adam, with parts=",
     ),
     "no Gaussians": (
         lambda: one(name="mlp"),
@@ -134,6 +139,8 @@ def test_a_group_that_comes_later_is_refused_too() -> None:
         optimizer.add_param_group(
             {"params": [Parameter(torch.ones(ROWS, 3))], "name": "scales", "amsgrad": True}
         )
+    with pytest.raises(ValueError, match=r"two groups hold the same of \['means'\]"):
+        optimizer.add_param_group({"params": [Parameter(torch.ones(ROWS, 3))], "name": "xyz"})
     assert len(optimizer.param_groups) == 1
     optimizer.add_param_group({"params": [Parameter(torch.ones(ROWS, 3))], "name": "scales"})
     assert optimizer.param_groups[1]["gaussian"] == "scales"
@@ -143,8 +150,7 @@ def test_two_sets_under_one_name_are_told(recwarn: pytest.WarningsRecorder) -> N
     """And no optimizer that takes the place of one that has stepped."""
     first, params = one(), parameters(ROWS, "means")
     phases = PhaseScheduler(100, parts=[Averaging()])
-    steps({"means": phases.upgrade(first)}, params, 0)
-    phases.upgrade(first)
+    phases.upgrade(phases.upgrade(first))
     assert not recwarn.list
     with pytest.warns(UserWarning, match="another optimizer holds means already; if both"):
         phases.upgrade(one())
@@ -211,7 +217,7 @@ SCHEDULERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
             100, parts=[Averaging(), type("Averaging", (Part,), {"after": print})()]
         ),
         ValueError,
-        "Averaging is there twice in parts",
+        "Averaging is there twice in parts; give one part of each class",
     ),
     "no star": (
         lambda: PhaseScheduler(100, parts=[DEFAULTS, Averaging()]),  # pyright: ignore
@@ -222,11 +228,6 @@ SCHEDULERS: dict[str, tuple[Callable[[], Any], type[Exception], str]] = {
         lambda: PhaseScheduler(100, parts=Averaging()),  # pyright: ignore
         TypeError,
         r"a list of parts is needed, parts=\[Averaging\(\)\]",
-    ),
-    "a part twice": (
-        lambda: PhaseScheduler(100, parts=[Averaging(), Averaging()]),
-        ValueError,
-        "Averaging is there twice in parts; give one part of each class",
     ),
     "own frame and curvature": (
         lambda: PhaseScheduler(100, parts=[OwnFrame(), Curvature()]),
@@ -241,15 +242,6 @@ def test_schedulers_that_are_refused(what: str) -> None:
     make, kind, said = SCHEDULERS[what]
     with pytest.raises(kind, match=said):
         make()
-
-
-def test_a_part_that_learns_serves_one_training() -> None:
-    parts: list[Part] = [EnergyHistogram()]
-    PhaseScheduler(100, parts=parts)
-    with pytest.raises(ValueError, match="EnergyHistogram serves another training already"):
-        PhaseScheduler(100, parts=parts)
-    PhaseScheduler(100, parts=DEFAULTS)
-    PhaseScheduler(100, parts=DEFAULTS)
 
 
 @pytest.mark.parametrize(
@@ -291,14 +283,6 @@ def test_a_loss_is_one_real_number(loss: Any) -> None:
 def test_images_of_two_shapes() -> None:
     with pytest.raises(ValueError, match=r"render has shape \(2, 3\) and target \(3, 2\)"):
         PhaseScheduler(100).pixel_loss(torch.ones(2, 3), torch.ones(3, 2))
-
-
-def test_a_part_that_gets_no_loss_says_so_once() -> None:
-    optimizer = PhaseScheduler(100, parts=[EnergyHistogram()]).upgrade(one())
-    params = {"means": optimizer.param_groups[0]["params"][0]}
-    with pytest.warns(UserWarning, match=r"no energy has .*; call phases.observe\(loss\)") as said:
-        steps({"means": optimizer}, params, 40)
-    assert len(said) == 1
 
 
 @pytest.mark.filterwarnings("ignore:EnergyHistogram. no energy")
@@ -351,24 +335,17 @@ def test_numbers_that_are_not_finite_are_told_where_a_training_goes_back() -> No
         optimizer.step()
 
 
-def test_numbers_that_are_not_finite_are_told_at_the_end() -> None:
-    """Of a training that ends between two looks."""
+@pytest.mark.parametrize(("finite", "bad"), [(0, 76), (78, 1)])
+def test_numbers_that_are_not_finite_are_told_before_the_end(finite: int, bad: int) -> None:
+    """Of a training that ends between two looks, and where only the last ones are not."""
     params = parameters(ROWS, "means")
     optimizers = PhaseScheduler(80, parts=[Averaging()]).upgrade(adams_of(params))
+    steps(optimizers, params, finite)
     params["means"].grad = torch.full((ROWS, 3), torch.nan)
-    for _ in range(76):
+    for _ in range(bad):
         optimizers["means"].step()
-    with pytest.warns(UserWarning, match="iteration 76: 912 numbers of gradients"):
-        optimizers["means"].step()
-
-
-def test_numbers_of_the_last_iterations_that_are_not_finite_are_told() -> None:
-    params = parameters(ROWS, "means")
-    optimizers = PhaseScheduler(80, parts=[Averaging()]).upgrade(adams_of(params))
-    steps(optimizers, params, 78)
-    params["means"].grad = torch.full((ROWS, 3), torch.nan)
-    optimizers["means"].step()
-    with pytest.warns(UserWarning, match="iteration 79: 12 numbers of gradients"):
+    said = f"iteration {finite + bad}: {3 * ROWS * bad} numbers of gradients"
+    with pytest.warns(UserWarning, match=said):
         optimizers["means"].step()
 
 
@@ -431,6 +408,12 @@ def test_optimizers_that_make_no_step(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "ended at iteration 3 of 600" in str(phases.end_line())
 
 
+def test_a_child_that_imports_the_training_again_says_nothing(monkeypatch: Any) -> None:
+    """As workers of a DataLoader do, where processes are spawned."""
+    monkeypatch.setattr("multiprocessing.parent_process", lambda: "the training")
+    assert PhaseScheduler(600).end_line() is None
+
+
 def test_a_schedule_that_another_takes_over_says_no_more() -> None:
     params = parameters(ROWS, "means")
     first = PhaseScheduler(600, parts=[Averaging()])
@@ -475,6 +458,8 @@ for _ in range(585):
 {error}
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    begun = "600 iterations, OwnFrame, Fading, OutOfView, Averaging, in the steps of opacities"
+    assert done.stderr.startswith(f"opt3dgs_optim: {begun}\n")
     assert ("the training ended at iteration 585 of 600" in done.stderr) is not bool(error)
     assert done.returncode == bool(error)
     assert done.stdout == ""

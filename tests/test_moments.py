@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import io
 from typing import Any
 
 import pytest
 import torch
-from gaussians import adam_of, adams_of, parameters
+from gaussians import adam_of, adams_of, parameters, through_a_file
+from masked_adams import SelectiveAdam
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
@@ -197,15 +197,12 @@ def test_a_resume_is_bit_for_bit(order: str, at: int, total: int) -> None:
     """Also in the last thirtieth, and where the mean is in the parameters' place."""
     adams, _ = trained(total=total)
     iterate(adams, 0, at)
-    file = io.BytesIO()
-    torch.save([(param_of(a).detach(), a.state_dict()) for a in adams.values()], file)
+    saved = through_a_file([(param_of(a).detach(), a.state_dict()) for a in adams.values()])
     iterate(adams, at, total)
-    file.seek(0)
     if order == "gsplat":
         again, _ = trained(total=total)
     else:
         again = {k: Adam([Parameter(torch.zeros(200, *s))], lr=1e-2) for k, s in SHAPES.items()}
-    saved = torch.load(file, weights_only=True)
     for adam, (values_, state) in zip(again.values(), saved, strict=True):
         param_of(adam).data.copy_(values_)
         adam.load_state_dict(state)
@@ -312,10 +309,6 @@ def test_other_numbers_of_bits_are_refused(bits: Any) -> None:
 
 
 def test_steps_of_other_classes_and_float64_are_refused() -> None:
-    class SelectiveAdam(Adam):
-        def step(self, visibility: Any = None) -> None:  # pyright: ignore
-            raise AssertionError
-
     masked = SelectiveAdam([{"params": [Parameter(torch.ones(2, 3))], "name": "means"}])
     with pytest.raises(ValueError, match="moments=16, but SelectiveAdam makes its own step"):
         PhaseScheduler(10, moments=16).upgrade(masked)

@@ -10,7 +10,6 @@ import torch
 from gaussians import adams_of, parameters, same_tensors, steps
 
 from opt3dgs_optim import (
-    DEFAULTS,
     Averaging,
     Curvature,
     FreshMoments,
@@ -18,7 +17,6 @@ from opt3dgs_optim import (
     PhaseScheduler,
     SquaredLoss,
 )
-from opt3dgs_optim.clock import Phase
 from opt3dgs_optim.parts.averaging import SHARE_OF_FALL
 from opt3dgs_optim.step import Step
 from opt3dgs_optim.training import Training
@@ -68,19 +66,11 @@ def test_steps_fall_to_the_end_and_are_as_long_as_before_after_it(caplog: Any) -
     said = "after the end that was planned at 250, so that the parameters are the last iterate"
     assert said in str(phases.end_line())
     assert caplog.text.count("the end that was planned, at iteration 250, is over; the") == 1
+    assert "opt3dgs_optim: no planned end, OwnFrame, Fading, " in caplog.text
     phases.finish_in(10)
     steps(optimizers, params, 10)
     assert phases.total_steps == 280
     assert phases.end_line() is None
-
-
-def test_its_mean_is_gone_where_it_goes_on() -> None:
-    phases, optimizers, params = begun([Averaging()])
-    phases.finish_in(60)
-    steps(optimizers, params, 60)
-    assert "averaging.mean" in optimizers["sh0"].state[params["sh0"]]
-    steps(optimizers, params, 1)
-    assert all("averaging.mean" not in optimizers[n].state[params[n]] for n in params)
 
 
 def test_what_holds_no_gaussians_is_averaged_and_forgets_it_too() -> None:
@@ -204,17 +194,6 @@ def test_a_planned_training_goes_on_without_an_end_and_the_other_way_round() -> 
         steps(optimizers, params, 1)
         kept = "averaging.mean" in optimizers["sh0"].state[params["sh0"]]
         assert kept is (then == 100)
-
-
-def test_exploitation_is_the_fall() -> None:
-    phases, optimizers, params = begun([Curvature()])
-    steps(optimizers, params, 20)
-    assert phases.phase is Phase.EXPLORATION
-    phases.finish_in(10)
-    steps(optimizers, params, 10)
-    assert phases.phase is Phase.EXPLOITATION
-    steps(optimizers, params, 1)
-    assert phases.phase is Phase.EXPLORATION
 
 
 def test_its_moments_begin_anew_and_its_loss_is_squared() -> None:
@@ -388,9 +367,3 @@ def test_a_part_sees_how_far_the_fall_is() -> None:
     steps(optimizers, {"means": params["means"]}, 11)
     fall = [(12, pytest.approx(i / 10)) for i in range(10)]
     assert part.seen == [(None, 0.0), (None, 0.0), *fall, (None, 0.0)]
-
-
-def test_the_defaults_say_how_it_ends(caplog: Any) -> None:
-    caplog.set_level("INFO")
-    begun(DEFAULTS)
-    assert "no planned end" in caplog.text

@@ -13,28 +13,18 @@ import pytest
 import reference_step
 import torch
 from gaussians import RATES, SHAPES, adams_of, decayed, make_gaussians, same_tensors
-from reference_step import (
-    adam_,
-    default_step,
-    new_moments,
-    paper_pixel_loss,
-    paper_step,
-)
+from reference_step import default_step, paper_pixel_loss, paper_step
 from torch import Tensor
 from torch.nn import Parameter
 
 from opt3dgs_optim import (
     DEFAULTS,
     Averaging,
-    Curvature,
-    EnergyHistogram,
     Fading,
-    FreshMoments,
     OutOfView,
     OwnFrame,
     Part,
     PhaseScheduler,
-    SquaredLoss,
     paper_parts,
 )
 from opt3dgs_optim.mean import like_rows
@@ -240,28 +230,6 @@ def test_the_papers_step(num_points: int, share: float) -> None:
     newest_first: list[Tensor] = state["means"]["pairs"][2]
     filled = [float((each != 0).any(1).float().mean()) for each in newest_first]
     assert num_points == 1 or (filled[0] > 0.5 and filled[4] > 0.0)  # all five slots
-
-
-@pytest.mark.parametrize("left_out", [EnergyHistogram, FreshMoments, SquaredLoss, Curvature])
-def test_each_part_of_the_paper_matters(left_out: type[Part]) -> None:
-    """Else the test above would hold whatever that part does."""
-    scene, total = Scene(57, 0.3), 300
-    theirs, _ = with_the_reference(scene, total, paper_step, partial(paper_pixel_loss, total=total))
-    others = [part for part in paper_parts(total) if not isinstance(part, left_out)]
-    assert first_difference(with_the_package(scene, total, others, observe=True), theirs)
-
-
-def test_one_adam_is_torchs() -> None:
-    torch.manual_seed(0)
-    param = torch.nn.Parameter(torch.randn(31, 3))
-    target, own = param.detach().clone(), new_moments(param.detach())
-    adam = torch.optim.Adam([param], lr=0.01, eps=1e-15)
-    for grad in torch.randn(20, 31, 3):
-        param.grad = grad
-        adam.step()
-        adam_(target, grad, own, 0.01)
-    assert torch.equal(param, target)
-    assert torch.equal(adam.state[param]["exp_avg_sq"], own["exp_avg_sq"])
 
 
 def test_the_reference_needs_torch_only() -> None:

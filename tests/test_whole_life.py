@@ -7,7 +7,6 @@ their orders, copies, switches of phase, numbers that are not finite, ends and l
 from __future__ import annotations
 
 import copy
-import io
 import pickle
 from typing import Any
 
@@ -15,7 +14,7 @@ import pytest
 import reference_step
 import row_edits
 import torch
-from gaussians import RATES, adam_of, adams_of, make_gaussians, parameters
+from gaussians import RATES, adam_of, adams_of, make_gaussians, parameters, through_a_file
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
@@ -209,10 +208,7 @@ class WholeLife(RuleBasedStateMachine):
     # -- saves, loads, copies ----------------------------------------------------------------------
 
     def saved(self) -> Any:
-        buffer = io.BytesIO()
-        torch.save([optimizer.state_dict() for optimizer in self.optimizers], buffer)
-        buffer.seek(0)
-        return torch.load(buffer, weights_only=True)
+        return through_a_file([optimizer.state_dict() for optimizer in self.optimizers])
 
     def load(self, states: list[Any], upgraded_first: bool) -> None:
         """Into new Parameters and new optimizers, and a new scheduler."""

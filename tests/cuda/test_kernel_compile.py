@@ -34,8 +34,7 @@ class Compiled(NamedTuple):
 def compiled_for(name: str, arch: str, dtype: torch.dtype, size: int) -> Compiled:
     log = io.StringIO()
     options = {"history_size": size, "ptxas_options": ["-v"]}
-    code = cuda.compile_cubin(name, dtype, f"sm_{arch}", logs=log, **options)
-    assert code.get_kernel is not None
+    cuda.compile_cubin(name, dtype, f"sm_{arch}", logs=log, **options)
     return Compiled(log.getvalue(), nvrtc_ptx(name, arch, dtype, size))
 
 
@@ -116,9 +115,3 @@ def test_sources_need_no_include_path() -> None:
     for kernel, name in cuda.KERNELS.items():
         assert "#include" not in cuda.source(name)
         assert f" {kernel}(" in cuda.source(name)
-
-
-def test_no_barriers_shared_memory_warps_or_atomics() -> None:
-    """What the host shim could not run."""
-    for name in cuda.KERNELS.values():
-        assert not re.search(r"__sync|__shared__|__shfl|__ballot|atomic[A-Z]", cuda.source(name))

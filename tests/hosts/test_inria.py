@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import io
 from typing import Any
 
 import pytest
 import torch
+from gaussians import through_a_file
 from gsplat_host import POINTS, splats
 from inria_host import ATTRIBUTES, OPTIONS, SimulatedModel, made_model
 
@@ -47,14 +47,6 @@ def same(a: SimulatedModel, b: SimulatedModel) -> bool:
     return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ATTRIBUTES.values())
 
 
-def saved(model: SimulatedModel) -> Any:
-    """The checkpoint's tuple, through a file that may hold tensors and numbers only."""
-    buffer = io.BytesIO()
-    torch.save(model.capture(), buffer)
-    buffer.seek(0)
-    return torch.load(buffer, weights_only=True)
-
-
 def test_without_parts_it_is_the_trainer() -> None:
     ours, theirs = made_model(splats()), made_model(splats())
     upgrade(ours, [])
@@ -88,7 +80,7 @@ def test_capture_and_restore_are_bit_exact(at: int) -> None:
     run(whole, 0, TOTAL)
     upgrade(first)
     run(first, 0, at)
-    second.restore(saved(first), OPTIONS)
+    second.restore(through_a_file(first.capture()), OPTIONS)
     assert upgrade(second).iteration == at - 1
     run(second, at, TOTAL)
     assert same(whole, second)
@@ -98,7 +90,7 @@ def test_a_checkpoint_of_the_unchanged_trainer() -> None:
     """Its Adam has counted less; the page's further line puts the clock where it was."""
     stock, ours = made_model(splats()), made_model(splats())
     assert run(stock, 0, 40) == 5
-    ours.restore(saved(stock), OPTIONS)
+    ours.restore(through_a_file(stock.capture()), OPTIONS)
     phases = upgrade(ours)
     assert phases.iteration == 40 - 5 - 1
     phases.observe(iteration=40)

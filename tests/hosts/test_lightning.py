@@ -44,12 +44,7 @@ def lightning(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     sys.modules.pop("opt3dgs_optim.hosts.lightning", None)
 
 
-def trainer(
-    density: str = "VanillaDensityControllerImpl",
-    strategy: str = "VanillaOptStrategy",
-    total: int = TOTAL,
-    epochs: int = -1,
-) -> Any:
+def trainer(strategy: str = "VanillaOptStrategy", total: int = TOTAL, epochs: int = -1) -> Any:
     """What the plugin sees of the trainer's `GaussianSplatting`."""
     torch.manual_seed(0)
     optimizers = [
@@ -66,7 +61,6 @@ def trainer(
     return types.SimpleNamespace(
         trainer=types.SimpleNamespace(max_steps=total, max_epochs=epochs),
         gaussian_optimizers=optimizers,
-        density_controller=type(density, (), {})(),
         hparams={"opt_strategy": type(strategy, (), {})()},
         on_after_backward_hooks=[],
     )
@@ -96,9 +90,8 @@ def values(host: Any) -> list[torch.Tensor]:
     return [g["params"][0].detach() for o in host.gaussian_optimizers for g in o.param_groups]
 
 
-@pytest.mark.parametrize("density", ["VanillaDensityControllerImpl", "MCMCDensityControllerImpl"])
-def test_a_run_and_its_resume(lightning: Any, density: str) -> None:
-    whole, half, again = (trainer(density) for _ in range(3))
+def test_a_run_and_its_resume(lightning: Any) -> None:
+    whole, half, again = (trainer() for _ in range(3))
     phases = set_up(lightning, whole).phases
     assert phases.parts == DEFAULTS
     run(whole, 1, TOTAL)

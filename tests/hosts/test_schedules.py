@@ -107,10 +107,10 @@ def test_what_counts_no_iterations_stays() -> None:
 def test_no_refinement_and_no_reset_is_added(name: str) -> None:
     """INRIA's form of it, and gsplat's, which rounds down by itself."""
     for n in MANY if name != "taming-3dgs" else range(300, 30_001, 300):
-        for words in commands(name, n):
-            (found, stock) = (options(each) for each in (words, commands(name)[0]))
+        for words in zip(commands(name, n), commands(name), strict=True):
+            found, stock = map(options, words)
             assert all(each > 0 for each in found.values() if isinstance(each, int)), (n, found)
-            assert list(found) == list(options(words))
+            assert list(found) == list(stock)
             if "steps_scaler" in found:
                 factor = found["steps_scaler"]
                 assert int(30_000 * factor) == n

@@ -97,10 +97,9 @@ def prune(rows: Tensor, is_state: bool) -> Tensor:
     return rows[3:]
 
 
-def train(
-    parts: Sequence[Part], gpu: SimulatedDevice | None, seen: float, moments: Any = 32
-) -> Training:
-    made = Training(parts, gpu, seen, moments)
+def train(gpu: SimulatedDevice | None, seen: float, moments: Any = 32) -> Training:
+    """The defaults."""
+    made = Training(DEFAULTS, gpu, seen, moments)
     for i in range(STEPS):
         made.iterate(bad=i == 25)
         if i in (10, 40):
@@ -112,19 +111,12 @@ def train(
     return made
 
 
-@pytest.mark.parametrize(
-    ("parts", "seen"),
-    [
-        (DEFAULTS, 0.1),
-        (DEFAULTS, 0.6),
-    ],
-    ids=["few in view", "all in view"],
-)
+@pytest.mark.parametrize("seen", [0.1, 0.6], ids=["few in view", "most in view"])
 @pytest.mark.filterwarnings("ignore:opt3dgs_optim. iteration 5[69]. 12 numbers")
-def test_a_training_ends_as_on_a_cpu(parts: Sequence[Part], seen: float) -> None:
-    ours = train(parts, None, seen)
+def test_a_training_ends_as_on_a_cpu(seen: float) -> None:
+    ours = train(None, seen)
     with SimulatedDevice() as gpu:
-        theirs = train(parts, gpu, seen)
+        theirs = train(gpu, seen)
         assert all(isinstance(p, DeviceTensor) for p in theirs.params().values())
     for name, param in theirs.params().items():
         mean = theirs.adams[name].state[param]["averaging.mean"]
@@ -142,9 +134,9 @@ def test_a_training_ends_as_on_a_cpu(parts: Sequence[Part], seen: float) -> None
 @pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore:opt3dgs_optim. iteration 5[69]. 12 numbers")
 def test_a_training_with_moments_of_16_bits_ends_as_on_a_cpu() -> None:
-    ours = train(DEFAULTS, None, 0.3, moments=16)
+    ours = train(None, 0.3, moments=16)
     with SimulatedDevice() as gpu:
-        theirs = train(DEFAULTS, gpu, 0.3, moments=16)
+        theirs = train(gpu, 0.3, moments=16)
     for name, param in theirs.params().items():
         assert theirs.adams[name].state[param]["exp_avg"].dtype == torch.int16
         torch.testing.assert_close(on_host(param), ours.params()[name].data, rtol=1e-3, atol=1e-3)

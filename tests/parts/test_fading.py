@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 
 import pytest
 import torch
+from gaussians import adams_of, parameters, same_tensors, steps
 from hypothesis import given
 from hypothesis import strategies as st
 from torch.nn import Parameter
@@ -73,6 +75,22 @@ def test_events_become_rarer_where_no_end_is_planned(events: int, fall: int) -> 
     assert counts[-1] - counts[6_250] == pytest.approx(events / 3 * math.log(2), abs=1.1)
     clock.plan_fall(fall, fall + 100)
     assert before(part, fall + 100, clock) == before(part, fall, clock)
+
+
+def test_nothing_is_faded_in_the_fall() -> None:
+    """Three events would fade in iterations 10, 29, 80 and 218; torch's Adam goes on as it does."""
+    params = parameters(6)
+    phases = PhaseScheduler(parts=[Fading(events=3)])
+    optimizers = phases.upgrade(adams_of(params))
+    steps(optimizers, params, 60)
+    phases.finish_in(60)
+    plain = copy.deepcopy(params)
+    stock = adams_of(plain)
+    for name, each in stock.items():
+        each.load_state_dict(copy.deepcopy(optimizers[name].state_dict()))
+    for adams, of in ((optimizers, params), (stock, plain)):
+        steps(adams, of, 60, seed=1)
+    assert same_tensors(params, plain)
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,13 @@ import copy
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from gaussians import adam_of, adams_of, make_gaussians, parameters, same_tensors, steps
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles import rotation_matrix
 from row_edits import added, apply, relocated, removed
 from torch import Tensor
 from torch.nn import Parameter
@@ -31,14 +33,8 @@ def draw(seed: int, *shape: int) -> Tensor:
 
 
 def dense_axes(quats: Tensor, scales: Tensor, least: float) -> Tensor:
-    """B = R diag(s) [N, 3, 3], by the textbook's matrix of a quaternion, in float64."""
-    w, x, y, z = torch.nn.functional.normalize(quats.double(), dim=1).unbind(1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    rotation = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    """B = R diag(s) [N, 3, 3], in float64."""
+    rotation = torch.from_numpy(np.stack([rotation_matrix(q) for q in quats.double().numpy()]))
     s = scales.double().exp()
     return rotation * torch.maximum(s, least * s.amax(1, keepdim=True))[:, None, :]
 
@@ -284,6 +280,23 @@ def test_thin_axes_count_for_less_in_a_long_training(steps_of_run: int, least: f
     assert min_aspect_of(steps_of_run) == pytest.approx(least)
 
 
+@pytest.mark.parametrize(("iteration", "least"), [(0, 0.25), (15_000, 0.2), (60_000, 0.1)])
+def test_without_a_planned_end_thin_axes_count_by_the_iterations_so_far(
+    iteration: int, least: float
+) -> None:
+    params = parameters(ROWS, *NAMES)
+    params["means"].data.zero_()
+    params["quats"].data[:] = torch.eye(4)[0]
+    params["scales"].data[:] = torch.tensor([0.0, -40.0, -40.0])
+    phases = PhaseScheduler(parts=[OwnFrame()])
+    optimizers = phases.upgrade(adams_of(params))
+    phases.observe(iteration=iteration)
+    params["means"].grad = torch.ones(ROWS, 3)
+    optimizers["means"].step()
+    x, y, _ = params["means"].detach().unbind(1)
+    torch.testing.assert_close(y / x, torch.full((ROWS,), least))
+
+
 def test_moments_of_another_frame_begin_anew(caplog: pytest.LogCaptureFixture) -> None:
     """A training that begins with it in the middle, from a checkpoint of the stock trainer."""
     params = parameters(ROWS, *NAMES)
@@ -308,6 +321,17 @@ def test_without_scales_or_quats_adam_steps_and_it_is_said_once(missing: str) ->
         steps(optimizers, params, 5)
     steps(adams_of(plain), plain, 5)
     assert len(said) == 1
+    assert torch.equal(params["means"], plain["means"])
+
+
+@pytest.mark.parametrize("scales", [torch.zeros(ROWS + 1, 3), torch.zeros(ROWS, 3).double()])
+def test_with_scales_of_other_rows_or_another_dtype_adam_steps(scales: Tensor) -> None:
+    params, plain = parameters(ROWS, *NAMES), parameters(ROWS, "means")
+    params["scales"] = Parameter(scales)
+    optimizers = PhaseScheduler(TOTAL, parts=[OwnFrame()]).upgrade(adams_of(params))
+    with pytest.warns(UserWarning, match=r"scales \[N, 3\] .* of the same points .*; Adam steps"):
+        steps(optimizers, {"means": params["means"]}, 1)
+    steps(adams_of(plain), plain, 1)
     assert torch.equal(params["means"], plain["means"])
 
 

@@ -353,14 +353,17 @@ def test_command_line_says_in_one_line_what_is_wrong(tmp_path, capsys):
         assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("every", [1, 2])
-def test_the_report_says_what_the_last_iterations_gained(tmp_path: Path, every: int) -> None:
-    """Of a log that has the loss of every iteration."""
+@pytest.mark.parametrize(("every", "unit"), [(1, 1.0), (2, 1.0), (1, 0.0)])
+def test_the_report_says_what_the_last_iterations_gained(
+    tmp_path: Path, every: int, unit: float
+) -> None:
+    """Of a log that has the loss of every iteration, above 0."""
     with RunLog(tmp_path / "log.jsonl", metadata={"arm": "mine"}) as log:
         for iteration in range(0, 4_100, every):
             value: Any = 0.1 if iteration < 2_100 else 0.05
-            log.step(iteration, loss=value)
+            log.step(iteration, loss=unit * value)
         log.evaluation(4_100, psnr=25.0)
     written = report.write_report([read_run(tmp_path / "log.jsonl")], tmp_path / "out")
     said = "The last 2,000 iterations of mine gained 6.02 ± 0.00 dB in the loss"
-    assert (said in written[0].read_text()) is (every == 1)
+    assert (said in written[0].read_text()) is (every == unit == 1)
+    assert " nan " not in written[0].read_text()

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import copy
 import hashlib
-import io
 import random
 import sys
 import warnings
@@ -22,7 +21,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import torch
-from gaussians import adam_of, adams_of, decayed, parameters
+from gaussians import adam_of, adams_of, decayed, parameters, through_a_file
 from masked_adams import SelectiveAdam, SparseGaussianAdam, masked
 from row_edits import added, apply, forgotten, relocated, removed
 from torch import Tensor
@@ -112,11 +111,9 @@ def train(number: int) -> str:
             edit = edit_of(draw, count) if len(names) > 1 else forgotten()
             apply(edit, params, optimizers, names, inria and len(names) > 1)
         if iteration == again:
-            saved = io.BytesIO()
-            torch.save([each.state_dict() for each in optimizers], saved)
-            saved.seek(0)
+            saved = through_a_file([each.state_dict() for each in optimizers])
             phases, optimizers = made()
-            for optimizer, state in zip(optimizers, torch.load(saved), strict=True):
+            for optimizer, state in zip(optimizers, saved, strict=True):
                 optimizer.load_state_dict(state)
     phases.finish()
     digest = hashlib.sha256()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -84,3 +85,11 @@ def steps(
 def same_tensors(a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> bool:
     """Whether two sets of tensors are equal bit for bit."""
     return set(a) == set(b) and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def through_a_file(saved: Any) -> Any:
+    """What `torch.load` makes of it, which takes tensors and plain values only."""
+    file = io.BytesIO()
+    torch.save(saved, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
