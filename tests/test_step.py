@@ -6,6 +6,7 @@ import math
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from simulated_device import on_device, on_host
@@ -13,6 +14,7 @@ from step_cases import case, moved, tensors
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
+from opt3dgs_optim import Fading, OwnFrame, PositionNoise
 from opt3dgs_optim import step as module
 from opt3dgs_optim.mean import Mean, places_of, take_into_mean
 from opt3dgs_optim.moments import CODES, chances
@@ -196,3 +198,11 @@ def test_the_cases_of_a_gpu_lie_on_it(kind: dict[str, Any]) -> None:
     found = [x for x in tree_leaves(asdict(there)) if isinstance(x, Tensor)]
     assert {each.device.type for each in found} == {"meta"}
     assert len(found) >= 7  # of the parameter, the mean and the counter
+
+
+def test_options_are_pythons_own_numbers() -> None:
+    """A launcher takes another kind of number for another kind of argument."""
+    own, fading = OwnFrame(rate=1, min_aspect=np.float32(0.5)), Fading(share=1, seed=np.int64(3))
+    noise = PositionNoise(scale=np.float64(2))
+    found = (own.rate, own.min_aspect, fading.share, fading.seed, noise.scale)
+    assert [type(each) for each in found] == [float, float, float, int, float]
