@@ -64,7 +64,7 @@ def list_paths(value: Any, path: tuple[Any, ...] = ()) -> None:
 
 
 list_paths(SAVED)
-IGNORED = {"name", "gaussian", "foreach", "fused", "decoupled_weight_decay"}  # torch's: any value
+IGNORED = {"name", "foreach", "fused", "decoupled_weight_decay"}  # torch's: any value
 WRONG = ("gone", "renamed", None, "text", [], {}, -1, math.nan, True, 10**9, "shape", "complex")
 
 

@@ -143,7 +143,7 @@ def test_a_group_that_comes_later_is_refused_too() -> None:
         optimizer.add_param_group({"params": [Parameter(torch.ones(ROWS, 3))], "name": "xyz"})
     assert len(optimizer.param_groups) == 1
     optimizer.add_param_group({"params": [Parameter(torch.ones(ROWS, 3))], "name": "scales"})
-    assert optimizer.param_groups[1]["gaussian"] == "scales"
+    assert optimizer._slots[1] == ("", "scales")  # pyright: ignore
 
 
 def test_two_sets_under_one_name_are_told(recwarn: pytest.WarningsRecorder) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -202,7 +202,8 @@ def test_the_cases_of_a_gpu_lie_on_it(kind: dict[str, Any]) -> None:
 
 def test_options_are_pythons_own_numbers() -> None:
     """A launcher takes another kind of number for another kind of argument."""
-    own, fading = OwnFrame(rate=1, min_aspect=np.float32(0.5)), Fading(share=1, seed=np.int64(3))
-    noise = PositionNoise(scale=np.float64(2))
+    half, three, two = cast(tuple[Any, ...], (np.float32(0.5), np.int64(3), np.float64(2)))
+    own, fading = OwnFrame(rate=1, min_aspect=half), Fading(share=1, seed=three)
+    noise = PositionNoise(scale=two)
     found = (own.rate, own.min_aspect, fading.share, fading.seed, noise.scale)
     assert [type(each) for each in found] == [float, float, float, int, float]

@@ -54,53 +54,41 @@ class StepAdam(Adam):
     has_positions = False  # whether it holds positions, whose steps count
     coded = False  # whether its moments are codes of 16 bits, see `moments`
     _base: type[Adam] = Adam  # the class whose optimizer it was
+    _masked = False  # whether that class has a step of its own
     _steppers: list[ParamStepper] = []  # noqa: RUF012  (made anew, never changed)
     _in_order: list[ParamStepper] = []  # noqa: RUF012  (the same, as they step)
     _slots: Slots
-    _last: tuple[int, ...] = ()  # what `last_steps` and `own_frame` say until the first step
-    _own_frame: frozenset[str] = frozenset()
+    _last: tuple[int, ...] = ()  # what `last_steps` and `framed_sets` say until the first step
+    _framed: frozenset[str] = frozenset()
 
     def follow(self, training: Training, slots: Slots) -> None:
         """Use `training`'s parts from now on; `slots` has each group's set and name."""
-        self._last, self._own_frame = self.last_steps(), self.own_frame()
+        self._last, self._framed = self.last_steps(), self.framed_sets()
         params = [param for group in self.param_groups for param in group["params"]]
         if len(self._last) != len(params):
             self._last = ()  # groups are others now
         self.training, self._slots, self._steppers, self._in_order = training, slots, [], []
         if not self.state:
             self.coded = training.moments == 16
-        self._masked = own_step(self._base) is not None
         self._step_supports_amp_scaling = False  # a GradScaler unscales, and leaves steps out
         self._on_gpu = any(map(operator.attrgetter("is_cuda"), params))
         self._name_groups()
-        self._count_on_host()
         self._remember_rows()
 
     def _name_groups(self) -> None:
-        """Say in each group which Gaussian parameter it holds, by gsplat's name, or None."""
+        """Tell the training which Gaussian parameters it holds, and in which groups."""
         members = self.training.members
         self.training.all_optimizers[id(self)] = weakref.ref(self)
         self.has_positions = False
         for slot in [slot for slot, each in members.items() if each[0]() is self]:
             del members[slot]
         for at, (which, name) in enumerate(self._slots):
-            self.param_groups[at]["gaussian"] = name
             # Always there, since flattened states are loaded by the keys that a group has.
             self.param_groups[at].setdefault(STATE_KEY, "")
             if name is not None:
                 members[which, name] = weakref.ref(self), at
             if name == "means":
                 self.has_positions = self.training.counts_positions = True
-
-    def _count_on_host(self) -> None:
-        """Keep Adam's count of steps on the host, which reads it in every step of ours."""
-        if not self.training.changes_steps:
-            return
-        for group in self.param_groups:
-            group["fused"], group["foreach"] = False, False
-        for state in self.state.values():
-            if isinstance(state.get("step"), Tensor):
-                state["step"] = state["step"].to("cpu", torch.float32)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """As torch's; refuses what `upgrade` would, with nothing changed."""
@@ -118,7 +106,6 @@ class StepAdam(Adam):
             raise
         self._slots = slots
         self._name_groups()
-        self._count_on_host()
 
     def step(self, *args: Any, **options: Any) -> Any:
         """One step of every parameter that has a gradient; return the value of `closure`, if given.
@@ -145,8 +132,8 @@ class StepAdam(Adam):
         loss, training, given = None, self.training, ()
         if self._masked:
             given = () if closure is None and not masked else (closure, *masked)
-            check_arguments(type(self).__name__, self._base.step, self, *given, masks)
-        elif masked or masks or isinstance(closure, Tensor):
+            check_arguments(type(self).__name__, self._base.step, (self, *given), masks)
+        elif masked or masks or not (closure is None or callable(closure)):
             refuse_mask(type(self).__name__)
         if callable(closure):
             with torch.enable_grad():
@@ -210,7 +197,7 @@ class StepAdam(Adam):
                 else:
                     stepper.stepped_in = self._last[i] if i < len(self._last) else None
                     if "exp_avg" in state:
-                        stepper.framed = stepper.name == "means" and stepper.set in self._own_frame
+                        stepper.framed = stepper.name == "means" and stepper.set in self._framed
                         stepper.remember(state["exp_avg"])
                 if check:
                     stepper.check_rows(param, state)
@@ -259,22 +246,16 @@ class StepAdam(Adam):
     def state_dict(self) -> dict[str, Any]:
         """As torch's, with a line of JSON of ours in each group, under `"opt3dgs"`.
 
-        Any Adam may load it, with the trainer's `fused` and `foreach`. Moments of 16 bits are
-        float32 in it, on the host.
+        Any Adam may load it. Moments of 16 bits are float32 in it, on the host.
         """
         if not self.training.changes_steps:
             return super().state_dict()
-        own = [dict(group) for group in self.param_groups]
         try:
             self.note_in_groups()
-            for group in self.param_groups:
-                for option in ("fused", "foreach"):
-                    group[option] = self.defaults.get(option)
             found = super().state_dict()
         finally:  # it is of this moment
-            for group, was in zip(self.param_groups, own, strict=True):
-                group.clear()
-                group.update(was)
+            for group in self.param_groups:
+                group[STATE_KEY] = ""
         if self.coded:
             found["state"] = {at: as_numbers(state) for at, state in found["state"].items()}
         return found
@@ -286,7 +267,7 @@ class StepAdam(Adam):
         kept = sum(bool(kept_in(state)) for state in self.state.values())
         common = numbers_of(self.training, self.next_iteration, max(counts, default=0), kept)
         last, now = self.last_steps(), self.next_iteration - 1
-        note_in_groups(self.param_groups, self._slots, common, last, now, self.own_frame())
+        note_in_groups(self.param_groups, self._slots, common, last, now, self.framed_sets())
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """As torch's; training goes on where the checkpoint was (a stock one: by Adam's count).
@@ -309,7 +290,6 @@ class StepAdam(Adam):
         def go_on(_: Any) -> None:
             self.coded = False  # what is loaded is numbers
             complete_groups(self.training, self.param_groups, own)
-            self._count_on_host()
             self.resume()
 
         handles = [
@@ -328,11 +308,11 @@ class StepAdam(Adam):
         if not self.state and not any(map(operator.itemgetter(STATE_KEY), self.param_groups)):
             self.next_iteration = training.iteration + 1  # made anew, perhaps under way
             return
-        saved, last, own_frame = take_from_groups(self.param_groups, self._slots)
+        saved, last, framed = take_from_groups(self.param_groups, self._slots)
         counts = [int(state["step"]) for state in self.state.values() if "step" in state]
         missed = steps_of_a_stock_adam(counts, saved, training)
         ours = None if missed else saved  # what it says of the moments holds
-        self._last, self._own_frame = ((), frozenset()) if ours is None else (last, own_frame)
+        self._last, self._framed = ((), frozenset()) if ours is None else (last, framed)
         if saved is not None:
             restore_training(training, saved)
             iteration = saved["iteration"] + missed
@@ -346,7 +326,7 @@ class StepAdam(Adam):
         recode_all(self.state, self.coded, saved, training)
         self.coded = training.moments == 16
         if not training.changes_steps:
-            forget_own_frames(self.param_groups, self._slots, self._own_frame, self.state)
+            forget_own_frames(self.param_groups, self._slots, self._framed, self.state)
         self._remember_rows()
 
     def last_steps(self) -> tuple[int, ...]:
@@ -355,21 +335,24 @@ class StepAdam(Adam):
         made = [now if each.stepped_in is None else each.stepped_in for each in self._steppers]
         return tuple(made) or self._last
 
-    def own_frame(self) -> frozenset[str]:
+    def framed_sets(self) -> frozenset[str]:
         """The sets whose positions have moments in the own frame."""
         framed = frozenset(each.set for each in self._steppers if each.framed)
-        return framed if self._steppers else self._own_frame
+        return framed if self._steppers else self._framed
+
+    def __copy__(self) -> StepAdam:
+        raise TypeError(f"{type(self).__name__}: two optimizers of one state; use copy.deepcopy")
 
     def __getstate__(self) -> dict[str, Any]:
         self.notice_edits()
-        kept = ("training", "next_iteration", "has_positions", "_slots", "_masked", "coded")
+        kept = ("training", "next_iteration", "has_positions", "_slots", "coded")
         own = {key: getattr(self, key) for key in (*kept, "_on_gpu")}
-        own |= {"_steppers": [], "_last": self.last_steps(), "_own_frame": self.own_frame()}
+        own |= {"_steppers": [], "_last": self.last_steps(), "_framed": self.framed_sets()}
         return {**super().__getstate__(), **own}
 
     def __reduce__(self) -> Any:
         # The class of an upgraded optimizer is made when it is needed, and has no name to find.
-        made = type(self) is _CLASSES.get(self._base)
+        made = type(self) is upgraded_class(self._base)
         return _made_again, (None if made else type(self), self._base), self.__getstate__()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -389,12 +372,8 @@ def _made_again(kind: type[StepAdam] | None, base: type[Adam]) -> StepAdam:
     return kind.__new__(kind)
 
 
-_CLASSES: dict[type[Adam], type[StepAdam]] = {}
-
-
+@functools.cache
 def upgraded_class(base: type[Adam]) -> type[StepAdam]:
     """A class that is `StepAdam` and `base`."""
-    if base not in _CLASSES:
-        made = type(base.__name__, (StepAdam, base), {"_base": base, "__module__": base.__module__})
-        _CLASSES[base] = cast(type[StepAdam], made)
-    return _CLASSES[base]
+    own = {"_base": base, "_masked": own_step(base) is not None, "__module__": base.__module__}
+    return cast(type[StepAdam], type(base.__name__, (StepAdam, base), own))

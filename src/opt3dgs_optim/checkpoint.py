@@ -69,20 +69,20 @@ def note_in_groups(
     common: dict[str, Any],
     last: Iterable[int],
     now: int,
-    own_frame: Container[str],
+    framed: Container[str],
 ) -> None:
     """Put into each group what it has beside tensors.
 
     Args:
         common: of all groups, see `numbers_of`.
         last: of every parameter, the iteration of its last step; `now` where it is not known.
-        own_frame: the sets whose positions' moments are the own frame's.
+        framed: the sets whose positions' moments are the own frame's.
     """
     steps = iter(last)
     for group, (which, name) in zip(groups, slots, strict=True):
         of_group = {
             "last": [next(steps, now) for _ in group["params"]],
-            "own_frame": name == "means" and which in own_frame,
+            "own_frame": name == "means" and which in framed,
         }
         group[STATE_KEY] = json.dumps({**common, **of_group})
 

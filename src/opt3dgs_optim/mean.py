@@ -53,12 +53,11 @@ def mean_of(
     """
     grid = GRIDS.get(name or "") if state["exp_avg"].dtype is CODES else None
     key = MEAN if grid is None else RESIDUE
-    found = state.get(key), state.get(BEGAN), state.get(REST)
-    mean, began, rest = found
-    rows = param.numel() if mean is None else mean.numel()
+    mean, began, rest = state.get(key), state.get(BEGAN), state.get(REST)
+    numbers = param.numel()
     if (
-        mean is None or began is None or rows != param.numel()
-        or (name == "means" and (rest is None or rest.numel() != rows))
+        mean is None or began is None or mean.numel() != numbers
+        or (name == "means" and (rest is None or rest.numel() != numbers))
     ):  # fmt: skip
         drop_means([state])
         mean = torch.zeros_like(param, dtype=None if grid is None else CODES)

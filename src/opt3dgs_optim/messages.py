@@ -25,7 +25,7 @@ def warn_user(message: str) -> None:
 
 
 def say(message: str) -> None:
-    """Tell the user, by the logger, or on stderr where nothing has been set up to show INFO."""
+    """Tell the user, by the logger, or on stderr where logging has no handler."""
     LOGGER.info(message)
     if not LOGGER.hasHandlers():
         bars = getattr(sys.modules.get("tqdm"), "tqdm", None)  # a trainer's would share the line

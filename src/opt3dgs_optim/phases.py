@@ -143,8 +143,7 @@ class PhaseScheduler(Training):
                 ) from None
             if ours and optimizer.training is not self:
                 check_slots(f"{CALL}.upgrade", optimizer.param_groups, optimizer._slots)
-            if ours and optimizer.training is not self:  # as a checkpoint of now
-                saved.append(numbers_of(optimizer.training, 0, 0, 0))
+                saved.append(numbers_of(optimizer.training, 0, 0, 0))  # as a checkpoint of now
             else:
                 saved.append(check_groups(f"{CALL}.upgrade", optimizer.param_groups))
         check_held_together(f"{CALL}.upgrade", given, slots, self.moments)

@@ -33,9 +33,8 @@ from opt3dgs_optim.training import Training
 _signature = functools.lru_cache(maxsize=8)(inspect.signature)  # every step asks
 
 
-def check_arguments(call: str, step: Any, *args: Any) -> None:
-    """TypeError unless a step takes these arguments: self, the others, and a dict of named ones."""
-    *given, named = args
+def check_arguments(call: str, step: Any, given: tuple[Any, ...], named: dict[str, Any]) -> None:
+    """TypeError unless a step takes these arguments, `self` the first of them."""
     try:
         _signature(step).bind(*given, **named)
     except TypeError as error:

@@ -51,7 +51,8 @@ class Fade(NamedTuple):
 class Frame(NamedTuple):
     """Step the positions [N, 3] along each Gaussian's axes, in its standard deviations.
 
-    A row without a gradient, as of a Gaussian out of view, stays as it is, moments and all.
+    A row without a gradient, as of a Gaussian out of view, keeps its moments, and moves by weight
+    decay alone.
     """
 
     rate: float  # standard deviations of a full step
@@ -293,7 +294,7 @@ def cross(a: Sequence[Tensor], b: Sequence[Tensor]) -> tuple[Tensor, Tensor, Ten
 
 
 def _within(largest: float, numbers: Tensor) -> Tensor:
-    """The numbers, with zeros for those that are larger, or none."""
+    """The numbers, with zeros for those that are larger, or NaN."""
     if numbers.is_cpu and (not numbers.numel() or numbers.abs().amax().item() <= largest):
         return numbers
     return torch.where(numbers.abs() <= largest, numbers, 0.0)

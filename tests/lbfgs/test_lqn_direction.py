@@ -145,15 +145,15 @@ def test_a_gpu_that_nothing_compiles_for_has_plain_torch(
 def test_what_insists_on_a_kernel_is_told_why_there_is_none() -> None:
     gpu, (x, grad, history) = torch.device("cuda"), points(7)
     assert torch.equal(two_loop(grad, history, 5, backend="torch"), two_loop(grad, history, 5))
-    with pytest.raises(RuntimeError, match=r"backend='cuda' was asked for on cpu in torch\.float3"):
+    with pytest.raises(RuntimeError, match="backend='cuda' was asked for on cpu, but"):
         two_loop(grad, history, 5, backend="cuda")
-    with pytest.raises(RuntimeError, match=r"asked for on cpu in torch\.float32"):
+    with pytest.raises(RuntimeError, match="asked for on cpu, but"):
         lqn_direction(x, grad, history, 5, **OPTIONS, backend="cuda")
     with pytest.raises(RuntimeError, match=r"points of 2 coordinates, .* at most 5 of 3"):
         lqn_direction(*points(7, dim=2), 5, **OPTIONS, backend="cuda")
     with pytest.raises(RuntimeError, match="no kernel for 6 pairs of points of 3 coordinates"):
-        obstacle("cuda", gpu, torch.float32, 3, 6)
-    assert obstacle("auto", gpu, torch.float32, 3, 6)  # more than a thread holds are torch's
+        obstacle("cuda", gpu, 3, 6)
+    assert obstacle("auto", gpu, 3, 6)  # more than a thread holds are torch's
     with pytest.raises(ValueError, match=r"two_loop: backend='gpu', but 'auto' or 'cuda' or"):
         two_loop(grad, history, 5, backend="gpu")  # pyright: ignore[reportArgumentType]
 
@@ -189,7 +189,7 @@ def test_points_on_a_gpu_are_one_launch(name: str, monkeypatch: pytest.MonkeyPat
         return lqn_direction(x, grad, history, 5, **OPTIONS, **options)
 
     assert called(grad.as_subclass(There)) == "launched"
-    assert asked == [("auto", grad.device, grad.dtype, 3, 5)]
+    assert asked == [("auto", grad.device, 3, 5)]
     assert called(grad) != "launched"
     assert len(asked) == 1
     assert called(grad, backend="cuda") == "launched"

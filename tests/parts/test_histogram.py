@@ -256,14 +256,14 @@ def test_clamp_and_warm_up_are_those_of_the_loops(options: dict[str, Any], clamp
 
 
 def test_moments_of_nu_before_there_are_any() -> None:
-    histogram = EnergyHistogram(warmup=9)
+    histogram, training = EnergyHistogram(warmup=9), Training([])
     nus_of(histogram, stream(9))
     moments = histogram.mean_multiplier, histogram.multiplier_std, histogram.multiplier
     assert [float(each) for each in moments] == [1.0, 0.0, 1.0]
-    assert histogram.numbers() == {}
+    assert histogram.numbers(training) == {}
     nu = float(histogram.observe(0.7))
     assert nu != 1.0
-    assert histogram.numbers() == {"nu": nu}
+    assert histogram.numbers(training) == {"nu": nu}
     assert float(histogram.mean_multiplier) == nu
 
 

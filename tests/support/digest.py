@@ -102,8 +102,8 @@ def train(number: int) -> str:
         phases.observe(torch.rand((), generator=generator) * 0.2)
         rates = decayed(iteration, total)
         for optimizer in optimizers:
-            for group in optimizer.param_groups:
-                group["lr"] = rates[group["gaussian"]]
+            for group, (_, name) in zip(optimizer.param_groups, optimizer._slots, strict=True):
+                group["lr"] = rates[name]
             given: Any = () if kind in (Adam, AdamW) else masked(kind, visible)  # pyright: ignore
             optimizer.step(*given)
         if edits and iteration % 7 == 6 and iteration < 0.8 * total and draw.random() < 0.7:

@@ -21,7 +21,6 @@ MOST_PAIRS = 5  # of curvature, that fit into a thread's registers
 BLOCK = 128  # threads; the .cu files promise it to the compiler
 HEADER = "two_loop.cuh"
 KERNELS = {"lqn_direction": "lqn.cu", "two_loop": "two_loop.cu"}  # the kernel: its file
-DTYPES = (torch.float32, torch.float64)  # of the kernels
 ALIGNMENT = 16  # bytes; the kernels read and write histories by vectors of so many
 REALS = {torch.float32: np.float32, torch.float64: np.float64}  # the kernels' numbers
 CONFIGS = 1024  # of the grids last launched; the number of points changes with density control

@@ -117,8 +117,3 @@ class Trainer:
         """Its name and its file."""
         file, name = re.findall(r"^File: (.+?) of (.+?) \(", self.head)[0]
         return f"{name}: {file.strip('`')}"
-
-    @property
-    def file(self) -> str:
-        """The path of the file in the trainer's repository."""
-        return self.title.rpartition(": ")[2]

@@ -40,7 +40,7 @@ def new_history(points: Tensor, history_size: int) -> Tensor:
 
 
 def check_points(call: str, name: str, points: Any, dims: int) -> None:
-    """Whether `points` are [.., D] in so many dimensions.
+    """Raise unless `points` is a tensor [.., D] of so many dimensions.
 
     Raises:
         TypeError: no tensor of float32 or float64.

@@ -76,8 +76,8 @@ def two_loop(
     """
     history_size = check_history("two_loop", grad, history, history_size)
     # torch.compile cannot trace the kernel's launch, and makes kernels of its own.
-    given = grad.is_cuda and not torch.compiler.is_compiling()
-    if by_kernel("two_loop", grad, history_size, backend, given):
+    auto = grad.is_cuda and not torch.compiler.is_compiling()
+    if by_kernel("two_loop", grad, history_size, backend, auto):
         return cuda.two_loop(grad, history, history_size)
     result = torch.empty_like(grad)
     with torch.no_grad():
@@ -90,8 +90,8 @@ def two_loop(
     return result
 
 
-def by_kernel(call: str, grad: Tensor, history_size: int, backend: str, given: bool) -> bool:
-    """Whether the CUDA kernel runs; where it is not `given`, it does not unless insisted on.
+def by_kernel(call: str, grad: Tensor, history_size: int, backend: str, auto: bool) -> bool:
+    """Whether the CUDA kernel runs; `auto`: whether `backend="auto"` may take it here.
 
     Raises:
         ValueError: `backend` is none of `BACKENDS`.
@@ -99,9 +99,9 @@ def by_kernel(call: str, grad: Tensor, history_size: int, backend: str, given: b
     """
     if backend not in BACKENDS:
         check_choice(call, "backend", backend, BACKENDS)
-    if not given and backend != "cuda":
+    if not auto and backend != "cuda":
         return False
-    return obstacle(backend, grad.device, grad.dtype, grad.shape[1], history_size) is None
+    return obstacle(backend, grad.device, grad.shape[1], history_size) is None
 
 
 def recursion(grad: Tensor, cells: Cells) -> Tensor:

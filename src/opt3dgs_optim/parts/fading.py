@@ -29,9 +29,9 @@ class Fading(Part):
 
     The same points are faded in all of `names`. Which ones depends only on `seed`, the event and
     the point's index: a resumed run repeats them, and every device chooses the same. Where no end
-    is planned, there are `events` / (3 i) events in iteration i, until the fall to the end begins.
-    It costs no memory. Positions that `OwnFrame` steps are left alone: a faded step of them would
-    be half a standard deviation long.
+    is planned, there are `events` / (3 i) events in iteration i, from 4/3 `events` on, until the
+    fall to the end begins. It costs no memory. Positions that `OwnFrame` steps are left alone: a
+    faded step of them would be half a standard deviation long.
 
     Args:
         share: each point's chance to be faded in an event, in (0, 1].
@@ -83,7 +83,7 @@ class Fading(Part):
             step.fade = self.fade(now - 1)
 
     def happens(self, event: int, num_points: int) -> bool:
-        """Whether an event fades any of so many points: of more than 10,000, some do."""
+        """Whether an event happens: with more than 10,000 points only some of them do."""
         share = share_of_events(num_points)
         return int((event + 1) * share) > int(event * share)
 

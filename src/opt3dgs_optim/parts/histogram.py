@@ -193,10 +193,10 @@ class EnergyHistogram(Part):
         count, total, squares = self._sums
         return (squares / count - (total / count) ** 2).nan_to_num(0.0).clamp(min=0).sqrt()
 
-    def numbers(self, training: Training | None = None) -> dict[str, float | Tensor]:
+    def numbers(self, training: Training) -> dict[str, float | Tensor]:
         """`nu`, after as many energies as the warm-up has, while it acts."""
-        acts = training is None or training.phase is self.during
-        return {"nu": self._factor()} if acts and self.num_observed > self.warmup else {}
+        acts = training.phase is self.during and self.num_observed > self.warmup
+        return {"nu": self._factor()} if acts else {}
 
     def state_dict(self) -> dict[str, Any]:
         """All that `observe` has learnt, as plain numbers and lists. Synchronises."""
