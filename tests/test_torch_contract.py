@@ -240,6 +240,21 @@ def test_a_stock_adam_that_loads_ours_steps_as_the_trainers_did(fused: bool) -> 
     assert all({k: group[k] for k in made} == made for group in stock.param_groups)
 
 
+def test_a_hook_of_state_dict_may_write_into_the_groups() -> None:
+    _, optimizers, _ = upgraded()
+    adam = optimizers["all"]
+    adam.register_state_dict_pre_hook(lambda each: each.param_groups[0].update(epoch=3))
+    assert adam.state_dict()["param_groups"][0]["epoch"] == 3
+    assert adam.param_groups[0]["epoch"] == 3
+
+
+def test_two_optimizers_of_one_state_are_refused() -> None:
+    """The copy would take the clock and the names with it."""
+    _, optimizers, _ = upgraded()
+    with pytest.raises(TypeError, match=r"Adam: two optimizers of one state; use copy\.deepcopy"):
+        copy.copy(optimizers["all"])
+
+
 def test_a_copy_of_one_of_six_optimizers_does_not_carry_the_others() -> None:
     _, optimizers, _ = upgraded(one=False)
     assert len(pickle.dumps(optimizers["opacities"])) < 8_000

@@ -144,10 +144,10 @@ class WholeLife(RuleBasedStateMachine):
             self.phases.observe(iteration=later)
             self.iteration = later
 
-    @rule()
-    def step_with_a_mask(self) -> None:
-        with pytest.raises(TypeError, match="a mask was given, but torch's Adam steps all rows"):
-            self.optimizers[0].step(torch.ones(len(self.params["means"]), dtype=torch.bool))
+    @rule(given=st.sampled_from([torch.ones(9, dtype=torch.bool), [True], 5]))
+    def step_with_what_is_no_closure(self, given: Any) -> None:
+        with pytest.raises(TypeError, match="torch's Adam takes a closure at most"):
+            self.optimizers[0].step(given)
 
     # -- rows --------------------------------------------------------------------------------------
 

@@ -42,9 +42,9 @@ def check_arguments(call: str, step: Any, given: tuple[Any, ...], named: dict[st
 
 
 def refuse_mask(call: str) -> None:
-    """TypeError where a mask is given to torch's Adam."""
+    """TypeError where torch's Adam is given more than a closure."""
     raise TypeError(
-        f"{call}.step: a mask was given, but torch's Adam steps all rows; use gsplat's "
+        f"{call}.step: torch's Adam takes a closure at most, and steps all rows; use gsplat's "
         "SelectiveAdam or INRIA's SparseGaussianAdam for masked steps"
     )
 
