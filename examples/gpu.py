@@ -5,8 +5,9 @@ On a machine with an NVIDIA GPU, torch for it and `pip install -e ".[cuda,test]"
 1. `opt3dgs doctor`, and the tests marked `cuda`;
 2. what a step costs beside six fused torch Adams: time, launches, waits for the device, memory.
 
-Writes `report.md` and `report.json` to `--out`. With `--device cpu` it runs on a CPU, at smaller
-sizes, which says nothing about a GPU. `benchmarks/simple_trainer.py` runs gsplat's own trainer.
+Writes `report.md` and `report.json` to `--out`; the `steps` of docs/results/gpu.json are its own.
+With `--device cpu` it runs on a CPU, at smaller sizes, which says nothing about a GPU.
+`benchmarks/simple_trainer.py` runs gsplat's own trainer.
 """
 
 from __future__ import annotations
@@ -40,18 +41,15 @@ POINTS = {"cuda": (10_000, 100_000, 1_000_000, 5_000_000), "cpu": (1_000, 10_000
 PACKAGE = ("-m", "opt3dgs_optim")
 TESTS = ("-m", "pytest", "-o", "addopts=--import-mode=importlib", "-m", "cuda", "-q", "-rs")
 TESTS += ("tests/cuda", "tests/runs/test_log.py", "tests/test_doctor.py")  # where they are
-# What a step reads and writes of a number: parameter, gradient and moments, by bits of a moment.
-MOVED = {"defaults": 28, "defaults, moments of 16 bits": 20}
-NUMBERS, PAIRS = 59, 5  # of a Gaussian at degree 3; of curvature
+PAIRS = 5  # of curvature
 
 
-def run(words: Sequence[str], folder: Path = ROOT) -> tuple[int, str, float]:
-    """Run Python with these words in a folder: exit status, what it printed, seconds."""
-    folder.mkdir(parents=True, exist_ok=True)
+def run(words: Sequence[str]) -> tuple[int, str, float]:
+    """Run Python with these words: exit status, what it printed, seconds."""
     begin = time.perf_counter()
     done = subprocess.run(
         [sys.executable, *words],
-        cwd=folder,
+        cwd=ROOT,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -82,16 +80,6 @@ def recursion(device: torch.device, rounds: int, points: int) -> dict[str, float
     return found
 
 
-def bandwidth(results: dict[int, dict[str, steps.Row]]) -> str:
-    """How much memory a step moves in a second, in a sentence for each number of Gaussians."""
-    lines = []
-    for points, rows in results.items():
-        for name in (name for name in MOVED if name in rows):
-            speed = MOVED[name] * NUMBERS * points / rows[name]["ms"] / 1e6
-            lines.append(f"{points:,} Gaussians, {name}: {speed:,.0f} GB/s.")
-    return "\n".join(lines)
-
-
 def counts(results: dict[int, dict[str, steps.Row]]) -> str:
     """Markdown: what an iteration launches, waits for and takes, at the most Gaussians."""
     points, rows = max(results.items())
@@ -115,10 +103,9 @@ def report(made: dict[str, Any]) -> str:
     for points, found in made["two_loop"].items():
         said = ", ".join(f"{us:.1f} us {name}" for name, us in found.items())
         lines += ["", f"`two_loop` of {points:,} points with {PAIRS} pairs: {said}."]
-    if made["steps"]:
-        lines += ["", steps.table(made["steps"]), ""]
-        lines += ["On a GPU the six Adams are PyTorch's fused ones.", "", counts(made["steps"])]
-        lines += ["", bandwidth(made["steps"])]
+    if results := made["steps"]["results"]:
+        lines += ["", steps.table(results), ""]
+        lines += ["On a GPU the six Adams are PyTorch's fused ones.", "", counts(results)]
     lines += [f"\n{what}: {why}" for what, why in made["failed"].items()]
     return "\n".join([*lines, ""])
 
@@ -147,7 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     torch.set_num_threads(1)
     about = {"machine": steps.machine(device), "date": time.strftime("%Y-%m-%d", time.gmtime())}
     made: dict[str, Any] = {"about": {**about, **versions(device)}}
-    made |= {"two_loop": {}, "steps": {}, "failed": {}}
+    made |= {"two_loop": {}, "steps": {"rounds": args.rounds, "results": {}}, "failed": {}}
     for name, words in (
         ("doctor", (*PACKAGE, "doctor", "--device", args.device)),
         ("tests", TESTS),
@@ -163,7 +150,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         write(made, out)  # what is measured is kept, whatever comes
         try:
             if what == "steps":
-                made[what][points] = steps.measure(points, device, names, args.rounds)
+                found = steps.measure(points, device, names, args.rounds)
+                made[what]["results"][points] = found
             else:
                 made[what][points] = recursion(device, args.rounds, points)
         except Exception as error:  # one on a GPU's kernels may be any

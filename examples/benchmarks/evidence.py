@@ -19,10 +19,9 @@ from typing import Any
 FILE = Path(__file__).resolve().parents[2] / "docs" / "results" / "evidence.jsonl"
 TRAINED = ("scene", "size", "density", "arm", "iterations", "points", "sh_degree", "seed")
 # `rotated`: the seed says which views are held out. `views`: trained on, 0 is all of them.
-# `rates`: factor on all learning rates. `threshold`: factor on that of clone and split. `pieces`:
-# every photo was cut into so many. `host`: whose own script trained, see simple_trainer.py.
-USUAL = {"rotated": True, "views": 0, "init": "sfm", "rates": 1.0, "threshold": 1.0, "pieces": 0}
-USUAL |= {"host": ""}
+# `threshold`: factor on that of clone and split. `host`: whose own script trained, see
+# simple_trainer.py.
+USUAL = {"rotated": True, "views": 0, "threshold": 1.0, "host": ""}
 MEASURED = ("psnr", "ssim", "lpips", "train_psnr", "seconds")
 CURVE = ("iteration", "psnr", "ssim", "lpips")
 SHOWN = ("bonsai", "lego", "plush")  # whose curves of half size are kept
@@ -47,7 +46,7 @@ def line_of(record: Line) -> Line:
 def command_of(line: Line) -> str:
     """The command that trains a line, in a folder that holds the scenes."""
     options = {"scene": "", "density": "relocation", "arm": "", "size": "", "iterations": 0}
-    options |= {"points": 0, "sh_degree": 0, "views": 0, "rates": 1.0, "threshold": 1.0, "seed": -1}
+    options |= {"points": 0, "sh_degree": 0, "views": 0, "threshold": 1.0, "seed": -1}
     said = [(name, line.get(name, usual)) for name, usual in options.items()]
     words = [f"--{n.replace('_', '-')} {v}" for n, v in said if v != options[n]]
     words += ["--background white"] * (line["scene"] == "lego")

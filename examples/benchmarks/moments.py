@@ -69,7 +69,7 @@ def optimizer_of(param: Parameter, bits: int, lr: float, steps: int) -> Adam:
 def run(
     start: Tensor, gradient: Gradient, bits: int, lr: float, steps: int, look: Callable[..., None]
 ) -> None:
-    """Steps of Adam; `look` sees parameter, second moment and iteration after each."""
+    """Steps of Adam; from half of them on `look` sees parameter and optimizer after each."""
     param, draw = Parameter(start.clone()), torch.Generator().manual_seed(0)
     adam = optimizer_of(param, bits, lr, steps)
     for i in tqdm(range(steps), desc=f"{gradient.__name__}, {bits} bits", leave=False):

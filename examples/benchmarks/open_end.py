@@ -16,7 +16,6 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -25,7 +24,7 @@ import torch
 from splatting.arms import find_arm
 from splatting.density import MCMCDensityControl
 from splatting.fit import Fit
-from splatting.stopping import command
+from splatting.stopping import check_folder, command
 from torch import Tensor
 from tqdm import trange
 
@@ -74,12 +73,13 @@ def train_to(fit: Fit, iterations: int) -> float:
 
 
 def parser() -> argparse.ArgumentParser:
-    """The options: those of `train.py`, and the ends."""
+    """The options that `train.py` has, too, and the ends."""
     made = argparse.ArgumentParser(
-        description=(__doc__ or "").splitlines()[0], parents=[train.parser()], add_help=False
+        description=(__doc__ or "").splitlines()[0], parents=[train.shared()]
     )
     made.add_argument("ends", nargs="+", type=int, metavar="ITERATIONS", help="lengths, ascending")
-    made.set_defaults(arm="open-end", out=Path("runs/open-end"))
+    made.set_defaults(out=Path("runs/open-end"), arm="open-end", density=train.DENSITIES[0])
+    made.set_defaults(sh_degree=0, threshold=1.0)
     return made
 
 
@@ -91,10 +91,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ends, scene = args.ends, train.scene_of(args)
     if sorted(set(ends)) != ends or ends[0] < SHORTEST:
         raise ValueError(f"ends {ends}: ascending numbers, {SHORTEST} or more, are needed")
-    options = replace(train.options_of(args), iterations=ends[-1])
+    args.iterations = ends[-1]
+    options = train.options_of(args)
     lpips = args.lpips and train.lpips_of(*args.lpips)
     name = f"{scene.name}-{args.size}-{args.seed}"
-    args.out.mkdir(parents=True, exist_ok=True)
+    check_folder(args.out)
     state = args.out / f"{name}.pt"
     fit, seconds = OpenFit(scene, find_arm(args.arm), options), 0.0
     fit.compile_kernels()

@@ -1,4 +1,4 @@
-"""What a step costs beside six Adams, on a CPU or a GPU: python examples/benchmarks/steps.py
+"""What a step costs beside six Adams, on a CPU: python examples/benchmarks/steps.py
 
 Everything is stepped in turns, so that a busy machine slows all alike, in another order in each
 round, since what a step follows changes its time. Writes the medians to `--out`, from which
@@ -44,7 +44,7 @@ from opt3dgs_optim import (
 )
 
 OUT = Path(__file__).resolve().parents[2] / "docs" / "results" / "steps.json"
-POINTS = {"cpu": (1_000, 10_000, 100_000, 1_000_000), "cuda": (10_000, 100_000, 1_000_000)}
+POINTS = (1_000, 10_000, 100_000, 1_000_000)
 TOTAL, VIEWS, WARM_UP = 30_000, 4, 4
 SWEPT = torch.zeros(1 << 24)  # 64 MB: more than a core's caches, which a renderer fills as well
 Row = dict[str, Any]
@@ -234,16 +234,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     add = parser.add_argument
-    add("--device", default="cpu", choices=("cpu", "cuda"))
     add("--points", type=int, nargs="+", metavar="N", help="numbers of Gaussians")
     add("--rounds", type=int, default=50, help="of 100,000 Gaussians or less; a fifth of more")
     add("-o", "--out", type=Path, default=OUT, metavar="FILE", help="JSON")
     args = parser.parse_args(arguments)
-    device = torch.device(args.device)
+    device = torch.device("cpu")
     torch.set_num_threads(1)
     logging.getLogger("opt3dgs_optim").setLevel(logging.ERROR)  # nothing is trained to its end
     results: dict[int, dict[str, Row]] = {}
-    for points in tqdm(args.points or POINTS[device.type], unit="size"):
+    for points in tqdm(args.points or POINTS, unit="size"):
         rounds = args.rounds if points <= 100_000 else max(args.rounds // 5, 5)
         results[points] = measure(points, device, [*SUBJECTS], rounds)
     date = time.strftime("%Y-%m-%d", time.gmtime())

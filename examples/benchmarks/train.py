@@ -31,13 +31,12 @@ import torch
 from splatting.arms import ARMS, Arm, find_arm
 from splatting.fit import Fit, FitOptions
 from splatting.scenes import Background, Scene, Size, load_scene
-from splatting.stopping import command
+from splatting.stopping import check_folder, command
 from torch import Tensor
 from tqdm import tqdm
 
 EVALUATIONS = 10
-KEPT = ("size", "density", "arm", "iterations", "points", "sh_degree", "seed", "views")
-KEPT += ("rates", "threshold")
+KEPT = ("size", "density", "arm", "iterations", "points", "sh_degree", "seed", "views", "threshold")
 DENSITIES = ("relocation", "clone-and-split")
 Lpips = Callable[[Tensor, Tensor], float]  # of images [H, W, 3] in 0..1
 
@@ -122,24 +121,31 @@ def train(fit: Fit, record: dict[str, Any], out: Path, lpips: Lpips | None = Non
             fit.save(checkpoint)
 
 
-def parser() -> argparse.ArgumentParser:
-    """The options."""
-    made = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+def shared() -> argparse.ArgumentParser:
+    """The options that `open_end.py` has, too."""
+    made = argparse.ArgumentParser(add_help=False)
     add = made.add_argument
     add("--scene", default="embedded", metavar="DIR", help="scene folder, or 'embedded'")
-    add("--arm", default="defaults", choices=ARMS, metavar="ARM", help=", ".join(ARMS))
     add("--size", default="images_4", choices=get_args(Size), help="folder of the photos")
     add("--background", default="black", choices=get_args(Background))
-    add("--iterations", type=int, default=7_500)
     add("--points", type=int, default=10_000, help="the most Gaussians")
-    add("--sh-degree", type=int, default=0, choices=range(4))
     add("--seed", type=int, default=0)
     add("--views", type=int, default=0, metavar="N", help="evenly spaced ones to train on; 0: all")
-    add("--rates", type=float, default=1.0, help="factor on all of the trainer's learning rates")
-    add("--density", default=DENSITIES[0], choices=DENSITIES)
-    add("--threshold", type=float, default=1.0, help="factor on that of clone and split")
     add("--lpips", nargs=2, type=Path, metavar=("FILE.py", "WEIGHTS"), help="see `lpips_of`")
     add("-o", "--out", type=Path, metavar="FILE", help="default: in runs/benchmarks")
+    return made
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options."""
+    about, planned = (__doc__ or "").splitlines()[0], [x for x in ARMS if not ARMS[x].open_end]
+    made = argparse.ArgumentParser(description=about, parents=[shared()])
+    add = made.add_argument
+    add("--arm", default="defaults", choices=planned, metavar="ARM", help=", ".join(planned))
+    add("--iterations", type=int, default=7_500)
+    add("--sh-degree", type=int, default=0, choices=range(4))
+    add("--density", default=DENSITIES[0], choices=DENSITIES)
+    add("--threshold", type=float, default=1.0, help="factor on that of clone and split")
     return made
 
 
@@ -150,7 +156,6 @@ def options_of(args: argparse.Namespace) -> FitOptions:
         args.points,
         args.seed,
         sh_degree=args.sh_degree,
-        rates=args.rates,
         threshold=args.threshold,
     )
 
@@ -171,7 +176,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     record = record_of(args, scene)
     name = "-".join(str(record[key]) for key in ("scene", *KEPT))
     out = args.out or Path("runs/benchmarks", f"{name}.json")
-    out.parent.mkdir(parents=True, exist_ok=True)
+    check_folder(out.parent)
     lpips = args.lpips and lpips_of(*args.lpips)
     # gsplat's split draws from torch's global generator; `lpips_of` may have drawn from it, too.
     torch.manual_seed(args.seed)

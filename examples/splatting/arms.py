@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 from opt3dgs_optim import (
     DEFAULTS,
@@ -43,16 +42,14 @@ class Arm:
     rates: float = 1.0  # factor on all of the trainer's learning rates
     beta1: float = 0.9
     decays: bool = True  # the positions' rate, to a hundredth
-    moments: Literal[32, 16] = 32  # bits of Adam's moments
     open_end: bool = False  # whether the scheduler is told no number of iterations
 
     def scheduler(self, iterations: int) -> PhaseScheduler | None:
         """Of one training; None where the trainer's own Adam stays as it is."""
         if self.parts is None:
             return None
-        parts = self.parts(iterations)
         total = None if self.open_end else iterations
-        return PhaseScheduler(total, parts=parts, moments=self.moments)
+        return PhaseScheduler(total, parts=self.parts(iterations))
 
 
 def of(*parts: Part) -> Callable[[int], Sequence[Part]]:
@@ -63,7 +60,6 @@ def of(*parts: Part) -> Callable[[int], Sequence[Part]]:
 _ARMS = (
     Arm(BASELINE, "the trainer as its authors publish it: the baseline"),
     Arm("defaults", "the package's defaults", of(*DEFAULTS)),
-    Arm("defaults-16", "as defaults, Adam's moments in 16 bits", of(*DEFAULTS), moments=16),
     Arm("harmonics", "the defaults and `Harmonics`", of(*DEFAULTS, Harmonics())),
     Arm("stock-harmonics", "the baseline and `Harmonics`", of(Harmonics())),
     Arm(

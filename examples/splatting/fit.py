@@ -35,19 +35,17 @@ class FitOptions:
     """How to fit; two runs are comparable if these agree."""
 
     iterations: int = 1500
-    points: int = 2000  # the most Gaussians
+    points: int = 2000  # the most Gaussians; with clone and split the most at the start
     seed: int = 0
     sh_degree: int = 0
-    rates: float = 1.0  # factor on all learning rates of the trainer
     threshold: float = 1.0  # factor on that of clone and split
 
     def __post_init__(self) -> None:
         for name in ("iterations", "points"):
             if getattr(self, name) < 1:
                 raise ValueError(f"FitOptions: {name}={getattr(self, name)}, must be at least 1")
-        for name in ("rates", "threshold"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"FitOptions: {name}={getattr(self, name)}, must be above 0")
+        if not self.threshold > 0:
+            raise ValueError(f"FitOptions: threshold={self.threshold}, must be above 0")
 
 
 class DensityControl(Protocol):
@@ -79,8 +77,7 @@ class Fit:
             name: torch.Generator().manual_seed(options.seed + i) for i, name in enumerate(DRAWS)
         }
         self.gaussians = self._initial_gaussians()
-        factor = options.rates * arm.rates
-        self.rates = {k: lr * factor for k, lr in stock_learning_rates(scene.extent).items()}
+        self.rates = {k: lr * arm.rates for k, lr in stock_learning_rates(scene.extent).items()}
         self.optimizers = {
             name: torch.optim.Adam(
                 [{"params": param, "lr": self.rates[name], "name": name}],
@@ -211,9 +208,11 @@ class Fit:
         os.replace(partial, path)
 
     def _training(self) -> list[Any]:
-        """What a checkpoint must agree in: also the photos' size, and what is behind them."""
+        """What a checkpoint must agree in: also the photos, and what is behind them."""
         photo = [*self.scene.train[0].image.shape[:2], *self.scene.background.tolist()]
-        return [self.scene.name, photo, self.arm.name, asdict(self.options)]
+        photos = [view.name for view in self.scene.train]
+        kind, arm = type(self).__name__, self.arm.name
+        return [self.scene.name, photo, photos, kind, arm, asdict(self.options)]
 
     def load(self, path: Path) -> None:
         """Go on from a checkpoint; ValueError if it is none, or one of another training."""

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-MAX_COPIES = 51  # gsplat's and 3dgs-mcmc's table of binomial coefficients ends here
+MAX_COPIES = 51  # gsplat's table of binomial coefficients ends here; 3dgs-mcmc stops at 50
 MAX_OPACITY = 1.0 - torch.finfo(torch.float32).eps  # their upper bound: its logit is finite
 
 
@@ -20,7 +20,7 @@ def relocated_values(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple
     Args:
         opacities: [M], after the sigmoid.
         scales: [M, 3], world units, after the exponential.
-        copies: [M] int, N, the original included; more than 51 count as 51, as upstream.
+        copies: [M] int, N, the original included; more than 51 count as 51, as in gsplat.
 
     Returns:
         opacities [M] and scales [M, 3]. Computed in float64, which the alternating sum deserves.

@@ -19,7 +19,7 @@ def said(monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple[int, str]]:
     """What the processes say that it starts; the doctor and the tests do not run."""
     answers = {"doctor": (0, "all is well"), "pytest": (0, "3 passed")}
 
-    def run(words: Any, folder: Path = gpu.ROOT) -> tuple[int, str, float]:
+    def run(words: Any) -> tuple[int, str, float]:
         return (*answers[next(k for k in answers if k in words)], 1.5)
 
     monkeypatch.setattr(gpu, "run", run)
@@ -33,7 +33,7 @@ def small(out: Path, *words: str) -> list[str]:
 def test_all_of_it_runs_on_a_cpu(said: dict[str, tuple[int, str]], tmp_path: Path) -> None:
     assert gpu.main(small(tmp_path)) == 0
     made = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
-    assert set(made["steps"]["64"]) == set(steps.SUBJECTS)
+    assert set(made["steps"]["results"]["64"]) == set(steps.SUBJECTS)
     page = (tmp_path / "report.md").read_text(encoding="utf-8")
     assert "## doctor: exit status 0\n\n```text\nall is well\n" in page
     assert "| defaults | - | - | " in page
@@ -70,10 +70,10 @@ def test_without_a_gpu_it_says_so(
     assert "torch sees no CUDA device" in capsys.readouterr().err
 
 
-def test_a_process_is_run_with_its_output_kept(tmp_path: Path) -> None:
+def test_a_process_is_run_with_its_output_kept() -> None:
     words = ["-c", "import os, sys; print(os.getcwd()); sys.exit(3)"]
-    code, printed, seconds = gpu.run(words, tmp_path / "new")
-    assert (code, printed.strip()) == (3, str((tmp_path / "new").resolve()))
+    code, printed, seconds = gpu.run(words)
+    assert (code, printed.strip()) == (3, str(gpu.ROOT))
     assert 0.0 <= seconds < 60.0
 
 

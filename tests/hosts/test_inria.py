@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from cpu_gsplat import relocation
 from gaussians import through_a_file
 from gsplat_host import POINTS, splats
 from inria_host import ATTRIBUTES, OPTIONS, SimulatedModel, made_model
@@ -110,3 +111,10 @@ def test_an_optimizer_made_anew_under_way() -> None:
             model.training_setup(OPTIONS)
             phases.upgrade(model.optimizer)
     assert phases.end_line() is None
+
+
+def test_the_kernel_that_relocates_on_a_cpu_is_called_as_3dgs_mcmc_calls_it() -> None:
+    """The size of the table is last; two Gaussians of opacity 0.5 together have 0.75."""
+    opacities, scales = torch.tensor([0.75]), torch.ones(1, 3)
+    new, _ = relocation(opacities, scales, torch.tensor([2]), torch.zeros(51, 51), 51)
+    torch.testing.assert_close(new, torch.tensor([0.5]))

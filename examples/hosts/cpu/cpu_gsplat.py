@@ -91,11 +91,11 @@ def rasterize(
 
 
 def relocation(
-    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, min_opacity: float = 0.0
+    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, n_max: int = 51
 ) -> tuple[Tensor, Tensor]:
-    """Opacities and scales of relocated Gaussians; gsplat's and 3dgs-mcmc's kernel."""
+    """Opacities and scales of relocated Gaussians; gsplat's, 3dgs-mcmc's and 3DGRUT's kernel."""
     new_opacities, new_scales = relocated_values(opacities.flatten(), scales, ratios.flatten())
-    return new_opacities.clamp(min=min_opacity).reshape(opacities.shape), new_scales
+    return new_opacities.reshape(opacities.shape), new_scales
 
 
 @torch.no_grad()

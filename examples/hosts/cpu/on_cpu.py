@@ -4,9 +4,9 @@
     python examples/hosts/cpu/on_cpu.py train.py -s SCENE --iterations 100
 
 What follows the script's path is the script's own. CUDA is mapped to the CPU, the CUDA rasterizers
-are replaced by the examples' own (`pip install "opt3dgs_optim[examples]"`), viewers and loggers
-that are not installed by ones that do nothing; the script itself is not touched. A hundred
-iterations on photos of 160 x 106 pixels show whether the lines work, not how good a result gets.
+are replaced by the examples' own (`pip install ".[examples]"` in a clone), viewers and loggers that
+are not installed by ones that do nothing; the script itself is not touched. A hundred iterations on
+photos of 160 x 106 pixels show whether the lines work, not how good a result gets.
 
 What is not as on a GPU: pinhole cameras only; 2DGS draws thin Gaussians and has no depths; the
 importances of mini-splatting and taming-3dgs are estimates; LPIPS is NaN; one process loads photos.

@@ -120,7 +120,7 @@ TRIALS = (
         for options in ("mcmc", "default")
     ),
     Trial("gaussian-splatting", "--disable_viewer"),
-    # Its steps have no bias correction, and annealing makes them up to four times longer still.
+    # Its steps have no bias correction: early ones are up to 6.6 times as long as Adam's.
     Trial("gaussian-splatting", "--optimizer_type sparse_adam --disable_viewer", worse=6.0),
     Trial("3dgs-mcmc", "--cap_max 2500 --init_type sfm"),
     Trial("2d-gaussian-splatting", "--opacity_cull 0.005"),  # else none is left after a reset

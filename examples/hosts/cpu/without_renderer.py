@@ -3,8 +3,8 @@
     python examples/hosts/cpu/without_renderer.py 3dgrut TRAINERS/3dgrut
     python examples/hosts/cpu/without_renderer.py fvdb TRAINERS/fvdb-0.6.0
 
-The folder of fVDB is one into which `pip install --no-deps fvdb-reality-capture==0.6.0` has put the
-package. 3DGRUT needs hydra-core.
+fVDB's folder is made by `pip install --no-deps --target TRAINERS/fvdb-0.6.0
+fvdb-reality-capture==0.6.0`. 3DGRUT needs hydra-core.
 
 3DGRUT and fVDB reality capture render with kernels of their own. What touches an optimizer is
 Python, and runs here from their sources: how they make it, move, add and remove Gaussians in it,
@@ -31,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import cpu_cuda
 import cpu_stand_ins
 import torch
-from cpu_gsplat import masked_adam
+from cpu_gsplat import masked_adam, relocation
 from splatting.relocation import relocated_values
 from torch import Tensor
 from torch.nn import Parameter
@@ -106,7 +106,7 @@ class Threedgrut:
         strategies: Any = importlib.import_module(f"threedgrut.strategy.{source}")
         if source == "mcmc":  # its CUDA extension
             strategies.load_mcmc_plugin = lambda: None
-            strategies._mcmc_plugin = types.SimpleNamespace(compute_relocation_tensor=_relocate)
+            strategies._mcmc_plugin = types.SimpleNamespace(compute_relocation_tensor=relocation)
         self.strategy = getattr(strategies, kind)(config, self.model)
         self.strategy.init_densification_buffer()
         self.relocates = source == "mcmc"
@@ -149,14 +149,6 @@ class Threedgrut:
 
     def checkpoint(self) -> dict[str, Any]:
         return self.model.get_model_parameters()
-
-
-def _relocate(
-    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, largest: int
-) -> tuple[Tensor, Tensor]:
-    """Opacities and scales of relocated Gaussians, in the place of the extension's."""
-    new_opacities, new_scales = relocated_values(opacities.reshape(-1), scales, ratios.reshape(-1))
-    return new_opacities.reshape(opacities.shape), new_scales
 
 
 def threedgrut(sources: Path, app: str, *changes: str) -> Callable[..., Host]:

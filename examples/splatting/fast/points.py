@@ -1,7 +1,6 @@
 """The projection of `projection.py` and its gradient, compiled, for the visible points alone.
 
-Parameters are read as float32 or float64, and computed with in float64: points are few beside
-pixels.
+Parameters are float32, and computed with in float64: points are few beside pixels.
 """
 
 from __future__ import annotations

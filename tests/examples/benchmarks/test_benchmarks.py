@@ -92,6 +92,19 @@ def test_ends_that_do_not_ascend_are_refused(ends: list[str], tmp_path: Path, ca
     assert "ascending numbers" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("main", "words"),
+    [
+        (open_end.main, ["60", "--density", "clone-and-split"]),
+        (open_end.main, ["60", "--arm", "stock"]),
+        (train.main, ["--arm", "open-end"]),
+    ],
+)
+def test_what_the_other_command_trains_is_refused(main: Any, words: list[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(words)
+
+
 def test_seed_and_views_say_what_is_trained_on(tmp_path: Path) -> None:
     parsed = train.parser().parse_args(["--seed", "2", "--views", "5"])
     scene = train.scene_of(parsed)
@@ -99,6 +112,13 @@ def test_seed_and_views_say_what_is_trained_on(tmp_path: Path) -> None:
     assert [view.name for view in scene.train] == [f"view_{i:02d}" for i in (0, 5, 11, 17, 22)]
     words = [*TINY, "--views", "99", "-o", str(tmp_path / "x.json")]
     assert train.main(words) == 2
+
+
+def test_a_folder_that_cannot_be_written_to_is_refused_before_the_training(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delattr(train.Fit, "step")
+    assert train.main([*TINY, "-o", "/proc/x.json"]) == 2
 
 
 def test_lines_are_replaced_and_kept_in_order(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 
-import pytest
 import torch
 from splatting.embedded import embedded_scene
 from splatting.scenes import Scene, load_scene
@@ -64,8 +63,3 @@ def test_points_lie_where_the_photos_show_their_colours():
     # A pixel averages the texture that a point samples, which is what is left here.
     assert torch.cat(matched).mean() < 0.4 * torch.cat(shuffled).mean()
     assert torch.cat(matched).median() < 0.06
-
-
-def test_bad_size_is_named():
-    with pytest.raises(ValueError, match="size='huge', allowed are"):
-        embedded_scene("huge")  # pyright: ignore[reportArgumentType]

@@ -100,10 +100,12 @@ def test_checkpoints_of_other_trainings_are_refused(scene: Scene, tmp_path: Path
         (scene, ARMS["stock"], replace(OPTIONS, seed=1)),
         (replace(scene, background=torch.ones(3)), ARMS["stock"], OPTIONS),
         (replace(scene, train=[smaller, *scene.train[1:]]), ARMS["stock"], OPTIONS),
+        (replace(scene, train=scene.train[1:]), ARMS["stock"], OPTIONS),
     ]
-    for other in others:
+    kinds = [*[Fit] * len(others), type("OtherFit", (Fit,), {})]
+    for kind, other in zip(kinds, [*others, (scene, ARMS["stock"], OPTIONS)], strict=True):
         with pytest.raises(ValueError, match="choose another folder"):
-            Fit(*other).load(path)
+            kind(*other).load(path)
     for content in (b"", b"no checkpoint"):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=r"checkpoint\.pt: no checkpoint of this trainer"):
@@ -116,7 +118,7 @@ def test_checkpoints_of_other_trainings_are_refused(scene: Scene, tmp_path: Path
         (lambda: find_arm("sgd"), "'sgd' is unknown; there are stock, defaults"),
         (lambda: FitOptions(iterations=0), "iterations=0"),
         (lambda: FitOptions(points=0), "points=0"),
-        (lambda: FitOptions(rates=0.0), r"rates=0\.0"),
+        (lambda: FitOptions(threshold=0.0), r"threshold=0\.0"),
     ],
 )
 def test_bad_options(make, message: str) -> None:
