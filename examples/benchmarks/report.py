@@ -47,13 +47,13 @@ NAMES = {
     "learn2splat": "Learn2Splat's tuned Adam",
 }
 PHOTOS = (
-    ("bonsai", "220 of 800x532", WHOLE),
-    ("lego", "87 of 800x800", WHOLE),
-    ("train", "263 of 979x543", WHOLE),
-    ("bonsai", "220 of 400x266", HALF),
-    ("lego", "87 of 400x400", HALF),
-    ("plush", "84 of 320x240", HALF),
-    ("train", "263 of 489x271", HALF),
+    ("bonsai", "220 photos, 800x532", WHOLE),
+    ("lego", "87 photos, 800x800", WHOLE),
+    ("train", "263 photos, 979x543", WHOLE),
+    ("bonsai", "220 photos, 400x266", HALF),
+    ("lego", "87 photos, 400x400", HALF),
+    ("plush", "84 photos, 320x240", HALF),
+    ("train", "263 photos, 489x271", HALF),
 )
 Run = tuple[str, int]  # an arm, and the iterations that it is planned for
 lines = cache(evidence.read)
