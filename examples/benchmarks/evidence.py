@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 FILE = Path(__file__).resolve().parents[2] / "docs" / "results" / "evidence.jsonl"
+DENSITIES = RELOCATION, SPLIT = ("relocation", "clone-and-split")
 TRAINED = ("scene", "size", "density", "arm", "iterations", "points", "sh_degree", "seed")
 # `rotated`: the seed says which views are held out. `views`: trained on, 0 is all of them.
 # `threshold`: factor on that of clone and split. `host`: whose own script trained, see
@@ -45,7 +46,7 @@ def line_of(record: Line) -> Line:
 
 def command_of(line: Line) -> str:
     """The command that trains a line, in a folder that holds the scenes."""
-    options = {"scene": "", "density": "relocation", "arm": "", "size": "", "iterations": 0}
+    options = {"scene": "", "density": RELOCATION, "arm": "", "size": "", "iterations": 0}
     options |= {"points": 0, "sh_degree": 0, "views": 0, "threshold": 1.0, "seed": -1}
     said = [(name, line.get(name, usual)) for name, usual in options.items()]
     words = [f"--{n.replace('_', '-')} {v}" for n, v in said if v != options[n]]

@@ -78,7 +78,7 @@ def parser() -> argparse.ArgumentParser:
         description=(__doc__ or "").splitlines()[0], parents=[train.shared()]
     )
     made.add_argument("ends", nargs="+", type=int, metavar="ITERATIONS", help="lengths, ascending")
-    made.set_defaults(out=Path("runs/open-end"), arm="open-end", density=train.DENSITIES[0])
+    made.set_defaults(out=Path("runs/open-end"), arm="open-end", density=evidence.RELOCATION)
     made.set_defaults(sh_degree=0, threshold=1.0)
     return made
 

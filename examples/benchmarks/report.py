@@ -21,7 +21,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks import evidence, steps
-from benchmarks.evidence import Line
+from benchmarks.evidence import RELOCATION, SPLIT, Line
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = tuple(ROOT / each for each in ("README.md", "docs/evidence.md", "docs/performance.md"))
@@ -34,7 +34,6 @@ WHOLE: dict[str, Any] = {"size": "images", "points": 200_000, "sh_degree": 3}
 QUARTER: dict[str, Any] = {"size": "images_4", "sh_degree": 0}
 # With clone and split at whole size; with a threshold of 1 some 400,000 Gaussians would come.
 WHOLE_SPLIT: dict[str, Any] = WHOLE | {"points": 50_000, "threshold": 2.4}
-RELOCATION, SPLIT = "relocation", "clone-and-split"
 METRICS = ("psnr", "ssim", "lpips")
 COUNTS = ("10000", "100000", "1000000", "5000000")  # of Gaussians, as steps.json has them
 NAMES = {

@@ -35,9 +35,10 @@ from splatting.stopping import check_folder, command
 from torch import Tensor
 from tqdm import tqdm
 
+from benchmarks.evidence import DENSITIES, RELOCATION
+
 EVALUATIONS = 10
 KEPT = ("size", "density", "arm", "iterations", "points", "sh_degree", "seed", "views", "threshold")
-DENSITIES = ("relocation", "clone-and-split")
 Lpips = Callable[[Tensor, Tensor], float]  # of images [H, W, 3] in 0..1
 
 
@@ -51,9 +52,9 @@ def scene_of(args: argparse.Namespace) -> Scene:
     return replace(scene, train=[scene.train[i] for i in kept])
 
 
-def fit_of(scene: Scene, arm: Arm, options: FitOptions, density: str = DENSITIES[0]) -> Fit:
+def fit_of(scene: Scene, arm: Arm, options: FitOptions, density: str = RELOCATION) -> Fit:
     """The trainer of an arm, with that kind of density control."""
-    if density == DENSITIES[0]:
+    if density == RELOCATION:
         return Fit(scene, arm, options)
     from benchmarks.adaptive import AdaptiveFit  # needs gsplat, which is optional
 
@@ -144,7 +145,7 @@ def parser() -> argparse.ArgumentParser:
     add("--arm", default="defaults", choices=planned, metavar="ARM", help=", ".join(planned))
     add("--iterations", type=int, default=7_500)
     add("--sh-degree", type=int, default=0, choices=range(4))
-    add("--density", default=DENSITIES[0], choices=DENSITIES)
+    add("--density", default=RELOCATION, choices=DENSITIES)
     add("--threshold", type=float, default=1.0, help="factor on that of clone and split")
     return made
 
