@@ -32,7 +32,7 @@ FEW = ("banana", "brighton_beach", "lund_door")
 HALF: dict[str, Any] = {"size": "images_2", "points": 50_000, "sh_degree": 0}
 WHOLE: dict[str, Any] = {"size": "images", "points": 200_000, "sh_degree": 3}
 QUARTER: dict[str, Any] = {"size": "images_4", "sh_degree": 0}
-# With clone and split at whole size; with a threshold of 1 some 400,000 Gaussians would come.
+# With clone and split at whole size; a threshold of 1 would give 400,000 to 600,000 Gaussians.
 WHOLE_SPLIT: dict[str, Any] = WHOLE | {"points": 50_000, "threshold": 2.4}
 METRICS = ("psnr", "ssim", "lpips")
 COUNTS = ("10000", "100000", "1000000", "5000000")  # of Gaussians, as steps.json has them
