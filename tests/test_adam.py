@@ -316,9 +316,85 @@ def test_a_group_that_was_taken_away_is_told() -> None:
         lambda: optimizer.add_param_group({"params": [Parameter(torch.zeros(2))]}),
         lambda: PhaseScheduler(TOTAL).upgrade(optimizer),
     ):
-        with pytest.raises(ValueError, match="5 parameter groups, but 6 when it was upgraded"):
+        with pytest.raises(
+            ValueError, match=r"the parameter groups are .*\], but were .*, 'shN'\] "
+        ):
             call()
     assert all(torch.equal(params[name], start[name]) for name in params)
+
+
+def test_groups_in_another_order_are_told() -> None:
+    params = parameters(ROWS)
+    optimizer = PhaseScheduler(TOTAL).upgrade(adam_of(params))
+    steps({"all": optimizer}, params, 2)
+    optimizer.param_groups.reverse()
+    with pytest.raises(ValueError, match=r"groups are \['shN', .*, but were \['means'"):
+        steps({"all": optimizer}, params, 1)
+
+
+def test_a_list_of_other_tensors_may_grow() -> None:
+    """A list of poses beside the Gaussians, and before them."""
+    params, poses = parameters(ROWS), [Parameter(torch.zeros(6))]
+    groups = [{"params": poses, "lr": 0.01, "name": "poses"}, *adam_of(params).param_groups]
+    optimizer = PhaseScheduler(TOTAL).upgrade(Adam(groups, eps=1e-15))
+    steps({"all": optimizer}, params | {"first": poses[0]}, 5)
+    poses.append(Parameter(torch.zeros(6)))
+    optimizer.param_groups[0]["params"].append(poses[1])
+    every = params | {"first": poses[0], "second": poses[1]}
+    steps({"all": optimizer}, every, 5)
+    assert [int(optimizer.state[each]["step"]) for each in every.values()] == [10] * 7 + [5]
+
+
+def test_an_upgrade_after_an_edit_drops_the_mean_of_the_old_rows() -> None:
+    """A trainer may upgrade again after each edit."""
+    found = []
+    for again in (False, True):
+        params = parameters(ROWS)
+        optimizer = adam_of(params)
+        phases = PhaseScheduler(TOTAL, parts=[Averaging()])
+        phases.upgrade(optimizer)
+        phases.observe(iteration=TOTAL - 2)
+        steps({"all": optimizer}, params, 1)
+        for group in optimizer.param_groups:  # relocation: rows written, in the same memory
+            (old,) = group["params"]
+            group["params"] = [new := Parameter(old.detach())]
+            new.data[0] = 10.0
+            optimizer.state[new] = optimizer.state.pop(old)
+            params[next(name for name, param in params.items() if param is old)] = new
+        if again:
+            phases.upgrade(optimizer)
+        steps({"all": optimizer}, params, 1)
+        assert "averaging.mean" in optimizer.state[params["means"]]
+        found.append({name: param.detach() for name, param in params.items()})
+    assert same_tensors(*found)
+
+
+def test_parameters_that_an_edit_makes_of_another_kind_are_refused() -> None:
+    for change, said in (
+        (
+            lambda group: group["params"].__setitem__(0, Parameter(torch.ones(5, 3).half())),
+            "is torch.float16",
+        ),
+        (lambda group: group.update(params=[]), "holds 0 tensors"),
+    ):
+        params = parameters(ROWS, "scales", "sh0")
+        optimizers = PhaseScheduler(TOTAL, parts=[Fading()]).upgrade(adams_of(params))
+        steps(optimizers, params, 2)
+        change(optimizers["scales"].param_groups[0])
+        with pytest.raises(ValueError, match=f"Adam.step: scales {said}"):
+            steps({"scales": optimizers["scales"]}, params, 1)
+
+
+def test_a_checkpoint_of_numbers_for_rows_is_refused() -> None:
+    """Opacities [N], as gsplat has them, in the place of nerfstudio's [N, 1]."""
+    params, others = parameters(ROWS, "opacities"), {"opacities": Parameter(torch.zeros(ROWS, 1))}
+    given, taken = (
+        PhaseScheduler(TOTAL, parts=[Fading()]).upgrade(adams_of(each)) for each in (params, others)
+    )
+    steps(given, params, 2)
+    taken["opacities"].load_state_dict(given["opacities"].state_dict())
+    with pytest.raises(ValueError, match=r"opacities is .*, 1\), but its exp_avg is \(\d+,\)"):
+        steps(taken, others, 1)
 
 
 def test_other_rows_of_the_positions_are_named_where_another_steps_first() -> None:

@@ -147,18 +147,46 @@ def test_a_group_that_comes_later_is_refused_too() -> None:
 
 
 def test_two_sets_under_one_name_are_told(recwarn: pytest.WarningsRecorder) -> None:
-    """And no optimizer that takes the place of one that has stepped."""
-    first, params = one(), parameters(ROWS, "means")
-    phases = PhaseScheduler(100, parts=[Averaging()])
-    phases.upgrade(phases.upgrade(first))
+    """Where both are stepped; not where one takes the place of another, which steps no more."""
+    params = parameters(ROWS, "means")
+    for before in (0, 3):
+        phases = PhaseScheduler(100, parts=[Averaging()])
+        first = phases.upgrade(phases.upgrade(adams_of(params)))
+        steps(first, params, before)
+        second = phases.upgrade(adams_of(params))
+        steps(second, params, 3)
+        assert not recwarn.list
+        with pytest.warns(UserWarning, match="another optimizer holds means, too, and was upgra"):
+            steps(first, params, 1)
+        steps(first, params, 1)
+        assert len(recwarn.list) == 0
+
+
+def test_an_optimizer_that_is_made_anew_is_missed(recwarn: pytest.WarningsRecorder) -> None:
+    """Also of a parameter that no part looks for; but no set of Gaussians that is gone."""
+    params = parameters(ROWS)
+    phases = PhaseScheduler(300)
+    optimizers = phases.upgrade(adams_of(params))
+    other = phases.upgrade({"sky#means": one(name="sky#means"), "sky#sh0": one(name="sky#sh0")})
+    steps(optimizers, params, 90)
+    del other
+    steps(optimizers, params, 20)
     assert not recwarn.list
-    with pytest.warns(UserWarning, match="another optimizer holds means already; if both"):
-        phases.upgrade(one())
-    phases = PhaseScheduler(100, parts=[Averaging()])
-    trained = phases.upgrade(adams_of(params))
-    steps(trained, params, 1)
-    phases.upgrade(adams_of(params))
-    assert not recwarn.list
+    optimizers["opacities"] = adams_of({"opacities": params["opacities"]})["opacities"]
+    with pytest.warns(UserWarning, match=r"the optimizer of \['opacities'\] that was upgraded has"):
+        steps(optimizers, params, 100)
+
+
+def test_a_clock_goes_on_where_positions_are_trained_no_more() -> None:
+    params = parameters(ROWS)
+    phases = PhaseScheduler(300)
+    optimizer = phases.upgrade(adam_of(params))
+    steps({"all": optimizer}, params, 30)
+    del params["means"]
+    optimizer = phases.upgrade(adam_of(params))
+    with pytest.warns(UserWarning, match="no optimizer holds positions, so that OwnFrame does no"):
+        steps({"all": optimizer}, params, 30)
+    assert phases.iteration == 59
 
 
 def part(**attributes: Any) -> PhaseScheduler:

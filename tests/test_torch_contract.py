@@ -353,6 +353,20 @@ def test_rows_of_a_stranger_are_not_reset() -> None:
     optimizers["means"].state_dict()
 
 
+@pytest.mark.parametrize(
+    "rows", [None, (0, 1), 3, torch.ones(3), torch.ones(29, dtype=torch.bool), torch.tensor(3)]
+)
+def test_rows_to_reset_are_indices_or_a_mask(rows: Any) -> None:
+    params, optimizers, _ = upgraded(one=False)
+    steps(optimizers, params, 2)
+    before = optimizers["scales"].state[params["scales"]]["exp_avg"].clone()
+    with pytest.raises(
+        ValueError, match=r"reset_rows: rows=.*, but their indices \[n\], or a bool"
+    ):
+        optimizers["scales"].reset_rows(params["scales"], rows)
+    assert torch.equal(optimizers["scales"].state[params["scales"]]["exp_avg"], before)
+
+
 @pytest.mark.parametrize("moments", [32, 16])
 @pytest.mark.parametrize("away", [0.0, 1e3, 1e6])
 def test_the_mean_of_positions_is_exact_to_one_rounding(away: float, moments: Any) -> None:

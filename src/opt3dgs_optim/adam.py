@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import operator
-import weakref
 from collections.abc import Mapping
 from typing import Any, cast
 
@@ -32,7 +31,15 @@ from opt3dgs_optim.checkpoint import (
     steps_of_a_stock_adam,
     take_from_groups,
 )
-from opt3dgs_optim.contract import Slots, bare, check_held, check_slots, check_supported, own_step
+from opt3dgs_optim.contract import (
+    Slots,
+    bare,
+    check_group,
+    check_held,
+    check_slots,
+    check_supported,
+    own_step,
+)
 from opt3dgs_optim.mean import kept_in, put_mean
 from opt3dgs_optim.moments import MOMENTS, as_numbers
 from opt3dgs_optim.names import split_name
@@ -63,32 +70,23 @@ class StepAdam(Adam):
 
     def follow(self, training: Training, slots: Slots) -> None:
         """Use `training`'s parts from now on; `slots` has each group's set and name."""
-        self._last, self._framed = self.last_steps(), self.framed_sets()
-        params = [param for group in self.param_groups for param in group["params"]]
-        if len(self._last) != len(params):
-            self._last = ()  # groups are others now
-        self.training, self._slots, self._steppers, self._in_order = training, slots, [], []
+        if vars(self).get("training") is not training:
+            self.forget_steppers()
+        self.training, self._slots = training, slots
         if not self.state:
             self.coded = training.moments == 16
         self._step_supports_amp_scaling = False  # a GradScaler unscales, and leaves steps out
-        self._on_gpu = any(map(operator.attrgetter("is_cuda"), params))
+        self._on_gpu = any(p.is_cuda for group in self.param_groups for p in group["params"])
         self._name_groups()
         self._remember_rows()
 
     def _name_groups(self) -> None:
         """Tell the training which Gaussian parameters it holds, and in which groups."""
-        members = self.training.members
-        self.training.all_optimizers[id(self)] = weakref.ref(self)
-        self.has_positions = False
-        for slot in [slot for slot, each in members.items() if each[0]() is self]:
-            del members[slot]
-        for at, (which, name) in enumerate(self._slots):
+        for group in self.param_groups:
             # Always there, since flattened states are loaded by the keys that a group has.
-            self.param_groups[at].setdefault(STATE_KEY, "")
-            if name is not None:
-                members[which, name] = weakref.ref(self), at
-            if name == "means":
-                self.has_positions = self.training.counts_positions = True
+            group.setdefault(STATE_KEY, "")
+        self.has_positions = any(name == "means" for _, name in self._slots)
+        self.training.take(self, self._slots)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """As torch's; refuses what `upgrade` would, with nothing changed."""
@@ -184,18 +182,29 @@ class StepAdam(Adam):
             self._new_steppers(check=False)
             self.training.read_back()
 
+    def forget_steppers(self) -> None:
+        """Have none, but know when they stepped last."""
+        self._last, self._framed = self.last_steps(), self.framed_sets()
+        self._steppers, self._in_order = [], []
+
     def _new_steppers(self, check: bool = True) -> list[ParamStepper]:
-        old, made, call = self._steppers, [], type(self).__name__
+        made, call = [], type(self).__name__
+        old: dict[Any, ParamStepper] = {each.place: each for each in self._steppers}
+        old |= {id(param): each for each in self._steppers if (param := each.param()) is not None}
         check_slots(f"{call}.step", self.param_groups, self._slots)
-        for group, slot in zip(self.param_groups, self._slots, strict=True):
-            for param in group["params"]:
-                i = len(made)
+        for at, (group, slot) in enumerate(zip(self.param_groups, self._slots, strict=True)):
+            if check:
+                check_group(f"{call}.step", group, slot[1])
+                self.training.check_member(call, *slot, self)
+            for j, param in enumerate(group["params"]):
                 stepper = ParamStepper(call, self.training, group, param, slot)
+                stepper.place = (slot if slot[1] else at, j)
                 state = self.state.get(param, {})
-                if i < len(old):
-                    stepper.follow(old[i], param, state)
+                before = old.get(id(param)) or old.get(stepper.place)
+                if before is not None:
+                    stepper.follow(before, param, state)
                 else:
-                    stepper.stepped_in = self._last[i] if i < len(self._last) else None
+                    stepper.stepped_in = dict(enumerate(self._last)).get(len(made))
                     if "exp_avg" in state:
                         stepper.framed = stepper.name == "means" and stepper.set in self._framed
                         stepper.remember(state["exp_avg"])
@@ -220,12 +229,11 @@ class StepAdam(Adam):
             param: one of the optimizer's parameters [N, ...].
             rows: their indices, or an [N] bool mask.
         """
-        check_held(f"{type(self).__name__}.reset_rows", self, param)
+        check_held(f"{type(self).__name__}.reset_rows", self, param, rows)
         self.notice_edits()
         state = self.state.get(param, {})
-        for key in (*MOMENTS, *kept_in(state)):
-            if key in state:
-                state[key][rows] = 0
+        for key in state.keys() & {*MOMENTS, *kept_in(state)}:
+            state[key][rows] = 0
 
     @torch.no_grad()
     def put_means(self) -> int:

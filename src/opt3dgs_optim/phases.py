@@ -157,18 +157,6 @@ class PhaseScheduler(Training):
         self._say_upgraded(" ".join(name for its in slots for _, name in its if name))
         return optimizers
 
-    def _warn_of_a_second_set(self, optimizer: Any, slots: Slots) -> None:
-        """Before the first step, another optimizer that is still there is no one replaced."""
-        for which, name in slots:
-            held = self.members.get((which, name or ""))
-            if held is not None and held[0]() not in (None, optimizer) and self.iteration < 0:
-                self.messages.warn_once(
-                    "second",
-                    f"{CALL}.upgrade: another optimizer holds {name} already; if both are "
-                    "stepped, of two sets of Gaussians, name the groups 'first#means', "
-                    "'second#means', or make a scheduler for each",
-                )
-
     def _say_upgraded(self, names: str) -> None:
         """One line, so that a user sees that something has happened."""
         listed = ", ".join(type(part).__name__ for part in self.parts) or "no parts"
@@ -183,7 +171,6 @@ class PhaseScheduler(Training):
             optimizer.note_in_groups()
             optimizer.training._end.finished = True  # pyright: ignore[reportAttributeAccessIssue]
         else:
-            self._warn_of_a_second_set(optimizer, slots)
             vars(optimizer).pop("step", None)  # as learning-rate schedulers of old have wrapped it
             optimizer.__class__ = upgraded_class(type(optimizer))
         self._end.hold(optimizer)

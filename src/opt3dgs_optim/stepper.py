@@ -30,6 +30,7 @@ class ParamStepper:
     Attributes:
         param: the Parameter, a weak reference: an old one lives no longer than the trainer wants.
         name, set: which Gaussian parameter it is, and of which set of Gaussians.
+        place: where the optimizer has it: a Parameter that is new there follows the one before.
         acting: by `Training.exploiting`: the parts with a `plan`, and with an `after`.
         later: what later steps may have and the first has not, see `Part.later`.
         counter: where its device counts numbers that are not finite; None on a CPU.
@@ -50,6 +51,7 @@ class ParamStepper:
         self.param = weakref.ref(param)
         self.counter = training.bad_numbers.counter_on(param.device)
         self.set, self.name = slot
+        self.place: Any = None
         mine = [
             p for p in training.parts if p.names is None or (self.name and self.name in p.names)
         ]
@@ -127,7 +129,10 @@ class ParamStepper:
             )
         if not state:
             self._begin(param, state)
-        elif state["exp_avg"].numel() != numbers or state["exp_avg_sq"].numel() != numbers:
+        elif (
+            state["exp_avg"].numel() != numbers or state["exp_avg_sq"].numel() != numbers
+            or state["exp_avg"].dim() != param.dim()  # a checkpoint of [N] in the place of [N, 1]
+        ):  # fmt: skip
             self.check_rows(param, state)
         if training.moments == 16:
             as_codes(state)
@@ -230,10 +235,11 @@ class ParamStepper:
         for key in MOMENTS:
             moment = state.get(key)
             if moment is not None and moment.shape != param.shape:
+                rows = f": {len(moment)} rows for {len(param)}" * (len(moment) != len(param))
                 raise ValueError(
                     f"{self.call}.step: {self.name or 'a parameter'} is {tuple(param.shape)}, but "
-                    f"its {key} is {tuple(moment.shape)}: {len(moment)} rows for {len(param)}; "
-                    "load the checkpoint of these Gaussians, or edit their moments with them"
+                    f"its {key} is {tuple(moment.shape)}{rows}; load the checkpoint of these "
+                    "Gaussians, or edit their moments with them"
                 )
 
 

@@ -75,12 +75,44 @@ class Training(Clock):
         """What a part knows of this training: plain numbers by name, saved with the optimizers."""
         return self._notes[type(part).__name__]
 
+    def take(self, optimizer: Any, slots: list[tuple[str, str | None]]) -> None:
+        """Have an optimizer of these parameters, in the place of those that held any of them."""
+        ref = self.all_optimizers[id(optimizer)] = weakref.ref(optimizer)
+        replaced: list[weakref.ref[Any]] = [ref]
+        for of_set, name in slots:
+            if name is not None and (of_set, name) in self.members:
+                replaced.append(self.members[of_set, name][0])
+        self.counts_positions = optimizer.has_positions
+        for slot, (held, _) in [*self.members.items()]:
+            if held in replaced:
+                del self.members[slot]
+            elif slot[1] == "means" and held() is not None:
+                self.counts_positions = True
+        for held in replaced[1:]:
+            if (other := held()) not in (None, optimizer):
+                other.forget_steppers()  # so that it is missed among the members if it steps again
+        for at, (of_set, name) in enumerate(slots):
+            if name is not None:
+                self.members[of_set, name] = ref, at
+
     def param_of(self, set_name: str, name: str) -> Tensor | None:
         """The present tensor of a Gaussian parameter, by gsplat's name; None if nobody holds it."""
         member = self.members.get((set_name, name))
         if member is None or (optimizer := member[0]()) is None:
             return None
-        return optimizer.param_groups[member[1]]["params"][0]
+        params = optimizer.param_groups[member[1]]["params"]
+        return params[0] if params else None
+
+    def check_member(self, call: str, of_set: str, name: str | None, optimizer: Any) -> None:
+        """Say once that another optimizer, upgraded later, has the place of one that steps."""
+        member = self.members.get((of_set, name or ""))
+        if member is not None and member[0]() is not optimizer:
+            self.messages.warn_once(
+                "second",
+                f"{call}.step: another optimizer holds {name}, too, and was upgraded later; for "
+                "two sets of Gaussians name the groups 'first#means', 'second#means', or make a "
+                "scheduler for each",
+            )
 
     def state_of_param(self, set_name: str, name: str) -> dict[str, Any] | None:
         """The optimizer's state of a Gaussian parameter; None before its first step."""
@@ -137,6 +169,7 @@ class Training(Clock):
         if iteration >= self._look_at or left in (LAG + 1, 1):  # a look tells of the one before
             self._look_at = iteration + LOOK_INTERVAL
             self.look_at_numbers()
+            self.look_at_members()
 
     def resume(self, iteration: int, by_count: bool = False) -> None:
         """Go on at an iteration; drop what was kept from step to step before.
@@ -155,6 +188,17 @@ class Training(Clock):
                 f"opt3dgs_optim: iteration {self.iteration}: {bad} numbers of gradients have "
                 "not been finite (NaN or infinite) since the start, and counted as zero; look for "
                 "the first NaN of the loss",
+            )
+
+    def look_at_members(self) -> None:
+        """Say once that an optimizer has gone, while others of its Gaussians are stepped."""
+        gone = {key for key, (held, _) in self.members.items() if held() is None}
+        sets = {of_set for of_set, _ in self.members.keys() - gone}
+        if names := [name for of_set, name in gone if of_set in sets]:
+            self.messages.warn_once(
+                "gone",
+                f"opt3dgs_optim: iteration {self.iteration}: the optimizer of {sorted(names)} "
+                "that was upgraded has gone; upgrade the one in its place, by the same scheduler",
             )
 
     def read_back(self) -> None:

@@ -71,14 +71,15 @@ def test_rows_of_nonsense_do_not_move_and_move_no_other() -> None:
 
 @pytest.mark.parametrize("rows", [1, 3, 5])
 def test_gaussians_of_another_scene(rows: int) -> None:
-    """Where the number of points is one, or that of the coordinates, too."""
+    """Refused before the step; also where there is one point, or as many as coordinates."""
     for name in ("scales", "quats", "opacities"):
         splats = dim(rows)
         splats[name] = dim(6)[name]
         start = splats["means"].detach().clone()
         for said in (rf"{name} is \[6.*is needed for {rows} means", rf"{name} is missing"):
+            adams, splats["means"].grad = upgraded(splats, PositionNoise()), torch.ones_like(start)
             with pytest.raises(ValueError, match=f"PositionNoise: {said}"):
-                moved(splats, upgraded(splats, PositionNoise()))
+                adams["means"].step()
             splats.pop(name, None)
         assert torch.equal(splats["means"], start)
 

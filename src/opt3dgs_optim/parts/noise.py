@@ -41,8 +41,22 @@ class PositionNoise(Part):
     def __post_init__(self) -> None:
         set_options(self, scale=check_number("PositionNoise", "scale", self.scale, 0.0))
 
+    def plan(self, step: Step, training: Training) -> None:
+        """Refuse, before the step, what `after` could not do."""
+        self._shapes(step, training)
+
     def after(self, step: Step, training: Training) -> None:
         """Add the noise to the positions [N, 3] in place."""
+        means = step.param
+        eta = torch.randn(
+            means.shape, dtype=means.dtype, device=means.device, generator=self.generator
+        )
+        scales, quats, opacities = self._shapes(step, training)
+        noise = covariance_noise(scales, quats, opacities, eta)
+        means.data.add_(noise, alpha=step.group["lr"] * self.scale)
+
+    def _shapes(self, step: Step, training: Training) -> list[Tensor]:
+        """Scales, rotations and opacities of the positions' Gaussians."""
         means, others = step.param, []
         for name, numbers in (("scales", 3), ("quats", 4), ("opacities", 1)):
             tensor = training.param_of(step.set, name)
@@ -53,12 +67,7 @@ class PositionNoise(Part):
                     f"{len(means)} means, in an optimizer that is upgraded with theirs"
                 )
             others.append(tensor)
-        eta = torch.randn(
-            means.shape, dtype=means.dtype, device=means.device, generator=self.generator
-        )
-        scales, quats, opacities = others
-        noise = covariance_noise(scales, quats, opacities, eta)
-        means.data.add_(noise, alpha=step.group["lr"] * self.scale)
+        return others
 
 
 @dataclass(repr=False, eq=False)
