@@ -1,8 +1,8 @@
 """The steps of this package, written out on tensors: slow, plain, torch only.
 
 `default_step` is one iteration of `PhaseScheduler(total)`, `paper_step` one of
-`PhaseScheduler.paper(total)`, around torch's Adam. docs/algorithms/reference-step.md reads them
-with the paper, and tests/test_reference_step.py holds the package to them, bit for bit on a CPU.
+`PhaseScheduler.paper(total)`, around torch's Adam. docs/algorithms/reference-step.md shows this
+file, and tests/test_reference_step.py holds the package to it, bit for bit on a CPU.
 
 Arguments of both:
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 import torch
-from docs_blocks import DOCS, ROOT, Block, anchors, blocks, name, pages, unfenced
+from docs_blocks import DOCS, ROOT, anchors, blocks, name, pages, unfenced
 from docs_commands import SHELL, check_command, commands
 
 import opt3dgs_optim
@@ -28,11 +28,6 @@ OF_OTHERS = ("hosts.nerfstudio", "hosts.lightning", "__main__")  # import what o
 def of_pages(*languages: str) -> list[Any]:
     """The pages that have blocks of these languages, as test parameters."""
     return [pytest.param(p, id=name(p)) for p in PAGES if blocks(p, *languages)]
-
-
-def is_excerpt(block: Block) -> bool:
-    """Whether a block quotes a file instead of being a program."""
-    return "/" in block.title
 
 
 # -- code ------------------------------------------------------------------------------------------
@@ -50,7 +45,7 @@ def test_python_blocks_run_and_print_what_is_shown(
     printed = io.StringIO()
     try:
         for block in blocks(page):
-            if block.language == "python" and not is_excerpt(block):
+            if block.language == "python":
                 assert printed.getvalue() == "", f"line {block.line}: not shown what is printed"
                 code = compile("\n" * block.line + block.text, name(page), "exec")
                 with contextlib.redirect_stdout(printed):
@@ -62,20 +57,6 @@ def test_python_blocks_run_and_print_what_is_shown(
     finally:
         if "log" in namespace:
             namespace["log"].close()
-
-
-@pytest.mark.parametrize("page", of_pages("python"))
-def test_excerpts_stand_in_the_source(page: Path) -> None:
-    for block in filter(is_excerpt, blocks(page, "python")):
-        source = [line.strip() for line in (ROOT / block.title).read_text().splitlines()]
-        if block.text.startswith("--8<--"):  # the whole file, by the build
-            continue
-        for part in re.split(r"^\.\.\.\n", block.text, flags=re.M):
-            lines = [line.strip() for line in part.strip().splitlines()]
-            starts = range(len(source) - len(lines) + 1)
-            assert any(source[i : i + len(lines)] == lines for i in starts), (
-                f"{name(page)}, line {block.line}: not in {block.title}:\n{part}"
-            )
 
 
 @pytest.mark.parametrize("module", [m for m in MODULES if not m.endswith(OF_OTHERS)])

@@ -20,7 +20,7 @@ class Block:
     """One fenced block."""
 
     language: str
-    title: str  # a path: an excerpt of it; "prints": what the block before it prints
+    title: str  # "prints": what the block before it prints
     text: str
     line: int  # of the fence, from 1
 
