@@ -261,7 +261,6 @@ def test_wrong_options_are_named() -> None:
     ):
         with pytest.raises(error, match=re.escape(said)):
             build(**options)
-    assert build(moments=16).training.moments == 16
 
 
 def test_a_histogram_serves_one_optimizer_or_one_training() -> None:

@@ -103,4 +103,3 @@ def test_what_is_outside_is_refused() -> None:
             LQNAdam([Parameter(torch.ones(2, 2, dtype=dtype))])
     with pytest.raises(ValueError, match="Curvature: history_size=17"):
         LQNAdam([points()], history_size=17)
-    assert LQNAdam([points()], moments=16).training.moments == 16

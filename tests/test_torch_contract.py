@@ -337,14 +337,6 @@ def test_an_edit_between_a_load_and_the_first_step_shows() -> None:
     assert began.tolist() == [TOTAL] * ROWS
 
 
-def test_moments_of_16_bits_of_an_optimizer_by_itself_resume() -> None:
-    params = {"x": Parameter(torch.ones(5, 3))}
-    ours, twin = (LQNAdam(list(params.values()), 1e-2, moments=16) for _ in range(2))
-    steps({"all": ours}, params, 5)
-    twin.load_state_dict(copy.deepcopy(ours.state_dict()))
-    assert torch.equal(*(o.state[params["x"]]["exp_avg_sq"] for o in (ours, twin)))
-
-
 def test_rows_of_a_stranger_are_not_reset() -> None:
     params, optimizers, _ = upgraded(one=False)
     steps(optimizers, params, 2)

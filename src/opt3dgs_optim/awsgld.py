@@ -37,7 +37,6 @@ class AWSGLD(StepAdam):
             (its groups named as a trainer's), or None.
         preconditioner: `"adam"`, or `"none"` for the plain SGLD drift `lr * nu * grad`, which
             samples exp(-energy / temperature) together with `IsotropicNoise(temperature=...)`.
-        moments: bits per number of each of Adam's two moments; 16 halves Adam's memory.
 
     The energy is the closure's value, or comes from `histogram.observe(loss)`, called once per
     iteration before `step()`. A non-finite energy leaves nu as it is.
@@ -93,10 +92,8 @@ class AWSGLD(StepAdam):
         histogram: EnergyHistogram | None = None,
         noise: IsotropicNoise | PositionNoise | None = None,
         preconditioner: Literal["adam", "none"] = "adam",
-        moments: Literal[32, 16] = 32,
     ) -> None:
         check_choice("AWSGLD", "preconditioner", preconditioner, ("adam", "none"))
-        check_choice("AWSGLD", "moments", moments, (32, 16))
         if histogram is not None and not isinstance(histogram, EnergyHistogram):
             raise TypeError(f"AWSGLD: histogram={histogram!r}, but an EnergyHistogram is needed")
         if noise is not None and not isinstance(noise, (IsotropicNoise, PositionNoise)):
@@ -105,11 +102,11 @@ class AWSGLD(StepAdam):
             )
         super().__init__(params, lr, betas, eps, weight_decay)
         slots: Slots = [split_name(group.get("name")) for group in self.param_groups]
-        check_supported("AWSGLD", self, slots, moments)
+        check_supported("AWSGLD", self, slots)
         parts: list[Part] = [part for part in (histogram, noise) if part is not None]
         if preconditioner == "none":
             parts.append(PlainDrift())
-        training = Training(parts, moments=moments)
+        training = Training(parts)
         if histogram is not None:
             histogram.names = None  # nu is on every group's step
         self.follow(training, slots)

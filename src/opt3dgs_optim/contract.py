@@ -41,7 +41,7 @@ def bare(step: Any) -> Any:
     return step.__wrapped__ if getattr(step, "hooked", False) else step
 
 
-def check_supported(call: str, optimizer: Any, slots: Slots, moments: int) -> None:
+def check_supported(call: str, optimizer: Any, slots: Slots, moments: int = 32) -> None:
     """Refuse an optimizer that is outside of the contract, before anything has been changed.
 
     Args:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 from torch import Tensor
 
 from opt3dgs_optim.adam import StepAdam
-from opt3dgs_optim.checks import check_choice
 from opt3dgs_optim.contract import check_supported
 from opt3dgs_optim.lbfgs.backend import Backend
 from opt3dgs_optim.messages import warn_user
@@ -46,7 +45,6 @@ class LQNAdam(StepAdam):
     Args:
         params, lr, betas, eps, weight_decay: as in `torch.optim.Adam`.
         history_size, min_cosine, graft, backend: as in `Curvature`.
-        moments: bits per number of each of Adam's two moments; 16 halves Adam's memory.
 
     Examples:
         Fifty starts in Rosenbrock's valley, each optimizer with the best of its rates there:
@@ -84,16 +82,14 @@ class LQNAdam(StepAdam):
         min_cosine: float = 1e-6,
         graft: bool = True,
         backend: Backend = "auto",
-        moments: Literal[32, 16] = 32,
     ) -> None:
-        check_choice("LQNAdam", "moments", moments, (32, 16))
         curvature = Curvature(
             history_size, min_cosine=min_cosine, graft=graft, names=None, backend=backend
         )
         super().__init__(params, lr, betas, eps, weight_decay)
         slots = [split_name(group.get("name")) for group in self.param_groups]
-        check_supported("LQNAdam", self, slots, moments)
-        self.follow(Training([curvature], switch_step=0, moments=moments), slots)
+        check_supported("LQNAdam", self, slots)
+        self.follow(Training([curvature], switch_step=0), slots)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Add a group as in `torch.optim.Adam`; parameters of one dimension get a warning."""
