@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from splatting.camera import Camera
 from splatting.colmap import PosedImage, SparseModel, read_colmap
-from splatting.transforms import read_json_object, read_transforms
+from splatting.transforms import read_transforms
 
 Size = Literal["images", "images_2", "images_4"]  # the folder of the photos
 Background = Literal["black", "white"]
@@ -54,14 +54,14 @@ def load_scene(
 
     A folder holds `images/`, its halves `images_2/` and quarters `images_4/`, and either a COLMAP
     model in `sparse/0/` (or `sparse/`), or `transforms.json` with its .ply; COLMAP's is preferred.
-    Test views are those of `split.json` where there is one, and otherwise every 8th of the names.
+    Test views are every 8th of the names.
 
     Args:
         source: "embedded" (procedural, nothing to download; see `embedded.py`) or a folder.
         size: the folder of the photos; intrinsics follow the actual image size.
         background: what is behind the Gaussians; "white" for NeRF-synthetic scenes.
         held_out: the test views are those whose index among the sorted names is this modulo 8
-            (7 in the embedded scene); by default those of `split.json`, or 0.
+            (7 in the embedded scene); by default 0 (3 there).
 
     Raises FileNotFoundError, or ValueError where a file is malformed or an option none of these.
     """
@@ -127,32 +127,14 @@ def _split(folder: Path, names: list[str], held_out: int | None) -> tuple[list[s
     if len(set(names)) != len(names):
         doubled = sorted({name for name in names if names.count(name) > 1})
         raise ValueError(f"{folder}: images listed more than once: {doubled}")
-    path = folder / "split.json"
-    if path.is_file() and held_out is None:
-        train, test = _read_split(path, names)
-    else:
-        test = names[held_out or 0 :: _TEST_EVERY]
-        train = [name for name in names if name not in test]
+    test = names[held_out or 0 :: _TEST_EVERY]
+    train = [name for name in names if name not in test]
     if len(train) < 2 or not test:
         raise ValueError(
             f"{folder}: needs at least 2 train views and a test view, got {len(train)} and "
             f"{len(test)} of {len(names)} views"
         )
     return train, test
-
-
-def _read_split(path: Path, names: list[str]) -> tuple[list[str], list[str]]:
-    table = read_json_object(path)
-    parts: list[Any] = [table.get("train"), table.get("test")]
-    if not all(isinstance(p, list) and all(isinstance(n, str) for n in p) for p in parts):
-        raise ValueError(f"{path}: expected lists of image names under 'train' and 'test'")
-    train, test = parts
-    unknown = sorted({*train, *test}.difference(names))
-    if unknown:
-        raise ValueError(f"{path}: names {unknown}, which the scene's model does not have")
-    if len({*train, *test}) != len(train) + len(test):
-        raise ValueError(f"{path}: a view is listed more than once, or in both 'train' and 'test'")
-    return sorted(train), sorted(test)
 
 
 def _load_view(folder: Path, posed: PosedImage, background: Background) -> View:

@@ -88,33 +88,6 @@ def test_colmap_is_preferred(tmp_path):
     assert len(load_scene(folder).train) == 8
 
 
-def test_split_json_decides(tmp_path):
-    folder = write_scene(tmp_path / "s", "json")
-    names = image_names(10)
-    split = {"train": names[5:8], "test": names[:2]}  # the others are left out
-    (folder / "split.json").write_text(json.dumps(split))
-    scene = load_scene(folder)
-    assert [view.name for view in scene.train] == names[5:8]
-    assert [view.name for view in scene.test] == names[:2]
-
-
-@pytest.mark.parametrize(
-    ("split", "message"),
-    [
-        ({"train": image_names(3)}, "expected lists of image names under 'train' and 'test'"),
-        ({"train": image_names(3), "test": ["x.png"]}, r"names \['x.png'\], which"),
-        ({"train": image_names(3), "test": image_names(1)}, "more than once, or in both"),
-        ({"train": image_names(1), "test": image_names(2)[1:]}, "got 1 and 1 of 10 views"),
-        ({"train": image_names(3), "test": []}, "2 train views and a test view, got 3 and 0 of"),
-    ],
-)
-def test_bad_splits_are_named(tmp_path, split, message):
-    folder = write_scene(tmp_path / "s", "json")
-    (folder / "split.json").write_text(json.dumps(split))
-    with pytest.raises(ValueError, match=message):
-        load_scene(folder)
-
-
 def test_bad_images_are_named(tmp_path):
     folder = write_scene(tmp_path / "s", "bin")
     path = folder / "images_4" / "photo_03.png"
