@@ -277,7 +277,7 @@ REACHED = {  # relative to the start's value: what is left after the line search
     ids=lambda p: p.name,
 )
 @pytest.mark.parametrize(
-    "rows", [50, pytest.param(10_000, marks=pytest.mark.slow, id="ten thousand")]
+    "rows", [50, pytest.param(10_000, marks=pytest.mark.thorough, id="ten thousand")]
 )
 def test_two_loop_with_a_line_search_reaches_the_minimum(problem: Problem, rows: int) -> None:
     """Every row, in units of 1e-8 to 1e8 and in axes of its own."""

@@ -88,7 +88,7 @@ def columns(*points: Tensor) -> Tensor:
     """M times points [N, D] as [M, D, N], each coordinate contiguous."""
     like = points[0].detach()
     found = like.new_empty(len(points), *reversed(like.shape))
-    if like.is_cpu:  # numpy takes half of the time
+    if like.is_cpu and not torch.compiler.is_compiling():  # numpy takes half of the time
         for place, given in zip(found.numpy(), points, strict=True):
             np.copyto(place, given.detach().numpy().T)
     else:  # three times as fast as a transposed copy
@@ -98,7 +98,7 @@ def columns(*points: Tensor) -> Tensor:
 
 def put(points: Tensor, found: Tensor) -> None:
     """Into `points` [N, D] what was found as [D, N]: as fast as `columns`."""
-    if points.is_cpu:
+    if points.is_cpu and not torch.compiler.is_compiling():
         target = points.numpy()
         for i, row in enumerate(found.numpy()):  # a fifth of the time of a transposed copy
             np.copyto(target[:, i], row)
