@@ -1,7 +1,6 @@
 """What mkdocs does to these pages besides Markdown; see `hooks` in mkdocs.yml.
 
-Formulas become MathML (no script, no font). Every page has the version at its foot. A built page
-that would fetch anything from the net fails the build.
+Formulas become MathML (no script, no font). Every page has the version at its foot.
 """
 
 from __future__ import annotations

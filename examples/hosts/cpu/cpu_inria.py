@@ -97,11 +97,6 @@ class GaussianRasterizer(torch.nn.Module):
             return image, radii, torch.zeros(1, view.height, view.width)
         return image, radii
 
-    def markVisible(self, positions: Tensor) -> Tensor:  # noqa: N802 (its name)
-        """[N] bool, in front of the camera."""
-        depth = positions @ self.raster_settings.viewmatrix[:3, 2]
-        return depth + self.raster_settings.viewmatrix[3, 2] > 0.2
-
     @staticmethod
     def _weights(geometry: tuple[Tensor, ...], view: Camera) -> Tensor:
         """[N] the sum of each Gaussian's blending weights: the derivative by its colour."""

@@ -102,23 +102,8 @@ def install() -> None:
     lpips = types.ModuleType("lpipsPyTorch")
     lpips.lpips = lambda *_, **__: torch.tensor(float("nan"))  # type: ignore[attr-defined]
     sys.modules["lpipsPyTorch"] = lpips
-    _psnr()
     _torchvision()
     _scene_manager()
-
-
-def _psnr() -> None:
-    """torchmetrics' PSNR without a `data_range`, as CityGaussian makes it; newer ones want one."""
-    try:
-        image: Any = importlib.import_module("torchmetrics.image")
-    except ImportError:
-        return
-
-    class Psnr(image.PeakSignalNoiseRatio):
-        def __init__(self, data_range: Any = 1.0, **options: Any) -> None:
-            super().__init__(data_range=data_range, **options)
-
-    image.PeakSignalNoiseRatio = Psnr
 
 
 def _torchvision() -> None:

@@ -36,28 +36,16 @@ class OwnFrame(Part):
 
         rate(i, x) = rate * (1 + i / 1,000)^(-3/4) * (1 - (1 - final) sqrt(x))
 
-    3DGS moves every centre by one learning rate in world units, while the sizes of the Gaussians of
-    one scene differ by a factor of fifty, and the axes of one Gaussian by twenty. A step that a
-    large Gaussian does not notice throws a small one out of its place. Here Adam is fed the
-    gradient in the Gaussian's own frame, and returns a step along the Gaussian's axes: a full step
-    is `rate` standard deviations. It does not depend on the unit of the scene, nor on the
-    positions' learning rate, except that a learning rate of 0 holds them.
+    Adam is fed the gradient in the Gaussian's own frame, and returns a step along its axes, in its
+    standard deviations. That depends neither on the unit of the scene nor on the positions'
+    learning rate, except that a learning rate of 0 holds them. A Gaussian whose position has no
+    gradient stays, and so do its moments (as in Taming 3DGS, 2024, with its Adam for visible ones).
+    docs/algorithms/own-frame.md has the reasons.
 
-    A Gaussian is stepped in the iterations that see it: where its position has no gradient it
-    stays, and so do its moments, as with the Adam of Taming 3DGS (2024) for visible Gaussians.
-    Otherwise one view's momentum carries those that few views see almost a standard deviation.
-
-    Trained Gaussians are thin, often far thinner than a pixel. Steps in proportion to such an axis
-    would pin the Gaussian across its own surface, so an axis counts as no thinner than `min_aspect`
-    of the longest. The fewer steps a training has, the longer they must be: by default this share
-    is 3,000 / total_steps, but between 0.1 (from 30,000 iterations on) and 0.25 (up to 12,000).
-
-    The largest Gaussians would be stepped farthest, and with density control that clones and splits
-    they fill the space in front of the cameras. So an axis counts as no longer than 6 times the
-    median of the Gaussians' longest axes, which is found every 100 iterations. Relocation does not
-    need this bound, which slows far Gaussians down. It makes a new Parameter of the same memory,
-    and clone, split and prune make one of other memory. So two edits in a row of the first kind
-    lift the bound, until one of the second.
+    An axis counts as no thinner than `min_aspect` of the longest, by default 3,000 / total_steps,
+    but between 0.1 and 0.25. It counts as no longer than 6 times the median of the Gaussians'
+    longest axes, which is found every 100 iterations. Two edits in a row that make a new Parameter
+    of the same memory, as relocation does, lift that bound, until one that makes other memory.
 
     For b views in a batch, or b ranks, gsplat sets beta1 = 1 - 0.1 b and scales rates by sqrt(b).
     The rate here follows beta1: below beta1 = 0.9 it is scaled by sqrt((1 - beta1) / 0.1).
