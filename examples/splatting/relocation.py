@@ -11,7 +11,9 @@ MAX_COPIES = 51  # gsplat's table of binomial coefficients ends here; 3dgs-mcmc 
 MAX_OPACITY = 1.0 - torch.finfo(torch.float32).eps  # their upper bound: its logit is finite
 
 
-def relocated_values(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
+def relocated_values(
+    opacities: Tensor, scales: Tensor, copies: Tensor, min_opacity: float = 0.0
+) -> tuple[Tensor, Tensor]:
     """Opacity and scale of N copies that together look like one Gaussian (MCMC paper, eq. 9).
 
     The composite keeps its opacity at the centre and its integral over every line through it.
@@ -21,6 +23,7 @@ def relocated_values(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple
         opacities: [M], after the sigmoid.
         scales: [M, 3], world units, after the exponential.
         copies: [M] int, N, the original included; more than 51 count as 51, as in gsplat.
+        min_opacity: of a copy; gsplat after 1.5.3 has it before the scales are computed.
 
     Returns:
         opacities [M] and scales [M, 3]. Computed in float64, which the alternating sum deserves.
@@ -29,7 +32,7 @@ def relocated_values(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple
     # An opacity that rounded to 1 would make terms of 1e14 cancel.
     old = opacities.double().clamp(max=MAX_OPACITY)
     # 1 - (1 - o)^(1/N) without the cancellation
-    new = -torch.expm1(torch.log1p(-old) / number)
+    new = (-torch.expm1(torch.log1p(-old) / number)).clamp(min=min_opacity)
     # The sum over i = 1..N of binom(i - 1, k) is binom(N, k + 1): one sum is left of two.
     table = _signed_binomials(old.device)[number]  # [M, 51]
     powers = new[:, None] ** torch.arange(1, MAX_COPIES + 1, device=old.device)

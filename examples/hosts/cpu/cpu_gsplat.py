@@ -91,10 +91,17 @@ def rasterize(
 
 
 def relocation(
-    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, n_max: int = 51
+    opacities: Tensor,
+    scales: Tensor,
+    ratios: Tensor,
+    binoms: Tensor,
+    n_max: int = 51,
+    min_opacity: float = 0.0,
 ) -> tuple[Tensor, Tensor]:
     """Opacities and scales of relocated Gaussians; gsplat's, 3dgs-mcmc's and 3DGRUT's kernel."""
-    new_opacities, new_scales = relocated_values(opacities.flatten(), scales, ratios.flatten())
+    new_opacities, new_scales = relocated_values(
+        opacities.flatten(), scales, ratios.flatten(), min_opacity
+    )
     return new_opacities.reshape(opacities.shape), new_scales
 
 
