@@ -173,8 +173,41 @@ def test_an_optimizer_that_is_made_anew_is_missed(recwarn: pytest.WarningsRecord
     steps(optimizers, params, 20)
     assert not recwarn.list
     optimizers["opacities"] = adams_of({"opacities": params["opacities"]})["opacities"]
-    with pytest.warns(UserWarning, match=r"the optimizer of \['opacities'\] that was upgraded has"):
+    with pytest.warns(UserWarning, match=r"the optimizer of \['opacities'\] has gone; if another"):
         steps(optimizers, params, 100)
+
+
+def test_the_clock_goes_on_where_the_optimizer_of_the_positions_is_made_anew(
+    recwarn: pytest.WarningsRecorder,
+) -> None:
+    """And it is told, as soon as numbers are looked at."""
+    params = parameters(ROWS)
+    phases = PhaseScheduler(300)
+    optimizers = phases.upgrade(adams_of(params))
+    steps(optimizers, params, 50)
+    optimizers["means"] = adams_of({"means": params["means"]})["means"]
+    with pytest.warns(
+        UserWarning, match=r"the optimizer of \['means'\] has gone; if another is in"
+    ):
+        steps(optimizers, params, 100)
+    assert phases.iteration == 149
+    assert len(recwarn.list) == 0
+
+
+def test_an_optimizer_of_the_positions_alone_takes_none_of_the_others(recwarn: Any) -> None:
+    """The first goes on with what is left to it."""
+    params = parameters(ROWS)
+    phases = PhaseScheduler(300)
+    first = phases.upgrade(adam_of(params))
+    steps({"all": first}, params, 3)
+    second = phases.upgrade(adam_of({"means": params["means"]}))
+    for _ in range(3):
+        steps({"means": second}, {"means": params["means"]}, 1)
+        params["means"].grad = None
+        first.step()
+    assert all(phases.param_of("", name) is param for name, param in params.items())
+    assert phases.iteration == 5
+    assert not recwarn.list
 
 
 def test_a_clock_goes_on_where_positions_are_trained_no_more() -> None:
@@ -184,9 +217,11 @@ def test_a_clock_goes_on_where_positions_are_trained_no_more() -> None:
     steps({"all": optimizer}, params, 30)
     del params["means"]
     optimizer = phases.upgrade(adam_of(params))
-    with pytest.warns(UserWarning, match="no optimizer holds positions, so that OwnFrame does no"):
-        steps({"all": optimizer}, params, 30)
-    assert phases.iteration == 59
+    with pytest.warns(
+        UserWarning, match=r"the optimizer of \['means'\] has gone; if another is in"
+    ):
+        steps({"all": optimizer}, params, 80)
+    assert phases.iteration == 109
 
 
 def part(**attributes: Any) -> PhaseScheduler:

@@ -196,6 +196,19 @@ def test_groups_that_a_checkpoint_names_otherwise_are_told(caplog: Any) -> None:
     assert "'positions' is loaded into the group 'xyz'" in caplog.text
 
 
+def test_sets_that_are_named_after_a_checkpoint_take_it() -> None:
+    params, optimizers, _ = upgraded()
+    steps(optimizers, params, 3)
+    adam = adam_of(params)
+    for group in adam.param_groups:
+        group["name"] = f"first#{group['name']}"
+    phases = PhaseScheduler(TOTAL)
+    phases.upgrade(adam)
+    adam.load_state_dict(optimizers["all"].state_dict())
+    steps({"all": adam}, params, 3)
+    assert phases.iteration == 5
+
+
 class Model(torch.nn.Module):
     def __init__(self, params: dict[str, Parameter]) -> None:
         super().__init__()
@@ -345,16 +358,31 @@ def test_rows_of_a_stranger_are_not_reset() -> None:
     optimizers["means"].state_dict()
 
 
-@pytest.mark.parametrize(
-    "rows", [None, (0, 1), 3, torch.ones(3), torch.ones(29, dtype=torch.bool), torch.tensor(3)]
-)
+def usual(rows: list[int]) -> list[Any]:
+    """What trainers write for rows."""
+    at = torch.tensor(rows)
+    mask = torch.zeros(30, dtype=torch.bool)
+    mask[at] = True
+    return [at, mask, torch.where(mask), mask.nonzero(), mask.nonzero().squeeze(), rows, at.numpy()]
+
+
+@pytest.mark.parametrize("rows", [*usual([4]), *usual([0, 7, 29])], ids=str)
 def test_rows_to_reset_are_indices_or_a_mask(rows: Any) -> None:
     params, optimizers, _ = upgraded(one=False)
     steps(optimizers, params, 2)
+    optimizers["scales"].reset_rows(params["scales"], rows)
+    kept = optimizers["scales"].state[params["scales"]]["exp_avg"].any(1)
+    assert (~kept).nonzero().flatten().tolist() in ([4], [0, 7, 29])
+
+
+@pytest.mark.parametrize(
+    "rows", [None, (0, 1), torch.ones(3), torch.ones(29, dtype=torch.bool), [30], "1"], ids=str
+)
+def test_other_rows_to_reset_are_refused(rows: Any) -> None:
+    params, optimizers, _ = upgraded(one=False)
+    steps(optimizers, params, 2)
     before = optimizers["scales"].state[params["scales"]]["exp_avg"].clone()
-    with pytest.raises(
-        ValueError, match=r"reset_rows: rows=.*, but their indices \[n\], or a bool"
-    ):
+    with pytest.raises(ValueError, match=r"reset_rows: rows=.*, but indices below 30, or a bool m"):
         optimizers["scales"].reset_rows(params["scales"], rows)
     assert torch.equal(optimizers["scales"].state[params["scales"]]["exp_avg"], before)
 

@@ -34,10 +34,11 @@ from opt3dgs_optim.checkpoint import (
 from opt3dgs_optim.contract import (
     Slots,
     bare,
-    check_group,
     check_held,
     check_slots,
     check_supported,
+    check_tensors,
+    indices_of,
     own_step,
 )
 from opt3dgs_optim.mean import kept_in, put_mean
@@ -85,8 +86,7 @@ class StepAdam(Adam):
         for group in self.param_groups:
             # Always there, since flattened states are loaded by the keys that a group has.
             group.setdefault(STATE_KEY, "")
-        self.has_positions = any(name == "means" for _, name in self._slots)
-        self.training.take(self, self._slots)
+        self.has_positions = self.training.take(self, self._slots)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """As torch's; refuses what `upgrade` would, with nothing changed."""
@@ -178,7 +178,7 @@ class StepAdam(Adam):
 
     def _remember_rows(self) -> None:
         """Know whose rows the state is of, so that an edit before the first step shows."""
-        if self.state and len(self._slots) == len(self.param_groups):
+        if (self.state or self._steppers) and len(self._slots) == len(self.param_groups):
             self._new_steppers(check=False)
             self.training.read_back()
 
@@ -188,14 +188,14 @@ class StepAdam(Adam):
         self._steppers, self._in_order = [], []
 
     def _new_steppers(self, check: bool = True) -> list[ParamStepper]:
-        made, call = [], type(self).__name__
+        made, call, last = [], type(self).__name__, dict(enumerate(self._last))
         old: dict[Any, ParamStepper] = {each.place: each for each in self._steppers}
         old |= {id(param): each for each in self._steppers if (param := each.param()) is not None}
         check_slots(f"{call}.step", self.param_groups, self._slots)
         for at, (group, slot) in enumerate(zip(self.param_groups, self._slots, strict=True)):
             if check:
-                check_group(f"{call}.step", group, slot[1])
-                self.training.check_member(call, *slot, self)
+                check_tensors(f"{call}.step", group, slot[1])
+                self.training.check_member(call, slot, at, self)
             for j, param in enumerate(group["params"]):
                 stepper = ParamStepper(call, self.training, group, param, slot)
                 stepper.place = (slot if slot[1] else at, j)
@@ -204,7 +204,7 @@ class StepAdam(Adam):
                 if before is not None:
                     stepper.follow(before, param, state)
                 else:
-                    stepper.stepped_in = dict(enumerate(self._last)).get(len(made))
+                    stepper.stepped_in = last.get(len(made))
                     if "exp_avg" in state:
                         stepper.framed = stepper.name == "means" and stepper.set in self._framed
                         stepper.remember(state["exp_avg"])
@@ -229,7 +229,9 @@ class StepAdam(Adam):
             param: one of the optimizer's parameters [N, ...].
             rows: their indices, or an [N] bool mask.
         """
-        check_held(f"{type(self).__name__}.reset_rows", self, param, rows)
+        call = f"{type(self).__name__}.reset_rows"
+        check_held(call, self, param)
+        rows = indices_of(call, param, rows)
         self.notice_edits()
         state = self.state.get(param, {})
         for key in state.keys() & {*MOMENTS, *kept_in(state)}:

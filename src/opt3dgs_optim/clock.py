@@ -165,6 +165,7 @@ class Clock:
             self._positions_at = iteration
         elif self.counts_positions and iteration > present:  # it has stepped in the present one
             begins = self._positions_at >= present and not self._positions_open
+            begins = begins or self.positions_gone()
             iteration = max(present + begins, 0)
         self._resumed, self._begun = False, iteration
         optimizer.next_iteration = iteration + 1
@@ -174,6 +175,10 @@ class Clock:
             self.go_to(iteration)
             self.advanced()
         return iteration
+
+    def positions_gone(self) -> bool:
+        """Whether no optimizer of positions is there any more."""
+        return False
 
     def put_on(self, iteration: int) -> None:
         """Put the clock forward, to where the trainer's own count is."""

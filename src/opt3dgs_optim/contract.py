@@ -80,20 +80,21 @@ def check_supported(call: str, optimizer: Any, slots: Slots, moments: int = 32) 
             "sets of Gaussians name the groups 'first#means', 'second#means'"
         )
     for group, (_, name) in zip(optimizer.param_groups, slots, strict=True):
-        check_group(call, group, name)
+        shown = group.get("name") or name or "a group"
+        for option in REFUSED:
+            if group.get(option):
+                raise ValueError(f"{call}: {shown} has {option}=True; make the Adam without it")
+        if isinstance(group["lr"], Tensor):
+            raise ValueError(f"{call}: {shown} has a tensor as lr; give a float")
+        check_tensors(call, group, name)
     devices = {str(p.device) for g in optimizer.param_groups for p in g["params"]}
     if len(devices) > 1:
         raise ValueError(f"{call}: its parameters lie on {sorted(devices)}; one device is needed")
 
 
-def check_group(call: str, group: dict[str, Any], name: str | None) -> None:
-    """ValueError where a group's options or tensors are not taken; `name`: which it holds."""
+def check_tensors(call: str, group: dict[str, Any], name: str | None) -> None:
+    """ValueError where a group's tensors are not taken; `name`: which Gaussian parameter it is."""
     shown = group.get("name") or name or "a group"
-    for option in REFUSED:
-        if group.get(option):
-            raise ValueError(f"{call}: {shown} has {option}=True; make the Adam without it")
-    if isinstance(group["lr"], Tensor):
-        raise ValueError(f"{call}: {shown} has a tensor as lr; give a float")
     if name is not None and len(group["params"]) != 1:
         raise ValueError(
             f"{call}: {shown} holds {len(group['params'])} tensors; give each Gaussian "
@@ -112,32 +113,35 @@ def check_group(call: str, group: dict[str, Any], name: str | None) -> None:
             )
 
 
-def check_held(call: str, optimizer: Optimizer, param: Tensor, rows: Any) -> None:
-    """ValueError unless a tensor is one of the optimizer's parameters, and these are rows of it."""
+def check_held(call: str, optimizer: Optimizer, param: Tensor) -> None:
+    """ValueError unless a tensor is one of the optimizer's parameters."""
     if not any(param is each for group in optimizer.param_groups for each in group["params"]):
         raise ValueError(
             f"{call}: a tensor {tuple(param.shape)} that is none of this optimizer's parameters; "
             "call it on the optimizer that steps it, with its present Parameter"
         )
-    given = f"{rows!r:.100}"
-    if isinstance(rows, Tensor):
-        given = f"{rows.dtype} {tuple(rows.shape)}"
-        mask = rows.dtype == torch.bool and rows.shape == param.shape[:1]
-        if mask or (rows.dtype in (torch.int64, torch.int32) and rows.dim() == 1):
-            return
+
+
+def indices_of(call: str, param: Tensor, rows: Any) -> Tensor:
+    """The indices [n] of some rows of a parameter; ValueError for what names none."""
+    try:
+        if rows is not None:
+            return torch.arange(len(param), device=param.device)[rows].reshape(-1)
+    except (IndexError, TypeError):
+        pass
+    given = f"{rows.dtype} {[*rows.shape]}" if isinstance(rows, Tensor) else f"{rows!r:.100}"
     raise ValueError(
-        f"{call}: rows={given}, but their indices [n], or a bool mask [{len(param)}], are needed"
+        f"{call}: rows={given}, but indices below {len(param)}, or a bool mask [{len(param)}], "
+        "are needed"
     )
 
 
 def check_slots(call: str, groups: list[dict[str, Any]], slots: Slots) -> None:
-    """ValueError unless the groups are those for which slots were found, in their order."""
-    now = [split_name(group.get("name")) for group in groups]
-    if len(now) != len(slots) or any(a != b for a, b in zip(now, slots, strict=True) if a[1]):
-        shown = [[name for _, name in each] for each in (now, slots)]
+    """ValueError unless there are as many groups as slots were found for."""
+    if len(groups) != len(slots):
         raise ValueError(
-            f"{call}: the parameter groups are {shown[0]}, but were {shown[1]} when it was "
-            "upgraded; upgrade it again, by the same scheduler, where they change"
+            f"{call}: {len(groups)} parameter groups, but {len(slots)} when it was upgraded; "
+            "upgrade it again, by the same scheduler, where they change"
         )
 
 

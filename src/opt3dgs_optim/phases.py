@@ -305,7 +305,10 @@ class PhaseScheduler(Training):
 
     def advanced(self) -> None:
         """Say what is wrong with the training as it goes."""
-        if self.members and not self.counts_positions and self.part(OwnFrame) is not None:
+        if (
+            self.members and not self.counts_positions and self.part(OwnFrame) is not None
+            and not any(name == "means" for _, name in self.members)  # they have not gone
+        ):  # fmt: skip
             self.messages.warn_once(
                 "positions",
                 f"{CALL}: no optimizer holds positions, so that OwnFrame does nothing; name their "

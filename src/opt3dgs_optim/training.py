@@ -75,25 +75,24 @@ class Training(Clock):
         """What a part knows of this training: plain numbers by name, saved with the optimizers."""
         return self._notes[type(part).__name__]
 
-    def take(self, optimizer: Any, slots: list[tuple[str, str | None]]) -> None:
-        """Have an optimizer of these parameters, in the place of those that held any of them."""
+    def take(self, optimizer: Any, slots: list[tuple[str, str | None]]) -> bool:
+        """Have an optimizer of these parameters, in the place of those that held them.
+
+        Returns whether positions are among them.
+        """
+        positions = False
         ref = self.all_optimizers[id(optimizer)] = weakref.ref(optimizer)
-        replaced: list[weakref.ref[Any]] = [ref]
-        for of_set, name in slots:
-            if name is not None and (of_set, name) in self.members:
-                replaced.append(self.members[of_set, name][0])
-        self.counts_positions = optimizer.has_positions
-        for slot, (held, _) in [*self.members.items()]:
-            if held in replaced:
-                del self.members[slot]
-            elif slot[1] == "means" and held() is not None:
-                self.counts_positions = True
-        for held in replaced[1:]:
-            if (other := held()) not in (None, optimizer):
-                other.forget_steppers()  # so that it is missed among the members if it steps again
+        for slot in [slot for slot, (held, _) in self.members.items() if held() is optimizer]:
+            del self.members[slot]
         for at, (of_set, name) in enumerate(slots):
             if name is not None:
+                other: Any = self.members.get((of_set, name), (ref,))[0]()
+                if other is not None and other is not optimizer and other.training is self:
+                    other.forget_steppers()  # so that it is missed here if it steps again
                 self.members[of_set, name] = ref, at
+                positions |= name == "means"
+        self.counts_positions |= positions
+        return positions
 
     def param_of(self, set_name: str, name: str) -> Tensor | None:
         """The present tensor of a Gaussian parameter, by gsplat's name; None if nobody holds it."""
@@ -103,13 +102,19 @@ class Training(Clock):
         params = optimizer.param_groups[member[1]]["params"]
         return params[0] if params else None
 
-    def check_member(self, call: str, of_set: str, name: str | None, optimizer: Any) -> None:
+    def check_member(self, call: str, slot: tuple[str, Any], at: int, optimizer: Any) -> None:
         """Say once that another optimizer, upgraded later, has the place of one that steps."""
-        member = self.members.get((of_set, name or ""))
-        if member is not None and member[0]() is not optimizer:
+        member = self.members.get(slot)
+        other = None if member is None else member[0]()
+        if other is None and slot[1] is not None:
+            self.members[slot] = weakref.ref(optimizer), at  # it is alone again
+        elif (
+            other not in (None, optimizer)
+            and optimizer.param_groups[at]["params"][0].grad is not None
+        ):
             self.messages.warn_once(
                 "second",
-                f"{call}.step: another optimizer holds {name}, too, and was upgraded later; for "
+                f"{call}.step: another optimizer holds {slot[1]}, too, and was upgraded later; for "
                 "two sets of Gaussians name the groups 'first#means', 'second#means', or make a "
                 "scheduler for each",
             )
@@ -191,15 +196,21 @@ class Training(Clock):
             )
 
     def look_at_members(self) -> None:
-        """Say once that an optimizer has gone, while others of its Gaussians are stepped."""
+        """Say once that an optimizer has gone, while others of its Gaussians are there."""
         gone = {key for key, (held, _) in self.members.items() if held() is None}
         sets = {of_set for of_set, _ in self.members.keys() - gone}
         if names := [name for of_set, name in gone if of_set in sets]:
             self.messages.warn_once(
                 "gone",
-                f"opt3dgs_optim: iteration {self.iteration}: the optimizer of {sorted(names)} "
-                "that was upgraded has gone; upgrade the one in its place, by the same scheduler",
+                f"opt3dgs_optim: iteration {self.iteration}: the optimizer of {sorted(names)} has "
+                "gone; if another is in its place, upgrade that one, by the same scheduler",
             )
+
+    def positions_gone(self) -> bool:
+        """Whether no optimizer of positions is there any more; others then count."""
+        held = [each() for (_, name), (each, _) in self.members.items() if name == "means"]
+        self.counts_positions = any(each is not None for each in held)
+        return not self.counts_positions
 
     def read_back(self) -> None:
         """Have what is on its way from a device in the parts' notes."""

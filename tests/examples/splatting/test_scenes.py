@@ -88,6 +88,13 @@ def test_colmap_is_preferred(tmp_path):
     assert len(load_scene(folder).train) == 8
 
 
+def test_too_few_photos_are_told(tmp_path):
+    with pytest.raises(
+        ValueError, match="needs at least 2 train views and a test view, got 1 and 1"
+    ):
+        load_scene(write_scene(tmp_path / "s", "json", count=2))
+
+
 def test_bad_images_are_named(tmp_path):
     folder = write_scene(tmp_path / "s", "bin")
     path = folder / "images_4" / "photo_03.png"
