@@ -205,12 +205,16 @@ def test_the_readme_says_what_was_measured() -> None:
     assert f"{4 * (numbers + 9)} bytes more" in words
     assert f"{4 * 2 * numbers} bytes" in words
     less, same_number, more, share = [], [], [], []
-    for scene, those, equal in (
-        *zip(report.MAIN, [report.HALF] * 3, (1.3, 0.89, 1.18), strict=True),
-        ("bonsai", report.WHOLE_SPLIT, 3.12),
+    for scene, size, equal, trained in (
+        ("bonsai", report.HALF, 1.3, 2),
+        ("lego", report.HALF, 0.89, 2),
+        ("plush", report.HALF, 1.18, 2),
+        ("train", report.HALF, 2.0, 1),
+        ("bonsai", report.WHOLE, 3.12, 1),
     ):
+        those = report.with_split(scene, size)
         stock, ours = report.third(scene, report.SPLIT, those)
-        assert len(stock) == 1 + (those is report.HALF)
+        assert len(stock) == trained
         same = report.of(report.THIRD, scene, density=report.SPLIT, **those | {"threshold": equal})
         assert same[0]["gaussians"] == pytest.approx(stock[0]["gaussians"], rel=0.05)
         less.append(-report.gain(ours, stock)["psnr"])
