@@ -65,7 +65,8 @@ def test_a_compiled_kernel_is_launched_as_tritons_launcher_does(
     assert len(first) == len(again)
     addresses = 0
     for one, other in zip(first, again, strict=True):
-        if isinstance(one, int) and one > 2**32:
+        # Not above 2**32: where Python lies at a fixed place, its heap begins low.
+        if isinstance(one, int) and one > 2**20 and one % 16 == 0:
             addresses += 1  # of other tensors, both of them aligned
             assert other % 16 == 0
         else:
