@@ -195,7 +195,7 @@ class StepAdam(Adam):
         for at, (group, slot) in enumerate(zip(self.param_groups, self._slots, strict=True)):
             if check:
                 check_tensors(f"{call}.step", group, slot[1])
-                self.training.check_member(call, slot, at, self)
+                self.training.claim(call, slot, at, self)
             for j, param in enumerate(group["params"]):
                 stepper = ParamStepper(call, self.training, group, param, slot)
                 stepper.place = (slot if slot[1] else at, j)

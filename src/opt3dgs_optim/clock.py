@@ -165,7 +165,8 @@ class Clock:
             self._positions_at = iteration
         elif self.counts_positions and iteration > present:  # it has stepped in the present one
             begins = self._positions_at >= present and not self._positions_open
-            begins = begins or self.positions_gone()
+            if not begins and self.positions_gone():
+                self.counts_positions, begins = False, True
             iteration = max(present + begins, 0)
         self._resumed, self._begun = False, iteration
         optimizer.next_iteration = iteration + 1

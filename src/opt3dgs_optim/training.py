@@ -102,12 +102,12 @@ class Training(Clock):
         params = optimizer.param_groups[member[1]]["params"]
         return params[0] if params else None
 
-    def check_member(self, call: str, slot: tuple[str, Any], at: int, optimizer: Any) -> None:
-        """Say once that another optimizer, upgraded later, has the place of one that steps."""
+    def claim(self, call: str, slot: tuple[str, Any], at: int, optimizer: Any) -> None:
+        """Have an optimizer that steps in its place; say once if one upgraded later has that."""
         member = self.members.get(slot)
         other = None if member is None else member[0]()
         if other is None and slot[1] is not None:
-            self.members[slot] = weakref.ref(optimizer), at  # it is alone again
+            self.members[slot] = weakref.ref(optimizer), at  # the other has gone
         elif (
             other not in (None, optimizer)
             and optimizer.param_groups[at]["params"][0].grad is not None
@@ -207,10 +207,9 @@ class Training(Clock):
             )
 
     def positions_gone(self) -> bool:
-        """Whether no optimizer of positions is there any more; others then count."""
+        """Whether no optimizer of positions is there any more."""
         held = [each() for (_, name), (each, _) in self.members.items() if name == "means"]
-        self.counts_positions = any(each is not None for each in held)
-        return not self.counts_positions
+        return all(each is None for each in held)
 
     def read_back(self) -> None:
         """Have what is on its way from a device in the parts' notes."""

@@ -33,10 +33,11 @@ def points(n: int, dim: int = 3) -> tuple[Tensor, Tensor, Tensor]:
 
 
 @pytest.mark.compiles
-def test_plain_torch_is_traced_whole() -> None:
+@pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")  # inductor's, of torch's own
+def test_pure_torch_compiles_with_inductor() -> None:
     """The path of ROCm, MPS and CPU."""
     _, grad, history = points(1000)
-    compiled = torch.compile(two_loop, fullgraph=True, backend="eager")(grad, history, 5)
+    compiled = torch.compile(two_loop, fullgraph=True)(grad, history, 5)
     torch.testing.assert_close(compiled, two_loop(grad, history, 5), rtol=1e-5, atol=1e-6)
 
 
